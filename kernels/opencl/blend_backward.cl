@@ -189,20 +189,21 @@ static inline Parts moments_of(const Sums *sums, const BlendConstants *constants
     return m;
 }
 
-// Which of a splat's tiles this one is, counted row by row.
-#if LANES > 1
-// big_rows: what reserve_slots has left.
-static inline uint tile_rank(uint2 window, global const uint *big_rows, int column, int row, int height) {
-    if (window.y == 0) return big_rows[window.x * (size_t)((height + TILE_H - 1) / TILE_H) + row] + column;
+// Of a window's tiles, row by row, which one this is.
+static inline uint window_rank(uint2 window, int column, int row) {
     int bit = (row - (int)(window.x >> 16)) * WINDOW_W + column - (int)(window.x & 0xFFFFu);
     return popcount(window.y & ((1u << bit) - 1u));
 }
+
+// Which of a splat's tiles this one is, counted row by row.
+#if LANES > 1
+// big_rows: what reserve_slots has left, row by row, so that what a tile reads lies close together.
+static inline uint tile_rank(uint2 window, uint big_capacity, global const uint *big_rows, int column, int row) {
+    return window.y != 0 ? window_rank(window, column, row) : big_rows[row * (size_t)big_capacity + window.x] + column;
+}
 #else
 static inline uint tile_rank(uint2 window, global const Bounds *big_bounds, int column, int row, int width, int height) {
-    if (window.y != 0) {
-        int bit = (row - (int)(window.x >> 16)) * WINDOW_W + column - (int)(window.x & 0xFFFFu);
-        return popcount(window.y & ((1u << bit) - 1u));
-    }
+    if (window.y != 0) return window_rank(window, column, row);
     const Bounds b = big_bounds[window.x];
     int y0, y1;
     bounds_rows(&b, height, &y0, &y1);
@@ -232,13 +233,13 @@ static inline uint tile_count(uint2 window, uint big_capacity, global const Boun
 
 #if LANES > 1
 // For each row of tiles of a big splat, how many tiles it has above, less its first column.
-static inline void put_rows(global uint *rows, const Bounds *b, int width, int height) {
+static inline void put_rows(global uint *rows, uint stride, const Bounds *b, int width, int height) {
     int y0, y1;
     bounds_rows(b, height, &y0, &y1);
     uint above = 0;
     for (int row = y0 / TILE_H; row * TILE_H < y1; row++) {
         TileSpan span = tile_span(b, row, width, height);
-        rows[row] = above - (uint)span.first;
+        rows[row * (size_t)stride] = above - (uint)span.first;
         above += max(span.last - span.first + 1, 0);
     }
 }
@@ -261,7 +262,7 @@ kernel __attribute__((reqd_work_group_size(RESERVED, 1, 1))) void reserve_slots(
 #if LANES > 1
     if (i < count && keys[i] < OUTSIDE && windows[i].y == 0 && windows[i].x < big_capacity) {
         const Bounds b = big_bounds[windows[i].x];
-        put_rows(big_rows + windows[i].x * (size_t)((height + TILE_H - 1) / TILE_H), &b, width, height);
+        put_rows(big_rows + windows[i].x, big_capacity, &b, width, height);
     }
 #endif
     barrier(CLK_LOCAL_MEM_FENCE);

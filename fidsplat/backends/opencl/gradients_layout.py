@@ -50,13 +50,14 @@ _BLENDED = takes(
 
 KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": takes(
-        *(_RESERVED, "out uint big_rows  // (big splats, rows of tiles): tiles above, less the first column"),
+        *(_RESERVED, "out uint big_rows  // (rows of tiles, big splats): tiles above, less the first column"),
     ),
     "blend_backward": takes(
         *(
             "in Splat splats",
             "in uint lists starts",
             "in uint2 windows",
+            "uint big_capacity",
             _SIZE,
             "in uint splat_slots big_rows",
         ),

@@ -161,7 +161,7 @@ kernel void blend_backward(
             }
             FETCH_SPLAT(min(walked + AHEAD_SPLATS, end - 1));
             uint index = lists[walked], place = walked - first;
-            tape->slots[place] = splat_slots[index] + tile_rank(windows[index], big_rows, column, tile_row, height);
+            tape->slots[place] = splat_slots[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
             const Splat s = splats[index];
             alive = walk_splat(&s, &tile, pixels, alive, tape, place);
         }
@@ -179,7 +179,7 @@ kernel void blend_backward(
         for (uint k = walked; k < end; k++) {
             FETCH_AHEAD(windows + lists[min(k + AHEAD_SPLATS, end - 1)]);
             FETCH_AHEAD(splat_slots + lists[min(k + AHEAD_SPLATS, end - 1)]);
-            uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_rows, column, tile_row, height);
+            uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_capacity, big_rows, column, tile_row);
             leave_nothing(moments, slot);
         }
         for (bool again = false; walked > start; again = true) {
@@ -195,7 +195,7 @@ kernel void blend_backward(
                 for (uint k = first; k < walked; k++) {
                     FETCH_SPLAT(min(k + AHEAD_SPLATS, end - 1));
                     uint index = lists[k];
-                    tape->slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_rows, column, tile_row, height);
+                    tape->slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
                     const Splat s = splats[index];
                     alive = walk_splat(&s, &tile, pixels, alive, tape, k - first);
                 }
