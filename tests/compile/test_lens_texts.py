@@ -27,10 +27,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "bb41da3ff0cd42248ce4b0f38a2e44b46ff98bfc0edb2298ed9bceb5a4a4786b",
-    ("lanes", OUTPUTS): "ce4e6d51d9e195314a86609f4d27eac0db493da84d24136e3fd2247e18bd1886",
-    ("group", ("rgb",)): "af23be2629b8f248d74720a4095e5cea92317bc1d77ffae34cac6e1a9b14e336",
-    ("group", OUTPUTS): "6387be3d421a748e7419c7e2ba77b471e723964d049dad8069821eac7b3c9302",
+    ("lanes", ("rgb",)): "99a3d564b75619b680535c9fdd58c028fa0ec16cbdfc0c5efef9e83ee7fee2fa",
+    ("lanes", OUTPUTS): "cfc7086f8160c080d820ceac26bfd61e6cb4bf6ee876514b86ca63799295ca92",
+    ("group", ("rgb",)): "a91ed8c537c02e20e6553209a8f8e48e4a4182d916670f75676d3cd609ca9910",
+    ("group", OUTPUTS): "81a11fc3a1ea310a34819a4b7fa90bcbfd265dd71e0353199d2df282171bdf70",
 }
 
 
