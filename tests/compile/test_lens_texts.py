@@ -29,8 +29,8 @@ CAMERAS = {
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "99a3d564b75619b680535c9fdd58c028fa0ec16cbdfc0c5efef9e83ee7fee2fa",
     ("lanes", OUTPUTS): "cfc7086f8160c080d820ceac26bfd61e6cb4bf6ee876514b86ca63799295ca92",
-    ("group", ("rgb",)): "a91ed8c537c02e20e6553209a8f8e48e4a4182d916670f75676d3cd609ca9910",
-    ("group", OUTPUTS): "81a11fc3a1ea310a34819a4b7fa90bcbfd265dd71e0353199d2df282171bdf70",
+    ("group", ("rgb",)): "ec8deb36a93382275635863170b5053f08fe9322afcccf5cdc574689882495e6",
+    ("group", OUTPUTS): "79d9f8050f17d6b3e9731fb76628a7fd228ab1f535742d191c4db7804dd560b2",
 }
 
 
