@@ -6,12 +6,13 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
 
 from fidsplat.backends.chunks import Chunk
+from fidsplat.backends.ends import TileEnds, hidden, least_keys
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.seen import Boxes, seen, sizes
 from fidsplat.backends.view import View
@@ -21,6 +22,7 @@ from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
 from fidsplat.store.layout import MOST_SPLATS
 from fidsplat.store.part import StorePart, colors_of, joined
+from fidsplat.store.pieces import Pieces, PiecesOf
 from fidsplat.store.store import Store
 
 KEPT_BYTES = 2 * 2**30
@@ -33,14 +35,33 @@ Pixels = float | tuple[tuple[float, ...], ...]
 store"""
 
 
+Nodes = tuple[np.ndarray, ...]
+"""of each store which of its nodes, (places * nodes,) bool"""
+
+
 @dataclass(frozen=True)
 class Selection:
     """What views are drawn of: numbers of each store's nodes, in the order of their splats."""
 
     nodes: tuple[tuple[int, ...], ...]
+    rows: tuple[tuple[tuple[int, int], ...], ...] | None = None
+    """of each of these the first row and how many; None: all of each node"""
+
+    @staticmethod
+    def of(nodes: Nodes) -> Selection:
+        """Of some of all nodes."""
+        return Selection(tuple(tuple(np.flatnonzero(each).tolist()) for each in nodes))
+
+    @staticmethod
+    def of_pieces(pieces: Sequence[Pieces]) -> Selection:
+        """Of pieces of nodes."""
+        return Selection(
+            tuple(tuple(each.nodes.tolist()) for each in pieces),
+            tuple(tuple(zip(each.first.tolist(), each.rows.tolist(), strict=True)) for each in pieces),
+        )
 
     def __len__(self) -> int:
-        return sum(map(len, self.nodes))
+        return sum(len(set(each)) for each in self.nodes)
 
 
 class Streamed:
@@ -112,12 +133,42 @@ class Streamed:
     def select(self, views: Sequence[View], features: FeatureSet, pixels: Pixels = 0.0) -> Selection:
         """What these views see. pixels: cells smaller than so many samples need not be told apart; 0: exactly
         the scene itself."""
+        return Selection.of(self.seen(views, features, pixels))
+
+    def seen(self, views: Sequence[View], features: FeatureSet, pixels: Pixels = 0.0) -> Nodes:
+        """As `select`."""
         chosen = []
         for number, store in enumerate(self.stores):
             own = pixels[number] if isinstance(pixels, tuple) else (pixels,) * (store.levels + 1)
-            numbers = _chosen(store, self._boxes(number), views, features, np.array(own))
-            chosen.append(tuple(numbers.tolist()))
-        return Selection(tuple(chosen))
+            chosen.append(_chosen(store, self._boxes(number), views, features, np.array(own)))
+        return tuple(chosen)
+
+    def least_keys(self, view: View, features: FeatureSet) -> Nodes:
+        """Of each store's nodes (n,) metres: below the depths at which a view sorts their splats."""
+        return tuple(least_keys(view, features, self._boxes(k)) for k in range(len(self.stores)))
+
+    def hidden(self, view: View, features: FeatureSet, ends: TileEnds) -> Nodes:
+        """The nodes of which nothing can show in a picture whose tiles end there."""
+        made = []
+        for number, store in enumerate(self.stores):
+            reach = np.tile(store.nodes["reach"].astype(np.float64), store.places)
+            # what stands on planes is in every picture
+            made.append(hidden(view, features, self._boxes(number), reach, ends) & ~_pinned(store))
+        return tuple(made)
+
+    def pieces(self, nodes: Nodes) -> list[Pieces]:
+        """Those of some nodes of each store."""
+        every = zip(self._pieces, nodes, strict=True)
+        return [pieces.of(np.flatnonzero(mask)) for pieces, mask in every]
+
+    @cached_property
+    def _pieces(self) -> list[PiecesOf]:
+        return [PiecesOf(store, store.origin - self.origin, _pinned(store)) for store in self.stores]
+
+    @cached_property
+    def node_counts(self) -> Nodes:
+        """Splats of each store's nodes."""
+        return tuple(np.tile(store.nodes["count"].astype(np.int64), store.places) for store in self.stores)
 
     def part(self, selection: Selection) -> StorePart:
         """The splats of a selection."""
@@ -129,9 +180,13 @@ class Streamed:
     def ids(self, selection: Selection) -> np.ndarray:
         """Indices in the whole (n,) int32 of the splats of a selection; -1 of those that stand for others."""
         made, first = [np.empty(0, np.int32)], 0
-        for store, nodes in zip(self.stores, selection.nodes, strict=True):
+        for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
             numbers = np.array(nodes, np.int64)
-            for at, count in zip(store.first_of(numbers), store.counts(numbers), strict=True):
+            begins, counts = store.first_of(numbers), store.counts(numbers)
+            if selection.rows is not None:
+                own_rows = np.array(selection.rows[number], np.int64).reshape(-1, 2)
+                begins, counts = np.where(begins < 0, -1, begins + own_rows[:, 0]), own_rows[:, 1]
+            for at, count in zip(begins, counts, strict=True):
                 own = np.full(count, -1) if at < 0 else np.arange(first + at, first + at + count)
                 made.append(own.astype(np.int32))
             first += len(store)
@@ -161,9 +216,12 @@ class Streamed:
         for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
             moved = places and self._may_move(store)
             known = self._chunks_of.setdefault((number, moved), {})
-            for node in nodes:
+            for place, node in enumerate(nodes):
                 if (chunk := known.get(node)) is None:
                     chunk = known[node] = self._chunk_of(number, node, moved)
+                if selection.rows is not None:
+                    first, count = selection.rows[number][place]
+                    chunk = replace(chunk, first=first, count=count)
                 made.append(chunk)
         most, count = self.largest_chunk, len(self.beside)
         for first in range(0, count if made else max(count, 1), most):
@@ -313,10 +371,10 @@ def _pinned(store: Store) -> np.ndarray:
 def _chosen(
     store: Store, boxes: Boxes, views: Sequence[View], features: FeatureSet, pixels: np.ndarray
 ) -> np.ndarray:
-    """Numbers of the nodes of a store that views are drawn of, in the order of their splats. boxes: as
-    `Store.boxes`, from the origin that views see it from."""
+    """(n,) bool: the nodes of a store that views are drawn of. boxes: as `Store.boxes`, from the origin that
+    views see it from."""
     if not len(store.nodes):
-        return np.zeros(0, np.int64)
+        return np.zeros(0, bool)
     nodes, places = store.nodes, store.places
     level = np.tile(nodes["level"], places)
     reach = np.tile(nodes["reach"].astype(np.float64), places)
@@ -325,7 +383,7 @@ def _chosen(
         visible |= seen(view, features, boxes, reach)
     pinned = _pinned(store)
     if not pixels.any():
-        return np.flatnonzero((visible | pinned) & (level == 0))
+        return (visible | pinned) & (level == 0)
     parents = np.tile(nodes["parent"].astype(np.int64), places)
     parents = np.where(parents >= 0, parents + np.repeat(np.arange(places), len(nodes)) * len(nodes), -1)
     edges = np.tile(nodes["size"].astype(np.float64), places)
@@ -336,4 +394,4 @@ def _chosen(
     for above in range(int(level.max()), 0, -1):
         children = np.flatnonzero((level == above - 1) & (parents >= 0))
         reached[children] = (reached & refined & visible)[parents[children]]
-    return np.flatnonzero(((reached & visible) | pinned) & (~refined | (level == 0)))
+    return ((reached & visible) | pinned) & (~refined | (level == 0))
