@@ -137,13 +137,18 @@ class OpenCLTraining:
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
         """As `TrainingKernels`."""
         if self._drawn is None or self._drawn[0] != degree:
-            count, drawn = self._count, (degree + 1) ** 2
-            for name, floats in (("quats", 4), ("scales", 2), ("opacities", 1), ("sh", 3 * drawn)):
+            count, drawn, every = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
+            itself = degree > 0 and drawn == every  # what is drawn is the values themselves
+            sizes = {"quats": 4, "scales": 2, "opacities": 1} | ({} if itself else {"sh": 3 * drawn})
+            for name, floats in sizes.items():
                 size = 4 * count * floats
                 self._held[f"drawn_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
-            self._held |= {"drawn": drawn, "all": self._shapes["sh"][1], "plain": int(degree == 0)}
+            self._held |= {"drawn": drawn, "all": every, "plain": int(degree == 0)}
             self._launch("activate", count)
-            self._launch("activate_sh", 3 * count * drawn)
+            if itself:
+                self._held["drawn_sh"] = self._held["sh"]
+            else:
+                self._launch("activate_sh", 3 * count * drawn)
             buffers = {name: self._held[f"drawn_{name}"] for name in ("quats", "scales", "opacities")}
             buffers["means"] = self._held["means"]
             buffers["colors" if degree == 0 else "sh"] = self._held["drawn_sh"]
@@ -235,8 +240,15 @@ class OpenCLTraining:
             "rest1": 1 - numbers["beta1"],
             "rest2": 1 - numbers["beta2"],
         }
-        self._launch("adam_shapes", self._count, given)
-        self._launch("adam_sh", 3 * self._count * self._held["drawn"], given)
+        whole = 0 if self._lanes == 1 or numbers["sparse"] else self._count // 16  # adam_rows.cl
+        if whole:
+            self._launch("adam_shapes_16", whole, given)
+        if 16 * whole < self._count:
+            self._launch("adam_shapes", self._count - 16 * whole, given, 16 * whole)
+        if self._lanes == 1 or self._held["plain"]:
+            self._launch("adam_sh", 3 * self._count * self._held["drawn"], given)
+        else:
+            self._launch("adam_sh_rows", self._count, given)
 
     def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
         """As `TrainingKernels`."""
@@ -249,21 +261,28 @@ class OpenCLTraining:
         """The queue on which pictures with derivatives are drawn, after all that is on others."""
         return self._workspace.turn_to(self._workspace.queue)
 
-    def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
+    def _launch(
+        self, kernel: str, items: int, given: Mapping[str, Any] | None = None, first: int = 0
+    ) -> None:
         size = max(_GROUP, -(-items // _GROUP) * _GROUP)
-        self._enqueue(kernel, (size,), (_GROUP,), given or {})
+        self._enqueue(kernel, (size,), (_GROUP,), given or {}, first)
 
     def _launch_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> None:
         size = max(_GROUP, -(-items // _GROUP) * _GROUP)
         self._enqueue(kernel, (size, rows), (_GROUP, 1), given)
 
     def _enqueue(
-        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
+        self,
+        kernel: str,
+        size: tuple[int, ...],
+        group: tuple[int, ...],
+        given: Mapping[str, Any],
+        first: int = 0,
     ) -> cl.Event:
         every = {**self._held, "count": self._count, **given}
         values = [every[one.name] for one in self._program.source.arguments[kernel]]
         try:
-            return self._program.launch(self._queue, kernel, size, group, values)
+            return self._program.launch(self._queue, kernel, size, group, values, first)
         except cl.Error as error:
             raise DeviceError(f"{self._workspace.info.title} failed while training: {error}") from error
 
