@@ -61,10 +61,14 @@ class DifferentiablePipeline(Protocol):
 class TrainingKernels(Protocol):
     """The work of a training step around the picture (`fidsplat.train`), on arrays of the device.
 
+    `late`: so many losses may be asked for after later pictures.
+
     It holds splats before their activations, n of them, float32: `means` (n, 3), `log_scales` (n, 2), `quats`
     (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's running means of each as `first_NAME` and `second_NAME`;
     `gradients` (n,) and `seen` (n,), the sums by which splats are made.
     """
+
+    late: int
 
     def take_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
         """Keep pictures (h, w, 3) uint8 with their masks (h, w) bool, to be compared with."""
@@ -91,8 +95,8 @@ class TrainingKernels(Protocol):
         self, images: Any, view: int, dssim_weight: float
     ) -> tuple[Callable[[], tuple[float, float]], Any]:
         """Compare a picture with that of a view, by its number: what waits for the loss and the mean squared
-        difference, to be called before the next picture, and the loss's derivative (h, w, 3) as an array of
-        the device, which holds until the next call."""
+        difference, to be called before `late` more pictures, and the loss's derivative (h, w, 3) as an array
+        of the device, which holds until the next call."""
         ...
 
     def surface(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:

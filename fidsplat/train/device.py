@@ -31,6 +31,7 @@ class DeviceWork:
         self, kernels: TrainingKernels, views: Sequence[TrainingView], settings: TrainSettings
     ) -> None:
         self._kernels, self._settings = kernels, settings
+        self.late = kernels.late
         kernels.take_views([(view.picture, view.mask) for view in views])
         self._cameras = [view.camera for view in views]
         self._number = 0

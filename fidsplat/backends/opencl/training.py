@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
+from fidsplat.backends.opencl.launches import Launch, Launches
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.training_source import IMAGES, MARGIN, MARGIN_ROWS, training_source
 from fidsplat.backends.opencl.workspace import Workspace
@@ -21,6 +22,8 @@ from fidsplat.errors import DeviceError
 _GROUP = 64
 _SUMS, _SUMMED = 512, 128
 """work-groups that add up the loss, and their work-items (SUMMED of kernels/opencl/train/loss.cl)"""
+LATE = 16
+"""losses whose sums are kept until they are asked for"""
 _REMEMBERED = ("first_", "second_")
 
 
@@ -32,6 +35,40 @@ class _Truth(NamedTuple):
     masked: bool
     counted: int
     """values that matter"""
+
+
+class _Sums:
+    """Room for the sums of several losses, so that the host need not read each before the next."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        align = max(1, workspace.device.mem_base_addr_align // 8)
+        self._each = -(-12 * _SUMS // align) * align
+        self._buffer = workspace.pool.fresh("losses", LATE * self._each)
+        self.slots = [self._buffer.get_sub_region(k * self._each, 12 * _SUMS) for k in range(LATE)]
+        self._words = np.empty((LATE, self._each // 4), np.float32)
+        self._next = 0
+        self._last: cl.Event | None = None
+        """when the sums of the last loss are there, and so those before it"""
+        self._unread: set[int] = set()
+
+    def take(self) -> int:
+        """The number of a slot that is written next."""
+        self._next = (self._next + 1) % LATE
+        return self._next
+
+    def added(self, slot: int, event: cl.Event) -> None:
+        """Its sums are there when this has come to pass."""
+        self._last = event
+        self._unread.add(slot)
+
+    def read(self, slot: int) -> np.ndarray:
+        """Three sums (3,) float64, with those of all that have not been read."""
+        if slot in self._unread:
+            after = None if self._last is None else [self._last]
+            cl.enqueue_copy(self._workspace.side_queue, self._words, self._buffer, wait_for=after)
+            self._unread.clear()
+        return self._words[slot, : 3 * _SUMS].reshape(_SUMS, 3).sum(axis=0, dtype=np.float64)
 
 
 class ResidentArrays:
@@ -68,6 +105,8 @@ class ResidentArrays:
 class OpenCLTraining:
     """As `TrainingKernels`."""
 
+    late = LATE // 2 - 1  # a picture may be compared twice
+
     def __init__(self, workspace: Workspace, lanes: int = 0) -> None:
         """lanes: of vectors, in place of the device's own (tests)."""
         self._workspace = workspace
@@ -80,6 +119,11 @@ class OpenCLTraining:
         self._drawn: tuple[int, ResidentArrays] | None = None
         self._truths: list[_Truth] = []
         self._loss_images: tuple[tuple[int, int], cl.Buffer] | None = None
+        self._sums = _Sums(workspace)
+        self._version = object()
+        """another one whenever splats are held in other buffers"""
+        self._kept: dict[str, tuple[tuple[Any, ...], Launches, Any]] = {}
+        """launches of a step that are made again, with what they hold for"""
         self._sights: WeakKeyDictionary[Camera, tuple[np.ndarray, dict[str, float]]] = WeakKeyDictionary()
         """numbers by which kernels know what a camera sees, each with the origin that they are of"""
 
@@ -112,7 +156,7 @@ class OpenCLTraining:
 
     def _begin(self) -> None:
         """Other splats are there."""
-        self._count, self._drawn = self._shapes["means"][0], None
+        self._count, self._drawn, self._version = self._shapes["means"][0], None, object()
         if math.prod(self._shapes["sh"]) >= 2**32:  # kernels count coefficients in 32 bits
             raise DeviceError(f"{self._count:,} splats are too many to train; use fewer")
 
@@ -137,39 +181,47 @@ class OpenCLTraining:
             buffers = {name: self._held[f"drawn_{name}"] for name in ("quats", "scales", "opacities")}
             buffers["means"] = self._held["means"]
             buffers["colors" if degree == 0 else "sh"] = self._held["drawn_sh"]
-            self._drawn = degree, ResidentArrays(buffers, count, degree, origin)
+            self._drawn, self._version = (degree, ResidentArrays(buffers, count, degree, origin)), object()
         return self._drawn[1]
 
     def loss(
         self, images: Any, view: int, dssim_weight: float
     ) -> tuple[Callable[[], tuple[float, float]], Any]:
         """As `TrainingKernels`."""
-        image = images.device_array("rgb")
-        height, columns, _ = image.shape
+        rgb, (height, columns, _) = images.device_buffer("rgb")
         truth = self._truths[view]
         number, stride = truth.counted, self._stride(columns)
-        slope = self._array("by_rgb", image.shape)
+        slot = self._sums.take()
         given = {
-            **{"rgb": image.data, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
-            **{"by_rgb": slope.data, "sums": self._scratch("loss sums", 12 * _SUMS)},
-            **{"l1_share": (1 - dssim_weight) / number, "ssim_share": dssim_weight / image.size},
-            **{"width": 3 * columns, "height": height, "stride": stride},
-            **{"images": self._room_for_images(height, columns)},
-            "image_stride": stride * (height + 2 * MARGIN_ROWS),
+            **{"rgb": rgb, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
+            **{"l1_share": (1 - dssim_weight) / number, "sums": self._sums.slots[slot]},
         }
-        self._launch_rows("loss_take", 3 * columns, height, given)
-        for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
-            each = self._each_rows if "columns" in name else 1
-            self._launch_rows(name, -(-3 * columns // self._lanes), -(-height // each), given)
-        added = self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
+
+        def plan() -> tuple[list[Launch], Array]:
+            slope = self._array("by_rgb", (height, columns, 3))
+            fixed = {
+                **{"by_rgb": slope.data, "ssim_share": dssim_weight / (3 * height * columns)},
+                **{"width": 3 * columns, "height": height, "stride": stride},
+                **{"images": self._room_for_images(height, columns)},
+                "image_stride": stride * (height + 2 * MARGIN_ROWS),
+            }
+            row = [self._of_rows("loss_take", 3 * columns, height, fixed | given)]
+            for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
+                each = self._each_rows if "columns" in name else 1
+                items = -(-3 * columns // self._lanes)
+                row.append(self._of_rows(name, items, -(-height // each), fixed | given))
+            row.append(self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), fixed | given))
+            return row, slope
+
+        events, slope = self._again("loss", (height, columns, dssim_weight), given, plan)
+        self._sums.added(slot, events[-1])
 
         def value() -> tuple[float, float]:
-            sums = np.empty((_SUMS, 3), np.float32)
             self._queue.flush()
             with self._workspace.failing("training"):
-                cl.enqueue_copy(self._workspace.side_queue, sums, given["sums"], wait_for=[added])
-            absolute, squared, similar = sums.sum(axis=0, dtype=np.float64)
-            loss = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / image.size)
+                absolute, squared, similar = self._sums.read(slot)
+            loss = (1 - dssim_weight) * absolute / number
+            loss += dssim_weight * (1 - similar / (3 * height * columns))
             return float(loss), float(squared / number)
 
         return value, slope
@@ -197,7 +249,8 @@ class OpenCLTraining:
         """As `TrainingKernels`."""
         if (known := self._sights.get(camera)) is None or known[0] is not origin:
             known = self._sights[camera] = origin, _sight(camera, origin)
-        self._launch("count_seen", self._count, known[1] | {"screen": screen.data})
+        given = known[1] | {"screen": screen.data}
+        self._again("count", (), given, lambda: ([self._items("count_seen", self._count, given)], None))
 
     def step(
         self, gradients: Mapping[str, Any], sizes: Mapping[str, float], numbers: Mapping[str, float]
@@ -216,8 +269,13 @@ class OpenCLTraining:
             "rest1": 1 - numbers["beta1"],
             "rest2": 1 - numbers["beta2"],
         }
-        self._launch("adam_shapes", self._count, given)
-        self._launch("adam_sh", 3 * self._count * self._held["drawn"], given)
+
+        def plan() -> tuple[list[Launch], None]:
+            of_sh = 3 * self._count * self._held["drawn"]
+            every = ("adam_shapes", self._count), ("adam_sh", of_sh)
+            return [self._items(name, items, given) for name, items in every], None
+
+        self._again("step", (), given, plan)
 
     def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
         """As `TrainingKernels`."""
@@ -231,22 +289,51 @@ class OpenCLTraining:
         return self._workspace.turn_to(self._workspace.queue)
 
     def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
-        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
-        self._enqueue(kernel, (size,), (_GROUP,), given or {})
+        self._enqueue(self._items(kernel, items, given or {}))
 
     def _launch_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> None:
-        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
-        self._enqueue(kernel, (size, rows), (_GROUP, 1), given)
+        self._enqueue(self._of_rows(kernel, items, rows, given))
 
-    def _enqueue(
+    def _items(self, kernel: str, items: int, given: Mapping[str, Any]) -> Launch:
+        return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP),), (_GROUP,), given)
+
+    def _of_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> Launch:
+        return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP), rows), (_GROUP, 1), given)
+
+    def _one(
         self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
-    ) -> cl.Event:
+    ) -> Launch:
+        """A launch: arguments are given here, or held."""
         every = {**self._held, "count": self._count, **given}
-        values = [every[one.name] for one in self._program.source.arguments[kernel]]
-        try:
-            return self._program.launch(self._queue, kernel, size, group, values)
-        except cl.Error as error:
-            raise DeviceError(f"{self._workspace.info.title} failed while training: {error}") from error
+        return kernel, size, group, [every[one.name] for one in self._program.source.arguments[kernel]]
+
+    def _enqueue(self, launch: Launch) -> None:
+        with self._workspace.failing("training"):
+            self._program.launch(self._queue, *launch)
+
+    def _again(
+        self,
+        name: str,
+        kind: tuple[Any, ...],
+        given: Mapping[str, Any],
+        plan: Callable[[], tuple[list[Launch], Any]],
+    ) -> tuple[list[cl.Event], Any]:
+        """Launches a part of a step: what the last step launched, where only `given` differs.
+
+        plan: gives the launches for all else, and what comes of them; `kind` tells what they depend on
+            beside the splats and the pool.
+        """
+        known = self._kept.pop(name, None)  # an interrupt on the way leaves none
+        with self._workspace.failing("training"):
+            if known is None or known[0] != (kind, self._version, self._workspace.pool.state):
+                launches = Launches(self._program) if known is None else known[1]
+                row, made = plan()
+                launches.keep(row, given.keys())
+                known = (kind, self._version, self._workspace.pool.state), launches, made
+            known[1].put(given)
+            events = known[1].launch(self._queue)
+        self._kept[name] = known
+        return events, known[2]
 
     def _put(self, what: str, array: np.ndarray) -> cl.Buffer:
         array = np.ascontiguousarray(array)
