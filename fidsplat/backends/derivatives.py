@@ -87,6 +87,14 @@ class TrainingKernels(Protocol):
         `kept` on."""
         ...
 
+    def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
+        """Other values in the last rows of these arrays, from row `first` on."""
+        ...
+
+    def clear(self, names: Sequence[str]) -> None:
+        """Zeros in these arrays."""
+        ...
+
     def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
         """The splats as they are drawn, with SH of this degree; it changes as they do."""
         ...

@@ -154,6 +154,19 @@ class OpenCLTraining:
             self._held[name], self._shapes[name] = picked, made
         self._begin()
 
+    def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
+        """As `TrainingKernels`."""
+        for name, array in arrays.items():
+            above = first * 4 * math.prod(self._shapes[name][1:])
+            if array.nbytes:
+                cl.enqueue_copy(self._queue, self._held[name], np.ascontiguousarray(array), dst_offset=above)
+
+    def clear(self, names: Sequence[str]) -> None:
+        """As `TrainingKernels`."""
+        for name in names:
+            if size := 4 * math.prod(self._shapes[name]):
+                cl.enqueue_fill_buffer(self._queue, self._held[name], np.zeros(1, np.float32), 0, size)
+
     def _begin(self) -> None:
         """Other splats are there."""
         self._count, self._drawn, self._version = self._shapes["means"][0], None, object()
