@@ -149,6 +149,16 @@ class Trains(Protocol):
 
 
 @runtime_checkable
+class CompilesAhead(Protocol):
+    """A backend that compiles in the background."""
+
+    def compile_ahead(self, features: FeatureSet) -> None:
+        """Begin to compile what `differentiate` gives for these features, which then waits for it. An error
+        is that of `differentiate`."""
+        ...
+
+
+@runtime_checkable
 class Differentiates(Backend, Protocol):
     """A backend that has derivatives of its pictures."""
 

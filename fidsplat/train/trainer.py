@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.derivatives import Differentiates, Trains
+from fidsplat.backends.derivatives import CompilesAhead, Differentiates, Trains
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
+from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.errors import DeviceError, InputError, unknown
 from fidsplat.files import ordinary_file, writable_folder
@@ -25,6 +26,7 @@ from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 from fidsplat.train import densify, mcmc
+from fidsplat.train.ahead import features_after
 from fidsplat.train.checkpoint import Progressed, load_checkpoint, save_checkpoint
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device import DeviceWork
@@ -117,6 +119,8 @@ class Trainer:
         """those of which nobody has been told"""
         self._failure: TrainingError | None = None
         """of an iteration that others have followed"""
+        self._features: FeatureSet | None = None
+        """of the last picture"""
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     @property
@@ -267,9 +271,15 @@ class Trainer:
         """
         resident = self._work.resident(self.settings.degree_at(iteration), self.dataset.origin)
         by_normals, by_distortions = self.settings.surface_weights_at(iteration)
-        features, seen = prepare(resident, (self._solid if by_normals else self._captures)[number])
+        plain, solid = self._captures[number], self._solid[number]
+        features, seen = prepare(resident, solid if by_normals else plain)
         if by_distortions:
             features = with_distortion(features)
+        if features != self._features:
+            self._features = features
+            later = features_after(self.settings, iteration, plain, solid)
+            if later is not None and isinstance(backend := self.renderer.backend, CompilesAhead):
+                backend.compile_ahead(later)
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, seen, waits)
         value, slope = self._work.loss(images, number)

@@ -2,16 +2,19 @@
 those of steps of which each is planned and waited for."""
 
 import math
+import threading
 
 import numpy as np
 import pyopencl as cl
 import pytest
 from training_scene import QUICK, scene
 
+import fidsplat as fs
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.opencl import gradients_again
 from fidsplat.backends.opencl.launches import Launches
 from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.prepare import prepare
 from fidsplat.train import Trainer, TrainingError
 from fidsplat.train.losses import Loss
 
@@ -170,3 +173,56 @@ def test_an_interrupt_keeps_the_losses_that_nobody_has_asked_for(renderer, datas
     done = stopped.iteration
     assert done == 19
     np.testing.assert_array_equal(stopped.history["losses"], whole.history["losses"][:done])
+
+
+@pytest.mark.parametrize("losses", [{}, {"normal_from": 24, "distortion_from": 30, "distortion_weight": 1.0}])
+def test_what_a_run_draws_next_is_compiled_meanwhile(renderer, dataset, monkeypatch, losses):
+    """Each set of kernels before the first iteration that draws by it, and all that are drawn by."""
+    begun, drawn = [], []
+    backend = renderer.backend
+    differentiate = backend.differentiate
+    monkeypatch.setattr(
+        backend, "compile_ahead", lambda features: begun.append((trainer.iteration + 1, features))
+    )
+    trainer = Trainer(dataset, renderer, **{**STEADY, "sh_degree": 2, **losses})
+    monkeypatch.setattr(
+        trainer, "_differentiate", lambda features: drawn.append(features) or differentiate(features)
+    )
+    trainer.run()
+    wanted = list(dict.fromkeys(drawn))
+    assert [features for _, features in begun] == wanted[1:]
+    changes = [1, 16, 25, 31] if losses else [1, 16]
+    assert [iteration for iteration, _ in begun] == changes
+
+
+def test_compiling_in_the_background_gives_what_is_asked_for_and_its_errors(renderer, dataset, monkeypatch):
+    """What fails there is an error where it is needed."""
+    backend = renderer.backend
+    capture = fs.Capture(dataset.views[0].camera, quality="surfel")
+    cloud = fs.marker("apriltag:36h11:5", size=0.16, mixture="fitted").cloud
+    features, _ = prepare(cloud, capture)
+    monkeypatch.setattr(backend, "_gradients", {})
+    where, made = [], backend.pipeline
+
+    def seen(*given):
+        where.append(threading.current_thread())
+        return made(*given)
+
+    monkeypatch.setattr(backend, "pipeline", seen)
+    for _ in range(2):
+        backend.compile_ahead(features)
+    found = backend.differentiate(features)
+    assert backend.differentiate(features) is found
+    assert [thread is threading.main_thread() for thread in where] == [False, True, True]
+    backend.compile_ahead(features)  # it is there
+    assert len(where) == 3
+
+    monkeypatch.setattr(backend, "_gradients", {})
+
+    def failing(*_):
+        raise fs.DeviceError("no compiler")
+
+    monkeypatch.setattr(backend, "pipeline", failing)
+    backend.compile_ahead(features)
+    with pytest.raises(fs.DeviceError, match="no compiler"):
+        backend.differentiate(features)
