@@ -32,6 +32,8 @@ from fidsplat.train.derivatives import drawn
 
 EXACT = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, order="centre")
 WIDENED = EXACT.with_(lowpass="none")
+WHOLE_DEPTH = 4.0
+"""samples for which that takes a depth"""
 VARIANCE = 0.25
 """square samples: of `lowpass="pixel"` (kernels/opencl/slot/lowpass_pixel.cl)"""
 RATES = {"means": 0.02, "log_scales": 0.02, "log_opacities": 0.02, "colors": 0.01}
@@ -109,6 +111,7 @@ def _widened(
     axes = np.einsum("ij,njk->nik", pose[:3, :3], frames[:, :, :2])
     depth = place[:, 2, None, None]
     by_metre = camera.matrix[0, 0] / depth * (axes[:, :2] - place[:, :2, None] / depth * axes[:, 2:])
+    by_metre = np.concatenate([by_metre, WHOLE_DEPTH / depth * axes[:, 2:]], axis=1)
     spread = VARIANCE * np.linalg.inv(np.einsum("nik,nil->nkl", by_metre, by_metre))
     scales = given["scales"].astype(np.float64)
     spread[:, 0, 0] += scales[:, 0] ** 2

@@ -9,20 +9,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from fidsplat.backends.view import View
-from fidsplat.cameras.lenses import Equirectangular, Fisheye
+from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
 
 Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """corners (n, 3) float64 [m], lowest and highest, of boxes around splats to so many standard deviations"""
 
-_ROOM = 1.01
+ROOM = 1.01
 """how much further splats are taken to reach: for rounding, and what bounds are padded with"""
+BRIGHTEST = 4.0
+"""most opacity, of splats that stand for others under the low-pass `pixel` (fidsplat/store/merge.py)"""
+_ACROSS, _ALONG = 0.5, 1 / 8
+"""standard deviations of what a sample sees under the low-pass `pixel`: across its ray in samples, and along
+it as a share of the depth (kernels/opencl/slot/lowpass_pixel.cl)"""
 _ROUNDING = 1e-5
 """of a coordinate: what a set-up in float32 may be off"""
 
@@ -45,20 +51,76 @@ def seen(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> n
     return made
 
 
+@dataclass(frozen=True)
+class Extent:
+    """How far splats show around their centres p, as the camera sees them.
+
+    The low-pass `pixel` adds to a disk, of R standard deviations, an ellipse of its plane: points e that are
+    by the derivative at p at most R s samples to the side and R k z further or nearer, z the depth of p, s
+    and k `_ACROSS` and `_ALONG`. A side of the picture is a plane through the camera's centre, from which p
+    is n . p / z samples away, and with p moved by e these samples times 1 + e_z / z, and those to the side.
+    Covariances add: p beyond a side, d = -n . p, reaches over it only if d^2 <= R^2 (E^2 + (k d)^2 + (s z)^2)
+    with E the disk's standard deviation along n. That is not so of a disk and a margin larger by
+    1 / sqrt(1 - (R k)^2) that lie beyond it. Of depths, z - R k z less the disk's, the bound is the sum's.
+    The low-pass leaves splats whose centre lies before the near plane as they are.
+    """
+
+    radius: float
+    """standard deviations to which disks are taken, to the sides"""
+    margin: float
+    """samples beside their picture"""
+    depths: float
+    """standard deviations to which disks are taken, in depth"""
+    nearer: float = 1.0
+    """by which depths are multiplied then"""
+
+    @staticmethod
+    def of(view: View, features: FeatureSet, least: float = 0.0) -> Extent | None:
+        """That of a view's splats, to `least` standard deviations at least; None where nothing bounds it:
+        under the low-pass `pixel` behind distorted lenses, which stretch without limit at their fold, to
+        parallel rays, whose footprint has no end, and at cut-offs as low as 1e-13."""
+        radius = max(_radius(view, features), least)
+        # a dot of the low-pass, or what EWA widens a splat by
+        plain = Extent(radius, radius * view.samples + 2.0, radius)
+        if not _widened(features):
+            return plain
+        # depths along the ray are bounded by spheres around disks, in which their parts to the side are too
+        aside = _ACROSS * _turned_by(view) if view.along_ray else 0.0
+        nearer = 1.0 - radius * math.hypot(_ALONG, aside)
+        if nearer <= 0 or view.parallel or isinstance(view.lens, BrownConrady):
+            return None
+        larger = 1.0 / math.sqrt(1.0 - (radius * _ALONG) ** 2)
+        margin = max(plain.margin, larger * radius * _ACROSS + 2.0)
+        return Extent(larger * radius, margin, radius / nearer, nearer)
+
+    def nearest(self, view: View, boxes: Boxes) -> np.ndarray:
+        """(n,) metres: below the depths of all that splats in boxes show, and of their sort keys."""
+        nearest = Turned(view, *boxes(self.depths)).nearest(view)
+        return np.minimum(self.nearer * nearest, nearest)
+
+
+def _widened(features: FeatureSet) -> bool:
+    return "lowpass_pixel" in features.names
+
+
+def _radius(view: View, features: FeatureSet) -> float:
+    """Standard deviations to which splats are drawn."""
+    log_opacity = math.log(BRIGHTEST) if _widened(features) else 0.0
+    return ROOM * math.sqrt(max(2.0 * (log_opacity - view.log_cut), 0.0))
+
+
 def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
-    radius = _ROOM * math.sqrt(max(-2.0 * view.log_cut, 0.0))
-    spread = "lowpass_pixel" in features.names
     ewa = bool({"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names)
-    centers = _Turned(view, *boxes(0.0))
-    whole = _Turned(view, *boxes(radius))
-    # a dot of the low-pass, or what it widens a splat by, in samples
-    margin = radius * view.samples + 2.0
-    if spread:
-        # of a splat that is seen edge-on the low-pass in its plane makes a streak along the line of sight, of
-        # any length; but not of one whose centre lies behind the near plane
-        return whole.furthest(view) >= view.near * (1 - _ROUNDING) if not view.along_ray else reach >= 0
-    made = whole.nearest(view) <= view.far * (1 + _ROUNDING)
-    made &= whole.furthest(view) >= view.near * (1 - _ROUNDING)
+    extent = Extent.of(view, features)
+    if extent is None:
+        # nothing of a splat whose centre lies behind the near plane is widened
+        whole = Turned(view, *boxes(_radius(view, features)))
+        return whole.furthest(view) >= view.near * (1 - _ROUNDING)
+    radius, margin = extent.radius, extent.margin
+    centers = Turned(view, *boxes(0.0))
+    whole = Turned(view, *boxes(radius))
+    made = whole.furthest(view) >= view.near * (1 - _ROUNDING)
+    made &= extent.nearest(view, boxes) <= view.far * (1 + _ROUNDING)
     if view.raster is None:
         half_spaces, slope = _pinhole_sides(view, margin)
         for normal, offset in half_spaces:
@@ -73,6 +135,9 @@ def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) 
         return made
     step = view.raster.step * margin
     if isinstance(lens, Fisheye):
+        if _widened(features):  # to the side at most that, and at least `nearer` times as far away
+            step = _turned_by(view) * max(margin, extent.depths * _ACROSS + 2.0)
+            return made & centers.within(_widest(view.raster), step, extent.depths * reach)
         return made & whole.within(_widest(view.raster) + step)
     low, high = _slopes(view.raster)
     for axis in (0, 1):
@@ -83,7 +148,7 @@ def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) 
     return made
 
 
-class _Turned:
+class Turned:
     """Boxes in the camera's frame."""
 
     def __init__(self, view: View, low: np.ndarray, high: np.ndarray) -> None:
@@ -120,11 +185,15 @@ class _Turned:
     def _radius(self) -> np.ndarray:
         return np.linalg.norm(self._half, axis=1) + self.room
 
-    def within(self, angle: float) -> np.ndarray:
-        """(n,) bool: which may have points at most so far [rad] from the optical axis."""
+    def within(self, angle: float, step: float = 0.0, further: np.ndarray | None = None) -> np.ndarray:
+        """(n,) bool: which may have points at most so far [rad] from the optical axis; or points as far from
+        those in the box as a share `step` of their distance from the camera, and `further` (n,) metres."""
         distance = np.linalg.norm(self.middle, axis=1)
         around = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
         off = np.arctan2(np.hypot(self.middle[:, 0], self.middle[:, 1]), self.middle[:, 2])
+        if further is not None:
+            aside = step + further / np.maximum(distance - self._radius, 1e-300)
+            around = np.where(aside < 1, around + np.arcsin(np.minimum(aside, 1.0)), np.inf)
         return (distance <= self._radius) | (off - around <= angle)
 
 
@@ -146,6 +215,19 @@ def _pinhole_sides(view: View, margin: float) -> tuple[list[tuple[np.ndarray, fl
             sides.append((normal, 0.0))
     steepest = max(map(abs, view.slopes))
     return sides, 1.0 if view.parallel else math.hypot(1.0, steepest)
+
+
+def _turned_by(view: View) -> float:
+    """The largest angle [rad] by which rays of a fisheye or a panorama turn in a sample, wherever it sees;
+    infinite for a fisheye that folds."""
+    lens = view.lens
+    if not isinstance(lens, Fisheye):
+        return 1.0 / min(view.focal_x, view.focal_y)
+    angles = np.linspace(1e-6, lens.limit, 4096)
+    slopes = lens.distance(angles + 1e-6) - lens.distance(angles - 1e-6)
+    least = min(float(slopes.min()) / 2e-6, float((lens.distance(angles) / np.sin(angles)).min()))
+    # between these angles it changes less than that
+    return math.inf if least < 0.05 else 1.05 / (least * min(view.focal_x, view.focal_y))
 
 
 @lru_cache(maxsize=8)
@@ -174,7 +256,7 @@ def sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
         if one.parallel:
             made = np.maximum(made, edges * focal)
             continue
-        turned = _Turned(one, *boxes(0.0))
+        turned = Turned(one, *boxes(0.0))
         panorama = one.raster is not None and isinstance(one.raster.lens, Equirectangular)
         nearest = turned.off_axis() if panorama else turned.nearest(one)
         with np.errstate(divide="ignore", invalid="ignore"):

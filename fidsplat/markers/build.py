@@ -30,6 +30,7 @@ from fidsplat.markers.printing import (
     box_cloud,
     gaussian_cloud,
     refuse_more,
+    without_slivers,
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
@@ -125,11 +126,11 @@ class Marker(PickledByFields):
         if self.mixture != "exact":
             return self.cloud
         templates = fitted_templates(self.quality.template)
-        count = int(count_gaussians(aspect_of(self.boxes), templates).sum())
-        refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
-        printed = Printed(
-            self.grid, self.boxes, self.values, self.turns, self.regions, self.module, self.palette
+        printed = without_slivers(
+            Printed(self.grid, self.boxes, self.values, self.turns, self.regions, self.module, self.palette)
         )
+        count = int(count_gaussians(aspect_of(printed.boxes), templates).sum())
+        refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
         return gaussian_cloud(printed, templates, fitted_growth(), _unseen)
 
     @cached_property
@@ -234,8 +235,9 @@ def marker(
         refuse_more(spec, len(boxes), max_splats)
         cloud = box_cloud(printed, progress)
     else:
-        refuse_more(spec, int(count_gaussians(aspect_of(boxes), templates).sum()), max_splats)
-        cloud = gaussian_cloud(printed, templates, growth, progress)
+        filled = without_slivers(printed)
+        refuse_more(spec, int(count_gaussians(aspect_of(filled.boxes), templates).sum()), max_splats)
+        cloud = gaussian_cloud(filled, templates, growth, progress)
     for array in (bits, grid, boxes, values, turns, labels, palette):
         if array is not None:
             array.flags.writeable = False

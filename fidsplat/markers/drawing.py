@@ -9,15 +9,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.markers.paths import FARTHEST, Rings, circle_rings, number, path_rings, polygon_rings
+from fidsplat.markers.paths import (
+    FARTHEST,
+    Rings,
+    circle_rings,
+    number,
+    path_rings,
+    polygon_rings,
+    rectangle_rings,
+)
 from fidsplat.markers.spec import Kind, Spec
+from fidsplat.markers.styles import COLORS, Rule, rules, styled
 
 MODULES = 256
 """Modules across a drawing unless its spec says otherwise."""
@@ -26,14 +36,13 @@ MOST_MODULES, MOST_BYTES, MOST_COLORS, MOST_POINTS = 2048, 2_000_000, 64, 200_00
 
 _HEAD = re.compile(r"svg(?:-(?P<modules>[0-9]{1,5}))?", re.IGNORECASE)
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_NAMED = {
-    "black": "#000", "white": "#fff", "red": "#f00", "lime": "#0f0", "green": "#008000", "blue": "#00f",
-    "yellow": "#ff0", "cyan": "#0ff", "aqua": "#0ff", "magenta": "#f0f", "fuchsia": "#f0f", "gray": "#808080",
-    "grey": "#808080", "silver": "#c0c0c0", "maroon": "#800000", "olive": "#808000", "purple": "#800080",
-    "teal": "#008080", "navy": "#000080", "orange": "#ffa500",
-}  # fmt: skip
 _GROUPS = ("svg", "g", "a", "switch")
 _SILENT = ("title", "desc", "metadata", "defs", "style", "namedview")
+_REFUSED = ("stroke", "filter", "mask", "clip-path", "mix-blend-mode")
+_PLACES = ("x", "y", "width", "height", "viewBox")
+# what a style sheet may place shapes by, where we read attributes
+_OF_SHAPES = ("d", "x", "y", "width", "height", "r", "rx", "ry", "cx", "cy")
+_MOVES = ("transform", "transform-origin", "translate", "rotate", "scale")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +59,15 @@ class _Style:
 
     fill: str = "black"
     rule: str = "nonzero"
+    visibility: str = "visible"
+    color: str = "black"
+
+
+class _File(NamedTuple):
+    """What all of a drawing is read by."""
+
+    name: str | None
+    sheet: list[Rule]
 
 
 def _parse(text: str, head: str, rest: str) -> DrawingSpec:
@@ -66,7 +84,13 @@ def _parse(text: str, head: str, rest: str) -> DrawingSpec:
 
 def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
     """Indices (h, w) uint8 into the spec's colours, the first of which is the paper's white."""
-    from fidsplat.markers.shapes import filled, is_whole, modules, visible  # late, as shapely is
+    from fidsplat.markers.shapes import (
+        filled,
+        is_whole,
+        modules,
+        refuse_tangles,
+        visible,
+    )  # late, as shapely is
 
     root, name = _root(Path(spec.payload or "")), spec.payload
     x, y, width, height = _view(root, name)
@@ -75,8 +99,9 @@ def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
     if not 1 <= rows <= MOST_MODULES:
         raise InputError(f"{name} would have {rows} rows of modules; 1 to {MOST_MODULES} are made")
     to_modules = np.array([[scale, 0, -x * scale], [0, scale, -y * scale], [0, 0, 1]])
-    colors, shapes, points = [(1.0, 1.0, 1.0)], [], 0
-    for rings, color, rule in _shapes(root, to_modules, _Style(), name):
+    colors, points = [(1.0, 1.0, 1.0)], 0
+    outlines: list[tuple[Rings, str, int]] = []
+    for rings, color, rule in _shapes(root, to_modules, _Style(), _File(name, _sheet(root, name))):
         if color not in colors:
             colors.append(color)
         points += sum(map(len, rings))
@@ -84,7 +109,9 @@ def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
             raise InputError(
                 f"{name} has more than {MOST_COLORS} colours or {MOST_POINTS} points: simplify the drawing"
             )
-        shapes.append((filled(rings, rule), colors.index(color)))
+        outlines.append((rings, rule, colors.index(color)))
+    refuse_tangles([ring for rings, _, _ in outlines for ring in rings], name)
+    shapes = [(filled(rings, rule), value) for rings, rule, value in outlines]
     regions = visible(shapes, (rows, spec.modules))
     finer = None if is_whole(regions) else regions
     return replace(spec, colors=tuple(colors), regions=finer), modules(regions, (rows, spec.modules))
@@ -117,35 +144,67 @@ def _view(root: ElementTree.Element, name: str | None) -> tuple[float, float, fl
     return box[0], box[1], box[2], box[3]
 
 
+def _sheet(root: ElementTree.Element, name: str | None) -> list[Rule]:
+    """The rules of its style sheets."""
+    text = "".join("".join(element.itertext()) for element in root.iter() if _tag(element) == "style")
+    try:
+        return rules(text)
+    except ValueError as error:
+        raise InputError(
+            f"{name}: its style sheet has {error}; only rules for .class, #id and tags are understood"
+        ) from None
+
+
 def _shapes(
-    element: ElementTree.Element, to_modules: np.ndarray, style: _Style, name: str | None, depth: int = 0
+    element: ElementTree.Element, to_modules: np.ndarray, style: _Style, file: _File, depth: int = 0
 ) -> Iterator[tuple[Rings, tuple[float, float, float], str]]:
     """Filled shapes in the order of painting: rings in modules, colour, fill rule."""
-    tag = _tag(element)
-    look = _look(element)
-    if tag in _SILENT or look.get("display") == "none":
+    tag, name = _tag(element), file.name
+    if tag in _SILENT:
+        return
+    look = _look(element, tag, file)
+    if look.get("display") == "none":
         return
     if depth > 100:
         raise InputError(f"{name}: groups are nested deeper than 100")
-    style = _Style(look.get("fill", style.fill), look.get("fill-rule", style.rule))
-    for what in ("stroke", "filter", "mask", "clip-path"):
-        if look.get(what, "none") != "none":
+    if tag == "svg" and depth and any(key in element.attrib for key in _PLACES):
+        raise InputError(f"{name}: it has a drawing within the drawing; make it a group")
+    for what in _REFUSED:
+        if look.get(what, "none") not in ("none", "normal"):
             raise InputError(f"{name}: <{tag}> has a {what}; convert it to filled paths")
-    if any(look.get(what, "1") not in ("1", "1.0", "100%") for what in ("opacity", "fill-opacity")):
+    if any(not _is_one(look.get(what, "1")) for what in ("opacity", "fill-opacity")):
         raise InputError(f"{name}: <{tag}> is translucent; a print is opaque")
+    style = _inherited(style, look)
     with np.errstate(all="ignore"):  # what reaches too far is refused below
         to_modules = to_modules @ _transform(element.get("transform", ""), name)
     if tag in _GROUPS:
-        for child in element:
-            yield from _shapes(child, to_modules, style, name, depth + 1)
+        for child in _first(element) if tag == "switch" else element:
+            yield from _shapes(child, to_modules, style, file, depth + 1)
         return
     rings = _rings(element, tag, name)
-    if style.fill != "none":
+    if style.fill not in ("none", "transparent") and style.visibility == "visible":
         with np.errstate(all="ignore"):
             moved = [ring @ to_modules[:2, :2].T + to_modules[:2, 2] for ring in rings]
         if not all((np.abs(ring) <= FARTHEST).all() for ring in moved):
             raise InputError(f"{name}: <{tag}> reaches too far beyond the drawing")
-        yield moved, _color(style.fill, name), style.rule
+        yield moved, _color(style.color if style.fill == "currentColor" else style.fill, name), style.rule
+
+
+def _inherited(style: _Style, look: dict[str, str]) -> _Style:
+    names = {"fill": "fill", "rule": "fill-rule", "visibility": "visibility", "color": "color"}
+    given = {field.name: look.get(names[field.name], "inherit") for field in fields(style)}
+    return replace(style, **{key: value for key, value in given.items() if value != "inherit"})
+
+
+def _first(switch: ElementTree.Element) -> list[ElementTree.Element]:
+    """The child that is drawn: the first that asks for no extension and no language."""
+    asks = ("requiredExtensions", "systemLanguage")
+    free = (
+        child
+        for child in switch
+        if _tag(child) not in _SILENT and not any(key in child.attrib for key in asks)
+    )
+    return [child for child, _ in zip(free, range(1), strict=False)]
 
 
 def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
@@ -157,9 +216,9 @@ def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
             return path_rings(element.get("d", ""))
         if tag in ("polygon", "polyline"):
             return polygon_rings(element.get("points", ""))
-        if tag == "rect" and not (side("rx") or side("ry")):
-            x, y, w, h = (side(key) for key in ("x", "y", "width", "height"))
-            return [np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])]
+        if tag == "rect":
+            rx, ry = side("rx", side("ry")), side("ry", side("rx"))
+            return rectangle_rings(side("x"), side("y"), side("width"), side("height"), rx, ry)
         if tag in ("circle", "ellipse"):
             rx, ry = side("rx", side("r")), side("ry", side("r"))
             return circle_rings(side("cx"), side("cy"), rx, ry)
@@ -168,14 +227,28 @@ def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
     raise InputError(f"{name}: <{tag}> is no filled shape; convert it to a path")
 
 
-def _look(element: ElementTree.Element) -> dict[str, str]:
-    """Attributes, and over them what stands in ``style``."""
-    parts = (part.partition(":") for part in element.get("style", "").split(";"))
-    return dict(element.attrib) | {key.strip(): value.strip() for key, colon, value in parts if colon}
+def _look(element: ElementTree.Element, tag: str, file: _File) -> dict[str, str]:
+    """Attributes, and over them what style sheets and ``style`` say."""
+    try:
+        said = styled(file.sheet, tag, element.attrib)
+    except ValueError as error:
+        raise InputError(f"{file.name}: the style of <{tag}> has {error}, which is not understood") from None
+    for key in (*_MOVES, *(() if tag in _GROUPS else _OF_SHAPES)):
+        if key in said or (key == "transform-origin" and key in element.attrib):
+            raise InputError(f"{file.name}: <{tag}> has a {key} in its style; make it an attribute")
+    return element.attrib | said
+
+
+def _is_one(text: str) -> bool:
+    try:
+        return float(text.removesuffix("%")) == (100 if text.endswith("%") else 1)
+    except ValueError:
+        return False
 
 
 def _color(text: str, name: str | None) -> tuple[float, float, float]:
-    word = _NAMED.get(text.strip().lower(), text.strip().lower())
+    word = text.strip().lower()
+    word = f"#{COLORS[word]}" if word in COLORS else word
     if re.fullmatch(r"#[0-9a-f]{3}|#[0-9a-f]{6}", word):
         digits = word[1:] if len(word) == 7 else "".join(2 * digit for digit in word[1:])
         r, g, b = (int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4))
@@ -188,19 +261,26 @@ def _color(text: str, name: str | None) -> tuple[float, float, float]:
 
 def _transform(text: str, name: str | None) -> np.ndarray:
     matrix = np.eye(3)
+    left = re.sub(r"\w+\s*\([^)]*\)|[\s,]", "", text)
+    if left:
+        raise InputError(f"{name}: the transform {text[:40]!r} is not understood")
     for word, inner in re.findall(r"(\w+)\s*\(([^)]*)\)", text):
         v = [float(value) for value in re.findall(_NUMBER, inner)]
         if any(abs(value) > FARTHEST for value in v):
             raise InputError(f"{name}: the transform {word}({inner}) has a number beyond {FARTHEST:g}")
-        if word == "matrix" and len(v) == 6:
+        plain = not re.sub(r"[\s,]", "", re.sub(_NUMBER, "", inner))
+        if word == "matrix" and len(v) == 6 and plain:
             step = np.array([[v[0], v[2], v[4]], [v[1], v[3], v[5]], [0, 0, 1]])
-        elif word == "translate" and len(v) in (1, 2):
+        elif word == "translate" and len(v) in (1, 2) and plain:
             step = np.array([[1, 0, v[0]], [0, 1, v[1] if len(v) == 2 else 0], [0, 0, 1]])
-        elif word == "scale" and len(v) in (1, 2):
+        elif word == "scale" and len(v) in (1, 2) and plain:
             step = np.diag([v[0], v[-1], 1.0])
-        elif word == "rotate" and len(v) in (1, 3):
+        elif word == "rotate" and len(v) in (1, 3) and plain:
             c, s, (x, y) = np.cos(np.radians(v[0])), np.sin(np.radians(v[0])), v[1:] or (0.0, 0.0)
             step = np.array([[c, -s, x - c * x + s * y], [s, c, y - s * x - c * y], [0, 0, 1]])
+        elif word in ("skewX", "skewY") and len(v) == 1 and plain:
+            step, at = np.eye(3), (0, 1) if word == "skewX" else (1, 0)
+            step[at] = np.tan(np.radians(v[0]))
         else:
             raise InputError(f"{name}: the transform {word}({inner}) is not understood")
         matrix = matrix @ step

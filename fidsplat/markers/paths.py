@@ -17,12 +17,14 @@ FARTHEST = 1e9
 """No number of a drawing is larger."""
 
 _TOKEN = re.compile(r"([MmLlHhVvCcSsQqTtAaZz])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
+_BETWEEN = re.compile(r"[\s,]*")
+_FLAG = re.compile(r"()([01])")  # of an arc: a single digit, with nothing between it and the next number
 _NUMBERS = {"M": 2, "L": 2, "H": 1, "V": 1, "C": 6, "S": 4, "Q": 4, "T": 2, "A": 7, "Z": 0}
 
 
 def number(text: str) -> float:
-    """A number of a drawing. Raises ValueError for another text, or one beyond `FARTHEST`."""
-    value = float(text)
+    """A number of a drawing, in pixels. Raises ValueError for another text, or one beyond `FARTHEST`."""
+    value = float(text.removesuffix("px"))
     if not abs(value) <= FARTHEST:
         raise ValueError(f"{text[:20]} is too far out; a number is at most {FARTHEST:g}")
     return value
@@ -42,14 +44,27 @@ def circle_rings(cx: float, cy: float, rx: float, ry: float) -> Rings:
     return [np.column_stack([cx + rx * np.cos(turn), cy + ry * np.sin(turn)])]
 
 
+def rectangle_rings(x: float, y: float, w: float, h: float, rx: float, ry: float) -> Rings:
+    """The ring of a rectangle, its corners quarters of an ellipse."""
+    if not (w > 0 and h > 0):
+        return []
+    rx, ry = min(rx, w / 2), min(ry, h / 2)
+    if not (rx > 0 and ry > 0):
+        return [np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])]
+    turn = np.linspace(0, np.pi / 2, PIECES + 1)
+    middles = ((x + w - rx, y + h - ry), (x + rx, y + h - ry), (x + rx, y + ry), (x + w - rx, y + ry))
+    corners = [
+        np.column_stack([cx + rx * np.cos(turn + i * np.pi / 2), cy + ry * np.sin(turn + i * np.pi / 2)])
+        for i, (cx, cy) in enumerate(middles)
+    ]
+    return [np.concatenate(corners)]
+
+
 def path_rings(text: str) -> Rings:
     """The rings of a path's ``d``: every subpath closed, as filling does, curves in straight pieces.
 
     Raises ValueError where a command lacks numbers, or the path does not begin with a move.
     """
-    left = re.sub(r"[\s,]", "", _TOKEN.sub("", text))
-    if left:
-        raise ValueError(f"{left[:10]!r} in a path")
     rings: Rings = []
     points: list[np.ndarray] = []
     here, control, before = np.zeros(2), np.zeros(2), ""
@@ -90,7 +105,14 @@ def path_rings(text: str) -> Rings:
 def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
     """Each command with as many numbers as one of its kind takes; a move's further pairs are lines."""
     command, numbers = "", []
-    for letter, digits in [*_TOKEN.findall(text), ("Z", "")]:
+    place = _skip(text, 0)
+    while place <= len(text):
+        in_flag = command in ("A", "a") and len(numbers) % 7 in (3, 4)
+        found = (_FLAG if in_flag else _TOKEN).match(text, place)
+        if found is None and place < len(text):
+            raise ValueError(f"{text[place : place + 10].split()[0]!r} in a path")
+        letter, digits = ("Z", "") if found is None else found.groups(default="")
+        place = len(text) + 1 if found is None else _skip(text, found.end())
         if not letter:
             numbers.append(number(digits))
             continue
@@ -106,6 +128,12 @@ def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
         elif numbers:
             raise ValueError("numbers before a command")
         command, numbers = letter, []
+
+
+def _skip(text: str, place: int) -> int:
+    """Where the next number or letter begins."""
+    between = _BETWEEN.match(text, place)
+    return place if between is None else between.end()
 
 
 def _bezier(control: np.ndarray) -> np.ndarray:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 MAX_SPLATS = 1_000_000
 """Most splats of a marker unless the caller allows more."""
 
+SLIVER = 1 / 64
+"""Modules: thinner rectangles of a drawing become no Gaussians."""
+
 CHUNK = 1 << 18
 """Splats that are placed at a time: intermediate results are in float64 and several."""
 
@@ -64,6 +67,18 @@ def box_cloud(printed: Printed, progress: Progress) -> SplatCloud:
         return np.column_stack([middle, half, np.ones(stop - start)]), np.arange(start, stop)
 
     return _cloud(printed, np.arange(1, len(boxes) + 1), make, progress).with_boxes()
+
+
+def without_slivers(printed: Printed) -> Printed:
+    """The rectangles that Gaussians are made of: of a drawing not those that nobody sees, between curves that
+    touch, which thousands of Gaussians each would fill."""
+    if printed.turns is None:
+        return printed
+    sides = printed.boxes[:, 2:] - printed.boxes[:, :2]
+    seen = sides.min(1) >= SLIVER
+    if not seen.any():
+        return printed
+    return printed._replace(boxes=printed.boxes[seen], values=printed.values[seen], turns=printed.turns[seen])
 
 
 def aspect_of(boxes: np.ndarray) -> np.ndarray:

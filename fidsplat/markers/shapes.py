@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import shapely
 
@@ -17,6 +19,23 @@ GRID = 1e-6
 
 MOST_OVERLAPS = 50_000
 """Pairs of shapes whose bounds overlap."""
+
+
+MOST_CROSSINGS = 5_000
+"""Places where the pieces of outlines cross."""
+
+
+def refuse_tangles(rings: Rings, name: str | None) -> None:
+    """Raise InputError where outlines cross in more places than polygons should be made of."""
+    pieces = [np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings]
+    lines = np.array(shapely.linestrings(np.concatenate([np.zeros((0, 2, 2)), *pieces])))
+    tree, crossings = shapely.STRtree(list(lines)), 0
+    for start in range(0, len(lines), 256):  # few at a time, as each may cross all
+        crossings += tree.query(lines[start : start + 256], predicate="crosses").shape[1]
+        if crossings > 2 * MOST_CROSSINGS:  # each from both sides
+            raise InputError(
+                f"{name} has outlines that cross in over {MOST_CROSSINGS} places: simplify the drawing"
+            )
 
 
 def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
@@ -39,7 +58,7 @@ def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
 
 
 def visible(
-    shapes: list[tuple[shapely.Geometry, int]], shape: tuple[int, int]
+    shapes: Sequence[tuple[shapely.Geometry, int]], shape: tuple[int, int]
 ) -> tuple[shapely.MultiPolygon, ...]:
     """What is seen on a sheet of (h, w) modules of shapes that are painted one over the other: the region of
     each value, the sheet's own being 0.

@@ -104,6 +104,9 @@ class Trainer:
                 "or 'reference'"
             )
         self._differentiate = backend.differentiate
+        self._quality = Quality.of(self.settings.quality)
+        if self.renderer.device.kind == "cpu" and "arithmetic" not in self.settings.quality:
+            self._quality = self._quality.with_(arithmetic="fast")
         self._captures = [self._capture(view) for view in dataset.views]
         self._solid = [replace(each, outputs=_SOLID) for each in self._captures]
         self._work = (
@@ -299,9 +302,7 @@ class Trainer:
         return splats
 
     def _capture(self, view: TrainingView) -> Capture:
-        return Capture(
-            view.camera, quality=Quality.of(self.settings.quality), background=self.dataset.background
-        )
+        return Capture(view.camera, quality=self._quality, background=self.dataset.background)
 
     def _begin(self, start: SplatCloud | None, restart: bool) -> Progressed:
         settings = self.settings

@@ -12,6 +12,12 @@ from fidsplat.scalars import LARGEST, real_array
 # OpenCV's square has y up and z towards the viewer, ours y down and z away (docs/conventions.md)
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
+SAME = 1e-6
+"""Pixels by which a pose must fit better to be another."""
+
+LOOSE = 0.1
+"""Share of the points' spread by which a stand-in may miss them."""
+
 
 def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
     """camera_from_marker, (4, 4) float64, metres.
@@ -62,15 +68,19 @@ def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) 
         seen, matrix, turned = _flattened(seen, camera)
     if not np.isfinite(seen).all():
         return np.full((4, 4), np.nan)
-    count, turns, moves, _ = cv2.solvePnPGeneric(points, seen, matrix, None, flags=method)
     best, least = np.full((4, 4), np.nan), math.inf
-    for turn, move in zip(turns[:count], moves[:count], strict=True):
-        turn, move = cv2.solvePnPRefineLM(points, seen, matrix, None, turn, move)
-        drawn, _ = cv2.projectPoints(points, turn, move, matrix, None)
-        error = float(np.linalg.norm(drawn.reshape(-1, 2) - seen))
-        if error < least and move[2, 0] > 0:
-            least, best = error, np.eye(4)
-            best[:3, :3], best[:3, 3] = cv2.Rodrigues(turn)[0], move[:, 0]
+    spread = float(np.linalg.norm(seen - seen.mean(0)))
+    # face to face OpenCV's IPPE divides by next to nothing: its poses may be NaN, or anything
+    for way in dict.fromkeys((method, cv2.SOLVEPNP_SQPNP)):
+        count, turns, moves, _ = cv2.solvePnPGeneric(points, seen, matrix, None, flags=way)
+        for turn, move in zip(turns[:count], moves[:count], strict=True):
+            turn, move = cv2.solvePnPRefineLM(points, seen, matrix, None, turn, move)
+            drawn, _ = cv2.projectPoints(points, turn, move, matrix, None)
+            error = float(np.linalg.norm(drawn.reshape(-1, 2) - seen))
+            fits = way == method or error < LOOSE * spread
+            if fits and error < least - SAME and move[2, 0] > 0:
+                least, best = error, np.eye(4)
+                best[:3, :3], best[:3, 3] = cv2.Rodrigues(turn)[0], move[:, 0]
     return turned @ best @ _FLIP
 
 

@@ -54,6 +54,13 @@ typedef struct {            // of a pixel: the loss's derivatives
 // The pixels of a block at (x, y), of an image (h, w, channels); 0 outside of it.
 static inline vfloat pixels_of(global const float *image, int channels, int channel, int x, int y, int width, int height) {
     float block[LANES];
+#if LANES > 1
+    if (x + BLOCK_W <= width && y + LANES / BLOCK_W <= height) {    // nothing is asked of each pixel
+        image += channels * (y * (size_t)width + x) + channel;
+        for (int lane = 0; lane < LANES; lane++) block[lane] = image[channels * (lane / BLOCK_W * width + lane % BLOCK_W)];
+        return VLOAD(block);
+    }
+#endif
     for (int lane = 0; lane < LANES; lane++) {
         int px = x + lane % BLOCK_W, py = y + lane / BLOCK_W;
         block[lane] = px < width && py < height ? image[channels * (py * (size_t)width + px) + channel] : 0.0f;
@@ -131,6 +138,16 @@ static inline float lane_sum(vfloat v) {
     float4 x = w.lo + w.hi;
     return (x.x + x.z) + (x.y + x.w);
 }
+// The sums of many vectors, each added up as above, side by side in one.
+#define FOLD_HALVES(a, b) ((vfloat)((a).lo + (a).hi, (b).lo + (b).hi))
+#define FOLD_FOURS(a, b) ((vfloat)((a).lo.lo, (a).hi.lo, (b).lo.lo, (b).hi.lo) + (vfloat)((a).lo.hi, (a).hi.hi, (b).lo.hi, (b).hi.hi))
+#define FOLD_TWOS(a, b) ((vfloat)((a).s014589cd, (b).s014589cd) + (vfloat)((a).s2367abef, (b).s2367abef))
+#define FOLD_ONES(a, b) ((vfloat)((a).even, (b).even) + (vfloat)((a).odd, (b).odd))
+static inline vfloat lane_sums_of_8(const vfloat *v) {
+    vfloat a = FOLD_FOURS(FOLD_HALVES(v[0], v[1]), FOLD_HALVES(v[2], v[3])), b = FOLD_FOURS(FOLD_HALVES(v[4], v[5]), FOLD_HALVES(v[6], v[7]));
+    return FOLD_TWOS(a, b);
+}
+static inline vfloat lane_sums(const vfloat *v) { return FOLD_ONES(lane_sums_of_8(v), lane_sums_of_8(v + 8)); }
 #elif LANES == 8
 static inline float lane_sum(vfloat v) {
     float4 x = v.lo + v.hi;
@@ -142,21 +159,32 @@ static inline float lane_sum(vfloat x) { return (x.x + x.z) + (x.y + x.w); }
 #define lane_sum(x) (x)
 #endif
 
-static inline Moments moments_of(const Sums *sums, const BlendConstants *constants) {
-    Moments m = {0};        // padding too
-    m.nu0 = lane_sum(sums->nu);
-    m.nux = lane_sum(sums->nu_x);
-    m.nuy = lane_sum(sums->nu_y);
-    m.nv0 = lane_sum(sums->nv);
-    m.nvx = lane_sum(sums->nv_x);
-    m.nvy = lane_sum(sums->nv_y);
-    m.d0 = lane_sum(sums->d);
-    m.dx = lane_sum(sums->d_x);
-    m.dy = lane_sum(sums->d_y);
-    m.log_opacity = lane_sum(sums->log_opacity);
-    m.r = lane_sum(sums->r);
-    m.g = lane_sum(sums->g);
-    m.b = lane_sum(sums->b);
+// What becomes of Moments: of each field what its lanes have, or at once their sum.
+#if LANES == 16
+typedef struct {
+    vfloat fields[(FIELDS + LANES - 1) / LANES * LANES];
+} Parts;
+#define MOMENT(field, parts) (m.fields[__builtin_offsetof(Moments, field) / sizeof(float)] = (parts))
+#else
+typedef Moments Parts;
+#define MOMENT(field, parts) (m.field = lane_sum(parts))
+#endif
+
+static inline Parts moments_of(const Sums *sums, const BlendConstants *constants) {
+    Parts m = {0};          // padding too
+    MOMENT(nu0, sums->nu);
+    MOMENT(nux, sums->nu_x);
+    MOMENT(nuy, sums->nu_y);
+    MOMENT(nv0, sums->nv);
+    MOMENT(nvx, sums->nv_x);
+    MOMENT(nvy, sums->nv_y);
+    MOMENT(d0, sums->d);
+    MOMENT(dx, sums->d_x);
+    MOMENT(dy, sums->d_y);
+    MOMENT(log_opacity, sums->log_opacity);
+    MOMENT(r, sums->r);
+    MOMENT(g, sums->g);
+    MOMENT(b, sums->b);
 //@@ moments
     return m;
 }

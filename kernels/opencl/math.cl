@@ -15,6 +15,7 @@ typedef int vint;
 #define VAS_INT(x) as_int(x)
 #define VAS_FLOAT(x) as_float(x)
 #define VFLOAT(i) ((vfloat)(i))
+#define VMIN(a, b) fmin(a, b)
 #define VLANE 0.0f
 #define BLOCK_W 1
 #define BLOCK_LOAD(p, stride) (*(p))
@@ -24,7 +25,13 @@ typedef GLUE(float, LANES) vfloat;
 typedef GLUE(int, LANES) vint;
 #define VSELECT(no, yes, mask) select(no, yes, mask)
 // Whether any lane is set. Clang makes a chain of branches of `any`, a lane each, and one test of its own reduction.
-#if defined(__has_builtin)
+#if LANES == 16 && defined(__AVX512DQ__) && defined(__has_builtin)
+#if __has_builtin(__builtin_ia32_cvtd2mask512)
+#define VBITS(mask) ((uint)(ushort)__builtin_ia32_cvtd2mask512((__attribute__((__vector_size__(64))) int)(mask)))
+#define VANY(mask) (VBITS(mask) != 0)
+#endif
+#endif
+#if !defined(VANY) && defined(__has_builtin)
 #if __has_builtin(__builtin_reduce_or)
 #define VANY(mask) (__builtin_reduce_or(mask) != 0)
 #define VBITS(mask) ((uint)__builtin_reduce_or((mask) & (vint)1 << VINDEX))
@@ -45,6 +52,8 @@ static inline uint lanes_set(vint mask) {
 #define VAS_INT(x) GLUE(as_int, LANES)(x)
 #define VAS_FLOAT(x) GLUE(as_float, LANES)(x)
 #define VFLOAT(i) GLUE(convert_float, LANES)(i)
+// The smaller, b where a is none: one instruction, of which PoCL's `fmin` makes five.
+#define VMIN(a, b) VSELECT(b, a, (a) < (b))
 // VLANE, VINDEX: the lanes' numbers. Lanes are pixels of a block that is BLOCK_W wide, row by row; in memory its rows lie `stride`
 // apart.
 #if LANES == 16

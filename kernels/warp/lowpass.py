@@ -7,24 +7,28 @@ import warp as wp
 
 @cache
 def make_filter(real):
-    """widened(a, b, by_x, by_y): how a Gaussian with scaled tangents a, b is filtered, with gradients of the
-    sample's column and row by the point at its centre (slopes.py).
+    """widened(a, b, by_x, by_y, by_depth): how a Gaussian with scaled tangents a, b is filtered, with
+    gradients by the point at its centre of the sample's column and row and of the logarithm of the depth
+    (slopes.py).
 
-    G, 2 x 2, is the derivative of the sample's position by (u, v) at the centre. A sample of standard
-    deviation s = 1/2 has the covariance s^2 (G^T G)^-1 in (u, v), so the filtered one has
+    What a sample sees is a Gaussian about its ray, with a standard deviation of s = 1/2 samples across and of
+    an eighth of the depth along it. G, 3 x 2, is the derivative by (u, v) at the centre of what the two are
+    in samples, so it has the covariance s^2 (G^T G)^-1 in (u, v), and the filtered one has
     C = 1 + s^2 (G^T G)^-1 there: with L L^T = C its tangents are (a, b) L, and its area grows by sqrt(det C).
     """
-    vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
+    vec3, vec4 = (wp.types.vector(n, real) for n in (3, 4))
     one = real(1.0)
     variance = real(0.25)
+    whole_depth = real(0.5 * 8.0)  # samples that it is taken for
 
     @wp.func
-    def widened(a: vec3, b: vec3, by_x: vec3, by_y: vec3):
-        """L_uu, L_vu, L_vv, and the factor of the area; not finite of a disk that is seen edge-on."""
-        by_u = vec2(wp.dot(by_x, a), wp.dot(by_y, a))
-        by_v = vec2(wp.dot(by_x, b), wp.dot(by_y, b))
-        area = by_u[0] * by_v[1] - by_v[0] * by_u[1]
-        share = variance / (area * area)
+    def widened(a: vec3, b: vec3, by_x: vec3, by_y: vec3, by_depth: vec3):
+        """L_uu, L_vu, L_vv, and the factor of the area; of parallel rays, whose depth has no say, not finite
+        of a disk that is seen edge-on."""
+        by_u = vec3(wp.dot(by_x, a), wp.dot(by_y, a), whole_depth * wp.dot(by_depth, a))
+        by_v = vec3(wp.dot(by_x, b), wp.dot(by_y, b), whole_depth * wp.dot(by_depth, b))
+        minors = wp.cross(by_u, by_v)
+        share = variance / wp.dot(minors, minors)
         uu, uv, vv = wp.dot(by_u, by_u), wp.dot(by_u, by_v), wp.dot(by_v, by_v)
         # det(1 + s^2 M^-1) = 1 + s^2 (tr M + s^2) / det M: no cancellation
         grown = wp.sqrt(one + share * (uu + vv + variance))

@@ -161,13 +161,13 @@ def make_project(
                 itself = wp.static(drawn_ewa)
         if wp.static(filtered):
             if depth >= near and not itself:
-                by_x, by_y, here = slopes_at(p, view, lens)
+                by_x, by_y, by_depth, here = slopes_at(p, view, lens)
                 if here:
-                    wide = widened(a, b, by_x, by_y)
+                    wide = widened(a, b, by_x, by_y, by_depth)
                     log_opacity -= float(wp.log(wide[3]))
                     half_r2 = log_opacity - view.log_cut
                     if not (half_r2 > 0.0):
-                        return  # edge-on too: infinitely thin, infinitely faint
+                        return  # to parallel rays edge-on too: infinitely thin, infinitely faint
                     a = wide[0] * a + wide[1] * b
                     b = wide[2] * b
                     su *= wide[0]

@@ -11,7 +11,8 @@ from .lens import LENSES, make_lens
 @cache
 def make_slopes(camera: str | None, real):
     """slopes(p, view, lens): gradients by the point of the column and of the row in which it falls [samples
-    per metre], and whether the lens sees it. camera: a lens; None for a pinhole.
+    per metre] and of the logarithm of the depth [1/m] (0 for parallel rays, which have no use for it), and
+    whether the lens sees it. camera: a lens; None for a pinhole.
     """
     Lens = make_lens(camera if camera in LENSES else None)
     vec3 = wp.types.vector(3, real)
@@ -23,11 +24,11 @@ def make_slopes(camera: str | None, real):
         per_z = one / p[2]
         by_x = vec3(per_z, zero, -p[0] * per_z * per_z)
         by_y = vec3(zero, per_z, -p[1] * per_z * per_z)
-        return real(view.focal_x) * by_x, real(view.focal_y) * by_y, True
+        return real(view.focal_x) * by_x, real(view.focal_y) * by_y, vec3(zero, zero, per_z), True
 
     @wp.func
     def slopes_parallel(p: vec3, view: View, lens: Lens):
-        return vec3(real(view.focal_x), zero, zero), vec3(zero, real(view.focal_y), zero), True
+        return vec3(real(view.focal_x), zero, zero), vec3(zero, real(view.focal_y), zero), vec3(), True
 
     @wp.func
     def slopes_distorted(p: vec3, view: View, lens: Lens):
@@ -50,7 +51,8 @@ def make_slopes(camera: str | None, real):
         per_z = one / p[2]
         by_a = vec3(a_x, a_y, -(x * a_x + y * a_y)) * per_z
         by_b = vec3(b_x, b_y, -(x * b_x + y * b_y)) * per_z
-        return real(view.focal_x) * by_a, real(view.focal_y) * by_b, q < real(lens.limit)
+        by_depth = vec3(zero, zero, per_z)
+        return real(view.focal_x) * by_a, real(view.focal_y) * by_b, by_depth, q < real(lens.limit)
 
     @wp.func
     def slopes_fisheye(p: vec3, view: View, lens: Lens):
@@ -68,7 +70,8 @@ def make_slopes(camera: str | None, real):
         away = vec3(p[2] * cos, p[2] * sin, -across) * (by_angle / wp.dot(p, p))
         around = vec3(-sin, cos, zero) * per_across
         by_x, by_y = cos * away - sin * around, sin * away + cos * around
-        return real(view.focal_x) * by_x, real(view.focal_y) * by_y, angle <= real(lens.limit)
+        by_depth = p / wp.dot(p, p)
+        return real(view.focal_x) * by_x, real(view.focal_y) * by_y, by_depth, angle <= real(lens.limit)
 
     @wp.func
     def slopes_panorama(p: vec3, view: View, lens: Lens):
@@ -82,7 +85,7 @@ def make_slopes(camera: str | None, real):
         flat = wp.sqrt(flat2)
         by_x = vec3(z, zero, -x) / flat2
         by_y = vec3(-x * p[1] / flat, flat, -z * p[1] / flat) / away2
-        return real(view.focal_x) * by_x, real(view.focal_y) * by_y, True
+        return real(view.focal_x) * by_x, real(view.focal_y) * by_y, p / away2, True
 
     return {
         None: slopes_pinhole,

@@ -8,7 +8,7 @@ from agreement import ALL_OUTPUTS, assert_agrees, random_splats
 from test_lens_pictures import CAMERAS, EVERY_TERM
 
 import fidsplat as fs
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.rotations import matrix_to_quaternion, quaternion_to_matrix, rigid_matrix
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 PIXEL = fs.Quality(lowpass="pixel")
@@ -64,6 +64,42 @@ def test_tilted_to_edge_on(renderer, tilt):
 def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
     cloud = random_splats(200, seed=8, depth=(-4.0, 5.0), scale=scale)
     assert_agrees(renderer, cloud, camera, quality=PIXEL)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, *LENSES.values()], ids=["pinhole", *LENSES])
+def test_splats_that_are_seen_nearly_edge_on(renderer, camera):
+    """From a hundredth of a degree to thirty, on all sides: the depth of what a sample sees counts."""
+    generator, count = np.random.default_rng(12), 250
+    away = generator.normal(size=(count, 3)) * (1, 1, 0.3) + (0, 0, 1.5)
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    means = away * generator.uniform(0.3, 6.0, (count, 1))
+    across = np.cross(away, generator.normal(size=(count, 3)))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    tilt = np.radians(10.0 ** generator.uniform(-2, 1.5, (count, 1)))
+    normals = np.cos(tilt) * across + np.sin(tilt) * away
+    tangents = np.cross(normals, generator.normal(size=(count, 3)))
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    turns = np.stack([tangents, np.cross(normals, tangents), normals], axis=2)
+    quats = np.array([matrix_to_quaternion(turn) for turn in turns])
+    colors, opacities = generator.uniform(0, 1, (count, 3)), generator.uniform(0.3, 1.0, count)
+    scales = 10.0 ** generator.uniform(-3, -0.5, (count, 2))
+    cloud = fs.SplatCloud(means, quats, scales, opacities, colors=colors)
+    frame = assert_agrees(renderer, cloud, camera, quality=PIXEL)
+    assert frame["alpha"].max() > 0.1
+
+
+def test_walls_beside_the_camera_draw_no_streaks(renderer):
+    """A wall that is seen from its edge, in the columns at 300 x 1.5 mm / 0.1 to 0.9 m from the middle."""
+    generator, count = np.random.default_rng(5), 600
+    at = generator.uniform((0.3, -1, 0.1), (0.3, 1, 0.9), (count, 3))
+    quats = np.tile((math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 0.0), (count, 1))
+    wall = fs.SplatCloud(
+        at, quats, np.full((count, 2), 0.01), np.full(count, 0.9), colors=np.ones((count, 3))
+    )
+    camera = fs.Camera.pinhole(64, 48, 300.0, 300.0, 32.0, 24.0, rigid_matrix((-0.2985, 0, 0)))
+    alpha = renderer.render(wall, camera, ALL_OUTPUTS, PIXEL)["alpha"]
+    assert alpha[:, 32:36].max() > 0.5
+    assert alpha[:, 42:].max() < 1e-3
 
 
 def test_splats_whose_centres_lie_beyond_the_fold(renderer):

@@ -12,6 +12,7 @@ from fidsplat.markers.cover import _met, turned
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.markers.paths import circle_rings, path_rings
 from fidsplat.markers.shapes import filled
+from fidsplat.markers.styles import COLORS
 from fidsplat.scenes import PlacedMarker
 
 
@@ -131,6 +132,7 @@ def test_a_sheet_on_which_nothing_is_seen(tmp_path, body):
         ("M0 0Q5 10 10 0T20 0", 0),
         ("M0 0C0 10 10 10 10 0", 60),
         ("M0 0c0 10 10 10 10 0s10-10 10 0", 0),
+        ("M-5 0a5 5 0 0110 0 5 5 0 01-10 0", np.pi * 25),
     ],
 )
 def test_areas_of_paths(path, area):
@@ -139,6 +141,11 @@ def test_areas_of_paths(path, area):
         for ring in path_rings(path)
     )
     assert abs(total) == pytest.approx(area, rel=3e-3, abs=1e-9)
+
+
+def test_numbers_with_nothing_between_them():
+    short, long = "m-5 0a5,5,0,01.5.5A5 5 0 1 0-5-1e0", "M-5 0a5 5 0 0 1 0.5 0.5 A5 5 0 1 0 -5 -1"
+    assert np.array_equal(path_rings(short)[0], path_rings(long)[0])
 
 
 def test_circles():
@@ -151,11 +158,21 @@ def test_circles():
     [
         ("<text>STOP</text>", "<text> is no filled shape"),
         ('<rect width="5" height="5" stroke="red"/>', "<rect> has a stroke"),
-        ('<rect width="5" height="5" rx="1"/>', "convert it to a path"),
+        ('<use href="#a"/>', "convert it to a path"),
         ('<rect width="5" height="5" fill="url(#a)"/>', "no plain colour"),
         ('<rect width="5" height="5" opacity="0.5"/>', "translucent"),
         ('<g clip-path="url(#a)"/>', "has a clip-path"),
-        ('<g transform="skewX(5)"/>', "skewX"),
+        ('<g transform="skewX(5 5)"/>', "skewX"),
+        ('<g transform="rotate(45"/>', "rotate(45"),
+        ('<g transform="rotate(45deg)"/>', "rotate(45deg)"),
+        ('<rect width="5" height="5" style="transform: scale(2)"/>', "a transform in its style"),
+        ('<style>rect { width: 9px }</style><rect width="5" height="5"/>', "a width in its style"),
+        ("<style>g rect { fill: red }</style>", "style sheet has 'g rect'"),
+        ('<style>@import "a.css";</style>', "style sheet has '@import"),
+        ("<style>.a { fill: red !important }</style>", "style sheet has !important"),
+        ('<rect width="5" height="5" style="display: none !important"/>', "has !important"),
+        ('<svg x="5"><rect width="5" height="5"/></svg>', "make it a group"),
+        ('<path d="M0 0A5 5 0 2 0 9 9"/>', "'2' in a path"),
         ('<path d="L5 5"/>', "must begin with M"),
         ('<path d="M0 0 L5"/>', "L with 1 numbers"),
         ('<path d="M0 0 # 5"/>', "'#' in a path"),
@@ -212,6 +229,70 @@ def test_shapes_that_touch_the_sheet_leave_no_lines(tmp_path):
     """The first lies beside the sheet and shares an edge with it."""
     made = drawn(tmp_path, '<rect x="-5" width="5" height="9" fill="red"/><circle cx="9" cy="9" r="5"/>')
     assert set(map(tuple, made.cloud.colors[:, :3])) == {(0, 0, 0), (1, 1, 1)}
+
+
+def test_what_a_style_sheet_says(tmp_path):
+    """Of equals the later; attributes, tags, classes, ids, an element's own: each over those before."""
+    made = drawn(
+        tmp_path,
+        "<style>/* as it comes */ .a, .b { fill: #ff0000; } rect { fill: lime } .c.b { fill: navy }"
+        " #it { visibility: hidden } .d { fill-rule: evenodd }</style>"
+        '<rect class="a" width="5" height="5" fill="olive"/><rect x="10" width="5" height="5"/>'
+        '<rect class="b c" x="20" width="5" height="5"/><g id="it"><rect x="30" width="5" height="5"/></g>'
+        '<rect class="a" x="5" width="5" height="5" style="fill: currentColor" color="teal"/>'
+        '<g fill="crimson"><path class="d" fill="inherit" d="M0 10h9v9h-9zM3 13h3v3h-3z"/></g>',
+    )
+    names = {"": (1, 1, 1)}
+    expected = {(0, 0): (1, 0, 0), (10, 0): (0, 1, 0), (20, 0): (0, 0, 128 / 255), (30, 0): names[""]}
+    expected |= {(5, 0): (0, 128 / 255, 128 / 255), (0, 10): (220 / 255, 20 / 255, 60 / 255)}
+    expected |= {(4, 14): names[""]}
+    for (x, y), color in expected.items():
+        assert np.allclose(made.palette[made.bits[y, x]], color), (x, y)
+
+
+def test_colours_have_the_names_of_css():
+    from matplotlib.colors import CSS4_COLORS
+
+    assert {name: f"#{digits}" for name, digits in COLORS.items()} == {
+        name: digits.lower() for name, digits in CSS4_COLORS.items()
+    }
+
+
+def test_what_is_not_seen_is_not_drawn(tmp_path):
+    made = drawn(
+        tmp_path,
+        '<g visibility="hidden"><rect width="5" height="5"/><rect x="9" width="5" height="5" '
+        'visibility="visible"/></g><rect y="9" width="5" height="5" fill="transparent"/>'
+        '<switch><desc/><rect x="20" width="5" height="5" requiredExtensions="x"/>'
+        '<rect x="25" width="5" height="5"/><rect x="30" width="5" height="5"/></switch>',
+    )
+    assert np.flatnonzero(made.bits.any(0)).tolist() == [*range(9, 14), *range(25, 30)]
+    assert not made.bits[5:].any()
+
+
+def test_round_corners(tmp_path):
+    made = drawn(tmp_path, '<rect x="1px" y="2" width="30" height="16" rx="4" fill="red"/>')
+    assert made.regions[1].area == pytest.approx(30 * 16 - (4 - np.pi) * 16, rel=1e-3)
+    made = drawn(tmp_path, '<rect width="30" height="16" rx="99" ry="99" fill="red"/>')
+    assert made.regions[1].area == pytest.approx(np.pi * 15 * 8, rel=1e-3)
+    made = drawn(tmp_path, '<path d="M10 0h10v10h-10z" transform="skewX(45)" fill="red"/>')
+    assert made.regions[1].bounds == pytest.approx((10, 0, 30, 10))
+
+
+def test_curves_that_touch_make_no_heaps_of_gaussians(tmp_path):
+    """Between them lie slivers of paper ten thousand times as long as wide."""
+    body = '<rect width="40" height="20" rx="6" fill="red"/>'
+    made = drawn(tmp_path, body)
+    thin = (made.boxes[:, 2:] - made.boxes[:, :2]).min(1) < 1 / 64
+    assert thin.sum() > 20
+    assert len(made.gaussians) < 20_000
+    assert np.array_equal(drawn(tmp_path, body, mixture="fitted").cloud.means, made.gaussians.means)
+
+
+def test_scribbles_are_refused(tmp_path):
+    places = " ".join(f"{7919 * i % 400 / 10} {104729 * i % 200 / 10}" for i in range(300))
+    with pytest.raises(fs.InputError, match="cross in over 5000 places: simplify"):
+        drawn(tmp_path, f'<path d="M{places}z"/>')
 
 
 def test_which_modules_a_region_meets():

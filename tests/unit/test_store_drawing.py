@@ -15,7 +15,7 @@ import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.seen import seen
 from fidsplat.random_clouds import random_splats
-from fidsplat.rotations import rigid_matrix
+from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.store import plan, streamed
 from fidsplat.store.sources import source_of
 from fidsplat.store.streamed import Streamed
@@ -28,6 +28,11 @@ CAPTURES = {
     "high cut-off": fs.Capture(look(turn=TURNED), quality="gsplat"),
     "samples": fs.Capture(look(), quality="samples=2"),
     "pixel": fs.Capture(look(turn=TURNED), quality="lowpass=pixel"),
+    "pixel, all": fs.Capture(look(turn=TURNED), quality="lowpass=pixel,alpha_cutoff=1e-8,samples=2"),
+    "pixel, fisheye": fs.Capture(look(focal=16.0, lens=fs.Fisheye(k1=0.02)), quality="lowpass=pixel"),
+    "pixel, folded": fs.Capture(look(focal=16.0, lens=fs.Fisheye(k1=-0.2)), quality="lowpass=pixel"),
+    "pixel, parallel": fs.Capture(look(focal=20.0, lens=fs.Orthographic()), quality="lowpass=pixel"),
+    "pixel, distorted": fs.Capture(look(lens=fs.BrownConrady(k1=-0.2)), quality="lowpass=pixel"),
     "distorted": fs.Capture(look(turn=TURNED, lens=fs.BrownConrady(k1=-0.2, k2=0.02, p1=0.01))),
     "fisheye": fs.Capture(look(focal=16.0, turn=TURNED, lens=fs.Fisheye())),
     "wide fisheye": fs.Capture(look(focal=9.0, lens=fs.Fisheye(k1=0.05))),
@@ -65,14 +70,14 @@ def test_views_are_drawn_of_what_they_see(stores, reference, name):
         assert whole["rgb"].any()
         read, every = streamed.data.nodes, store.chunks
         assert 0 < read <= every
-        if name in ("pinhole", "distorted"):
+        if name in ("pinhole", "distorted", "pixel"):
             assert read < 0.75 * every
 
 
 def test_a_box_around_each_splat_is_seen_where_the_splat_is(stores, reference):
     """What is left out shows nowhere: splat by splat."""
     cloud = stores["thick"].cloud()
-    for name in ("pinhole", "off-centre", "near and far", "distorted", "fisheye", "parallel"):
+    for name in ("pinhole", "off-centre", "near and far", "distorted", "fisheye", "parallel", "pixel"):
         capture = CAPTURES[name]
         features, view = prepare(cloud, capture)
         largest = np.maximum(cloud.scales.max(axis=1), cloud.thickness).astype(np.float64)
@@ -87,6 +92,84 @@ def test_a_box_around_each_splat_is_seen_where_the_splat_is(stores, reference):
         scales = np.column_stack([cloud.scales, cloud.thickness])[rest]
         unseen = fs.SplatCloud(scales=scales, **arrays)
         assert not reference.render(unseen, capture, outputs=("alpha",))["alpha"].any(), name
+
+
+WIDENED = {
+    "pinhole": (look(4.0), (0.16, 0.08)),
+    "fisheye": (look(focal=570.0, lens=fs.Fisheye(k1=0.02)), (0.05, 0.04)),
+}
+
+
+@pytest.mark.parametrize("name", WIDENED)
+def test_what_the_low_pass_pixel_draws_into_the_picture_is_seen(reference, name):
+    """Disks beside the picture that are seen nearly edge-on, their near ends further inwards."""
+    camera, most = WIDENED[name]
+    generator, count = np.random.default_rng(4), 1500
+    outward = np.column_stack([generator.uniform(-0.8, 0.8, count), np.zeros((count, 2))])
+    outward[:, 1] = generator.uniform(-0.2, 0.2, count)
+    towards = outward + np.array([0.0, 0.0, 1.0])
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    means = (towards * generator.uniform(1.0, 3.0, (count, 1))).astype(np.float32)
+    along = towards + 10.0 ** generator.uniform(-3, -1.5, (count, 1)) * outward
+    beside = np.cross(along, np.array([0, 1, 0]) + 0.3 * generator.normal(size=(count, 3)))
+    along, beside = (axis / np.linalg.norm(axis, axis=1, keepdims=True) for axis in (along, beside))
+    turns = np.stack([along, beside, np.cross(along, beside)], axis=2)
+    quats = [matrix_to_quaternion(turn) for turn in turns]
+    sizes = np.linalg.norm(means, axis=1)[:, None] * generator.uniform((0, 0), most, (count, 2))
+    cloud = fs.SplatCloud(means, quats, sizes, np.full(count, 0.99), colors=np.ones((count, 3)))
+    quality = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8)
+    capture = fs.Capture(camera, quality=quality, outputs=("alpha",))
+    features, view = prepare(cloud, capture)
+
+    def boxes(sigmas):
+        around = sigmas * np.hypot(along * sizes[:, :1], beside * sizes[:, 1:])
+        return means - around, means + around
+
+    shown = seen(view, features, boxes, sizes.max(axis=1))
+    assert 0.05 < shown.mean() < 0.95
+
+    def alpha(chosen):
+        arrays = {n: getattr(cloud, n)[chosen] for n in ("means", "quats", "scales", "opacities", "colors")}
+        return reference.render(fs.SplatCloud(**arrays), capture)["alpha"]
+
+    assert not alpha(~shown).any()
+    assert alpha(shown).any()
+
+
+@pytest.mark.parametrize("name", ["pixel, parallel", "pixel, distorted"])
+def test_where_a_footprint_has_no_bound_all_ahead_is_read(name):
+    cloud = fs.SplatCloud([(50.0, 0, 1)], [(1, 0, 0, 0)], [(0.1, 0.1)], [0.9], colors=[(1, 1, 1)])
+    features, view = prepare(cloud, CAPTURES[name])
+    assert seen(view, features, lambda sigmas: (cloud.means, cloud.means), np.array([0.1])).all()
+
+
+@pytest.mark.parametrize("lens", [None, fs.Fisheye(k1=0.02), fs.BrownConrady(k1=-0.1)], ids=str)
+def test_walls_beside_the_camera_under_the_low_pass_pixel(tmp_path, lens):
+    """A street from random places in it, whose walls are seen edge-on: the bits of all of it."""
+    generator, count = np.random.default_rng(9), 4000
+    means = generator.uniform((-1, -1.5, -12), (1, 0.5, 12), (count, 3))
+    means[:, 0] = np.sign(means[:, 0])  # to the left and right
+    quats = np.tile((math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 0.0), (count, 1))
+    sizes = generator.uniform(0.01, 0.06, (count, 2))
+    street = fs.SplatCloud(
+        means, quats, sizes, np.full(count, 0.7), colors=generator.uniform(0, 1, (count, 3))
+    )
+    store, renderer = made_store(tmp_path, street, "street"), fs.Renderer("opencl")
+    whole, resident = renderer.upload(store.cloud()), renderer.upload(store)
+    quality, read = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8), []
+    for number in range(12):
+        at = (
+            generator.choice([-1, 1]) * (1 - 10.0 ** generator.uniform(-4, 0)),
+            -0.4,
+            generator.uniform(-9, 9),
+        )
+        half = generator.uniform(-math.pi, math.pi) if number % 2 else generator.normal(0, 0.01)
+        turn = (math.cos(half), 0.0, math.sin(half), 0.0)
+        camera = look(turn=turn, at=at, lens=lens) if lens else look(turn=turn, at=at)
+        ours, wanted = (renderer.render(each, camera, quality=quality) for each in (resident, whole))
+        assert np.array_equal(ours["rgb"], wanted["rgb"])
+        read.append(ours.stats["splats"])
+    assert (min(read) < 0.6 * count) or isinstance(lens, fs.BrownConrady)
 
 
 def test_a_needle_that_ewa_draws_into_a_wide_picture_is_seen(reference):

@@ -10,7 +10,7 @@ from fidsplat.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.detect import DEFAULT_FAMILIES, detect
 from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family, predefined
-from fidsplat.vision.pose import marker_pose, pose_error
+from fidsplat.vision.pose import marker_pose, plane_pose, pose_error
 
 CAMERA = Camera.pinhole(480, 400, 700, 700, 240, 200)
 SIZE = 0.2
@@ -184,6 +184,23 @@ def test_what_detect_cannot_use():
     for wanted in (5, "36h11"):
         with pytest.raises(InputError, match="families must be several names"):
             detect(np.zeros((60, 60), np.uint8), wanted)
+
+
+@pytest.mark.parametrize("spin", [0.0, 90.0])
+def test_what_is_seen_face_to_face_has_a_pose(spin):
+    """Where OpenCV's IPPE divides by next to nothing: squares, and boards of many points."""
+    points = np.stack(np.meshgrid([-0.12, -0.04, 0.04, 0.12], [-0.08, 0, 0.08]), -1).reshape(-1, 2)
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * SIZE / 2
+    for away in np.linspace(0.5, 3, 250):
+        placed = pose(turned(0, spin), [0, 0, away])
+        for flat in (square, points):
+            seen = CAMERA.project(np.pad(flat, ((0, 0), (0, 1))) @ placed[:3, :3].T + placed[:3, 3])
+            # as detectors give them
+            seen = seen.astype(np.float32).astype(np.float64)
+            found = marker_pose(seen, SIZE, CAMERA) if flat is square else plane_pose(flat, seen, CAMERA)
+            apart, angle = pose_error(found, placed)
+            assert apart < 1e-4 * away
+            assert angle < 0.01
 
 
 def test_corners_of_no_square_before_the_camera_have_no_pose():

@@ -20,7 +20,7 @@ from fidsplat.backends.gradients import (
 )
 from fidsplat.backends.opencl.counts import pairs_of
 from fidsplat.backends.opencl.gradients_again import Again
-from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of, group_of
+from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of, group_of, tape_bytes
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
@@ -111,18 +111,21 @@ class OpenCLGradients:
         picture.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
         picture.take("tile_sums", 3 * real * picture.tiles)
         picture.take("group_sums", 6 * real * posed)
-        reserved = picture.take("reserved", 4)
+        reserved = picture.take("reserved", 8)
         found = self._room_for_results(picture)
 
-        cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 4)
+        cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 8)
         if count:
             picture.launch("reserve", "reserve_slots", count, _GROUP, count=count)
-        ceiling, groups = math.log(view.ceiling), chunks if in_groups else picture.tiles
+        ceiling = math.log(view.ceiling)
+        groups = chunks if in_groups else min(picture.tiles, picture.workspace.info.compute_units)
         if in_groups:
             picture.take("reached", 4 * picture.tiles)
             picture.take("chunk_tiles", 4 * chunks)
             items = shape.blend_items
             picture.launch("blend backward", "blend_light", picture.tiles * items, items, log_ceiling=ceiling)
+        else:
+            picture.take("tapes", tape_bytes(features, shape) * groups)
         items = group_of(features, shape)
         picture.launch("blend backward", "blend_backward", groups * items, items, log_ceiling=ceiling)
         self._ask(drawn)

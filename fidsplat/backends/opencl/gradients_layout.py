@@ -47,7 +47,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": takes(
         *("uint count", "in uint keys", _TILES),
         "out uint splat_slots  // (n): the first of a splat's, which has one for each of its tiles",
-        "out uint reserved  // (1) how many there are",
+        "out uint reserved  // how many there are",
     ),
     "blend_backward": takes(
         *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots"),
@@ -55,6 +55,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float checkpoints  // tiles' transmittances in front of every CHUNK splats",
         "out float moments  // of the record Moments, by slots",
         "out real tile_sums  // (tiles, 3) by the background",
+        "out float tapes  // a Tape for each work-item",
+        "out uint reserved  // its second word: tiles that are taken",
     ),
     "project_backward": takes(
         *("uint count", "in View view", "cloud float means quats scales opacities"),

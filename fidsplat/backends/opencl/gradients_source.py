@@ -53,11 +53,18 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
 
 def chunk_of(features: FeatureSet, shape: DeviceShape) -> int:
     """Splats of a tile's list that are walked forward and then back: on GPUs a column of a splat's pixels for
-    each work-item, on CPUs at least, where they touch all of a tile: their fragments fill half of a core's
-    second cache."""
+    each work-item, on CPUs at least, where they touch all of a tile."""
     if shape.schedule == "lanes":
-        return 128
+        return shape.tape
     return group_of(features, shape) // shape.tile_width
+
+
+def tape_bytes(features: FeatureSet, shape: DeviceShape) -> int:
+    """Of the record `Tape` (schedule/lanes_backward.cl): light and opacity of each pixel of so many splats,
+    two words of each of eight times as many, a word of its own, all in whole vectors."""
+    chunk, vector = chunk_of(features, shape), 4 * shape.lanes
+    words = 2 * 8 * chunk + 1
+    return 8 * chunk * shape.tile_width * shape.tile_height + -(-4 * words // vector) * vector
 
 
 def group_of(features: FeatureSet, shape: DeviceShape) -> int:

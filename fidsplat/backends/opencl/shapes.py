@@ -31,6 +31,9 @@ class DeviceShape:
     `group`"""
     rows: int = 2
     """pixels of a column that a work-item draws (`group`)"""
+    tape: int = 1024
+    """splats that cover a tile whose fragments are kept on the way forward for the way back (`lanes`), 2 KiB
+    each for each core; lists of which more are drawn are walked twice"""
 
     @property
     def blend_items(self) -> int:
@@ -70,6 +73,8 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
             **{f"own, room for {room}": replace(own, waiting=room) for room in (1, 3)},
             **{f"groups, room for {shape.waiting}": shape for shape in few},
         }
+    if kind == "tape":
+        return {"a short tape": replace(own, tape=40)} if own.schedule == "lanes" else {}
     if kind == "listing":
         return {lists: replace(_groups(own, 8), lists=lists) for lists in ("ordered", "tiled")}
     if kind == "arithmetic":

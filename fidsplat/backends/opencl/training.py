@@ -13,8 +13,16 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.opencl.launches import Launch, Launches
+from fidsplat.backends.opencl.loss_sums import LATE, LossSums
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.training_source import IMAGES, MARGIN, MARGIN_ROWS, training_source
+from fidsplat.backends.opencl.training_source import (
+    MARGIN,
+    MARGIN_ROWS,
+    PANEL,
+    STRIP,
+    images_of,
+    training_source,
+)
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras import Camera
 from fidsplat.errors import DeviceError
@@ -22,8 +30,8 @@ from fidsplat.errors import DeviceError
 _GROUP = 64
 _SUMS, _SUMMED = 512, 128
 """work-groups that add up the loss, and their work-items (SUMMED of kernels/opencl/train/loss.cl)"""
-LATE = 16
-"""losses whose sums are kept until they are asked for"""
+_EACH_ROWS = 4
+"""that a work-item of its passes over columns takes (EACH_ROWS there)"""
 _REMEMBERED = ("first_", "second_")
 
 
@@ -35,40 +43,6 @@ class _Truth(NamedTuple):
     masked: bool
     counted: int
     """values that matter"""
-
-
-class _Sums:
-    """Room for the sums of several losses, so that the host need not read each before the next."""
-
-    def __init__(self, workspace: Workspace) -> None:
-        self._workspace = workspace
-        align = max(1, workspace.device.mem_base_addr_align // 8)
-        self._each = -(-12 * _SUMS // align) * align
-        self._buffer = workspace.pool.fresh("losses", LATE * self._each)
-        self.slots = [self._buffer.get_sub_region(k * self._each, 12 * _SUMS) for k in range(LATE)]
-        self._words = np.empty((LATE, self._each // 4), np.float32)
-        self._next = 0
-        self._last: cl.Event | None = None
-        """when the sums of the last loss are there, and so those before it"""
-        self._unread: set[int] = set()
-
-    def take(self) -> int:
-        """The number of a slot that is written next."""
-        self._next = (self._next + 1) % LATE
-        return self._next
-
-    def added(self, slot: int, event: cl.Event) -> None:
-        """Its sums are there when this has come to pass."""
-        self._last = event
-        self._unread.add(slot)
-
-    def read(self, slot: int) -> np.ndarray:
-        """Three sums (3,) float64, with those of all that have not been read."""
-        if slot in self._unread:
-            after = None if self._last is None else [self._last]
-            cl.enqueue_copy(self._workspace.side_queue, self._words, self._buffer, wait_for=after)
-            self._unread.clear()
-        return self._words[slot, : 3 * _SUMS].reshape(_SUMS, 3).sum(axis=0, dtype=np.float64)
 
 
 class ResidentArrays:
@@ -111,15 +85,17 @@ class OpenCLTraining:
         """lanes: of vectors, in place of the device's own (tests)."""
         self._workspace = workspace
         lanes = lanes or (workspace.shape.lanes if workspace.shape.schedule == "lanes" else 1)
-        self._lanes, self._each_rows = lanes, 4 if lanes == 1 else 1  # EACH_ROWS of loss.cl
-        self._program = Program(workspace, training_source(lanes, workspace.info.float64))
+        self._lanes = lanes
+        source = training_source(lanes, workspace.info.float64, workspace.shape.fast_fma)
+        self._program = Program(workspace, source)
         self._held: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._count = 0
         self._drawn: tuple[int, ResidentArrays] | None = None
         self._truths: list[_Truth] = []
         self._loss_images: tuple[tuple[int, int], cl.Buffer] | None = None
-        self._sums = _Sums(workspace)
+        self._sums: dict[int, LossSums] = {}
+        """by numbers of work-groups"""
         self._version = object()
         """another one whenever splats are held in other buffers"""
         self._kept: dict[str, tuple[tuple[Any, ...], Launches, Any]] = {}
@@ -202,39 +178,41 @@ class OpenCLTraining:
     ) -> tuple[Callable[[], tuple[float, float]], Any]:
         """As `TrainingKernels`."""
         rgb, (height, columns, _) = images.device_buffer("rgb")
-        truth = self._truths[view]
+        truth, size, strided = self._truths[view], 3 * height * columns, self._lanes > 1
         number, stride = truth.counted, self._stride(columns)
-        slot = self._sums.take()
+        grid = (-(-3 * columns // PANEL), -(-height // STRIP)) if strided else (_SUMS,)
+        sums = self._sums_of(math.prod(grid))
+        slot, room = sums.take()
         given = {
             **{"rgb": rgb, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
-            **{"l1_share": (1 - dssim_weight) / number, "sums": self._sums.slots[slot]},
+            **{"l1_share": (1 - dssim_weight) / number, "sums": room},
         }
 
         def plan() -> tuple[list[Launch], Array]:
             slope = self._array("by_rgb", (height, columns, 3))
-            fixed = {
-                **{"by_rgb": slope.data, "ssim_share": dssim_weight / (3 * height * columns)},
+            every = given | {
+                **{"by_rgb": slope.data, "ssim_share": dssim_weight / size},
                 **{"width": 3 * columns, "height": height, "stride": stride},
                 **{"images": self._room_for_images(height, columns)},
                 "image_stride": stride * (height + 2 * MARGIN_ROWS),
             }
-            row = [self._of_rows("loss_take", 3 * columns, height, fixed | given)]
-            for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
-                each = self._each_rows if "columns" in name else 1
-                items = -(-3 * columns // self._lanes)
-                row.append(self._of_rows(name, items, -(-height // each), fixed | given))
-            row.append(self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), fixed | given))
-            return row, slope
+            if strided:
+                kernels = "loss_strips", "loss_strips_backward"
+                return [self._one(kernel, grid, (1, 1), every) for kernel in kernels], slope
+            row = [self._of_rows("loss_take", 3 * columns, height, every)]
+            for kernel in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
+                each = _EACH_ROWS if "columns" in kernel else 1
+                row.append(self._of_rows(kernel, 3 * columns, -(-height // each), every))
+            return [*row, self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), every)], slope
 
         events, slope = self._again("loss", (height, columns, dssim_weight), given, plan)
-        self._sums.added(slot, events[-1])
+        sums.added(slot, events[0 if strided else -1])
 
         def value() -> tuple[float, float]:
             self._queue.flush()
             with self._workspace.failing("training"):
-                absolute, squared, similar = self._sums.read(slot)
-            loss = (1 - dssim_weight) * absolute / number
-            loss += dssim_weight * (1 - similar / (3 * height * columns))
+                absolute, squared, similar = sums.read(slot)
+            loss = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / size)
             return float(loss), float(squared / number)
 
         return value, slope
@@ -361,6 +339,11 @@ class OpenCLTraining:
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:
         return self._workspace.pool.array(self._queue, f"training: {name}", shape)
 
+    def _sums_of(self, groups: int) -> LossSums:
+        if groups not in self._sums:
+            self._sums[groups] = LossSums(self._workspace, groups)
+        return self._sums[groups]
+
     def _stride(self, columns: int) -> int:
         return -(-3 * columns // self._lanes) * self._lanes + 2 * MARGIN
 
@@ -368,7 +351,7 @@ class OpenCLTraining:
         """Images for pictures of this size, all zeros at first: kernels leave the margins so."""
         if self._loss_images is not None and self._loss_images[0] == (height, columns):
             return self._loss_images[1]
-        size = 4 * IMAGES * self._stride(columns) * (height + 2 * MARGIN_ROWS)
+        size = 4 * images_of(self._lanes) * self._stride(columns) * (height + 2 * MARGIN_ROWS)
         self._loss_images = None  # the old ones go first
         buffer = self._workspace.pool.fresh("the loss's images", size)
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 
 from fidsplat.backends.opencl.assemble import Source, Text, kernel_text, with_scalars
 from fidsplat.backends.opencl.declare import Argument, Scalars, takes
 
-IMAGES = 11
-"""of the loss (kernels/opencl/train/loss.cl)"""
 MARGIN, MARGIN_ROWS = 16, 5
 """zeros around an image, floats of a row and rows"""
-_STEPS = ("loss", "surface", "adam", "pick", "shake")
-_FILES = ("prelude.cl", "math.cl", *(f"train/{step}.cl" for step in _STEPS))
+PANEL, STRIP = 128, 64
+"""values of a row and rows that a work-item takes, on CPUs (kernels/opencl/train/loss_strips.cl)"""
+_STEPS = ("surface", "adam", "pick", "shake")
 
 _PICTURE = takes(
     "int width height  // values of a row: three of a pixel; rows",
@@ -32,7 +32,7 @@ _ADAM = takes(
 )
 _DRAWN_SH = takes("uint count drawn all", "int plain")
 
-KERNELS: dict[str, tuple[Argument, ...]] = {
+_LOSS: dict[str, tuple[Argument, ...]] = {
     "loss_take": takes(_PICTURE, "in float rgb", "in uchar truth", _MASK, _IMAGES),
     "loss_rows": takes(_PICTURE, _IMAGES),
     "loss_columns": takes(_PICTURE, _IMAGES),
@@ -41,6 +41,18 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _PICTURE, "float l1_share ssim_share", _MASK, "in float images", "out float by_rgb"
     ),
     "loss_sums": takes("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
+}
+_LOSS_STRIPS: dict[str, tuple[Argument, ...]] = {
+    "loss_strips": takes(
+        *(_PICTURE, "in float rgb", "in uchar truth", _MASK),
+        *(_IMAGES, "out float sums  // (work-groups, 3)"),
+    ),
+    "loss_strips_backward": takes(
+        *(_PICTURE, "in float rgb", "in uchar truth", _MASK),
+        *("float l1_share ssim_share", "in float images", "out float by_rgb"),
+    ),
+}
+_KERNELS: dict[str, tuple[Argument, ...]] = {
     "surface_normals": takes(
         _SURFACE,
         _MASK,
@@ -98,20 +110,28 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
 }
 
 
+def images_of(lanes: int) -> int:
+    """Images that the loss takes."""
+    return 11 if lanes == 1 else 3
+
+
 @cache
-def training_source(lanes: int, float64: bool) -> Source:
+def training_source(lanes: int, float64: bool, fast_fma: bool) -> Source:
     """The program for vectors of so many floats; sums are in float64 where the device has it."""
-    numbers = {"LANES": lanes, "FAST_FMA": 0, "SETUP_FP64": int(float64)}
+    loss = "loss" if lanes == 1 else "loss_strips"
+    kernels = (_LOSS if lanes == 1 else _LOSS_STRIPS) | _KERNELS
+    numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
     head = "".join(f"#define {name} {value}\n" for name, value in numbers.items())
-    lines = "".join(map(kernel_text, _FILES)).split("\n")
-    text = with_scalars(head + "\n".join(map(_filled, lines)))
+    files = ("prelude.cl", "math.cl", *(f"train/{step}.cl" for step in ("loss_values", loss, *_STEPS)))
+    lines = "".join(map(kernel_text, files)).split("\n")
+    text = with_scalars(head + "\n".join(_filled(line, kernels) for line in lines))
     scalars = Scalars("double" if float64 else "float", "float")
-    return Source({"training": Text(text, text)}, {}, KERNELS, (), scalars)
+    return Source({"training": Text(text, text)}, {}, kernels, (), scalars)
 
 
-def _filled(line: str) -> str:
+def _filled(line: str, kernels: Mapping[str, tuple[Argument, ...]]) -> str:
     """A line, or what stands in place of a hook: a kernel's arguments, or nothing."""
     if not line.startswith("//@@ "):
         return line
     hook, _, subject = line.removeprefix("//@@ ").partition(" ")
-    return ",\n".join(f"    {one.text}" for one in KERNELS[subject]) if hook == "arguments" else ""
+    return ",\n".join(f"    {one.text}" for one in kernels[subject]) if hook == "arguments" else ""

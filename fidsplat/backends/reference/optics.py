@@ -111,6 +111,16 @@ def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
     return slopes * np.array([[view.focal_x], [view.focal_y]])
 
 
+def along_of(view: View, p: np.ndarray) -> np.ndarray:
+    """The derivative (n, 3) of the logarithm of points' depths by their coordinates p (n, 3), as the view
+    means depth; 0 for parallel rays."""
+    if view.parallel:
+        return np.zeros_like(p)
+    if view.along_ray:
+        return p / np.einsum("ni,ni->n", p, p)[:, None]
+    return np.array([0.0, 0.0, 1.0]) / p[:, 2:]
+
+
 def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edges of boxes with `forms` (3, n, 3), at samples (k,) on the grid.
 

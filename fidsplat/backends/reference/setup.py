@@ -139,6 +139,8 @@ class Setup:
         return part
 
 
+DEPTH_SHARE = 1 / 8
+"""of the depth: standard deviation, along its ray, of what a sample sees under the low-pass `pixel`"""
 _RANGE_RADIUS = math.sqrt(2 * math.log(255))
 """radius, in standard deviations, of the part of a splat whose depths bound those of all of it"""
 _PLANE_RADIUS = 64.0
@@ -200,23 +202,25 @@ def _filtered(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
 
-    chosen (n,) bool: the others stay as they are, and those whose centre a lens does not see. The covariance
-    of the filter in (u, v) is (G^T G)^-1 / 4 with G the derivative of the sample's position by (u, v) at the
-    centre.
+    chosen (n,) bool: the others stay as they are, and those whose centre a lens does not see. What a sample
+    sees is a Gaussian about its ray, with a standard deviation of half a sample across and of `DEPTH_SHARE`
+    of the depth along it; of parallel rays an endless one, since their picture is linear. So the covariance
+    of the filter in (u, v) is (G^T G)^-1 with G the derivative of the two by (u, v) at the centre, in these
+    units.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        slopes = optics.derivatives_of(view, p)
+        across, along = optics.derivatives_of(view, p) / 0.5, optics.along_of(view, p) / DEPTH_SHARE
+        slopes = np.concatenate([across, along[:, None]], axis=1)
         chosen = chosen & np.isfinite(slopes).all((1, 2))
-        columns = [np.einsum("nij,nj->in", slopes, t) for t in (a, b)]
-        turned = columns[0][0] * columns[1][1] - columns[1][0] * columns[0][1]
-        m11, m12, m22 = ((columns[i] * columns[j]).sum(0) for i, j in ((0, 0), (0, 1), (1, 1)))
-        variance = 0.25
-        c11, c12 = 1 + variance * m22 / turned**2, -variance * m12 / turned**2
-        grown = np.sqrt(1 + variance * (m11 + m22 + variance) / turned**2)
+        g_u, g_v = (np.einsum("nij,nj->ni", slopes, t) for t in (a, b))
+        m11, m12, m22 = (np.einsum("ni,ni->n", g, h) for g, h in ((g_u, g_u), (g_u, g_v), (g_v, g_v)))
+        determinant = (np.cross(g_u, g_v) ** 2).sum(1)  # of G^T G, without cancellation
+        c11, c12 = 1 + m22 / determinant, -m12 / determinant
+        grown = np.sqrt(1 + (m11 + m22 + 1) / determinant)
         l11 = np.sqrt(c11)
         grown, wide_a = np.where(chosen, grown, 1.0), l11[:, None] * a + (c12 / l11)[:, None] * b
         wide_b = (grown / l11)[:, None] * b
-    # edge-on splats grow without limit and are not drawn
+    # those that parallel rays see edge-on grow without limit and are not drawn
     chosen = (chosen & np.isfinite(grown))[:, None]
     return np.where(chosen, wide_a, a), np.where(chosen, wide_b, b), grown
 

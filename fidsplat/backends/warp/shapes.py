@@ -32,6 +32,8 @@ def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
         return {"ordered": own}
     if kind in ("sorting", "arithmetic"):
         return {"own": own}
+    if kind == "tape":
+        return {}
     if kind == "waiting":
         return {f"own, room for {room}": replace(own, waiting=room) for room in (1, 3)}
     return {f"{side} x {side}": WarpShape(own.schedule, side, side) for side in (8, 32)}

@@ -24,9 +24,9 @@
     sums->ny = FMA(weight, loss->normal_y, sums->ny);
     sums->nz = FMA(weight, loss->normal_z, sums->nz);
 //@ moments
-    m.nx = lane_sum(sums->nx);
-    m.ny = lane_sum(sums->ny);
-    m.nz = lane_sum(sums->nz);
+    MOMENT(nx, sums->nx);
+    MOMENT(ny, sums->ny);
+    MOMENT(nz, sums->nz);
 //@ facet_backward
         real towards = offset > 0 ? -1 : 1;
         real3_ by_facet = {towards * total.nx, towards * total.ny, towards * total.nz};

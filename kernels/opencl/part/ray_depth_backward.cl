@@ -22,9 +22,9 @@ static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vf
 }
 
 //@ moments
-    m.z_numerator = lane_sum(sums->z_numerator);
-    m.z_center = lane_sum(sums->z_center);
-    m.z_reach = lane_sum(sums->z_reach);
+    MOMENT(z_numerator, sums->z_numerator);
+    MOMENT(z_center, sums->z_center);
+    MOMENT(z_reach, sums->z_reach);
 //@ camera_backward
         // z_numerator is the determinant of M, with its sign
         real by_volume = facing * total.z_numerator;

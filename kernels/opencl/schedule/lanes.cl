@@ -40,7 +40,7 @@ kernel void blend(
             pixel_blend(&pixels[block], &s, c, mask, screen, &constants
 //@@ blend_arguments
             );
-            if (!VANY(pixel_unfinished(&pixels[block], &constants))) alive &= ~(1u << block);
+            if (RARELY(!VANY(pixel_unfinished(&pixels[block], &constants)))) alive &= ~(1u << block);
 //@@ walk_end
 //@@ pass_end
 

@@ -1,7 +1,8 @@
-// For CPUs: one work-item takes a tile back, a block of LANES pixels at a time.
-// Index space: one work-item (and work-group) per tile.
+// For CPUs: a work-item takes one tile after another back, a block of LANES pixels at a time: whichever nobody has taken yet, so
+// that there is a tape for each work-item alone, in memory of the device, as long as it needs to be.
+// Index space: one work-item (and work-group) per core.
 // Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
-// Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
+// Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints, tapes; reserved[1], tiles that are taken.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
 #define AHEAD_SPLATS 8
 
@@ -19,8 +20,13 @@ typedef struct {            // fragments in the order in which they were drawn, 
 
 typedef struct {
     int x0, y0;
+    float left[BLOCKS], top[BLOCKS];    // of its blocks
     const BlendConstants *constants;
 } Tile;
+
+typedef struct {            // of a tile's first block: where its pixels are, relative to a splat's anchor; whole numbers all
+    vfloat x, y;
+} Place;
 
 typedef struct {            // of a splat in a block: places relative to its anchor, and its forms
     vfloat x, y, nu_x, nv_x, screen;
@@ -28,11 +34,16 @@ typedef struct {            // of a splat in a block: places relative to its anc
     Crossing crossing;
 } Block;
 
-static inline Block block_of(const Splat *s, const Tile *tile, int block) {
+static inline Place place_of(const Splat *s, const Tile *tile) {
+    const Place place = {(float)(tile->x0 - s->ax) + BLOCK_X, (float)(tile->y0 - s->ay) + BLOCK_Y};
+    return place;
+}
+
+static inline Block block_of(const Splat *s, const Tile *tile, const Place *place, int block) {
     Block b;
     wide half_r2 = s->log_opacity - tile->constants->log_cut;
-    b.x = (float)(tile->x0 + LEFT(block) - s->ax) + BLOCK_X;
-    b.y = (float)(tile->y0 + TOP(block) - s->ay) + BLOCK_Y;
+    b.x = place->x + tile->left[block];
+    b.y = place->y + tile->top[block];
     b.nu_x = FMA((vfloat)s->nux, b.x, (vfloat)s->nu0);
     b.nv_x = FMA((vfloat)s->nvx, b.x, (vfloat)s->nv0);
     b.crossing = cross_row(s, b.nu_x, b.nv_x, FMA((vfloat)s->dx, b.x, (vfloat)s->d0), b.y, half_r2);
@@ -41,38 +52,53 @@ static inline Block block_of(const Splat *s, const Tile *tile, int block) {
 }
 
 // Lets the splat take its light in the blocks that are alive; keeps on the tape what it took there. Returns which stay alive.
-static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, Tape *tape, uint place) {
+static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, global Tape *tape, uint place) {
     const BlendConstants *constants = tile->constants;
     uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_cut, constants->filter), drawn_in = 0;
+    uint length = tape->length;
+    const Place at = place_of(s, tile);
     for (; touched != 0; touched &= touched - 1) {
         int block = 31 - clz((int)(touched & -touched));
-        const Block b = block_of(s, tile, block);
-        if (!VANY(b.mask)) continue;
+        const Block b = block_of(s, tile, &at, block);
+        if (RARELY(!VANY(b.mask))) continue;
         vfloat half_rho = fragment_half_rho(s, b.crossing, 1.0f / b.crossing.d, b.screen);
         vfloat opacity = fragment_opacity(s, half_rho, constants->ceiling);
-        tape->light[tape->length] = pixels[block].t;
-        tape->opacity[tape->length++] = take_light(&pixels[block], opacity, b.mask, constants);
+        tape->light[length] = pixels[block].t;
+        tape->opacity[length++] = take_light(&pixels[block], opacity, b.mask, constants);
         drawn_in |= 1u << block;
-        if (!VANY(VMASK(pixels[block].t > constants->stop))) alive &= ~(1u << block);
+        if (RARELY(!VANY(VMASK(pixels[block].t > constants->stop)))) alive &= ~(1u << block);
     }
+    tape->length = length;
     tape->blocks[place] = drawn_in;
     return alive;
 }
 
 // Takes the splat's fragments, the last ones on the tape, back and off it.
-static inline Moments back_splat(const Splat *s, const Tile *tile, Tape *tape, uint place, Loss *losses) {
+static inline void back_splat(const Splat *s, const Tile *tile, global Tape *tape, uint place, Loss *losses, global float *slot) {
     const BlendConstants *constants = tile->constants;
     Sums sums = {0};
     uint blocks = tape->blocks[place], at = tape->length -= popcount(blocks);
+    const Place corner = place_of(s, tile);
     for (; blocks != 0; blocks &= blocks - 1, at++) {
         int block = 31 - clz((int)(blocks & -blocks));
-        const Block b = block_of(s, tile, block);
+        const Block b = block_of(s, tile, &corner, block);
         const Geometry g = geometry_of(s, b.crossing, b.nu_x, b.nv_x, b.y, b.screen);
         vfloat opacity = tape->opacity[at], weight = tape->light[at] * opacity;
         vfloat by_log = take_back(&losses[block], fragment_worth(s, &losses[block], &g), weight, opacity);
         add_fragment(&sums, s, &losses[block], &g, weight, by_log, b.screen, b.x, b.y, constants);
     }
-    return moments_of(&sums, constants);
+    const Parts m = moments_of(&sums, constants);
+#if LANES == 16
+    uint field = 0;
+    for (; field + LANES <= FIELDS; field += LANES) VSTORE(lane_sums(m.fields + field), slot + field);
+    if (field < FIELDS) {
+        float last[LANES];
+        VSTORE(lane_sums(m.fields + field), last);
+        for (uint k = 0; field + k < FIELDS; k++) slot[field + k] = last[k];
+    }
+#else
+    *(global Moments *)slot = m;
+#endif
 }
 
 static inline void leave_nothing(global float *moments, uint slot) {
@@ -91,91 +117,101 @@ kernel void blend_backward(
 //@@ arguments blend_backward
 ) {
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
-    uint number = get_global_id(0);
-    int tiles_x = (width + TILE_W - 1) / TILE_W;
-    int column = (int)(number % (uint)tiles_x), tile_row = (int)(number / (uint)tiles_x);
-    const Tile tile = {column * TILE_W, tile_row * TILE_H, &constants};
-    uint start = starts[number], end = starts[number + 1];
-
-    // the derivatives of the tile's pixels; there is nothing outside of the picture
-    Loss losses[BLOCKS];
+    const int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
+    global Tape *tape = (global Tape *)tapes + get_global_id(0);
+    Tile tile;
+    tile.constants = &constants;
     for (int block = 0; block < BLOCKS; block++) {
-        Loss *loss = &losses[block];
-        int x = tile.x0 + LEFT(block), y = tile.y0 + TOP(block);
-        size_t at = y * (size_t)stride + x;
-        loss->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
-        loss->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
-        loss->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
-        loss->behind = FMA(loss->r, (vfloat)background_r, FMA(loss->g, (vfloat)background_g, loss->b * background_b));
+        tile.left[block] = (float)LEFT(block);
+        tile.top[block] = (float)TOP(block);
+    }
+    for (uint number; (number = atomic_inc(reserved + 1)) < (uint)(tiles_x * tiles_y);) {
+        int column = (int)(number % (uint)tiles_x), tile_row = (int)(number / (uint)tiles_x);
+        tile.x0 = column * TILE_W;
+        tile.y0 = tile_row * TILE_H;
+        uint start = starts[number], end = starts[number + 1];
+
+        // the derivatives of the tile's pixels; there is nothing outside of the picture
+        Loss losses[BLOCKS];
+        for (int block = 0; block < BLOCKS; block++) {
+            Loss *loss = &losses[block];
+            int x = tile.x0 + LEFT(block), y = tile.y0 + TOP(block);
+            size_t at = y * (size_t)stride + x;
+            loss->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
+            loss->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
+            loss->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+            loss->behind = FMA(loss->r, (vfloat)background_r, FMA(loss->g, (vfloat)background_g, loss->b * background_b));
 //@@ loss_start
-    }
-
-    // forward: the light in front of each chunk; of the last one the fragments stay on the tape
-    Pixel pixels[BLOCKS];
-    Tape tape;
-    for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block], (vfloat)1.0f);
-    const uint on_picture = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
-    uint alive = on_picture, walked = start, first = start, chunk = 0;
-    global float *own = checkpoints + (size_t)(start / CHUNK + number) * RECORD;
-    tape.length = 0;
-    for (; walked < end && alive; walked++) {
-        if (walked == start || tape.length + BLOCKS > ROOM || walked - first == MOST) {
-            chunk += walked != start;
-            first = walked;
-            tape.length = 0;
-            for (int block = 0; block < BLOCKS; block++) VSTORE(pixel_light(&pixels[block]), own + (size_t)chunk * RECORD + block * LANES);
-            ((global uint *)own)[(size_t)chunk * RECORD + TILE_W * TILE_H] = first;
         }
-        FETCH_SPLAT(min(walked + AHEAD_SPLATS, end - 1));
-        uint index = lists[walked], place = walked - first;
-        tape.slots[place] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
-        FETCH_AHEAD(moments + (size_t)tape.slots[place] * FIELDS);
-        const Splat s = splats[index];
-        alive = walk_splat(&s, &tile, pixels, alive, &tape, place);
-    }
-    vfloat behind_r = 0.0f, behind_g = 0.0f, behind_b = 0.0f;
-    for (int block = 0; block < BLOCKS; block++) {
-        behind_r = FMA(pixels[block].t, losses[block].r, behind_r);
-        behind_g = FMA(pixels[block].t, losses[block].g, behind_g);
-        behind_b = FMA(pixels[block].t, losses[block].b, behind_b);
-    }
-    tile_sums[3 * number] = lane_sum(behind_r);
-    tile_sums[3 * number + 1] = lane_sum(behind_g);
-    tile_sums[3 * number + 2] = lane_sum(behind_b);
 
-    // splats behind the last that was walked have nothing to do with the picture
-    for (uint k = walked; k < end; k++) {
-        FETCH_AHEAD(windows + lists[min(k + AHEAD_SPLATS, end - 1)]);
-        FETCH_AHEAD(splat_slots + lists[min(k + AHEAD_SPLATS, end - 1)]);
-        uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, column, tile_row, width, height);
-        leave_nothing(moments, slot);
-    }
-    for (bool again = false; walked > start; again = true) {
-        if (again) {
-            chunk--;
-            first = ((global const uint *)own)[(size_t)chunk * RECORD + TILE_W * TILE_H];
-            tape.length = 0;
-            alive = on_picture;
-            for (int block = 0; block < BLOCKS; block++) {
-                pixel_start(&pixels[block], VLOAD(own + (size_t)chunk * RECORD + block * LANES));
-                if (!VANY(VMASK(pixels[block].t > constants.stop))) alive &= ~(1u << block);
+        // forward: the light in front of each chunk; of the last one the fragments stay on the tape
+        Pixel pixels[BLOCKS];
+        for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block], (vfloat)1.0f);
+        const uint on_picture = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
+        uint alive = on_picture, walked = start, first = start, chunk = 0;
+        global float *own = checkpoints + (size_t)(start / CHUNK + number) * RECORD;
+        tape->length = 0;
+        for (; walked < end && alive; walked++) {
+            if (walked == start || tape->length + BLOCKS > ROOM || walked - first == MOST) {
+                chunk += walked != start;
+                first = walked;
+                tape->length = 0;
+                for (int block = 0; block < BLOCKS; block++) VSTORE(pixel_light(&pixels[block]), own + (size_t)chunk * RECORD + block * LANES);
+                ((global uint *)own)[(size_t)chunk * RECORD + TILE_W * TILE_H] = first;
             }
-            for (uint k = first; k < walked; k++) {
-                FETCH_SPLAT(min(k + AHEAD_SPLATS, end - 1));
-                uint index = lists[k];
-                tape.slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
-                const Splat s = splats[index];
-                alive = walk_splat(&s, &tile, pixels, alive, &tape, k - first);
-            }
+            FETCH_SPLAT(min(walked + AHEAD_SPLATS, end - 1));
+            uint index = lists[walked], place = walked - first;
+            tape->slots[place] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
+            const Splat s = splats[index];
+            alive = walk_splat(&s, &tile, pixels, alive, tape, place);
         }
-        for (; walked > first; walked--) {
-            uint place = walked - 1 - first;
-            if (tape.blocks[place] == 0) {
-                leave_nothing(moments, tape.slots[place]);
-                continue;
+        vfloat behind_r = 0.0f, behind_g = 0.0f, behind_b = 0.0f;
+        for (int block = 0; block < BLOCKS; block++) {
+            behind_r = FMA(pixels[block].t, losses[block].r, behind_r);
+            behind_g = FMA(pixels[block].t, losses[block].g, behind_g);
+            behind_b = FMA(pixels[block].t, losses[block].b, behind_b);
+        }
+        tile_sums[3 * number] = lane_sum(behind_r);
+        tile_sums[3 * number + 1] = lane_sum(behind_g);
+        tile_sums[3 * number + 2] = lane_sum(behind_b);
+
+        // splats behind the last that was walked have nothing to do with the picture
+        for (uint k = walked; k < end; k++) {
+            FETCH_AHEAD(windows + lists[min(k + AHEAD_SPLATS, end - 1)]);
+            FETCH_AHEAD(splat_slots + lists[min(k + AHEAD_SPLATS, end - 1)]);
+            uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, column, tile_row, width, height);
+            leave_nothing(moments, slot);
+        }
+        for (bool again = false; walked > start; again = true) {
+            if (again) {
+                chunk--;
+                first = ((global const uint *)own)[(size_t)chunk * RECORD + TILE_W * TILE_H];
+                tape->length = 0;
+                alive = on_picture;
+                for (int block = 0; block < BLOCKS; block++) {
+                    pixel_start(&pixels[block], VLOAD(own + (size_t)chunk * RECORD + block * LANES));
+                    if (!VANY(VMASK(pixels[block].t > constants.stop))) alive &= ~(1u << block);
+                }
+                for (uint k = first; k < walked; k++) {
+                    FETCH_SPLAT(min(k + AHEAD_SPLATS, end - 1));
+                    uint index = lists[k];
+                    tape->slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
+                    const Splat s = splats[index];
+                    alive = walk_splat(&s, &tile, pixels, alive, tape, k - first);
+                }
             }
-            const Splat s = splats[lists[walked - 1]];
-            ((global Moments *)moments)[tape.slots[place]] = back_splat(&s, &tile, &tape, place, losses);
+            for (; walked > first; walked--) {
+                uint place = walked - 1 - first, next = max(walked - 1, first + AHEAD_SPLATS) - AHEAD_SPLATS;
+                FETCH_AHEAD(splats + lists[next]);
+                FETCH_AHEAD((global const char *)(splats + lists[next]) + 64);
+                FETCH_AHEAD(moments + (size_t)tape->slots[next - first] * FIELDS);
+                if (tape->blocks[place] == 0) {
+                    leave_nothing(moments, tape->slots[place]);
+                    continue;
+                }
+                const Splat s = splats[lists[walked - 1]];
+                back_splat(&s, &tile, tape, place, losses, moments + (size_t)tape->slots[place] * FIELDS);
+            }
         }
     }
 }

@@ -3,10 +3,21 @@
 #define BLOCK_H (LANES / BLOCK_W)
 #define BLOCKS_X (TILE_W / BLOCK_W)
 #define BLOCKS (TILE_H / BLOCK_H * BLOCKS_X)          // 32 at most
-#define LEFT(block) ((block) % BLOCKS_X * BLOCK_W)    // in the tile
-#define TOP(block) ((block) / BLOCKS_X * BLOCK_H)
+#define LEFT(block) ((int)((uint)(block) % BLOCKS_X) * BLOCK_W)    // in the tile
+#define TOP(block) ((int)((uint)(block) / BLOCKS_X) * BLOCK_H)
 #define LANE_X(block, lane) (LEFT(block) + (lane) % BLOCK_W)
 #define LANE_Y(block, lane) (TOP(block) + (lane) / BLOCK_W)
+
+// A condition that hardly ever holds. So compilers branch, and the processor goes on with the next splat meanwhile: what they would
+// select instead, it could not go on without.
+#ifdef __has_builtin
+#if __has_builtin(__builtin_expect)
+#define RARELY(condition) __builtin_expect(condition, 0)
+#endif
+#endif
+#ifndef RARELY
+#define RARELY(condition) (condition)
+#endif
 
 // A bit for each block whose columns meet [x0, x1) and whose rows meet [y0, y1), of the tile and not empty.
 static inline uint blocks_within(int x0, int x1, int y0, int y1) {

@@ -40,4 +40,5 @@ static inline void lens_slopes(global const View *view, real x, real y, real *sl
         gx.y = view->focal_x * (slopes[0] * x_v + slopes[1] * y_v);
         gy.x = view->focal_y * (slopes[2] * x_u + slopes[3] * y_u);
         gy.y = view->focal_y * (slopes[2] * x_v + slopes[3] * y_v);
+        gz.x = a.z * ahead; gz.y = b.z * ahead;
         filtered = at_x * at_x + at_y * at_y < view->lens_fold;

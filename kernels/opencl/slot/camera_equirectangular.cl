@@ -45,6 +45,7 @@ static inline Bounds cone_bounds(global const View *view, real3_ a, real3_ b, re
         gx.y = across * (around_z * b.x - around_x * b.z);
         gy.x = up * (flat * a.y - sink * (around_x * a.x + around_z * a.z));
         gy.y = up * (flat * b.y - sink * (around_x * b.x + around_z * b.z));
+        gz.x = dot3(p, a) / (pz * pz); gz.y = dot3(p, b) / (pz * pz);
 //@ camera_box_reach
         reach = su + sv;
 //@ camera_ellipsoid_reach

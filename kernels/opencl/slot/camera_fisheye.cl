@@ -69,6 +69,7 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
         gx.y = view->focal_x * (cosine * out_v - sine * round_v);
         gy.x = view->focal_y * (sine * out_u + cosine * round_u);
         gy.y = view->focal_y * (sine * out_v + cosine * round_v);
+        gz.x = dot3(p, a) / (pz * pz); gz.y = dot3(p, b) / (pz * pz);
         filtered = angle <= view->lens_limit;
 //@ camera_box_reach
         reach = su + sv;

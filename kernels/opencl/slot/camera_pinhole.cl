@@ -24,6 +24,7 @@
         real3_ in_x = {a.x, b.x, p.x}, in_y = {a.y, b.y, p.y}, in_z = {a.z, b.z, p.z};
         gx = image_row(view->focal_x * ahead, -view->focal_x * p.x * ahead * ahead, in_x, in_z);
         gy = image_row(view->focal_y * ahead, -view->focal_y * p.y * ahead * ahead, in_y, in_z);
+        gz.x = a.z * ahead; gz.y = b.z * ahead;
 //@ camera_image
         // the derivative at most 0.3 half pictures outside the picture
         real ahead = 1 / pz, slope_x = fmin(fmax(p.x * ahead, -view->slopes[0]), view->slopes[1]);

@@ -59,5 +59,5 @@ static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y,
 //@ fragment_half_rho
 static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat inverse_d, vfloat screen) {
     vfloat half_rho = (c.q * inverse_d) * inverse_d;
-    return HAS_DOT(s) ? VSELECT(screen, fmin(half_rho, screen), c.inside) : half_rho;
+    return HAS_DOT(s) ? VSELECT(screen, VMIN(half_rho, screen), c.inside) : half_rho;
 }

@@ -10,8 +10,8 @@ static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho
     sums->dot_x = FMA(by_dot, x - s->dot_x, sums->dot_x);
     sums->dot_y = FMA(by_dot, y - s->dot_y, sums->dot_y);
 //@ moments
-    m.dot_x = 2.0f * constants->filter * lane_sum(sums->dot_x);
-    m.dot_y = 2.0f * constants->filter * lane_sum(sums->dot_y);
+    MOMENT(dot_x, 2.0f * constants->filter * sums->dot_x);
+    MOMENT(dot_y, 2.0f * constants->filter * sums->dot_y);
 //@ camera_backward
         // the dot's place is tu.z / pz
         by_tu.z += total.dot_x / pz;

@@ -1,30 +1,13 @@
-// The loss of a picture, (1 - w) L1 + w (1 - SSIM), and its derivative by each value. Its twin in NumPy, with the formulas:
-// fidsplat/train/losses.py.
-//
-// An image is rows of `stride` floats, the three channels of a pixel side by side, with MARGIN_ROWS rows and MARGIN floats of zeros
-// around the picture, so that a window that leaves it sees zeros without asking. A work-item computes LANES values of a row.
+// The loss for GPUs, image by image (see loss_values.cl). A work-item computes LANES values of a row.
 
-#define RADIUS 5
-#define MARGIN_ROWS RADIUS
-#define MARGIN 16  // at least three channels of RADIUS pixels
-
-constant float WINDOW[2 * RADIUS + 1] = {
-    0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f, 0.213005543f, 0.266011715f,
-    0.213005543f, 0.109360687f, 0.0360007733f, 0.00759875821f, 0.00102838012f,
-};
-#define C1 1e-4f
-#define C2 9e-4f
-// Rows that a work-item computes in the passes over columns, which share what they read. A CPU has no registers for more than one.
-#define EACH_ROWS (LANES == 1 ? 4 : 1)
+// Rows that a work-item computes in the passes over columns, which share what they read.
+#define EACH_ROWS 4
 
 // Where a work-item's values lie in an image, `rows` rows of them.
 #define HERE(rows) \
     int column = get_global_id(0) * LANES, row = get_global_id(1) * (rows); \
     if (column >= width || row >= height) return; \
     size_t at = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column
-
-// Values beyond the picture's last column stay 0.
-#define INSIDE(v) VSELECT((vfloat)(0.0f), v, VMASK((vfloat)((float)column) + VLANE < (vfloat)((float)width)))
 
 // Index space: one work-item per value of the picture. Reads: the picture, the truth, the mask. Writes: images 0 and 1 of `images`.
 // Where the mask is 0 the picture is the truth.
@@ -88,16 +71,11 @@ kernel void loss_columns(
     columns_of(images + 2 * image_stride + at, 5, stride, image_stride, found);
     for (int each = 0; each < EACH_ROWS && row + each < height; each++, at += stride) {
         vfloat a = found[each][0], b = found[each][1], aa = found[each][2], bb = found[each][3], ab = found[each][4];
-        vfloat means = a * a + b * b + C1, variances = (aa - a * a) + (bb - b * b) + C2;
-        vfloat top = 2.0f * a * b + C1, shared = 2.0f * (ab - a * b) + C2;
-        vfloat similar = top * shared / (means * variances);
-        vfloat by_shared = 2.0f * top / (means * variances), by_variance = -similar / variances;
-        vfloat by_mean = 2.0f * (b * shared - a * similar * variances) / (means * variances);
-        by_mean -= 2.0f * a * by_variance + b * by_shared;
-        VSTORE(INSIDE(by_mean), images + 7 * image_stride + at);
-        VSTORE(INSIDE(by_variance), images + 8 * image_stride + at);
-        VSTORE(INSIDE(by_shared), images + 9 * image_stride + at);
-        VSTORE(INSIDE(similar), images + 10 * image_stride + at);
+        const Similar here = similar_of(a, b, aa, bb, ab);
+        VSTORE(INSIDE(here.by_mean), images + 7 * image_stride + at);
+        VSTORE(INSIDE(here.by_variance), images + 8 * image_stride + at);
+        VSTORE(INSIDE(here.by_shared), images + 9 * image_stride + at);
+        VSTORE(INSIDE(here.similar), images + 10 * image_stride + at);
     }
 }
 

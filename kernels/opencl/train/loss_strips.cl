@@ -1,0 +1,161 @@
+// The loss for CPUs (see loss_values.cl): a work-item takes a strip of the picture down, PANEL values wide, and keeps the means along
+// the last TAPS rows, so that those along columns are read while they are in the first cache.
+// Index space of both kernels: (panels, strips), each a work-group.
+
+#define PANEL 128
+#define VECTORS (PANEL / LANES)
+#define STRIP 64
+#define TAPS (2 * RADIUS + 1)
+
+// Of a row the picture's and the truth's values from `column` - MARGIN on, zeros beyond the picture. Where the mask is 0 the picture
+// is the truth.
+static inline void take_row(
+    float *a, float *b, int column, int width, global const float *rgb, global const uchar *truth, int masked,
+    global const uchar *mask
+) {
+    for (int k = 0; k < PANEL + 2 * MARGIN; k += LANES) {
+        int from = column - MARGIN + k;
+        if (!masked && from >= 0 && from + LANES <= width) {
+            VSTORE(VLOAD(rgb + from), a + k);
+            VSTORE(VFLOAT(VLOAD(truth + from)) * (1.0f / 255), b + k);
+            continue;
+        }
+        for (int lane = 0; lane < LANES; lane++) {
+            int at = from + lane;
+            bool inside = at >= 0 && at < width;
+            float wanted = inside ? truth[at] * (1.0f / 255) : 0.0f;
+            b[k + lane] = wanted;
+            a[k + lane] = inside && (!masked || mask[at / 3]) ? rgb[at] : wanted;
+        }
+    }
+}
+
+static inline real sum_of(vfloat v) {
+    float values[LANES];
+    VSTORE(v, values);
+    real sum = 0;
+    for (int lane = 0; lane < LANES; lane++) sum += values[lane];
+    return sum;
+}
+
+// Reads: the picture, the truth, the mask. Writes: images 0 to 2, the derivatives of the SSIM by the mean of a, by that of a a, by
+// that of a b; each work-group's sums of |a - b|, (a - b)^2 and the SSIM.
+kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
+//@@ arguments loss_strips
+) {
+    const int left = get_global_id(0) * PANEL, first = get_global_id(1) * STRIP, end = min(first + STRIP, height);
+    float a[PANEL + 2 * MARGIN], b[PANEL + 2 * MARGIN];
+    vfloat means[TAPS][5 * VECTORS];
+    real absolute = 0, squared = 0, similar = 0;
+    for (int row = first - RADIUS; row < end + RADIUS; row++) {
+        bool there = row >= 0 && row < height;
+        size_t from = there ? (size_t)row * width : 0;
+        take_row(a, b, left, there ? width : 0, rgb + from, truth + from, masked, mask + from / 3);
+        vfloat differences = 0, squares = 0;
+        for (int vector = 0; vector < VECTORS; vector++) {
+            vfloat sum_a = 0, sum_b = 0, sum_aa = 0, sum_bb = 0, sum_ab = 0;
+            int at = MARGIN + vector * LANES;
+#pragma unroll
+            for (int k = -RADIUS; k <= RADIUS; k++) {
+                vfloat x = VLOAD(a + at + 3 * k), y = VLOAD(b + at + 3 * k), w = WINDOW[k + RADIUS];
+                sum_a = FMA(w, x, sum_a);
+                sum_b = FMA(w, y, sum_b);
+                sum_aa = FMA(w, x * x, sum_aa);
+                sum_bb = FMA(w, y * y, sum_bb);
+                sum_ab = FMA(w, x * y, sum_ab);
+            }
+            vfloat *here = means[(row + TAPS) % TAPS] + 5 * vector;
+            here[0] = sum_a, here[1] = sum_b, here[2] = sum_aa, here[3] = sum_bb, here[4] = sum_ab;
+            if (row >= first && row < end) {
+                vfloat difference = VLOAD(a + at) - VLOAD(b + at);
+                differences += fabs(difference);
+                squares = FMA(difference, difference, squares);
+            }
+        }
+        absolute += sum_of(differences);
+        squared += sum_of(squares);
+
+        int y = row - RADIUS;
+        if (y < first) continue;
+        vfloat alike = 0;
+        const vfloat *rows[TAPS];
+        for (int k = 0; k < TAPS; k++) rows[k] = means[(y - RADIUS + k + TAPS) % TAPS];
+        size_t to = (size_t)(y + MARGIN_ROWS) * stride + MARGIN + left;
+        for (int vector = 0, column = left; vector < VECTORS && column < width; vector++, column += LANES, to += LANES) {
+            vfloat mean_a = 0, mean_b = 0, mean_aa = 0, mean_bb = 0, mean_ab = 0;
+#pragma unroll
+            for (int k = 0; k < TAPS; k++) {
+                const vfloat *row_means = rows[k] + 5 * vector;
+                vfloat w = WINDOW[k];
+                mean_a = FMA(w, row_means[0], mean_a);
+                mean_b = FMA(w, row_means[1], mean_b);
+                mean_aa = FMA(w, row_means[2], mean_aa);
+                mean_bb = FMA(w, row_means[3], mean_bb);
+                mean_ab = FMA(w, row_means[4], mean_ab);
+            }
+            const Similar of = similar_of(mean_a, mean_b, mean_aa, mean_bb, mean_ab);
+            VSTORE(INSIDE(of.by_mean), images + to);
+            VSTORE(INSIDE(of.by_variance), images + image_stride + to);
+            VSTORE(INSIDE(of.by_shared), images + 2 * image_stride + to);
+            alike += INSIDE(of.similar);
+        }
+        similar += sum_of(alike);
+    }
+    size_t group = get_global_id(1) * get_global_size(0) + get_global_id(0);
+    sums[3 * group] = (float)absolute;
+    sums[3 * group + 1] = (float)squared;
+    sums[3 * group + 2] = (float)similar;
+}
+
+// Reads: images 0 to 2, the picture, the truth, the mask. Writes: the derivative of the loss, of the picture's shape.
+kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips_backward(
+//@@ arguments loss_strips_backward
+) {
+    const int left = get_global_id(0) * PANEL, first = get_global_id(1) * STRIP, end = min(first + STRIP, height);
+    vfloat means[TAPS][3 * VECTORS];
+    for (int row = first - RADIUS; row < end + RADIUS; row++) {
+        global const float *from = images + (size_t)(row + MARGIN_ROWS) * stride + MARGIN + left;
+        for (int vector = 0; vector < VECTORS && left + vector * LANES < width; vector++, from += LANES) {
+            vfloat by_mean = 0, by_variance = 0, by_shared = 0;
+#pragma unroll
+            for (int k = -RADIUS; k <= RADIUS; k++) {
+                vfloat w = WINDOW[k + RADIUS];
+                by_mean = FMA(w, VLOAD(from + 3 * k), by_mean);
+                by_variance = FMA(w, VLOAD(from + image_stride + 3 * k), by_variance);
+                by_shared = FMA(w, VLOAD(from + 2 * image_stride + 3 * k), by_shared);
+            }
+            vfloat *here = means[(row + TAPS) % TAPS] + 3 * vector;
+            here[0] = by_mean, here[1] = by_variance, here[2] = by_shared;
+        }
+        int y = row - RADIUS;
+        if (y < first) continue;
+        const vfloat *rows[TAPS];
+        for (int k = 0; k < TAPS; k++) rows[k] = means[(y - RADIUS + k + TAPS) % TAPS];
+        float a[PANEL + 2 * MARGIN], b[PANEL + 2 * MARGIN];
+        size_t at = (size_t)y * width;
+        take_row(a, b, left, width, rgb + at, truth + at, masked, mask + at / 3);
+        for (int vector = 0, column = left; vector < VECTORS && column < width; vector++, column += LANES) {
+            vfloat by_mean = 0, by_variance = 0, by_shared = 0;
+#pragma unroll
+            for (int k = 0; k < TAPS; k++) {
+                const vfloat *of = rows[k] + 3 * vector;
+                vfloat w = WINDOW[k];
+                by_mean = FMA(w, of[0], by_mean);
+                by_variance = FMA(w, of[1], by_variance);
+                by_shared = FMA(w, of[2], by_shared);
+            }
+            vfloat x = VLOAD(a + MARGIN + vector * LANES), wanted = VLOAD(b + MARGIN + vector * LANES);
+            vfloat slope = sign(x - wanted) * l1_share - (by_mean + 2.0f * x * by_variance + wanted * by_shared) * ssim_share;
+            if (!masked && column + LANES <= width) {
+                VSTORE(slope, by_rgb + at + column);
+                continue;
+            }
+            float values[LANES];
+            VSTORE(slope, values);
+            for (int k = 0; k < LANES && column + k < width; k++) {
+                bool counts = !masked || mask[(at + column + k) / 3];
+                by_rgb[at + column + k] = counts ? values[k] : 0.0f;
+            }
+        }
+    }
+}

@@ -1,0 +1,36 @@
+// What both ways of computing the loss share (loss.cl for GPUs, loss_strips.cl for CPUs): the loss of a picture,
+// (1 - w) L1 + w (1 - SSIM), and its derivative by each value. Its twin in NumPy, with the formulas: fidsplat/train/losses.py.
+//
+// An image is rows of `stride` floats, the three channels of a pixel side by side, with MARGIN_ROWS rows and MARGIN floats of zeros
+// around the picture, so that a window that leaves it sees zeros without asking.
+
+#define RADIUS 5
+#define MARGIN_ROWS RADIUS
+#define MARGIN 16  // at least three channels of RADIUS pixels
+
+constant float WINDOW[2 * RADIUS + 1] = {
+    0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f, 0.213005543f, 0.266011715f,
+    0.213005543f, 0.109360687f, 0.0360007733f, 0.00759875821f, 0.00102838012f,
+};
+#define C1 1e-4f
+#define C2 9e-4f
+
+// Values beyond the picture's last column stay 0.
+#define INSIDE(v) VSELECT((vfloat)(0.0f), v, VMASK((vfloat)((float)column) + VLANE < (vfloat)((float)width)))
+
+// Of means in a window: the SSIM, and its derivatives by that of a, by that of a a, by that of a b.
+typedef struct {
+    vfloat similar, by_mean, by_variance, by_shared;
+} Similar;
+
+static inline Similar similar_of(vfloat a, vfloat b, vfloat aa, vfloat bb, vfloat ab) {
+    Similar found;
+    vfloat means = a * a + b * b + C1, variances = (aa - a * a) + (bb - b * b) + C2;
+    vfloat top = 2.0f * a * b + C1, shared = 2.0f * (ab - a * b) + C2;
+    found.similar = top * shared / (means * variances);
+    found.by_shared = 2.0f * top / (means * variances);
+    found.by_variance = -found.similar / variances;
+    vfloat by_mean = 2.0f * (b * shared - a * found.similar * variances) / (means * variances);
+    found.by_mean = by_mean - (2.0f * a * found.by_variance + b * found.by_shared);
+    return found;
+}
