@@ -42,12 +42,20 @@ static inline Seen see(const Splat *s, Crossing c, vfloat inverse_d) {
 static inline void composite(Pixel *pixel, const Seen *seen, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
+#if LANES == 1
     vfloat weight = pixel->t * VSELECT((vfloat)0.0f, opacity, live);
+#else
+    vfloat taken = pixel->t * opacity, weight = VSELECT((vfloat)0.0f, taken, live);
+#endif
     pixel->r = FMA(weight, seen->r, pixel->r);
     pixel->g = FMA(weight, seen->g, pixel->g);
     pixel->b = FMA(weight, seen->b, pixel->b);
 //@@ composite
+#if LANES == 1
     pixel->t = pixel->t - weight;
+#else       // as fragment follows fragment: `live` is found meanwhile
+    pixel->t = VSELECT(pixel->t, pixel->t - taken, live);
+#endif
 }
 
 // Whether light comes through to what follows.

@@ -16,6 +16,7 @@ typedef int vint;
 #define VAS_FLOAT(x) as_float(x)
 #define VFLOAT(i) ((vfloat)(i))
 #define VMIN(a, b) fmin(a, b)
+#define VMAX(a, b) fmax(a, b)
 #define VLANE 0.0f
 #define BLOCK_W 1
 #define BLOCK_LOAD(p, stride) (*(p))
@@ -24,21 +25,28 @@ typedef int vint;
 typedef GLUE(float, LANES) vfloat;
 typedef GLUE(int, LANES) vint;
 #define VSELECT(no, yes, mask) select(no, yes, mask)
-// Whether any lane is set. Clang makes a chain of branches of `any`, a lane each, and one test of its own reduction.
-#if LANES == 16 && defined(__AVX512DQ__) && defined(__has_builtin)
-#if __has_builtin(__builtin_ia32_cvtd2mask512)
+// VBITS: a bit for each lane that is set. x86 has an instruction for it. VANY: whether any lane is; Clang makes a chain of branches of
+// `any`, a lane each, and one test of its own reduction.
+#if defined(__has_builtin)
+#if LANES == 16 && defined(__AVX512DQ__) && __has_builtin(__builtin_ia32_cvtd2mask512)
 #define VBITS(mask) ((uint)(ushort)__builtin_ia32_cvtd2mask512((__attribute__((__vector_size__(64))) int)(mask)))
-#define VANY(mask) (VBITS(mask) != 0)
-#endif
-#endif
-#if !defined(VANY) && defined(__has_builtin)
-#if __has_builtin(__builtin_reduce_or)
+#elif LANES == 8 && defined(__AVX__) && __has_builtin(__builtin_ia32_movmskps256)
+#define VBITS(mask) ((uint)__builtin_ia32_movmskps256(as_float8(mask)))
+#elif LANES == 4 && defined(__SSE__) && __has_builtin(__builtin_ia32_movmskps)
+#define VBITS(mask) ((uint)__builtin_ia32_movmskps(as_float4(mask)))
+#elif __has_builtin(__builtin_reduce_or)
 #define VANY(mask) (__builtin_reduce_or(mask) != 0)
 #define VBITS(mask) ((uint)__builtin_reduce_or((mask) & (vint)1 << VINDEX))
+#else
+#define VANY(mask) any(mask)
 #endif
+#else
+#define VANY(mask) any(mask)
 #endif
 #ifndef VANY
-#define VANY(mask) any(mask)
+#define VANY(mask) (VBITS(mask) != 0)
+#endif
+#ifndef VBITS
 static inline uint lanes_set(vint mask) {
     uint bits = 0;
     for (int lane = 0; lane < LANES; lane++) bits |= (uint)((int *)&mask)[lane] & 1u << lane;
@@ -46,14 +54,15 @@ static inline uint lanes_set(vint mask) {
 }
 #define VBITS(mask) lanes_set(mask)
 #endif
+// As fmin and fmax of a `b` that is a number: an instruction each, where those take four.
+static inline vfloat VMIN(vfloat a, vfloat b) { return VSELECT(b, a, a < b); }
+static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #define VLOAD(p) GLUE(vload, LANES)(0, p)
 #define VSTORE(v, p) GLUE(vstore, LANES)(v, 0, p)
 #define VMASK(condition) (condition)
 #define VAS_INT(x) GLUE(as_int, LANES)(x)
 #define VAS_FLOAT(x) GLUE(as_float, LANES)(x)
 #define VFLOAT(i) GLUE(convert_float, LANES)(i)
-// The smaller, b where a is none: one instruction, of which PoCL's `fmin` makes five.
-#define VMIN(a, b) VSELECT(b, a, (a) < (b))
 // VLANE, VINDEX: the lanes' numbers. Lanes are pixels of a block that is BLOCK_W wide, row by row; in memory its rows lie `stride`
 // apart.
 #if LANES == 16

@@ -6,104 +6,123 @@
 // A tile's list is walked through in chunks, and of a chunk block after block: so what waits at a block stays in the cache, and
 // each block has the chunk's splats in the order of their least depth there, which is mostly that of their fragments.
 //@ compose_types
-#define CHUNK 128
+#define CHUNK 128                   // splats, a multiple of 64 and a power of two
 #define NOTHING INFINITY            // the depth where nothing waits in the queue
 #define NONE (-INFINITY)            // and where nothing is held
 typedef union {
     Seen seen;
     vfloat fields[sizeof(Seen) / sizeof(vfloat)];
 } Shown;
-typedef struct {
-    wide depth;                     // the least in a block
-    uint which;                     // splat of a chunk
-} Listed;
 typedef struct {                    // a fragment in each lane, of any splat
     vfloat z, opacity;
     vint place;                     // of its splat in the list
     Shown shown;
 } Entry;
-typedef struct {
-    Entry held;
-    Entry entries[WAITING];         // the queue, of WAITING - 1
+typedef struct {                    // apart from what is to stay in registers
+    Entry entries[WAITING];         // of WAITING - 1
     uchar order[WAITING];           // places in the above: `count` that are taken, the nearest first, then those that are free
     int count;
     int bounded;                    // whether not all fragments are taken, but those between
     vfloat from, until;             // these depths: at the first from `from_place` in the list on, at the second those before
     vint from_place, until_place;
+} Queue;
+typedef struct {
+    Entry held;
+    Queue *queue;
 } Waiting;
 
 static inline void waiting_start(Waiting *waiting) {
-    for (int k = 0; k < WAITING; k++) waiting->order[k] = (uchar)k;
     const Entry none = {(vfloat)NONE};      // and the rest 0, which shows nothing
     waiting->held = none;
-    waiting->count = waiting->bounded = 0;
-    waiting->from = -INFINITY;
-    waiting->until = INFINITY;
-    waiting->from_place = waiting->until_place = 0;
 }
+
+static inline void queue_start(Queue *queue) {
+    for (int k = 0; k < WAITING; k++) queue->order[k] = (uchar)k;
+    queue->count = queue->bounded = 0;
+    queue->from = -INFINITY;
+    queue->until = INFINITY;
+    queue->from_place = queue->until_place = 0;
+}
+
+// Bits of a depth as a whole number that is sorted as it is, and back.
+static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFFF); }
+//@ lanes_start
+    Queue queues[BLOCKS];
+    for (int block = 0; block < (empty ? 1 : BLOCKS); block++) {
+        queue_start(&queues[block]);
+        pixels[block].waiting.queue = &queues[block];
+    }
 //@ blocks_parameters
-                                   , wide *nearest
+                                   , int which, int *keys
 //@ blocks_nearest
         vfloat least = s->nearest;
 //@@ camera_blocks_nearest
 //@@ plane_blocks_nearest
-        VSTORE(least, nearest + first);
+        VSTORE((in_order(VAS_INT(least)) & -CHUNK) | which, keys + first);
 //@ walk
     for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base; chunk < end && alive; chunk += CHUNK) {
-        uint length = min(end - chunk, (uint)CHUNK);
-        // of each block its splats and their least depths there, sorted; ties as they are in the list
-        int counts[BLOCKS];
-        Listed sorted[BLOCKS][CHUNK + 2];       // between what is before and behind all
-        for (int block = 0; block < BLOCKS; block++) {
-            counts[block] = 0;
-            sorted[block][0].depth = -INFINITY;
-        }
+        const uint length = min(end - chunk, (uint)CHUNK);
+        // of each splat its blocks, and its least depth in each of them, rounded down to have its place in the chunk as last bits
+        int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
+        for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
             FETCH_AHEAD(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]);
             FETCH_AHEAD((global const char *)(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]) + 64);
             const Splat s = splats[lists[chunk + which]];
-            wide nearest[BLOCKS];
-            for (int block = 0; block < BLOCKS; block++) nearest[block] = s.nearest;
-            for (uint touched = alive & touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, nearest);
-                 touched != 0; touched &= touched - 1) {
-                int block = 31 - clz((int)(touched & -touched));
-                const Listed own = {nearest[block], which};
-                Listed *at = &sorted[block][++counts[block]];
-                for (; at[-1].depth > own.depth; at--) *at = at[-1];
-                *at = own;
-            }
+            const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
+            for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which]);
         }
         const wide after = chunk + length < end ? splats[lists[chunk + length]].nearest : INFINITY;
         for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
-            int block = 31 - clz((int)(blocks & -blocks));
-            const Listed *next = &sorted[block][1], *last = next + counts[block];
-            sorted[block][counts[block] + 1].depth = INFINITY;
-            for (; next < last && (alive >> block & 1u); next++) {
-                const uint k = chunk + next->which;
-                const wide following = fmin(next[1].depth, after);     // nothing that follows comes before it
+            const int block = 31 - clz((int)(blocks & -blocks));
+            // its splats, sorted by those numbers: the place of each is how many are less
+            int unsorted[CHUNK + LANES] __attribute__((aligned(64))), sorted[CHUNK + 1 + LANES] __attribute__((aligned(64))), count = 0;
+            for (int first = 0; first < CHUNK; first += 64) {
+                ulong own = 0;
+                for (int at = 0; at < 64; at += LANES)
+                    own |= (ulong)VBITS(VMASK((VLOAD(touched + first + at) & (int)(1u << block)) != 0)) << at;
+                for (; own != 0; own &= own - 1) unsorted[count++] = keys[first + 63 - (int)clz(own & -own)][block];
+            }
+            VSTORE((vint)0x7FFFFFFF, unsorted + count);
+            for (int first = 0; first < count; first += LANES) {
+                const vint some = VLOAD(unsorted + first);
+                vint places = 0;
+                for (int other = 0; other < count; other++) places -= VMASK(some > unsorted[other]);
+                for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&places)[lane]] = unsorted[first + lane];
+            }
+            sorted[count] = 0x7F800000;         // infinity
+            wide nearest[CHUNK + LANES];        // what follows comes no nearer
+            for (int first = 0; first < count; first += LANES)
+                VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)after), nearest + first);
+            Pixel pixel = pixels[block];
+            for (int next = 0; next < count; next++) {
+                const uint k = chunk + (uint)(sorted[next] & (CHUNK - 1));
+                const wide following = nearest[next];
                 const Splat s = splats[lists[k]];
                 wide half_r2 = s.log_opacity - constants.log_cut;
 //@ walk_end
             }
+            pixels[block] = pixel;
         }
     }
 //@ compose_functions
 // Composites what waits nearer than `nearest`, but what shares an entry with something further.
 static inline void waiting_leave(Pixel *pixel, wide nearest, const BlendConstants *constants) {
-    Waiting *waiting = &pixel->waiting;
+    Queue *queue = pixel->waiting.queue;
     int left = 0;
-    for (; left < waiting->count; left++) {
-        const Entry *entry = &waiting->entries[waiting->order[left]];
+    for (; left < queue->count; left++) {
+        const Entry *entry = &queue->entries[queue->order[left]];
         vint waits = VMASK(entry->z < NOTHING), ready = waits & VMASK(entry->z < nearest);
         if (VANY(waits & ~ready)) break;
         composite(pixel, &entry->shown.seen, entry->opacity, ready, constants);
     }
     if (left == 0) return;
     uchar free[WAITING];
-    for (int k = 0; k < left; k++) free[k] = waiting->order[k];
-    waiting->count -= left;
-    for (int k = 0; k < waiting->count; k++) waiting->order[k] = waiting->order[k + left];
-    for (int k = 0; k < left; k++) waiting->order[waiting->count + k] = free[k];
+    for (int k = 0; k < left; k++) free[k] = queue->order[k];
+    queue->count -= left;
+    for (int k = 0; k < queue->count; k++) queue->order[k] = queue->order[k + left];
+    for (int k = 0; k < left; k++) queue->order[queue->count + k] = free[k];
 }
 
 static inline void waiting_exchange(vfloat *one, vfloat *other, vint mask) {
@@ -118,6 +137,7 @@ static inline void entry_exchange(Entry *one, Entry *other, vint mask) {
     vint place = one->place;
     one->place = VSELECT(place, other->place, mask);
     other->place = VSELECT(other->place, place, mask);
+#pragma unroll
     for (uint field = 0; field < sizeof(Seen) / sizeof(vfloat); field++)
         waiting_exchange(&one->shown.fields[field], &other->shown.fields[field], mask);
 }
@@ -129,21 +149,22 @@ static inline vint entry_before(const Entry *one, const Entry *other) {
 
 // Puts what leaves `held` into the queue. Where that is full, what is held is dropped for it: the furthest of all.
 static inline void waiting_queue(Waiting *waiting, Entry *own) {
+    Queue *queue = waiting->queue;
     own->z = VSELECT(own->z, (vfloat)NOTHING, VMASK(own->z == NONE));
-    for (int k = 0; k < waiting->count; k++) {
-        Entry *other = &waiting->entries[waiting->order[k]];
+    for (int k = 0; k < queue->count; k++) {
+        Entry *other = &queue->entries[queue->order[k]];
         vint before = entry_before(own, other);
         if (VANY(before)) entry_exchange(own, other, before);
         if (!VANY(VMASK(own->z < NOTHING))) return;
     }
-    if (waiting->count < WAITING - 1) {
-        waiting->entries[waiting->order[waiting->count++]] = *own;
+    if (queue->count < WAITING - 1) {
+        queue->entries[queue->order[queue->count++]] = *own;
         return;
     }
     vint dropped = VMASK(own->z < NOTHING);
-    waiting->until = VSELECT(waiting->until, waiting->held.z, dropped);
-    waiting->until_place = VSELECT(waiting->until_place, waiting->held.place, dropped);
-    waiting->bounded = 1;
+    queue->until = VSELECT(queue->until, waiting->held.z, dropped);
+    queue->until_place = VSELECT(queue->until_place, waiting->held.place, dropped);
+    queue->bounded = 1;
     entry_exchange(own, &waiting->held, dropped);
 }
 
@@ -152,16 +173,17 @@ static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opa
                                 vint mask, global const Splat *splats, const BlendConstants *constants) {
     Waiting *waiting = &pixel->waiting;
     vint here = (vint)(int)place;
-    if (waiting->bounded) {
-        mask &= VMASK(z < waiting->until) | (VMASK(z == waiting->until) & VMASK(here < waiting->until_place));
-        mask &= VMASK(z > waiting->from) | (VMASK(z == waiting->from) & VMASK(here >= waiting->from_place));
+    Queue *queue = waiting->queue;
+    if (queue->bounded) {
+        mask &= VMASK(z < queue->until) | (VMASK(z == queue->until) & VMASK(here < queue->until_place));
+        mask &= VMASK(z > queue->from) | (VMASK(z == queue->from) & VMASK(here >= queue->from_place));
         if (!VANY(mask)) return;
     }
     Entry own = {VSELECT((vfloat)NONE, z, mask), opacity, here};
     own.shown.seen = *seen;
     entry_exchange(&own, &waiting->held, mask & ~entry_before(&own, &waiting->held));
     vint leaves = VMASK(own.z > NONE);
-    if (waiting->count == 0 && !VANY(VMASK(own.z >= nearest)))
+    if (queue->count == 0 && !VANY(VMASK(own.z >= nearest)))
         composite(pixel, &own.shown.seen, own.opacity, leaves, constants);
     else {
         if (VANY(leaves)) waiting_queue(waiting, &own);
@@ -177,10 +199,11 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
     Entry *held = &pixel->waiting.held;
     composite(pixel, &held->shown.seen, held->opacity, VMASK(held->z > NONE), constants);
     held->z = NONE;
-    pixel->waiting.from = pixel->waiting.until;
-    pixel->waiting.from_place = pixel->waiting.until_place;
-    pixel->waiting.until = INFINITY;
-    return VMASK(pixel->waiting.from < INFINITY) & pixel_unfinished(pixel, constants);
+    Queue *queue = pixel->waiting.queue;
+    queue->from = queue->until;
+    queue->from_place = queue->until_place;
+    queue->until = INFINITY;
+    return VMASK(queue->from < INFINITY) & pixel_unfinished(pixel, constants);
 }
 //@ blend_arguments
                         , splats, lists[k], k, following

@@ -1,12 +1,29 @@
-// The way through a tile's list splat by splat, for CPUs: each splat at all blocks that it touches.
+// The way through a tile's list in chunks, for CPUs: of a chunk block after block, so that a block's pixels stay in registers.
+//@ compose_types
+#define CHUNK 64
 //@ walk
-    for (uint k = starts[tile] - base, end = starts[tile + 1] - base; k < end && alive; k++) {
-        FETCH_AHEAD(splats + lists[min(k + AHEAD_SPLATS, end - 1)]);
-        FETCH_AHEAD((global const char *)(splats + lists[min(k + AHEAD_SPLATS, end - 1)]) + 64);
-        const Splat s = splats[lists[k]];
-        wide half_r2 = s.log_opacity - constants.log_cut;
-        for (uint touched = alive & touched_blocks(&s, x0, y0, half_r2, constants.filter); touched != 0; touched &= touched - 1) {
-            int block = 31 - clz((int)(touched & -touched));
+    for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base; chunk < end && alive; chunk += CHUNK) {
+        const uint length = min(end - chunk, (uint)CHUNK);
+        int touched[CHUNK];                 // of each splat its blocks
+        for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
+        for (uint which = 0; which < length; which++) {
+            FETCH_AHEAD(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]);
+            FETCH_AHEAD((global const char *)(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]) + 64);
+            const Splat s = splats[lists[chunk + which]];
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter);
+        }
+        for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
+            const int block = 31 - clz((int)(blocks & -blocks));
+            ulong own = 0;                  // of the block its splats
+            for (int at = 0; at < CHUNK; at += LANES)
+                own |= (ulong)VBITS(VMASK((VLOAD(touched + at) & (int)(1u << block)) != 0)) << at;
+            Pixel pixel = pixels[block];
+            for (; own != 0; own &= own - 1) {
+                const uint k = chunk + 63 - (uint)clz(own & -own);
+                const Splat s = splats[lists[k]];
+                wide half_r2 = s.log_opacity - constants.log_cut;
 //@ walk_end
+            }
+            pixels[block] = pixel;
         }
     }

@@ -37,10 +37,13 @@ kernel void blend(
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
             if (!VANY(mask)) continue;
-            pixel_blend(&pixels[block], &s, c, mask, screen, &constants
+            pixel_blend(&pixel, &s, c, mask, screen, &constants
 //@@ blend_arguments
             );
-            if (RARELY(!VANY(pixel_unfinished(&pixels[block], &constants)))) alive &= ~(1u << block);
+            if (RARELY(!VANY(pixel_unfinished(&pixel, &constants)))) {
+                alive &= ~(1u << block);
+                break;
+            }
 //@@ walk_end
 //@@ pass_end
 

@@ -19,11 +19,14 @@
 #define RARELY(condition) (condition)
 #endif
 
-// A bit for each block whose columns meet [x0, x1) and whose rows meet [y0, y1), of the tile and not empty.
+// A bit for each block that meets columns [x0, x1) and rows [y0, y1) of the tile.
 static inline uint blocks_within(int x0, int x1, int y0, int y1) {
-    uint columns = (2u << (x1 - 1) / BLOCK_W) - (1u << x0 / BLOCK_W);
-    uint rows = (2u << ((y1 - 1) / BLOCK_H * BLOCKS_X + BLOCKS_X - 1)) - (1u << y0 / BLOCK_H * BLOCKS_X);
-    return columns * (0xFFFFFFFFu / ((1u << BLOCKS_X) - 1u)) & rows;
+    uint within = 0;
+    for (int first = 0; first < BLOCKS; first += LANES) {
+        vint x = VINDEX % BLOCKS_X * BLOCK_W, y = (first + VINDEX) / BLOCKS_X * BLOCK_H;
+        within |= VBITS(VMASK(x < x1) & VMASK(x > x0 - BLOCK_W) & VMASK(y < y1) & VMASK(y > y0 - BLOCK_H)) << first;
+    }
+    return within;
 }
 
 //@@ blocks_functions
@@ -31,9 +34,8 @@ static inline uint blocks_within(int x0, int x1, int y0, int y1) {
 static inline uint touched_blocks(const Splat *s, int left, int top, wide half_r2, wide filter
 //@@ blocks_parameters
 ) {
-    int x0 = max(s->x0 - left, 0), x1 = min(s->x1 - left, TILE_W), y0 = max(s->y0 - top, 0), y1 = min(s->y1 - top, TILE_H);
-    if (x0 >= x1 || y0 >= y1) return 0;
-    uint touched = blocks_within(x0, x1, y0, y1);
+    uint touched = blocks_within(s->x0 - left, s->x1 - left, s->y0 - top, s->y1 - top);
+    if (touched == 0) return 0;
 //@@ blocks_touched
     return touched;
 }
