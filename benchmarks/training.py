@@ -5,7 +5,8 @@
 A step is a picture, its loss, its derivatives and the optimiser, all splats included; none are made. It is
 timed on the clock, from the end of one step to that of the next, which waits for the loss: the median and the
 quartiles of the steps after ten that are not counted. The process's CPU time of a step, all cores together,
-is the mean of them; on a CPU that others use too it says more. The host's is that of the thread that launches.
+is the mean of them; on a CPU that others use too it says more. The host's: of the thread that
+launches.
 """
 
 from __future__ import annotations
