@@ -349,7 +349,8 @@ class Renderer:
                 return Frame(draw(pipeline, data, view), capture.outputs)
 
             def part(one: PartOfView) -> Frame:
-                return Frame(draw(pipeline, one.data, one.view), capture.outputs, one.ids)
+                images = draw(pipeline, one.data, one.view) if one.images is None else one.images
+                return Frame(images, capture.outputs, one.ids)
 
             return stacked(data.parts(view, features, capture.quality, pipeline), part)
 

@@ -45,7 +45,7 @@ _PLAIN = (
     *("background_constant", "background_gradient", "background_panorama"),
     *("arithmetic_precise", "arithmetic_fast"),
     # where a picture needs them
-    *("opaque_layer", "motion_groups", "shutter_exposure", "shutter_rows", "blend_double"),
+    *("opaque_layer", "motion_groups", "shutter_exposure", "shutter_rows", "blend_double", "tile_ends"),
     # steps after blending
     *("fog", "exposure", "vignetting", "noise", "gain"),
     *("response_gamma", "response_srgb", "response_table", "quantise"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -36,7 +36,8 @@ class FeatureSet:
 
     slots: tuple[str, ...]
     """One effect per kind, in the fixed order camera, color, ellipsoids if any, lowpass, stop, a layer if
-    any, compose, footprint, background, arithmetic; then motion, shutter and double blending, if any."""
+    any, compose, footprint, background, arithmetic; then motion, shutter, double blending and where tiles
+    end, if any."""
     outputs: tuple[str, ...]
     """Sorted names of the outputs beside rgb."""
     sh_degree: int
@@ -137,6 +138,11 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
         setup_precision=quality.setup_precision,
         posts=(*(("fog",) if capture.foggy else ()), *capture.sensor.steps),
     )
+
+
+def with_tile_ends(features: FeatureSet) -> FeatureSet:
+    """The same picture, of which blending tells where each tile was finished: what hides what of a store."""
+    return replace(features, slots=(*features.slots, "tile_ends"))
 
 
 def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:

@@ -10,10 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from fidsplat.backends.base import ResidentData
+from fidsplat.backends.base import Images, ResidentData
+from fidsplat.backends.ends import TileEnds
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
-from fidsplat.store.streamed import Pixels, Selection, Streamed
+from fidsplat.store.streamed import Nodes, Pixels, Selection, Streamed
 
 _LEAST_ROWS = 16
 """pixels: what a device lists together at least"""
@@ -32,6 +33,8 @@ class PartOfView:
     data: ResidentData
     ids: Callable[[], np.ndarray]
     """the indices in the whole (n,) int32 of its splats"""
+    images: Images | None = None
+    """if it is drawn already"""
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,8 @@ class Band:
     pixels: Pixels
     """as of `Streamed.select`"""
     rows: tuple[int, int]
+    some: Nodes | None = None
+    """all that it is drawn of, if that is not all that it sees"""
 
     @staticmethod
     def of(scene: Streamed, view: View, features: FeatureSet, pixels: Pixels) -> Band:
@@ -52,8 +57,15 @@ class Band:
         return Band(scene, view, features, pixels, (first // view.samples, end // view.samples))
 
     def within(self, first: int, end: int) -> Band:
-        """Fewer of its rows."""
-        return replace(self, rows=(first, end))
+        """Fewer of its rows, drawn of all that they see."""
+        return replace(self, rows=(first, end), some=None)
+
+    def drawn_of(self, some: Nodes) -> Band:
+        """It, drawn of some of what it sees."""
+        made = replace(self, some=some)
+        if "seen" in self.__dict__:
+            made.__dict__["seen"] = self.seen  # a cached property
+        return made
 
     @cached_property
     def view(self) -> View:
@@ -64,14 +76,41 @@ class Band:
         )
 
     @cached_property
+    def seen(self) -> Nodes:
+        """All nodes that it may see."""
+        return self.scene.seen([self.view], self.features, self.pixels)
+
+    @property
+    def nodes(self) -> Nodes:
+        """Those that it is drawn of."""
+        return self.seen if self.some is None else self.some
+
+    @property
+    def missing(self) -> Nodes:
+        """Those that it may see and is not drawn of."""
+        return tuple(each & ~own for each, own in zip(self.seen, self.nodes, strict=True))
+
+    def hidden(self, ends: TileEnds) -> Nodes:
+        """The nodes of which it shows nothing where its tiles end there."""
+        return self.scene.hidden(self.view, self.features, ends)
+
+    def least_keys(self) -> Nodes:
+        """As that of `Streamed`."""
+        return self.scene.least_keys(self.view, self.features)
+
+    @cached_property
     def selection(self) -> Selection:
         """What it is drawn of."""
-        return self.scene.select([self.view], self.features, self.pixels)
+        return Selection.of(self.nodes)
 
     @cached_property
     def count(self) -> int:
         """Splats of that."""
-        return self.scene.count_of(self.selection)
+        return self.count_of(self.nodes) + len(self.scene.beside)
+
+    def count_of(self, nodes: Nodes) -> int:
+        """Splats of some nodes."""
+        return sum(int(n[own].sum()) for n, own in zip(self.scene.node_counts, nodes, strict=True))
 
     @property
     def halves(self) -> list[Band]:

@@ -10,15 +10,18 @@ from functools import partial
 
 import numpy as np
 
-from fidsplat.backends.base import Backend, Pipeline, ResidentData
+from fidsplat.backends.base import Backend, Images, Pipeline, ResidentData
 from fidsplat.backends.chunks import KeepsChunks, KnowsRoom
+from fidsplat.backends.ends import GivesTileEnds, TileEnds, can_hide
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet
+from fidsplat.effects.select import with_tile_ends
 from fidsplat.errors import FidsplatError
 from fidsplat.quality import Quality
 from fidsplat.store.bands import Band, Bands, PartOfView
+from fidsplat.store.hidden import Hidden
 from fidsplat.store.streamed import Selection, Streamed
 
 
@@ -31,7 +34,7 @@ class Residency:
             backend.chunk_cache(scene, scene.largest_chunk) if isinstance(backend, KeepsChunks) else None
         )
         self._there: tuple[Selection, ResidentData] | None = None
-        self._bands = Bands()
+        self._bands, self._hidden = Bands(), Hidden()
         self._fetching: threading.Thread | None = None
         self.nodes = 0
         """of the last views"""
@@ -60,11 +63,28 @@ class Residency:
         def fits(band: Band) -> bool:
             return not isinstance(pipeline, KnowsRoom) or pipeline.fits(self._data(band.selection), band.view)
 
-        self.nodes = 0
-        for band in self._bands.cut(whole, fits):
+        def drawn(band: Band, images: Images | None = None) -> PartOfView:
             self.nodes += len(band.selection)
             ids = partial(self.scene.ids, band.selection)
-            yield PartOfView(band.rows, band.view, self._data(band.selection), ids)
+            return PartOfView(band.rows, band.view, self._data(band.selection), ids, images)
+
+        self.nodes = 0
+        backend = self._backend
+        if not self._hidden.expects(whole):
+            self._hidden.passed()
+        elif isinstance(backend, GivesTileEnds) and can_hide(view, features):
+            asking = backend.pipeline(with_tile_ends(features))
+
+            def draw(band: Band) -> tuple[Images, TileEnds]:
+                images = asking.render(self._data(band.selection), band.view)
+                return images, backend.tile_ends_of(images)
+
+            shown = self._hidden.drawn(whole, fits, draw)
+            if shown is not None:
+                yield drawn(*shown)
+                return
+        for band in self._bands.cut(whole, fits):
+            yield drawn(band)
 
     def of(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
@@ -123,9 +143,14 @@ class Residency:
         if self._fetching is not None and self._fetching.is_alive():
             return
 
+        asks = isinstance(self._backend, GivesTileEnds) and can_hide(view, features)
+
         def work() -> None:
             with suppress(FidsplatError, OSError, MemoryError):
-                selection = self.scene.select([view], features, pixels)
+                whole = Band.of(self.scene, view, features, pixels)
+                if asks and self._hidden.expects(whole, later=1):
+                    whole = self._hidden.begun(whole)
+                selection = whole.selection
                 if self._cache is None:
                     self.scene.fetch(selection)
                 else:

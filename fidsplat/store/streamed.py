@@ -12,6 +12,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from fidsplat.backends.chunks import Chunk
+from fidsplat.backends.ends import TileEnds, hidden, least_keys
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.seen import Boxes, seen, sizes
 from fidsplat.backends.view import View
@@ -33,11 +34,20 @@ Pixels = float | tuple[tuple[float, ...], ...]
 store"""
 
 
+Nodes = tuple[np.ndarray, ...]
+"""of each store which of its nodes, (places * nodes,) bool"""
+
+
 @dataclass(frozen=True)
 class Selection:
     """What views are drawn of: numbers of each store's nodes, in the order of their splats."""
 
     nodes: tuple[tuple[int, ...], ...]
+
+    @staticmethod
+    def of(nodes: Nodes) -> Selection:
+        """Of some of all nodes."""
+        return Selection(tuple(tuple(np.flatnonzero(each).tolist()) for each in nodes))
 
     def __len__(self) -> int:
         return sum(map(len, self.nodes))
@@ -112,12 +122,33 @@ class Streamed:
     def select(self, views: Sequence[View], features: FeatureSet, pixels: Pixels = 0.0) -> Selection:
         """What these views see. pixels: cells smaller than so many samples need not be told apart; 0: exactly
         the scene itself."""
+        return Selection.of(self.seen(views, features, pixels))
+
+    def seen(self, views: Sequence[View], features: FeatureSet, pixels: Pixels = 0.0) -> Nodes:
+        """As `select`."""
         chosen = []
         for number, store in enumerate(self.stores):
             own = pixels[number] if isinstance(pixels, tuple) else (pixels,) * (store.levels + 1)
-            numbers = _chosen(store, self._boxes(number), views, features, np.array(own))
-            chosen.append(tuple(numbers.tolist()))
-        return Selection(tuple(chosen))
+            chosen.append(_chosen(store, self._boxes(number), views, features, np.array(own)))
+        return tuple(chosen)
+
+    def least_keys(self, view: View, features: FeatureSet) -> Nodes:
+        """Of each store's nodes (n,) metres: below the depths at which a view sorts their splats."""
+        return tuple(least_keys(view, features, self._boxes(k)) for k in range(len(self.stores)))
+
+    def hidden(self, view: View, features: FeatureSet, ends: TileEnds) -> Nodes:
+        """The nodes of which nothing can show in a picture whose tiles end there."""
+        made = []
+        for number, store in enumerate(self.stores):
+            reach = np.tile(store.nodes["reach"].astype(np.float64), store.places)
+            # what stands on planes is in every picture
+            made.append(hidden(view, features, self._boxes(number), reach, ends) & ~_pinned(store))
+        return tuple(made)
+
+    @cached_property
+    def node_counts(self) -> Nodes:
+        """Splats of each store's nodes."""
+        return tuple(np.tile(store.nodes["count"].astype(np.int64), store.places) for store in self.stores)
 
     def part(self, selection: Selection) -> StorePart:
         """The splats of a selection."""
@@ -313,10 +344,10 @@ def _pinned(store: Store) -> np.ndarray:
 def _chosen(
     store: Store, boxes: Boxes, views: Sequence[View], features: FeatureSet, pixels: np.ndarray
 ) -> np.ndarray:
-    """Numbers of the nodes of a store that views are drawn of, in the order of their splats. boxes: as
-    `Store.boxes`, from the origin that views see it from."""
+    """(n,) bool: the nodes of a store that views are drawn of. boxes: as `Store.boxes`, from the origin that
+    views see it from."""
     if not len(store.nodes):
-        return np.zeros(0, np.int64)
+        return np.zeros(0, bool)
     nodes, places = store.nodes, store.places
     level = np.tile(nodes["level"], places)
     reach = np.tile(nodes["reach"].astype(np.float64), places)
@@ -325,7 +356,7 @@ def _chosen(
         visible |= seen(view, features, boxes, reach)
     pinned = _pinned(store)
     if not pixels.any():
-        return np.flatnonzero((visible | pinned) & (level == 0))
+        return (visible | pinned) & (level == 0)
     parents = np.tile(nodes["parent"].astype(np.int64), places)
     parents = np.where(parents >= 0, parents + np.repeat(np.arange(places), len(nodes)) * len(nodes), -1)
     edges = np.tile(nodes["size"].astype(np.float64), places)
@@ -336,4 +367,4 @@ def _chosen(
     for above in range(int(level.max()), 0, -1):
         children = np.flatnonzero((level == above - 1) & (parents >= 0))
         reached[children] = (reached & refined & visible)[parents[children]]
-    return np.flatnonzero(((reached & visible) | pinned) & (~refined | (level == 0)))
+    return ((reached & visible) | pinned) & (~refined | (level == 0))

@@ -29,8 +29,8 @@ CAMERAS = {
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "bb41da3ff0cd42248ce4b0f38a2e44b46ff98bfc0edb2298ed9bceb5a4a4786b",
     ("lanes", OUTPUTS): "ce4e6d51d9e195314a86609f4d27eac0db493da84d24136e3fd2247e18bd1886",
-    ("group", ("rgb",)): "af23be2629b8f248d74720a4095e5cea92317bc1d77ffae34cac6e1a9b14e336",
-    ("group", OUTPUTS): "6387be3d421a748e7419c7e2ba77b471e723964d049dad8069821eac7b3c9302",
+    ("group", ("rgb",)): "375fbb14e34b39b1a12f39d1bd1e5471966bc2300ad1c4ae7857e05a426939b5",
+    ("group", OUTPUTS): "55240a8c40a985f8d5d84c3c6605262f0faebd706bf2da61c59bf9e7a371e62e",
 }
 
 

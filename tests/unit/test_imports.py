@@ -201,6 +201,7 @@ SHARED = (
     "bands",
     "gradients",
     "chunks",
+    "ends",
 )
 
 

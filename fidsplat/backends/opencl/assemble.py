@@ -143,6 +143,10 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files.append(LAYOUTS[f"waiting_{shape.schedule}"].file)
     elif shape.schedule == "lanes":
         files.append(LAYOUTS["walk_lanes"].file)
+    if "tile_ends" in layouts:  # behind what may go through lists again
+        way = "_pixel" if "compose_pixel" in layouts else ""
+        files += [LAYOUTS["tile_ends_pixel"].file] if way else []
+        files.append(LAYOUTS[f"tile_ends{way}_{shape.schedule}"].file)
     if "opaque_layer" in layouts:  # behind what waits
         files.append(LAYOUTS["opaque_layer_end"].file)
     stages = {

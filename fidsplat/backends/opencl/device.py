@@ -9,11 +9,13 @@ import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.chunks import WholeScene
+from fidsplat.backends.ends import TileEnds
 from fidsplat.backends.opencl import pocl_cache, pocl_target
 from fidsplat.backends.opencl.ahead import Ahead
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.chunks import OpenCLChunks
 from fidsplat.backends.opencl.gradients import OpenCLGradients
+from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.resident import Resident
@@ -90,6 +92,10 @@ class OpenCLBackend(Workspace):
     def chunk_cache(self, whole: WholeScene, rows: int) -> OpenCLChunks:
         """As `KeepsChunks`."""
         return OpenCLChunks(self, whole, rows)
+
+    def tile_ends_of(self, images: OpenCLImages) -> TileEnds:
+        """As `GivesTileEnds`."""
+        return images.tile_ends()
 
     def unsupported(self, features: FeatureSet) -> str:
         """Blending in float64 where the device has none; empty for all else."""

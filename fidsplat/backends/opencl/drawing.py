@@ -73,6 +73,8 @@ def _blended(picture: Picture) -> Iterator[None]:
     view, shape = picture.view, picture.shape
     for name, channels, _ in _buffers_of(picture):
         picture.take(name, 4 * picture.held["channel_stride"] * channels)
+    if any(one.name == "tile_ends" for one in picture.program.source.arguments["blend"]):
+        picture.lease("tile_ends", 4 * picture.tiles)
     # not an attribute: in a cycle, all that this picture holds would wait for the garbage collector
     lists = LISTS["chunked" if picture.plan.chunk else shape.lists](picture)
     group = shape.blend_items

@@ -127,6 +127,9 @@ LAYOUTS: dict[str, Layout] = {
     "shutter_exposure": Layout("slot/shutter_exposure.cl"),
     "shutter_rows": Layout("slot/shutter_rows.cl"),
     "blend_double": Layout(),
+    "tile_ends": Layout(
+        blend=takes("in uint keys", "out uint tile_ends  // of each tile: the key at which it was finished")
+    ),
     # what several of them share
     "beside": Layout("part/beside.cl"),
     "beside_ewa": Layout("part/beside_ewa.cl"),
@@ -178,6 +181,12 @@ LAYOUTS: dict[str, Layout] = {
     "resolve_at_once": Layout("part/resolve_at_once.cl"),
     # how CPUs go through a list where nothing waits
     "walk_lanes": Layout("part/walk_lanes.cl"),
+    # where tiles are finished, by the schedule
+    "tile_ends_lanes": Layout("part/tile_ends_lanes.cl"),
+    "tile_ends_group": Layout("part/tile_ends_group.cl"),
+    "tile_ends_pixel": Layout("part/tile_ends_pixel.cl"),
+    "tile_ends_pixel_lanes": Layout("part/tile_ends_pixel_lanes.cl"),
+    "tile_ends_pixel_group": Layout("part/tile_ends_pixel_group.cl"),
     # how fragments wait for nearer ones, by the schedule
     "waiting_lanes": Layout("part/waiting_lanes.cl"),
     "waiting_group": Layout("part/waiting_group.cl"),

@@ -112,6 +112,8 @@ class OpenCLGradients:
         picture.take("tile_sums", 3 * real * picture.tiles)
         picture.take("group_sums", 6 * real * posed)
         reserved = picture.take("reserved", 8)
+        if not in_groups:
+            picture.take("big_rows", 4 * picture.held["big_capacity"] * -(-view.height // shape.tile_height))
         found = self._room_for_results(picture)
 
         cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 8)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.ends import TileEnds
 from fidsplat.backends.opencl.counts import fullness_of, read_counts, stats_of
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.recording import Recording
@@ -109,11 +110,13 @@ class OpenCLImages:
         size: tuple[int, int],
         drawn: Drawn,
         repeat: Repeat | None = None,
+        tiles: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0)),
     ) -> None:
-        """size: rows and columns of pixels."""
+        """size: rows and columns of pixels. tiles: rows and columns of them, and samples of one."""
         self._workspace, self._size, self._drawn, self._repeat = workspace, size, drawn, repeat
         self._outputs = {output.name: output for output in outputs}
         self._timings: dict[str, float] = {}
+        self._tiles = tiles
         self._leased = drawn.leased
         weakref.finalize(self, workspace.pool.give_back, self._leased)
 
@@ -151,6 +154,15 @@ class OpenCLImages:
             drawn = self.settle()
             image = drawn.buffer(f"{name}_out")
             return read_uint8(self._workspace, image, self._shape(name), drawn.done())
+
+    def tile_ends(self) -> TileEnds:
+        """As `GivesTileEnds`, of pictures whose features have the effect. Raises DeviceError as `read`."""
+        with self._workspace.failing("drawing"):
+            drawn, (grid, tile) = self.settle(), self._tiles
+            keys = np.empty(grid, np.uint32)
+            queue = self._workspace.read_queue
+            cl.enqueue_copy(queue, keys, drawn.buffer("tile_ends"), wait_for=drawn.done())
+        return TileEnds.of_keys(keys, tile)
 
     def wait(self) -> None:
         """Until the device has drawn it.

@@ -10,8 +10,8 @@ import pyopencl as cl
 from fidsplat.backends.opencl.program import Program, put_argument
 from fidsplat.backends.opencl.workspace import token_of
 
-Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], Sequence[Any]]
-"""kernel, size, work-group and values of the arguments"""
+Launch: TypeAlias = tuple[Any, ...]
+"""kernel, size, work-group, values of the arguments, and the first work-item where it is not 0"""
 
 
 class _Place:
@@ -35,7 +35,7 @@ class Launches:
     def __init__(self, program: Program) -> None:
         self._program = program
         self._kernels: dict[str, cl.Kernel] = {}
-        self._row: list[tuple[cl.Kernel, tuple[int, ...], tuple[int, ...]]] = []
+        self._row: list[tuple[cl.Kernel, tuple[int, ...], tuple[int, ...], tuple[int, ...] | None]] = []
         self._places: dict[str, _Place] = {}
         """of the arguments that may change"""
 
@@ -45,11 +45,12 @@ class Launches:
         self._row = []  # an interrupt on the way leaves none
         self._places = {name: _Place() for name in changing}
         made = []
-        for name, size, group, values in row:
+        for name, size, group, values, *first in row:
             if name not in self._kernels:
                 self._kernels[name] = cl.Kernel(self._program.kernels[name].program, name)
             kernel = self._kernels[name]
-            made.append((kernel, size, group))
+            offset = (first[0], *(0 for _ in size[1:])) if first and first[0] else None
+            made.append((kernel, size, group, offset))
             arguments = self._program.source.arguments[name]
             for index, (argument, value) in enumerate(zip(arguments, values, strict=True)):
                 scalar = self._program.type_of(name, index)
@@ -74,4 +75,4 @@ class Launches:
     def launch(self, queue: cl.CommandQueue, first: int = 0, end: int | None = None) -> list[cl.Event]:
         """The launches [first, end), in their order."""
         row = self._row[first:end]
-        return [cl.enqueue_nd_range_kernel(queue, kernel, size, group) for kernel, size, group in row]
+        return [cl.enqueue_nd_range_kernel(queue, *one) for one in row]

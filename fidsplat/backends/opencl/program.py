@@ -93,8 +93,10 @@ class Program:
         size: tuple[int, ...],
         group: tuple[int, ...],
         values: Sequence[Any],
+        first: int = 0,
     ) -> cl.Event:
-        """Launches a kernel with buffers and numbers in the order of its arguments.
+        """Launches a kernel with buffers and numbers in the order of its arguments. first: work-item, of the
+        first dimension.
 
         Only those are set that have changed since its last launch: from picture to picture hardly any do, and
         setting them takes the host longer than a small stage takes a GPU. A buffer is remembered by its
@@ -112,7 +114,8 @@ class Program:
                 put_argument(kernel, index, value, scalar)
                 bound[index] = mark
         self._bound[name] = bound
-        return cl.enqueue_nd_range_kernel(queue, kernel, size, group)
+        offset = (first, *(0 for _ in size[1:])) if first else None
+        return cl.enqueue_nd_range_kernel(queue, kernel, size, group, offset)
 
     def bound(self, name: str, values: Sequence[Any]) -> cl.Kernel:
         """A kernel of one's own whose arguments are these, and stay so."""

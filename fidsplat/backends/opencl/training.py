@@ -160,13 +160,18 @@ class OpenCLTraining:
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
         """As `TrainingKernels`."""
         if self._drawn is None or self._drawn[0] != degree:
-            count, drawn = self._count, (degree + 1) ** 2
-            for name, floats in (("quats", 4), ("scales", 2), ("opacities", 1), ("sh", 3 * drawn)):
+            count, drawn, every = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
+            itself = degree > 0 and drawn == every  # what is drawn is the values themselves
+            sizes = {"quats": 4, "scales": 2, "opacities": 1} | ({} if itself else {"sh": 3 * drawn})
+            for name, floats in sizes.items():
                 size = 4 * count * floats
                 self._held[f"drawn_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
-            self._held |= {"drawn": drawn, "all": self._shapes["sh"][1], "plain": int(degree == 0)}
+            self._held |= {"drawn": drawn, "all": every, "plain": int(degree == 0)}
             self._launch("activate", count)
-            self._launch("activate_sh", 3 * count * drawn)
+            if itself:
+                self._held["drawn_sh"] = self._held["sh"]
+            else:
+                self._launch("activate_sh", 3 * count * drawn)
             buffers = {name: self._held[f"drawn_{name}"] for name in ("quats", "scales", "opacities")}
             buffers["means"] = self._held["means"]
             buffers["colors" if degree == 0 else "sh"] = self._held["drawn_sh"]
@@ -261,12 +266,21 @@ class OpenCLTraining:
             "rest2": 1 - numbers["beta2"],
         }
 
-        def plan() -> tuple[list[Launch], None]:
-            of_sh = 3 * self._count * self._held["drawn"]
-            every = ("adam_shapes", self._count), ("adam_sh", of_sh)
-            return [self._items(name, items, given) for name, items in every], None
+        whole = 0 if self._lanes == 1 or numbers["sparse"] else self._count // 16  # adam_rows.cl
 
-        self._again("step", (), given, plan)
+        def plan() -> tuple[list[Launch], None]:
+            row = []
+            if whole:
+                row.append(self._items("adam_shapes_16", whole, given))
+            if 16 * whole < self._count:
+                row.append(self._items("adam_shapes", self._count - 16 * whole, given, 16 * whole))
+            if self._lanes == 1 or self._held["plain"]:
+                row.append(self._items("adam_sh", 3 * self._count * self._held["drawn"], given))
+            else:
+                row.append(self._items("adam_sh_rows", self._count, given))
+            return row, None
+
+        self._again("step", (whole,), given, plan)
 
     def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
         """As `TrainingKernels`."""
@@ -285,8 +299,9 @@ class OpenCLTraining:
     def _launch_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> None:
         self._enqueue(self._of_rows(kernel, items, rows, given))
 
-    def _items(self, kernel: str, items: int, given: Mapping[str, Any]) -> Launch:
-        return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP),), (_GROUP,), given)
+    def _items(self, kernel: str, items: int, given: Mapping[str, Any], first: int = 0) -> Launch:
+        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
+        return *self._one(kernel, (size,), (_GROUP,), given), first
 
     def _of_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> Launch:
         return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP), rows), (_GROUP, 1), given)

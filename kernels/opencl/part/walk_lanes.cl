@@ -4,6 +4,7 @@
 //@ walk
     for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base; chunk < end && alive; chunk += CHUNK) {
         const uint length = min(end - chunk, (uint)CHUNK);
+//@@ walked
         int touched[CHUNK];                 // of each splat its blocks
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {

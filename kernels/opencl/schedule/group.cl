@@ -49,6 +49,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         // uniform: every work-item reads the same vote, taken before this batch is drawn
+//@@ voted
         if (!alive) break;
         uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
         // not where all of a work-item's pixels are finished

@@ -1,0 +1,235 @@
+"""What other splats hide is not drawn, and the picture is that of all, bit for bit."""
+
+import math
+
+import numpy as np
+import pytest
+from agreement import ALL_OUTPUTS
+from store_views import TURNED, look, made_store, splats
+
+import fidsplat as fs
+from fidsplat.backends import ends
+from fidsplat.backends.prepare import prepare
+from fidsplat.rotations import rigid_matrix
+from fidsplat.store import hidden
+from fidsplat.store.streamed import Streamed
+
+
+def walls():
+    """Two walls at a corner, opaque, with a door."""
+    across, up = np.meshgrid(np.arange(-6, 3.1, 0.1), np.arange(-2.5, 2.5, 0.1))
+    wall = (np.abs(across - 1.2) > 0.3) | (up < 0)
+    flat = np.column_stack([across[wall], up[wall], np.full(wall.sum(), 3.0)])
+    flat = np.concatenate([flat, flat * [1, 1, 1.02]])
+    turned = np.repeat([[1, 0, 0, 0], [1, 0, 1, 0]], len(flat), axis=0)
+    means = np.concatenate([flat, flat[:, [2, 1, 0]]])
+    sizes, opacities = np.full((len(means), 2), 0.12), np.full(len(means), 0.99)
+    colors = np.random.default_rng(0).uniform(size=(len(means), 3))
+    return fs.SplatCloud(means, turned, sizes, opacities, colors=colors).with_labels(4)
+
+
+def bushes():
+    """Around and behind them."""
+    generator = np.random.default_rng(1)
+    middles = generator.uniform(-1, 1, (300, 3)) * [11, 1.5, 11]
+    means = np.repeat(middles, 160, axis=0) + generator.uniform(-0.2, 0.2, (48000, 3))
+    quats, colors = generator.normal(size=(len(means), 4)), generator.uniform(size=(len(means), 3))
+    opacities = generator.uniform(0.2, 0.9, len(means))
+    return fs.SplatCloud(means, quats, np.full((len(means), 2), 0.04), opacities, colors=colors)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("town")
+    stores = (made_store(folder, cloud(), cloud.__name__) for cloud in (walls, bushes))
+    return fs.Scene(stores=tuple(stores))
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Every view is asked for what is hidden; gives what each was drawn of, of how many splats."""
+    drawn, counts = hidden.Hidden.drawn, []
+    monkeypatch.setattr(hidden, "LEAST", 0)
+    monkeypatch.setattr(hidden, "_FIRST", 3000)
+    monkeypatch.setattr(hidden, "_SMALL", 1)
+    monkeypatch.setattr(hidden, "_RESTS", 0)
+
+    def noted(self, whole, fits, draw):
+        made = drawn(self, whole, fits, draw)
+        counts.append((whole.count if made is None else made[0].count, whole.count))
+        return made
+
+    monkeypatch.setattr(hidden.Hidden, "drawn", noted)
+    return counts
+
+
+def view(turn=0.0, along=0.0):
+    at = np.array([along, 0.0, 0.0])
+    towards = at + np.array([math.sin(turn), 0.0, math.cos(turn)])
+    return fs.Camera.look_at(192, 108, math.radians(60), at, towards)
+
+
+PATH = [view(), view(0.05, 0.1), view(1.6, -2.0), view(1.7, -7.0)]
+WAYS = {
+    "centres": "lowpass=screen",
+    "pixels": "lowpass=screen,order=pixel",
+    "samples": "lowpass=none,samples=2",
+    "exclusive": "stop_rule=exclusive,order=centre",
+    "never": "transmittance_stop=0",
+    "widened": "lowpass=pixel,alpha_cutoff=1e-8",
+    "widened pixels": "lowpass=pixel,order=pixel",
+}
+
+
+@pytest.mark.parametrize(
+    ("way", "schedule"), [*((way, "own") for way in WAYS), ("centres", "groups"), ("pixels", "groups")]
+)
+def test_pictures_have_the_bits_of_all_splats(town, asked, way, schedule):
+    renderer = fs.Renderer("opencl")
+    if schedule == "groups":
+        renderer.backend.shape = renderer.backend.shapes("schedule")["groups"]
+    cloud, resident = town.cloud(), renderer.upload(town)
+    asking, path = {"quality": WAYS[way], "outputs": ALL_OUTPUTS}, PATH
+    if schedule == "groups":  # which takes its time
+        asking["outputs"], path = ("rgb", "splat_id"), PATH[:1]
+    for number, frame in enumerate(renderer.render_views(resident, path, **asking)):
+        whole = renderer.render(cloud, path[number], **asking)
+        for output in whole:
+            assert np.array_equal(frame[output], whole[output]), (output, number)
+    assert len(asked) == len(path)
+    if way in ("centres", "pixels", "samples"):
+        assert asked[0][0] < 0.95 * asked[0][1]
+
+
+def test_what_is_hidden_is_not_read(town, asked):
+    renderer = fs.Renderer("opencl")
+    resident = renderer.upload(town)
+    for _ in renderer.render_views(resident, PATH[:2]):
+        pass
+    features, view = prepare(resident.whole, fs.Capture(PATH[1]))
+    seen = resident.whole.select([view], features)
+    assert len(resident.data._cache._slots) < 0.95 * len(seen)
+    assert resident.data.nodes < 0.95 * len(seen)
+
+
+def test_the_same_view_is_drawn_once(town, asked, monkeypatch):
+    renderer, times = fs.Renderer("opencl"), []
+    ask = type(renderer.backend).tile_ends_of
+    monkeypatch.setattr(
+        type(renderer.backend), "tile_ends_of", lambda self, images: times.append(1) or ask(self, images)
+    )
+    resident = renderer.upload(town)
+    renderer.render(resident, view())
+    first, _ = len(times), times.clear()
+    assert first > 1
+    renderer.render(resident, view())
+    assert len(times) == 1
+
+
+def test_of_what_lets_light_through_nothing_is_hidden(tmp_path, asked, monkeypatch):
+    monkeypatch.setattr(hidden, "_RESTS", 2)
+    monkeypatch.setattr(hidden, "_SMALL", 4)
+    monkeypatch.setattr(hidden, "_FIRST", 500)
+    cloud = splats(4)
+    faint = fs.SplatCloud(
+        cloud.means, cloud.quats, cloud.scales, np.full(len(cloud), 0.05, np.float32), colors=cloud.colors
+    )
+    store, renderer = made_store(tmp_path, faint, "faint"), fs.Renderer("opencl")
+    resident = renderer.upload(store)
+    for _ in range(4):
+        assert np.array_equal(renderer.render(resident, look())["rgb"], renderer.render(faint, look())["rgb"])
+    assert len(asked) == 2  # and then not for two views
+    assert all(count == of for count, of in asked)
+
+
+def test_levels_of_detail_and_places_are_hidden_too(town, tmp_path, asked, monkeypatch):
+    poses = [np.eye(4), rigid_matrix((1, 0, 16)), rigid_matrix((-2, 0, 30))]
+    places = fs.Store(fs.place_store(town.stores[1], tmp_path / "places.fss", poses))
+    whole = fs.Scene(stores=(town.stores[0], places))
+    renderer, scene = fs.Renderer("opencl"), Streamed(whole.stores)
+    resident = renderer.upload(whole)
+    monkeypatch.setattr(Streamed, "pixels_of", lambda self, *qualities: 4.0)
+    features, shot = prepare(scene, fs.Capture(view()))
+    assert any(
+        places.nodes["level"][node % len(places.nodes)]
+        for node in scene.select([shot], features, 4.0).nodes[1]
+    )
+    for camera in PATH[:3]:
+        ours = renderer.render(resident, camera, outputs=("rgb", "depth", "splat_id"))
+        monkeypatch.setattr(hidden, "LEAST", 1 << 60)
+        every = renderer.render(renderer.upload(whole), camera, outputs=("rgb", "depth", "splat_id"))
+        monkeypatch.setattr(hidden, "LEAST", 0)
+        for output in every:
+            assert np.array_equal(ours[output], every[output])
+    assert all(count < 0.9 * of for count, of in asked)
+
+
+def test_bands_of_several_devices_hide_for_themselves(town, asked):
+    devices, renderer = fs.SeveralDevices(["opencl", "opencl"]), fs.Renderer("opencl")
+    there = devices.upload(town)
+    for camera in PATH[:3]:
+        whole = renderer.render(town.cloud(), camera)["rgb"]
+        assert np.array_equal(devices.render(there, camera)["rgb"], whole)
+    assert any(count < of for count, of in asked)
+
+
+def test_too_little_memory_for_what_shows(town, asked):
+    renderer = fs.Renderer("opencl", memory_budget=4 * 2**20)
+    resident = renderer.upload(town)
+    whole = fs.Renderer("opencl").render(town.cloud(), view())["rgb"]
+    assert np.array_equal(renderer.render(resident, view())["rgb"], whole)
+
+
+CAPTURES = {
+    "pinhole": fs.Capture(look(turn=TURNED)),
+    "off-centre": fs.Capture(look(center=(-30.0, 50.0), turn=TURNED)),
+    "by pixel": fs.Capture(look(turn=TURNED), quality="order=pixel"),
+    "samples": fs.Capture(look(at=(2, 1, -1)), quality="samples=2,order=pixel,lowpass=none"),
+    "exact": fs.Capture(look(turn=TURNED), quality="ellipsoid=exact,order=pixel"),
+    "widened": fs.Capture(look(turn=TURNED), quality="lowpass=pixel,alpha_cutoff=1e-8"),
+    "widened by pixel": fs.Capture(look(turn=TURNED), quality="lowpass=pixel,order=pixel"),
+    "parallel": fs.Capture(look(focal=20.0, turn=TURNED, lens=fs.Orthographic())),
+    "fisheye": fs.Capture(look(focal=16.0, turn=TURNED, lens=fs.Fisheye()), quality="order=pixel"),
+}
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(name):
+    """Splat by splat: what says that it is hidden if all the tiles ended a little before its key says so."""
+    cloud, backend = splats(2, thick=True), fs.Renderer("opencl").backend
+    capture = CAPTURES[name].with_(outputs=("alpha",))
+    features, view = prepare(cloud, capture)
+    trace = backend.pipeline(features).trace(backend.upload(cloud), view)
+    assert cloud.thickness is not None
+    largest = np.maximum(cloud.scales.max(axis=1), cloud.thickness).astype(np.float64)
+
+    def boxes(sigmas):
+        return cloud.means - sigmas * largest[:, None], cloud.means + sigmas * largest[:, None]
+
+    shown = np.flatnonzero(trace["keys"] < 0xFFFFFFFE)
+    keys = ends.TileEnds.of_keys(trace["keys"], (1, 1)).depths
+    least = ends.least_keys(view, features, boxes)
+    assert (least[shown] <= keys[shown]).all()
+    # of one tile for each sample: what each splat touches ends behind all, the rest before all
+    records, rectangles = trace["records"], np.full((len(cloud), 4), -1)
+    for i in shown:
+        rectangles[i] = records["y0"][i], records["y1"][i], records["x0"][i], records["x1"][i]
+    for i in shown[:: max(1, len(shown) // 150)]:
+        depths = np.full((view.height, view.width), -np.inf, np.float32)
+        y0, y1, x0, x1 = rectangles[i]
+        for row, column in ((y0, x0), (y0, x1 - 1), (y1 - 1, x0), (y1 - 1, x1 - 1)):
+            depths[row, column] = np.inf
+            given = ends.TileEnds(depths, (1, 1))
+            only = lambda sigmas, i=i: tuple(each[i : i + 1] for each in boxes(sigmas))  # noqa: E731
+            assert not ends.hidden(view, features, only, largest[i : i + 1], given).any()
+            depths[row, column] = -np.inf
+
+
+def test_the_largest_in_rectangles():
+    generator = np.random.default_rng(0)
+    values = generator.normal(size=(13, 21))
+    tops, lefts = generator.integers(0, 13, 300), generator.integers(0, 21, 300)
+    bottoms, rights = generator.integers(0, 14, 300), generator.integers(0, 22, 300)
+    found = ends._Largest(values).within(tops, bottoms, lefts, rights)
+    for k, (top, bottom, left, right) in enumerate(zip(tops, bottoms, lefts, rights, strict=True)):
+        assert found[k] == values[top:bottom, left:right].max(initial=-np.inf)
