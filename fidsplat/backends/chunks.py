@@ -27,6 +27,8 @@ class Chunk:
     pose: np.ndarray | None = None
     """(16,) float64: where they are placed, the rotation by rows, where it puts the means' zero [m], and its
     quaternion; None: where they are"""
+    first: int = 0
+    """the row of those arrays from which on it has `count`"""
 
 
 class WholeScene(Traits, Protocol):

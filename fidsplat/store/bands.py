@@ -11,9 +11,11 @@ from itertools import pairwise
 import numpy as np
 
 from fidsplat.backends.base import Images, ResidentData
-from fidsplat.backends.ends import TileEnds
+from fidsplat.backends.ends import TileEnds, hidden
+from fidsplat.backends.seen import seen
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
+from fidsplat.store.pieces import Pieces
 from fidsplat.store.streamed import Nodes, Pixels, Selection, Streamed
 
 _LEAST_ROWS = 16
@@ -49,6 +51,8 @@ class Band:
     rows: tuple[int, int]
     some: Nodes | None = None
     """all that it is drawn of, if that is not all that it sees"""
+    pieces: tuple[tuple[Pieces, np.ndarray], ...] | None = None
+    """of these the pieces, and which of them (k,) bool it is drawn of; None: all"""
 
     @staticmethod
     def of(scene: Streamed, view: View, features: FeatureSet, pixels: Pixels) -> Band:
@@ -58,14 +62,33 @@ class Band:
 
     def within(self, first: int, end: int) -> Band:
         """Fewer of its rows, drawn of all that they see."""
-        return replace(self, rows=(first, end), some=None)
+        return replace(self, rows=(first, end), some=None, pieces=None)
 
     def drawn_of(self, some: Nodes) -> Band:
         """It, drawn of some of what it sees."""
-        made = replace(self, some=some)
+        return self._kept(replace(self, some=some, pieces=None))
+
+    def _kept(self, made: Band) -> Band:
         if "seen" in self.__dict__:
             made.__dict__["seen"] = self.seen  # a cached property
         return made
+
+    def cut_to(self, ends: TileEnds) -> Band:
+        """It, drawn of those pieces alone that may show where its tiles end there."""
+        pieces = self.scene.pieces(self.nodes)
+        return self._kept(replace(self, pieces=tuple((each, self._needed(each, ends)) for each in pieces)))
+
+    def lacks_pieces(self, ends: TileEnds) -> bool:
+        """Whether a piece of its nodes that it was not drawn of may show."""
+        return any((self._needed(each, ends) & ~drawn).any() for each, drawn in self.pieces or ())
+
+    def _needed(self, pieces: Pieces, ends: TileEnds) -> np.ndarray:
+        """(k,) bool: which pieces may show where tiles end there."""
+        if not len(pieces.nodes):
+            return np.zeros(0, bool)
+        shows = seen(self.view, self.features, pieces.boxes, pieces.reach)
+        shows &= ~hidden(self.view, self.features, pieces.boxes, pieces.reach, ends)
+        return shows | pieces.always
 
     @cached_property
     def view(self) -> View:
@@ -101,12 +124,16 @@ class Band:
     @cached_property
     def selection(self) -> Selection:
         """What it is drawn of."""
-        return Selection.of(self.nodes)
+        if self.pieces is None:
+            return Selection.of(self.nodes)
+        return Selection.of_pieces([pieces.only(drawn) for pieces, drawn in self.pieces])
 
     @cached_property
     def count(self) -> int:
         """Splats of that."""
-        return self.count_of(self.nodes) + len(self.scene.beside)
+        if self.pieces is None:
+            return self.count_of(self.nodes) + len(self.scene.beside)
+        return sum(int(each.rows[drawn].sum()) for each, drawn in self.pieces) + len(self.scene.beside)
 
     def count_of(self, nodes: Nodes) -> int:
         """Splats of some nodes."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -31,6 +32,9 @@ _SMALL = 16
 """but a smaller part of them than this says little"""
 _RESTS = 16
 """views that are not tried after one of which little was hidden"""
+_LOOKS, _SLACK = 4, 4.0
+"""directions of a tile, across and down, in which the last view's ends are looked up; and by how many times
+the way that the camera has moved they are taken to be further"""
 _ROUNDS = 12
 """drawn as often as that, a view is drawn of all that may show"""
 
@@ -57,7 +61,7 @@ class Hidden:
         ends = None if last is None else _carried(*last, whole.view)
         if ends is None:
             return whole.drawn_of(_nearest(whole, whole.nodes, _FIRST))
-        return whole.drawn_of(_without(whole.nodes, whole.hidden(ends)))
+        return whole.drawn_of(_without(whole.nodes, whole.hidden(ends))).cut_to(ends)
 
     def drawn(
         self,
@@ -75,16 +79,15 @@ class Hidden:
             self._last = whole.view, ends
             behind = whole.hidden(ends)
             missing = _without(band.missing, behind)
-            if not any(each.any() for each in missing):
+            if not (any(each.any() for each in missing) or band.lacks_pieces(ends)):
                 return band, images
             images = None  # its buffers are free for the next
             enough = band.count > whole.count // _SMALL
             if enough and band.count + whole.count_of(missing) > _FUTILE * whole.count:
                 break
             more = _nearest(whole, missing, max(_FIRST, int(_GROWTH * band.count)))
-            band = whole.drawn_of(
-                tuple(a | b for a, b in zip(_without(band.nodes, behind), more, strict=True))
-            )
+            shown = zip(_without(band.nodes, behind), more, strict=True)
+            band = whole.drawn_of(tuple(a | b for a, b in shown)).cut_to(ends)
         self._rest = _RESTS
         return None
 
@@ -112,30 +115,27 @@ def _nearest(whole: Band, nodes: Nodes, most: int) -> Nodes:
 
 def _carried(last: View, ends: TileEnds, view: View) -> TileEnds | None:
     """What the ends of a view's tiles may be, by those of the view before; None where the two have little in
-    common. Only a guess: wider by a tile, and further by how far the camera has moved."""
+    common. Only a guess: of what lay in the same directions, and further by what the camera has moved."""
     if (last.width, last.height, last.parallel) != (view.width, view.height, view.parallel):
         return None
     rows, columns = ends.depths.shape
-    y, x = np.meshgrid(
-        (np.arange(rows) + 0.5) * ends.tile[0], (np.arange(columns) + 0.5) * ends.tile[1], indexing="ij"
-    )
     depths = ends.depths
     if view.raster is None and not view.parallel:
-        ahead = np.stack(
-            [(x - view.center_x) / view.focal_x, (y - view.center_y) / view.focal_y, np.ones_like(x)], -1
-        )
-        then = ahead @ view.rotation @ last.rotation.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            across = (then[..., 0] / then[..., 2] * last.focal_x + last.center_x) / ends.tile[1]
-            down = (then[..., 1] / then[..., 2] * last.focal_y + last.center_y) / ends.tile[0]
-        inside = (then[..., 2] > 0) & (across >= 0) & (across < columns) & (down >= 0) & (down < rows)
-        if inside.mean() < 0.5:
+        depths, shares = np.full_like(depths, -np.inf), []
+        within = (np.arange(_LOOKS) + 0.5) / _LOOKS
+        for down, right in product(within, within):
+            y, x = np.mgrid[0:rows, 0:columns]
+            y, x = (y + down) * ends.tile[0], (x + right) * ends.tile[1]
+            ahead = (x - view.center_x) / view.focal_x, (y - view.center_y) / view.focal_y, np.ones(x.shape)
+            then = np.stack(ahead, -1) @ view.rotation @ last.rotation.T
+            before = then[..., 2] > 0
+            far = np.where(before, then[..., 2], 1.0)
+            column = (then[..., 0] / far * last.focal_x + last.center_x) // ends.tile[1]
+            row = (then[..., 1] / far * last.focal_y + last.center_y) // ends.tile[0]
+            shares.append(before & (column >= 0) & (column < columns) & (row >= 0) & (row < rows))
+            row, column = np.clip(row, 0, rows - 1).astype(int), np.clip(column, 0, columns - 1).astype(int)
+            depths = np.maximum(depths, np.where(before, ends.depths[row, column], np.inf))
+        if np.mean(shares) < 0.5:
             return None
-        column = np.clip(np.nan_to_num(across), 0, columns - 1).astype(int)
-        row = np.clip(np.nan_to_num(down), 0, rows - 1).astype(int)
-        depths = np.where(then[..., 2] > 0, depths[row, column], np.inf)
     moved = float(np.linalg.norm(view.rotation.T @ view.translation - last.rotation.T @ last.translation))
-    wide = np.pad(depths, 1, mode="edge")
-    wide = np.maximum(np.maximum(wide[:-2], wide[1:-1]), wide[2:])
-    wide = np.maximum(np.maximum(wide[:, :-2], wide[:, 1:-1]), wide[:, 2:])
-    return replace(ends, depths=(wide + moved).astype(np.float32))
+    return replace(ends, depths=(depths + np.float32(_SLACK * moved)).astype(np.float32))

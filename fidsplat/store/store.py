@@ -188,6 +188,18 @@ class Store(Summarised):
         around = around + 1e-6 * (np.abs(middles) + around)
         return (middles - around).reshape(-1, 3), (middles + around).reshape(-1, 3)
 
+    def placed_boxes(
+        self, low: np.ndarray, high: np.ndarray, places: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Boxes (k, 3) of the store that is placed, each at its place (k,)."""
+        assert self.poses is not None
+        turns = self.poses[places, :3, :3]
+        center, half = (low + high) / 2, (high - low) / 2
+        middles = np.einsum("kij,kj->ki", turns, center) + self._moves[places]
+        around = np.einsum("kij,kj->ki", np.abs(turns), half)
+        around = around + 1e-6 * (np.abs(middles) + around)  # as `boxes`
+        return middles - around, middles + around
+
     @cached_property
     def _moves(self) -> np.ndarray:
         """(p, 3) float64 metres: where each place has the zero of the placed store's means."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -22,6 +22,7 @@ from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
 from fidsplat.store.layout import MOST_SPLATS
 from fidsplat.store.part import StorePart, colors_of, joined
+from fidsplat.store.pieces import Pieces, PiecesOf
 from fidsplat.store.store import Store
 
 KEPT_BYTES = 2 * 2**30
@@ -43,14 +44,24 @@ class Selection:
     """What views are drawn of: numbers of each store's nodes, in the order of their splats."""
 
     nodes: tuple[tuple[int, ...], ...]
+    rows: tuple[tuple[tuple[int, int], ...], ...] | None = None
+    """of each of these the first row and how many; None: all of each node"""
 
     @staticmethod
     def of(nodes: Nodes) -> Selection:
         """Of some of all nodes."""
         return Selection(tuple(tuple(np.flatnonzero(each).tolist()) for each in nodes))
 
+    @staticmethod
+    def of_pieces(pieces: Sequence[Pieces]) -> Selection:
+        """Of pieces of nodes."""
+        return Selection(
+            tuple(tuple(each.nodes.tolist()) for each in pieces),
+            tuple(tuple(zip(each.first.tolist(), each.rows.tolist(), strict=True)) for each in pieces),
+        )
+
     def __len__(self) -> int:
-        return sum(map(len, self.nodes))
+        return sum(len(set(each)) for each in self.nodes)
 
 
 class Streamed:
@@ -145,6 +156,15 @@ class Streamed:
             made.append(hidden(view, features, self._boxes(number), reach, ends) & ~_pinned(store))
         return tuple(made)
 
+    def pieces(self, nodes: Nodes) -> list[Pieces]:
+        """Those of some nodes of each store."""
+        every = zip(self._pieces, nodes, strict=True)
+        return [pieces.of(np.flatnonzero(mask)) for pieces, mask in every]
+
+    @cached_property
+    def _pieces(self) -> list[PiecesOf]:
+        return [PiecesOf(store, store.origin - self.origin, _pinned(store)) for store in self.stores]
+
     @cached_property
     def node_counts(self) -> Nodes:
         """Splats of each store's nodes."""
@@ -160,9 +180,13 @@ class Streamed:
     def ids(self, selection: Selection) -> np.ndarray:
         """Indices in the whole (n,) int32 of the splats of a selection; -1 of those that stand for others."""
         made, first = [np.empty(0, np.int32)], 0
-        for store, nodes in zip(self.stores, selection.nodes, strict=True):
+        for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
             numbers = np.array(nodes, np.int64)
-            for at, count in zip(store.first_of(numbers), store.counts(numbers), strict=True):
+            begins, counts = store.first_of(numbers), store.counts(numbers)
+            if selection.rows is not None:
+                own_rows = np.array(selection.rows[number], np.int64).reshape(-1, 2)
+                begins, counts = np.where(begins < 0, -1, begins + own_rows[:, 0]), own_rows[:, 1]
+            for at, count in zip(begins, counts, strict=True):
                 own = np.full(count, -1) if at < 0 else np.arange(first + at, first + at + count)
                 made.append(own.astype(np.int32))
             first += len(store)
@@ -192,9 +216,12 @@ class Streamed:
         for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
             moved = places and self._may_move(store)
             known = self._chunks_of.setdefault((number, moved), {})
-            for node in nodes:
+            for place, node in enumerate(nodes):
                 if (chunk := known.get(node)) is None:
                     chunk = known[node] = self._chunk_of(number, node, moved)
+                if selection.rows is not None:
+                    first, count = selection.rows[number][place]
+                    chunk = replace(chunk, first=first, count=count)
                 made.append(chunk)
         most, count = self.largest_chunk, len(self.beside)
         for first in range(0, count if made else max(count, 1), most):

@@ -131,7 +131,8 @@ class OpenCLChunks:
         """How they are copied, once they are all there."""
         slots = self._there(chunks)
         table = np.full((len(chunks), 4), _NOWHERE, np.uint32)
-        table[:, 0] = np.array(slots) * self._rows + spans[:, 0]
+        begins = np.array([chunk.first for chunk in chunks])
+        table[:, 0] = np.array(slots) * self._rows + begins + spans[:, 0]
         table[:, 1:3] = spans[:, 1:]
         poses = [(number, chunk.pose) for number, chunk in enumerate(chunks) if chunk.pose is not None]
         table[[number for number, _ in poses], 3] = np.arange(len(poses))
