@@ -189,12 +189,21 @@ static inline Parts moments_of(const Sums *sums, const BlendConstants *constants
     return m;
 }
 
+// Of a window's tiles, row by row, which one this is.
+static inline uint window_rank(uint2 window, int column, int row) {
+    int bit = (row - (int)(window.x >> 16)) * WINDOW_W + column - (int)(window.x & 0xFFFFu);
+    return popcount(window.y & ((1u << bit) - 1u));
+}
+
 // Which of a splat's tiles this one is, counted row by row.
+#if LANES > 1
+// big_rows: what reserve_slots has left, row by row, so that what a tile reads lies close together.
+static inline uint tile_rank(uint2 window, uint big_capacity, global const uint *big_rows, int column, int row) {
+    return window.y != 0 ? window_rank(window, column, row) : big_rows[row * (size_t)big_capacity + window.x] + column;
+}
+#else
 static inline uint tile_rank(uint2 window, global const Bounds *big_bounds, int column, int row, int width, int height) {
-    if (window.y != 0) {
-        int bit = (row - (int)(window.x >> 16)) * WINDOW_W + column - (int)(window.x & 0xFFFFu);
-        return popcount(window.y & ((1u << bit) - 1u));
-    }
+    if (window.y != 0) return window_rank(window, column, row);
     const Bounds b = big_bounds[window.x];
     int y0, y1;
     bounds_rows(&b, height, &y0, &y1);
@@ -205,6 +214,7 @@ static inline uint tile_rank(uint2 window, global const Bounds *big_bounds, int 
     }
     return rank;
 }
+#endif
 
 // How many tiles a splat has.
 static inline uint tile_count(uint2 window, uint big_capacity, global const Bounds *big_bounds, int width, int height) {
@@ -221,10 +231,24 @@ static inline uint tile_count(uint2 window, uint big_capacity, global const Boun
     return tiles;
 }
 
+#if LANES > 1
+// For each row of tiles of a big splat, how many tiles it has above, less its first column.
+static inline void put_rows(global uint *rows, uint stride, const Bounds *b, int width, int height) {
+    int y0, y1;
+    bounds_rows(b, height, &y0, &y1);
+    uint above = 0;
+    for (int row = y0 / TILE_H; row * TILE_H < y1; row++) {
+        TileSpan span = tile_span(b, row, width, height);
+        rows[row * (size_t)stride] = above - (uint)span.first;
+        above += max(span.last - span.first + 1, 0);
+    }
+}
+#endif
+
 // Gives every splat that is drawn a slot for each of its tiles. Where they lie depends on the order of the groups, what they
 // hold and in which order it is added up does not.
 // Index space: one work-item per splat, in groups of RESERVED.
-// Reads: keys, windows, big_bounds. Writes: splat_slots; adds to reserved.
+// Reads: keys, windows, big_bounds. Writes: splat_slots, big_rows; adds to reserved.
 #define RESERVED 64
 kernel __attribute__((reqd_work_group_size(RESERVED, 1, 1))) void reserve_slots(
 //@@ arguments reserve_slots
@@ -235,6 +259,12 @@ kernel __attribute__((reqd_work_group_size(RESERVED, 1, 1))) void reserve_slots(
     barrier(CLK_LOCAL_MEM_FENCE);
     if (i < count && keys[i] < OUTSIDE)
         offset = atomic_add(&needed, tile_count(windows[i], big_capacity, big_bounds, width, height));
+#if LANES > 1
+    if (i < count && keys[i] < OUTSIDE && windows[i].y == 0 && windows[i].x < big_capacity) {
+        const Bounds b = big_bounds[windows[i].x];
+        put_rows(big_rows + windows[i].x, big_capacity, &b, width, height);
+    }
+#endif
     barrier(CLK_LOCAL_MEM_FENCE);
     if (get_local_id(0) == 0) first = atomic_add(reserved, needed);
     barrier(CLK_LOCAL_MEM_FENCE);

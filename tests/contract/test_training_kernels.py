@@ -67,7 +67,8 @@ def on_device(renderer, array):
 
 def drawn(renderer, image):
     """Images as a pipeline gives them."""
-    return SimpleNamespace(device_array=lambda name: on_device(renderer, image), read=lambda name: image)
+    array = on_device(renderer, image)
+    return SimpleNamespace(device_buffer=lambda name: (array.data, array.shape), read=lambda name: image)
 
 
 def agree(device, host, rtol=2e-5, atol=2e-6):
@@ -175,10 +176,11 @@ def test_adam_and_what_is_drawn(renderer, works, strategy, sparse):
         assert all(same) == (sparse and step < 4)
 
 
-def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, works):
+@pytest.mark.parametrize("sparse", [False, True])
+def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, works, sparse):
     """In every bit: after a stop it is made again from the values."""
     random, rate = np.random.default_rng(4), rates(TrainSettings(), 100, 1.5)
-    device, _ = works(sh_degree=2)
+    device, _ = works(sh_degree=2, sparse_adam=sparse)
     names = ("means", "quats", "scales", "opacities", "sh")
     shapes = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (), "sh": (9, 3)}
     for step in range(1, 6):

@@ -36,6 +36,11 @@ class BackwardLayout:
 
 _SIZE = takes("int width height  // of the picture")
 _TILES = takes("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _SIZE)
+_RESERVED = takes(
+    *("uint count", "in uint keys", _TILES),
+    "out uint splat_slots  // (n): the first of a splat's, which has one for each of its tiles",
+    "out uint reserved  // how many there are",
+)
 
 _BLENDED = takes(
     "wide log_cut ceiling stop filter",
@@ -45,12 +50,17 @@ _BLENDED = takes(
 
 KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": takes(
-        *("uint count", "in uint keys", _TILES),
-        "out uint splat_slots  // (n): the first of a splat's, which has one for each of its tiles",
-        "out uint reserved  // how many there are",
+        *(_RESERVED, "out uint big_rows  // (rows of tiles, big splats): tiles above, less the first column"),
     ),
     "blend_backward": takes(
-        *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots"),
+        *(
+            "in Splat splats",
+            "in uint lists starts",
+            "in uint2 windows",
+            "uint big_capacity",
+            _SIZE,
+            "in uint splat_slots big_rows",
+        ),
         _BLENDED,
         "out float checkpoints  // tiles' transmittances in front of every CHUNK splats",
         "out float moments  // of the record Moments, by slots",
@@ -75,6 +85,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
 }
 
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
+    "reserve_slots": _RESERVED,
     "blend_light": takes(
         *("in Splat splats", "in uint lists starts", _SIZE, _BLENDED),
         "out float checkpoints  // of each pixel of CHUNK splats: light in front, its worth behind",

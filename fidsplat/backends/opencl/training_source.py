@@ -52,6 +52,8 @@ _LOSS_STRIPS: dict[str, tuple[Argument, ...]] = {
         *("float l1_share ssim_share", "in float images", "out float by_rgb"),
     ),
 }
+_ADAM_ROWS = {"adam_shapes_16": "adam_shapes", "adam_sh_rows": "adam_sh"}
+"""kernels of CPUs that have the arguments of others"""
 _KERNELS: dict[str, tuple[Argument, ...]] = {
     "surface_normals": takes(
         _SURFACE,
@@ -118,11 +120,14 @@ def images_of(lanes: int) -> int:
 @cache
 def training_source(lanes: int, float64: bool, fast_fma: bool) -> Source:
     """The program for vectors of so many floats; sums are in float64 where the device has it."""
-    loss = "loss" if lanes == 1 else "loss_strips"
-    kernels = (_LOSS if lanes == 1 else _LOSS_STRIPS) | _KERNELS
+    if lanes == 1:
+        steps, kernels = ("loss_values", "loss", *_STEPS), _LOSS | _KERNELS
+    else:
+        steps, kernels = ("loss_values", "loss_strips", *_STEPS, "adam_rows"), _LOSS_STRIPS | _KERNELS
+        kernels |= {name: kernels[of] for name, of in _ADAM_ROWS.items()}
     numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
     head = "".join(f"#define {name} {value}\n" for name, value in numbers.items())
-    files = ("prelude.cl", "math.cl", *(f"train/{step}.cl" for step in ("loss_values", loss, *_STEPS)))
+    files = ("prelude.cl", "math.cl", *(f"train/{step}.cl" for step in steps))
     lines = "".join(map(kernel_text, files)).split("\n")
     text = with_scalars(head + "\n".join(_filled(line, kernels) for line in lines))
     scalars = Scalars("double" if float64 else "float", "float")

@@ -10,8 +10,8 @@
     vfloat z;
 //@ see
     seen.z = VSELECT((vfloat)s->z_center,
-                     VMIN(VMAX(s->z_numerator * inverse_d, (vfloat)(s->z_center - s->z_reach)),
-                          (vfloat)(s->z_center + s->z_reach)),
+                     VMIN(VMAX(s->z_numerator * inverse_d, (vfloat)s->z_center - (vfloat)s->z_reach),
+                          (vfloat)s->z_center + (vfloat)s->z_reach),
                      VMASK(c.d > 0.0f));
 //@@ see_depth
 //@ gather

@@ -27,7 +27,7 @@ kernel void blend(
 
 //@@ pass
 //@@ walk
-            vfloat x = (float)(x0 + LEFT(block) - s.ax) + BLOCK_X, y = (float)(y0 + TOP(block) - s.ay) + BLOCK_Y;
+            vfloat x = (float)(x0 + LEFT(block)) + BLOCK_X - (vfloat)s.ax, y = (float)(y0 + TOP(block)) + BLOCK_Y - (vfloat)s.ay;
             vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
             vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
             vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
@@ -36,7 +36,7 @@ kernel void blend(
             vfloat screen;
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
-            if (!VANY(mask)) continue;
+//@@ drawn
             pixel_blend(&pixel, &s, c, mask, screen, &constants
 //@@ blend_arguments
             );

@@ -1,7 +1,7 @@
 // For CPUs: a work-item takes one tile after another back, a block of LANES pixels at a time: whichever nobody has taken yet, so
 // that there is a tape for each work-item alone, in memory of the device, as long as it needs to be.
 // Index space: one work-item (and work-group) per core.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_rows, splat_slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints, tapes; reserved[1], tiles that are taken.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
 #define AHEAD_SPLATS 8
@@ -66,7 +66,7 @@ static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, u
         tape->light[length] = pixels[block].t;
         tape->opacity[length++] = take_light(&pixels[block], opacity, b.mask, constants);
         drawn_in |= 1u << block;
-        if (RARELY(!VANY(VMASK(pixels[block].t > constants->stop)))) alive &= ~(1u << block);
+        if (RARELY(!VANY(VMASK(pixel_light(&pixels[block]) > constants->stop)))) alive &= ~(1u << block);
     }
     tape->length = length;
     tape->blocks[place] = drawn_in;
@@ -161,7 +161,7 @@ kernel void blend_backward(
             }
             FETCH_SPLAT(min(walked + AHEAD_SPLATS, end - 1));
             uint index = lists[walked], place = walked - first;
-            tape->slots[place] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
+            tape->slots[place] = splat_slots[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
             const Splat s = splats[index];
             alive = walk_splat(&s, &tile, pixels, alive, tape, place);
         }
@@ -179,7 +179,7 @@ kernel void blend_backward(
         for (uint k = walked; k < end; k++) {
             FETCH_AHEAD(windows + lists[min(k + AHEAD_SPLATS, end - 1)]);
             FETCH_AHEAD(splat_slots + lists[min(k + AHEAD_SPLATS, end - 1)]);
-            uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, column, tile_row, width, height);
+            uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_capacity, big_rows, column, tile_row);
             leave_nothing(moments, slot);
         }
         for (bool again = false; walked > start; again = true) {
@@ -195,7 +195,7 @@ kernel void blend_backward(
                 for (uint k = first; k < walked; k++) {
                     FETCH_SPLAT(min(k + AHEAD_SPLATS, end - 1));
                     uint index = lists[k];
-                    tape->slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
+                    tape->slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
                     const Splat s = splats[index];
                     alive = walk_splat(&s, &tile, pixels, alive, tape, k - first);
                 }

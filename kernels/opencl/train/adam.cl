@@ -18,7 +18,15 @@ static inline float adam(
     (name[k] = adam(name[k], first_##name + (k), second_##name + (k), gradient, beta1, beta2, rest1, rest2, size, root, epsilon))
 
 static inline float4 unit(float4 q) { return q / sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w); }
-static inline float sigmoid(float x) { return 1.0f / (1.0f + exp(-x)); }
+
+// On CPUs those of 16 numbers at once (adam_rows.cl), which may differ from others in the last place: what is drawn has the same bits
+// whoever makes it.
+#if LANES == 1
+#define EXP(x) exp(x)
+#else
+#define EXP(x) (exp((float16)(x)).s0)
+#endif
+static inline float sigmoid(float x) { return 1.0f / (1.0f + EXP(-x)); }
 
 // Index space: one work-item per splat. Reads: the values. Writes: unit quaternions, scales, opacities.
 kernel void activate(
@@ -27,7 +35,7 @@ kernel void activate(
     size_t i = get_global_id(0);
     if (i >= count) return;
     vstore4(unit(vload4(i, quats)), i, drawn_quats);
-    vstore2(exp(vload2(i, log_scales)), i, drawn_scales);
+    for (size_t k = 2 * i; k < 2 * i + 2; k++) drawn_scales[k] = EXP(log_scales[k]);
     drawn_opacities[i] = sigmoid(logits[i]);
 }
 
@@ -61,7 +69,7 @@ kernel void adam_shapes(
     for (size_t k = 3 * i; k < 3 * i + 3; k++) ADAM(means, k, by_means[k], size_means);
     for (size_t k = 2 * i; k < 2 * i + 2; k++) {
         ADAM(log_scales, k, (by_scales[k] + scale_penalty) * drawn_scales[k], size_scales);
-        drawn_scales[k] = exp(log_scales[k]);
+        drawn_scales[k] = EXP(log_scales[k]);
     }
     float4 q = vload4(i, quats), by = vload4(i, by_quats);
     float length = sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w);
