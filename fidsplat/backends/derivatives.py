@@ -61,10 +61,14 @@ class DifferentiablePipeline(Protocol):
 class TrainingKernels(Protocol):
     """The work of a training step around the picture (`fidsplat.train`), on arrays of the device.
 
+    `late`: so many losses may be asked for after later pictures.
+
     It holds splats before their activations, n of them, float32: `means` (n, 3), `log_scales` (n, 2), `quats`
     (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's running means of each as `first_NAME` and `second_NAME`;
     `gradients` (n,) and `seen` (n,), the sums by which splats are made.
     """
+
+    late: int
 
     def take_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
         """Keep pictures (h, w, 3) uint8 with their masks (h, w) bool, to be compared with."""
@@ -83,6 +87,14 @@ class TrainingKernels(Protocol):
         `kept` on."""
         ...
 
+    def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
+        """Other values in the last rows of these arrays, from row `first` on."""
+        ...
+
+    def clear(self, names: Sequence[str]) -> None:
+        """Zeros in these arrays."""
+        ...
+
     def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
         """The splats as they are drawn, with SH of this degree; it changes as they do."""
         ...
@@ -91,8 +103,8 @@ class TrainingKernels(Protocol):
         self, images: Any, view: int, dssim_weight: float
     ) -> tuple[Callable[[], tuple[float, float]], Any]:
         """Compare a picture with that of a view, by its number: what waits for the loss and the mean squared
-        difference, to be called before the next picture, and the loss's derivative (h, w, 3) as an array of
-        the device, which holds until the next call."""
+        difference, to be called before `late` more pictures, and the loss's derivative (h, w, 3) as an array
+        of the device, which holds until the next call."""
         ...
 
     def surface(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
@@ -133,6 +145,16 @@ class Trains(Protocol):
         Raises:
             DeviceError: the compiler refuses.
         """
+        ...
+
+
+@runtime_checkable
+class CompilesAhead(Protocol):
+    """A backend that compiles in the background."""
+
+    def compile_ahead(self, features: FeatureSet) -> None:
+        """Begin to compile what `differentiate` gives for these features, which then waits for it. An error
+        is that of `differentiate`."""
         ...
 
 

@@ -103,7 +103,7 @@ class Train:
         trainer = Trainer(dataset, renderer, settings, checkpoint, restart=self.overwrite)
         before, begun = trainer.iteration, time.perf_counter()
         with _bar(trainer) as step:
-            trainer.run(step)
+            trainer.run(step, prompt=False)
         seconds = time.perf_counter() - begun
         trainer.save(file)
         scores = trainer.evaluate()

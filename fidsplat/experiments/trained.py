@@ -173,7 +173,7 @@ def train_marker(
     checkpoint = file.with_suffix(".training.npz")
     trainer = Trainer(load_dataset(scene), renderer, settings, checkpoint, restart=restart)
     begun, before = time.perf_counter(), trainer.iteration
-    trainer.run(tell)
+    trainer.run(tell, prompt=False)
     seconds = time.perf_counter() - begun
     trainer.save(file)
     scores = trainer.evaluate()

@@ -28,8 +28,8 @@ _GROWTH = 2.0
 """by how many times what was drawn it grows at most: what is added first may hide the rest"""
 _FUTILE = 0.7
 """of a view's splats: where as many are not hidden, all are drawn"""
-_SMALL = 16
-"""but a smaller part of them than this says little"""
+_SMALL, _CHEAP = 4, 4_000_000
+"""but a smaller part of them than this, or so many splats, are drawn to find out"""
 _RESTS = 16
 """views that are not tried after one of which little was hidden"""
 _LOOKS, _SLACK = 4, 4.0
@@ -80,14 +80,15 @@ class Hidden:
             behind = whole.hidden(ends)
             missing = _without(band.missing, behind)
             if not (any(each.any() for each in missing) or band.lacks_pieces(ends)):
+                self._rest = _RESTS if band.count > _FUTILE * whole.count else 0
                 return band, images
             images = None  # its buffers are free for the next
-            enough = band.count > whole.count // _SMALL
-            if enough and band.count + whole.count_of(missing) > _FUTILE * whole.count:
-                break
+            left = band.count + whole.count_of(missing)
             more = _nearest(whole, missing, max(_FIRST, int(_GROWTH * band.count)))
             shown = zip(_without(band.nodes, behind), more, strict=True)
             band = whole.drawn_of(tuple(a | b for a, b in shown)).cut_to(ends)
+            if left > _FUTILE * whole.count and band.count > max(whole.count // _SMALL, _CHEAP):
+                break
         self._rest = _RESTS
         return None
 

@@ -6,8 +6,9 @@ from fidsplat.train.memory import splats_within
 from fidsplat.train.parameters import TrainingError
 from fidsplat.train.read import load_dataset
 from fidsplat.train.refining import RefineStep, refine
+from fidsplat.train.scores import ViewScore
 from fidsplat.train.settings import TrainSettings
-from fidsplat.train.trainer import Step, Trainer, ViewScore
+from fidsplat.train.trainer import Step, Trainer
 
 __all__ = [
     "Dataset",

@@ -28,15 +28,18 @@ class Plan(NamedTuple):
     """(m,) uint32: of which splat each is made; first those that stay, in their order"""
     kept: int
     """how many stay; of the others nothing is remembered"""
+    moved: int
+    """from this one on they are parts of splats that were split, which have places and scales of their own"""
     means: np.ndarray
-    """(m, 3) float32"""
+    """(m - moved, 3) float32"""
     log_scales: np.ndarray
-    """(m, 2) float32"""
+    """(m - moved, 2) float32"""
 
     def made(self, splats: Splats) -> Splats:
         """The splats after the round."""
         made = splats.chosen(self.rows)
-        made.values |= {"means": self.means, "log_scales": self.log_scales}
+        made.values["means"][self.moved :] = self.means
+        made.values["log_scales"][self.moved :] = self.log_scales
         for remembered in (made.first, made.second):
             for array in remembered.values():
                 array[self.kept :] = 0
@@ -57,23 +60,27 @@ def plan(splats: Splats, settings: TrainSettings, iteration: int, extent: float)
         splats.gradients, splats.seen, out=np.zeros_like(splats.gradients), where=splats.seen > 0
     )
     chosen = _within_limit(mean, mean >= settings.gradient_threshold, settings.max_splats - len(splats))
-    large = _larger(splats.scales) > settings.dense_share * extent
+    sizes = _larger(splats.scales)
+    large = sizes > settings.dense_share * extent
     clones, splits = np.flatnonzero(chosen & ~large), np.flatnonzero(chosen & large)
     kept = np.ones(len(splats), bool)
     kept[splits] = False
-    rows = np.concatenate([np.flatnonzero(kept), clones, *[splits] * COPIES])
-    means, log_scales = (splats.values[name][rows] for name in ("means", "log_scales"))
-    _scatter(means, log_scales, len(rows) - COPIES * len(splits), splats, splits, settings, iteration)
-    fit = sigmoid(splats.values["logits"][rows]) >= settings.prune_opacity
+    means, log_scales = _parts(splats, splits, settings, iteration)
+    parts = np.concatenate([splits] * COPIES)
+    fit = sigmoid(splats.values["logits"]) >= settings.prune_opacity
+    fit_parts = fit[parts]
     if iteration > settings.reset_every:
-        fit &= _larger(np.exp(log_scales)) <= settings.prune_scale * extent
-    if not fit.any():
+        most = settings.prune_scale * extent
+        fit &= sizes <= most
+        fit_parts &= _larger(np.exp(log_scales)) <= most
+    stay, cloned, parts = np.flatnonzero(kept & fit), clones[fit[clones]], parts[fit_parts]
+    rows = np.concatenate([stay, cloned, parts]).astype(np.uint32)
+    if not len(rows):
         raise TrainingError(
             f"no splat is left after iteration {iteration}: all are fainter than {settings.prune_opacity:g} "
             f"or larger than {settings.prune_scale * extent:g} m; check the data set's cameras and points"
         )
-    stay = int(np.count_nonzero(fit[: np.count_nonzero(kept)]))
-    return Plan(rows[fit].astype(np.uint32), stay, means[fit], log_scales[fit])
+    return Plan(rows, len(stay), len(stay) + len(cloned), means[fit_parts], log_scales[fit_parts])
 
 
 def reset_logits(logits: np.ndarray, settings: TrainSettings) -> np.ndarray:
@@ -103,22 +110,19 @@ def _within_limit(mean: np.ndarray, wanted: np.ndarray, room: int) -> np.ndarray
     return wanted
 
 
-def _scatter(
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    first: int,
-    splats: Splats,
-    splits: np.ndarray,
-    settings: TrainSettings,
-    iteration: int,
-) -> None:
-    """Puts the copies of split splats, from row `first` on, at random places on these, and makes them
-    smaller."""
-    turns = quaternion_to_matrix(splats.values["quats"][splits])[:, :, :2]
-    scales = splats.scales[splits].astype(np.float64)
+def _parts(
+    splats: Splats, splits: np.ndarray, settings: TrainSettings, iteration: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means and log_scales of the copies of split splats, one of each and then another: at random places on
+    these, and smaller."""
+    values = {name: splats.values[name][splits] for name in ("means", "quats", "log_scales")}
+    turns = quaternion_to_matrix(values["quats"])[:, :, :2]
+    scales = np.exp(values["log_scales"]).astype(np.float64)
     draws = normal(settings.seed, Purpose.SPLITS, iteration, splits)
+    means = np.concatenate([values["means"]] * COPIES)
     for copy in range(COPIES):
-        rows = slice(first + copy * len(splits), first + (copy + 1) * len(splits))
         offset = scales * draws[:, 2 * copy : 2 * copy + 2]
-        means[rows] += np.einsum("nij,nj->ni", turns, offset).astype(np.float32)
-        log_scales[rows] -= np.float32(np.log(_SHRINK))
+        moved = np.einsum("nij,nj->ni", turns, offset).astype(np.float32)
+        means[copy * len(splits) : (copy + 1) * len(splits)] += moved
+    log_scales = values["log_scales"] - np.float32(np.log(_SHRINK))
+    return means, np.concatenate([log_scales] * COPIES)

@@ -31,6 +31,7 @@ class DeviceWork:
         self, kernels: TrainingKernels, views: Sequence[TrainingView], settings: TrainSettings
     ) -> None:
         self._kernels, self._settings = kernels, settings
+        self.late = kernels.late
         kernels.take_views([(view.picture, view.mask) for view in views])
         self._cameras = [view.camera for view in views]
         self._number = 0
@@ -59,16 +60,16 @@ class DeviceWork:
 
     def make(self, made: Plan) -> None:
         """Goes on with the splats of a plan, most of which never leaves the device."""
-        counted = {name: np.zeros(len(made.rows), np.float32) for name in _COUNTED}
         self._kernels.pick(made.rows, made.kept)
-        self._kernels.load({"means": made.means, "log_scales": made.log_scales, **counted})
+        self._kernels.write({"means": made.means, "log_scales": made.log_scales}, made.moved)
+        self._kernels.clear(_COUNTED)
         self._number = len(made.rows)
 
     def reset(self) -> None:
         """Makes all faint, and forgets how their opacities moved."""
         logits = reset_logits(self._kernels.store(("logits",))["logits"], self._settings)
-        nothing = np.zeros_like(logits)
-        self._kernels.load({"logits": logits, "first_logits": nothing, "second_logits": nothing})
+        self._kernels.load({"logits": logits})
+        self._kernels.clear(("first_logits", "second_logits"))
 
     def __len__(self) -> int:
         return self._number

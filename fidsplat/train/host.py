@@ -25,6 +25,9 @@ _REACH = 3.0
 class HostWork:
     """Splats in training in the host's memory, with the pictures that they are compared with."""
 
+    late = 0
+    """losses that may be asked for after later pictures"""
+
     def __init__(self, backend: Backend, views: Sequence[TrainingView], settings: TrainSettings) -> None:
         self._backend, self._views, self._settings = backend, views, settings
         self._splats: Splats

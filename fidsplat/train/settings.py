@@ -170,6 +170,14 @@ class TrainSettings:
         normal = self.normal_weight if iteration > self.normal_from else 0.0
         return normal, self.distortion_weight if iteration > self.distortion_from else 0.0
 
+    def changes_after(self, iteration: int) -> int | None:
+        """The next iteration of the run of which other kernels draw: the degree grows, or a loss begins."""
+        degree = self.degree_at(iteration) + 1
+        every = [degree * self.sh_every] if degree <= self.sh_degree else []
+        every += [self.normal_from + 1] if self.normal_weight else []
+        every += [self.distortion_from + 1] if self.distortion_weight else []
+        return min((one for one in every if iteration < one <= self.iterations), default=None)
+
     @property
     def first_opacity(self) -> float:
         """Opacity of all splats at first."""

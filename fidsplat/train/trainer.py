@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.derivatives import Differentiates, Trains
+from fidsplat.backends.derivatives import CompilesAhead, Differentiates, Trains
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
+from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.errors import DeviceError, InputError, unknown
 from fidsplat.files import ordinary_file, writable_folder
@@ -24,6 +26,7 @@ from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 from fidsplat.train import densify, mcmc
+from fidsplat.train.ahead import features_after
 from fidsplat.train.checkpoint import Progressed, load_checkpoint, save_checkpoint
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device import DeviceWork
@@ -32,12 +35,13 @@ from fidsplat.train.losses import Loss
 from fidsplat.train.optimiser import rates
 from fidsplat.train.parameters import Splats, TrainingError, first_splats, splats_from
 from fidsplat.train.random_numbers import Purpose, permutation
+from fidsplat.train.scores import ViewScore, scored
 from fidsplat.train.settings import TrainSettings
-from fidsplat.vision.images import to_uint8
-from fidsplat.vision.metrics import psnr, ssim
 
 _SOLID = ("rgb", "alpha", "depth", "normal")
 """outputs of pictures whose depths and normals are in the loss"""
+_TOLD_SECONDS = 0.1
+"""after which a run asks for losses, however few"""
 CHECKPOINT_SECONDS = 30.0
 """a run writes a checkpoint when this has passed since the last"""
 
@@ -55,19 +59,6 @@ class Step(NamedTuple):
     """dB, of that view before the step"""
     splats: int
     """after the step"""
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """How well the splats show one view."""
-
-    name: str
-    psnr: float
-    """dB, of 8-bit pictures"""
-    ssim: float
-    """mean over the channels, of whole windows (`fidsplat.vision.metrics.ssim`)"""
-    picture: np.ndarray
-    """(h, w, 3) uint8, as it is drawn"""
 
 
 class Trainer:
@@ -125,6 +116,14 @@ class Trainer:
         )
         self._made = self._begin(start, restart)
         self._work.load(self._made.splats)
+        self._waiting: deque[tuple[int, str, Callable[[], Loss]]] = deque()
+        """iterations and their views whose losses the host has not asked for"""
+        self._found: deque[tuple[int, str, Loss]] = deque()
+        """those of which nobody has been told"""
+        self._failure: TrainingError | None = None
+        """of an iteration that others have followed"""
+        self._features: FeatureSet | None = None
+        """of the last picture"""
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     @property
@@ -140,7 +139,8 @@ class Trainer:
     @property
     def history(self) -> dict[str, np.ndarray]:
         """Of each iteration that is done: `losses`, `psnrs` float32, `counts` int32 of splats; read them, do
-        not write."""
+        not write. Raises as `step`."""
+        self._settle()
         return {name: array[: self.iteration] for name, array in self._made.history.items()}
 
     def step(self) -> Step:
@@ -151,41 +151,28 @@ class Trainer:
             TrainingError: the loss is not finite, or no splat is left.
             DeviceError: the device fails or lacks memory.
         """
-        made, settings = self._made, self.settings
-        if self.done:
-            raise InputError(f"all {settings.iterations} iterations are done; give a trainer more of them")
-        self._make_splats()
-        iteration = made.iteration + 1
-        number = self._view_at(iteration)
-        view = self.dataset.views[number]
-        try:
-            value, gradients = self._compared(iteration, number, waits=False)
-        except TooLittleRoom:
-            value, gradients = self._compared(iteration, number, waits=True)
-        loss = value()  # not before: the device goes on meanwhile
-        if not math.isfinite(loss.value):
-            raise TrainingError(
-                f"the loss is {loss.value} at iteration {iteration}, in the view {view.name}; "
-                + self._what_is_kept()
-            )
-        self._change(gradients, iteration, view)
-        made.iteration = iteration
-        self._note(iteration, loss.value, loss.psnr)
-        return Step(iteration, view.name, loss.value, loss.psnr, int(made.history["counts"][iteration - 1]))
+        self._advance(late=False)
+        return list(self._steps())[-1]
 
-    def run(self, progress: Callable[[Step], None] | None = None) -> SplatCloud:
+    def run(self, progress: Callable[[Step], None] | None = None, prompt: bool = True) -> SplatCloud:
         """Train to the end, and write checkpoints on the way where there is a file for them.
 
         progress: called after each iteration.
+        prompt: before the next one begins; False: a few iterations later, so that a GPU does not wait.
 
         Raises:
             InputError: as `step`; or a checkpoint cannot be written, and the last one is whole.
+            TrainingError: as `step`.
         """
-        last = time.monotonic()
+        last = told = time.monotonic()
         while not self.done:
-            step = self.step()
-            if progress is not None:
-                progress(step)
+            self._advance(late=progress is None or not prompt)
+            if self.done or time.monotonic() - told > _TOLD_SECONDS:
+                self._settle()
+                told = time.monotonic()
+            for step in self._steps():
+                if progress is not None:
+                    progress(step)
             if self.done or time.monotonic() - last > CHECKPOINT_SECONDS:
                 self.save_checkpoint()
                 last = time.monotonic()
@@ -219,7 +206,64 @@ class Trainer:
         views = self.dataset.held_out if views is None else views
         captures = [self._capture(view) for view in views]
         frames = self.renderer.render_views(self.cloud(), captures)
-        return [_score(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
+        return [scored(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
+
+    def _advance(self, late: bool) -> None:
+        """An iteration. late: its loss may be asked for when others have followed."""
+        made, settings = self._made, self.settings
+        if self._failure is not None:
+            raise self._failure
+        if self.done:
+            raise InputError(f"all {settings.iterations} iterations are done; give a trainer more of them")
+        while self._waiting and self._waiting[-1][0] > made.iteration:  # of one that was interrupted
+            self._waiting.pop()
+        self._make_splats()
+        iteration = made.iteration + 1
+        number = self._view_at(iteration)
+        view = self.dataset.views[number]
+        try:
+            value, gradients = self._compared(iteration, number, waits=False)
+        except TooLittleRoom:
+            value, gradients = self._compared(iteration, number, waits=True)
+        self._waiting.append((iteration, view.name, value))
+        if not late or len(self._waiting) > self._work.late or self._due(iteration):
+            self._settle()  # not before: the device goes on meanwhile
+        self._change(gradients, iteration, view)
+        made.iteration = iteration
+        made.history["counts"][iteration - 1] = len(self._work)
+
+    def _settle(self) -> None:
+        """Asks for the losses that are waited for.
+
+        Raises:
+            TrainingError: one is not finite, and it or one that others have followed was not before.
+        """
+        while self._failure is None and self._waiting:
+            iteration, view, value = self._waiting[0]
+            loss = value()
+            if not math.isfinite(loss.value):
+                failure = TrainingError(
+                    f"the loss is {loss.value} at iteration {iteration}, in the view {view}; "
+                    + self._what_is_kept()
+                )
+                self._waiting.clear()
+                if iteration > self.iteration:  # the splats are those before it
+                    raise failure
+                self._failure = failure
+            else:
+                history = self._made.history
+                history["losses"][iteration - 1], history["psnrs"][iteration - 1] = loss.value, loss.psnr
+                self._found.append((iteration, view, loss))
+                self._waiting.popleft()
+        if self._failure is not None:
+            raise self._failure
+
+    def _steps(self) -> Iterator[Step]:
+        """Those that nobody has been told of."""
+        while self._found:
+            iteration, view, loss = self._found.popleft()
+            count = int(self._made.history["counts"][iteration - 1])
+            yield Step(iteration, view, loss.value, loss.psnr, count)
 
     def _compared(
         self, iteration: int, number: int, waits: bool
@@ -230,9 +274,15 @@ class Trainer:
         """
         resident = self._work.resident(self.settings.degree_at(iteration), self.dataset.origin)
         by_normals, by_distortions = self.settings.surface_weights_at(iteration)
-        features, seen = prepare(resident, (self._solid if by_normals else self._captures)[number])
+        plain, solid = self._captures[number], self._solid[number]
+        features, seen = prepare(resident, solid if by_normals else plain)
         if by_distortions:
             features = with_distortion(features)
+        if features != self._features:
+            self._features = features
+            later = features_after(self.settings, iteration, plain, solid)
+            if later is not None and isinstance(backend := self.renderer.backend, CompilesAhead):
+                backend.compile_ahead(later)
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, seen, waits)
         value, slope = self._work.loss(images, number)
@@ -246,6 +296,7 @@ class Trainer:
         return value, pipeline.backward(images, slopes)
 
     def _stored(self) -> Splats:
+        self._settle()
         splats = self._work.store()
         splats.check(f"after iteration {self.iteration}; {self._what_is_kept()}")
         return splats
@@ -299,6 +350,7 @@ class Trainer:
         settings, iteration = self.settings, self.iteration
         if settings.strategy == "mcmc" or not self._due(iteration):
             return
+        self._settle()
         self._work.make(densify.plan(self._work.shapes(), settings, iteration, self.dataset.extent))
         if iteration % settings.reset_every == 0:
             self._work.reset()
@@ -320,12 +372,6 @@ class Trainer:
                 self._work.load(mcmc.moved(self._work.store(), settings, iteration))
             self._work.shake(iteration, rate["means"])
 
-    def _note(self, iteration: int, loss: float, ratio: float) -> None:
-        history = self._made.history
-        history["losses"][iteration - 1] = loss
-        history["psnrs"][iteration - 1] = ratio
-        history["counts"][iteration - 1] = len(self._work)
-
     def _what_is_kept(self) -> str:
         if self.checkpoint is None or not self.checkpoint.exists():
             return "nothing was kept; lower the learning rates, or check the data set's cameras"
@@ -345,12 +391,3 @@ def _settings(settings: TrainSettings | None, changes: dict[str, Any]) -> TrainS
         if name not in TrainSettings.__dataclass_fields__:
             raise InputError(unknown("training setting", name, TrainSettings.__dataclass_fields__))
     return TrainSettings(**{**given, **changes})
-
-
-def _score(view: TrainingView, drawn: np.ndarray) -> ViewScore:
-    picture = to_uint8(drawn)
-    ours, theirs = picture / 255.0, view.picture / 255.0
-    if view.mask is not None:
-        ours = np.where(view.mask[:, :, None], ours, theirs)
-    similar = float(np.mean([ssim(ours[:, :, c], theirs[:, :, c]) for c in range(3)]))
-    return ViewScore(view.name, psnr(ours, theirs), similar, picture)

@@ -67,7 +67,8 @@ def on_device(renderer, array):
 
 def drawn(renderer, image):
     """Images as a pipeline gives them."""
-    return SimpleNamespace(device_array=lambda name: on_device(renderer, image), read=lambda name: image)
+    array = on_device(renderer, image)
+    return SimpleNamespace(device_buffer=lambda name: (array.data, array.shape), read=lambda name: image)
 
 
 def agree(device, host, rtol=2e-5, atol=2e-6):

@@ -273,6 +273,15 @@ def test_densification_keeps_the_order_and_puts_new_splats_behind():
     assert not made.seen.any()
 
 
+def test_a_faint_splat_goes_though_it_would_be_split():
+    settings, splats = TrainSettings(), ready()
+    splats.gradients[[1, 2]] = 4 * settings.gradient_threshold
+    splats.values["log_scales"][[1, 2]] = np.log(0.03)
+    splats.values["logits"][1] = logit(0.04)
+    made = densify.plan(splats, settings, 600, extent=2.0).made(splats)
+    assert ids(made) == [0, 3, 4, 5, 6, 7, 2, 2]
+
+
 def test_no_more_splats_are_made_than_allowed():
     settings, splats = TrainSettings(max_splats=10), ready()
     splats.gradients[[1, 2, 5, 6]] = np.array([2, 1, 3, 2]) * 4 * settings.gradient_threshold

@@ -11,6 +11,7 @@ from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.chunks import WholeScene
 from fidsplat.backends.ends import TileEnds
 from fidsplat.backends.opencl import pocl_cache, pocl_target
+from fidsplat.backends.opencl.ahead import Ahead
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.chunks import OpenCLChunks
 from fidsplat.backends.opencl.gradients import OpenCLGradients
@@ -80,6 +81,7 @@ class OpenCLBackend(Workspace):
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
+        self._ahead = Ahead()
         self._own: tuple[DeviceShape, dict[FeatureSet, OpenCLPipeline]] = self.shape, {}
         """of the device's own shape, by what is asked for: found by the first look"""
 
@@ -131,10 +133,16 @@ class OpenCLBackend(Workspace):
     def differentiate(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLGradients:
         """As `Differentiates`; `shape` replaces the device's own build constants (tests)."""
         check_differentiable(features)
+        self._ahead.wait(features)
         pipeline = self.pipeline(features, shape)
         if pipeline not in self._gradients:
             self._gradients[pipeline] = OpenCLGradients(pipeline)
         return self._gradients[pipeline]
+
+    def compile_ahead(self, features: FeatureSet) -> None:
+        """As `CompilesAhead`."""
+        if self._own[1].get(features) not in self._gradients:
+            self._ahead.begin(features, lambda: self.differentiate(features))
 
     def training(self) -> OpenCLTraining:
         """As `Trains`."""

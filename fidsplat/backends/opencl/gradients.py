@@ -19,6 +19,7 @@ from fidsplat.backends.gradients import (
     gradient_shape,
 )
 from fidsplat.backends.opencl.counts import pairs_of
+from fidsplat.backends.opencl.gradients_again import Again
 from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of, group_of, tape_bytes
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.picture import Picture
@@ -43,8 +44,12 @@ class OpenCLDifferentiable(DifferentiableImages):
 
     def device_array(self, name: str) -> Array:
         """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
-        shape, dtype = gradient_shape(name, self.picture.view), np.dtype(IMAGES[name].dtype)
-        return Array(self.picture.queue, shape, dtype, data=self.picture.held[f"{name}_out"])
+        buffer, shape = self.device_buffer(name)
+        return Array(self.picture.queue, shape, np.dtype(IMAGES[name].dtype), data=buffer)
+
+    def device_buffer(self, name: str) -> tuple[cl.Buffer, tuple[int, ...]]:
+        """The image's buffer and shape: an array takes the host longer to make than a kernel to launch."""
+        return self.picture.held[f"{name}_out"], gradient_shape(name, self.picture.view)
 
 
 class OpenCLGradients:
@@ -58,11 +63,20 @@ class OpenCLGradients:
         self._wanted = {one.name for one in arguments["blend_backward"]}
         self._cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
         self._pairs = 0
-        """most that a picture had so far, and a quarter more"""
+        """for which there is room"""
+        self._again = Again(pipeline.workspace, pipeline.program, self.program)
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """As `DifferentiablePipeline`: GPUs need not wait where pictures were taken back before."""
-        return OpenCLDifferentiable(*self._pipeline.drawn(resident, view, 0 if waits else self._pairs))
+        if waits or not self._pairs:
+            return OpenCLDifferentiable(*self._pipeline.drawn(resident, view))
+        again = self._again
+        with self._pipeline.workspace.lock:
+            found = self._pipeline.drawn_by(lambda: again.draw(resident, view, self._pairs), view)
+            if found is None:
+                found = self._pipeline.drawn(resident, view, self._pairs)
+                again.keep(found[0])
+        return OpenCLDifferentiable(*found)
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """As `DifferentiablePipeline`: pyopencl arrays."""
@@ -78,7 +92,11 @@ class OpenCLGradients:
             raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
 
     def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        picture = copy(drawn)  # its buffers and events, with other kernels
+        if drawn.counted is not None:
+            found = self._again.take_back(drawn, gradients, lambda: self._ask(drawn))
+            if found is not None:
+                return found
+        picture, first = copy(drawn), len(drawn.launched)  # its buffers and events, with other kernels
         picture.program = self.program
         view, shape, count, pairs = picture.view, self._pipeline.shape, picture.resident.count, picture.pairs
         self._take_gradients(picture, gradients)
@@ -121,6 +139,9 @@ class OpenCLGradients:
         given: dict[str, Any] = {name: found[name].data for name in ("background", "pose")}
         given |= {"tiles": picture.tiles, "groups": posed}
         picture.launch("project backward", "add_up", (3 + 6) * _GROUP, _GROUP, **given)
+        if drawn.counted is not None:
+            wanted = {f"by_{name}" for name in GRADIENT_OUTPUTS} & self._wanted
+            self._again.keep_back(picture, first, gradients, wanted, found)
         return found
 
     def _ask(self, drawn: Picture) -> None:
@@ -128,7 +149,8 @@ class OpenCLGradients:
         slots beyond the end. The device is busy meanwhile."""
         if (pairs := pairs_of(drawn)) is None:
             raise TooLittleRoom
-        self._pairs = max(self._pairs, pairs * 5 // 4)
+        if self._pairs < pairs * 9 // 8:  # seldom: with another number nothing is launched as before
+            self._pairs = pairs * 5 // 4
 
     def _take_gradients(self, picture: Picture, gradients: Mapping[str, Any]) -> None:
         """The derivatives by the images, as arguments of the kernels."""

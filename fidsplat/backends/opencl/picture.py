@@ -56,11 +56,7 @@ class Picture:
         """of all views, one after the other"""
         self.stride = self.tiles_x * shape.tile_width
         self.rows = self.tiles_y * shape.tile_height
-        behind = zip(("background_r", "background_g", "background_b"), view.background, strict=True)
-        self._numbers = {
-            **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
-            **{"filter": 1.0 / view.samples**2, **dict(behind)},
-        }
+        self._numbers = numbers_of(view)
         self.held: dict[str, Any] = self._numbers | {
             "width": view.width,
             "height": view.height,
@@ -166,11 +162,11 @@ class Picture:
 
     def put_view(self, row: int, end: int) -> None:
         """The uniforms of the projection, for rows of samples [row, end), of those that are wanted."""
-        view, record = self.view, self.program.source.records["View"]
+        view = self.view
         if view.band is not None:
             row, end = max(row, view.band[0]), min(end, view.band[1])
         self.put_rays()
-        self.put("view", _kept(packed(self.stack or view, row, end, record)))
+        self.put("view", _kept(self.record(row, end)))
         if view.groups:
             moving = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
             self.put("moving", _kept(moving))
@@ -180,11 +176,25 @@ class Picture:
             keys = planes.keys(view) if stack is None else planes.keys_of(stack).T.copy()
             self.put("plane_keys", _kept(keys))
 
+    def record(self, row: int, end: int) -> np.ndarray:
+        """The record `View` for rows of samples [row, end)."""
+        return packed(self.stack or self.view, row, end, self.program.source.records["View"])
+
     def put_rays(self) -> None:
         """What the kernels read of a lens: rays of the samples, and the map of directions."""
         if self.view.raster is not None:
             slopes = any(one.name == "ray_slopes" for one in self.program.source.arguments["blend"])
             self.held |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)
+
+
+def numbers_of(view: View) -> dict[str, float]:
+    """Numbers of a view that kernels take, beside its uniforms, by the names of their arguments."""
+    red, green, blue = view.background
+    return {
+        **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
+        **{"filter": 1.0 / view.samples**2},
+        **{"background_r": red, "background_g": green, "background_b": blue},
+    }
 
 
 def _kept(array: np.ndarray) -> np.ndarray:

@@ -118,6 +118,13 @@ class OpenCLPipeline:
             picture = self._tried(self._whole, resident, view, trusted)
             return picture, self._images(view, Drawn.of(picture))
 
+    def drawn_by(
+        self, launch: Callable[[], Picture | None], view: View
+    ) -> tuple[Picture, OpenCLImages] | None:
+        """As `drawn`, by who launches it (`lock` held); None where nothing was launched."""
+        picture = self._tried(launch)
+        return None if picture is None else (picture, self._images(view, Drawn.of(picture)))
+
     def _whole(self, resident: Resident, view: View, trusted: int) -> Picture:
         """A picture that is drawn at once, not in chunks or bands."""
         plan = self._plan(resident, view)

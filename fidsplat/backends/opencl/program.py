@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sqlite3
+import threading
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,6 +16,9 @@ from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
 from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import Workspace, token_of
 from fidsplat.errors import DeviceError
+
+in_background = threading.local()
+"""`on` in threads whose starter has filtered warnings for them: filters are the whole process's"""
 
 
 def load_invoker() -> None:
@@ -50,11 +54,17 @@ def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
     Raises:
         DeviceError: the compiler refuses; its log is in the message.
     """
+
+    def built() -> cl.Program:
+        program = cl.Program(workspace.context, text)
+        return program.build(options=[*build_options(workspace.device), *options])
+
     try:
+        if getattr(in_background, "on", False):
+            return built()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            program = cl.Program(workspace.context, text)
-            return program.build(options=[*build_options(workspace.device), *options])
+            return built()
     except cl.Error as error:
         raise DeviceError(f"{workspace.info.title} cannot compile the kernels: {error}") from error
 

@@ -12,6 +12,8 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
+from fidsplat.backends.opencl.launches import Launch, Launches
+from fidsplat.backends.opencl.loss_sums import LATE, LossSums
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.training_source import (
     MARGIN,
@@ -77,6 +79,8 @@ class ResidentArrays:
 class OpenCLTraining:
     """As `TrainingKernels`."""
 
+    late = LATE // 2 - 1  # a picture may be compared twice
+
     def __init__(self, workspace: Workspace, lanes: int = 0) -> None:
         """lanes: of vectors, in place of the device's own (tests)."""
         self._workspace = workspace
@@ -90,6 +94,12 @@ class OpenCLTraining:
         self._drawn: tuple[int, ResidentArrays] | None = None
         self._truths: list[_Truth] = []
         self._loss_images: tuple[tuple[int, int], cl.Buffer] | None = None
+        self._sums: dict[int, LossSums] = {}
+        """by numbers of work-groups"""
+        self._version = object()
+        """another one whenever splats are held in other buffers"""
+        self._kept: dict[str, tuple[tuple[Any, ...], Launches, Any]] = {}
+        """launches of a step that are made again, with what they hold for"""
         self._sights: WeakKeyDictionary[Camera, tuple[np.ndarray, dict[str, float]]] = WeakKeyDictionary()
         """numbers by which kernels know what a camera sees, each with the origin that they are of"""
 
@@ -120,9 +130,22 @@ class OpenCLTraining:
             self._held[name], self._shapes[name] = picked, made
         self._begin()
 
+    def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
+        """As `TrainingKernels`."""
+        for name, array in arrays.items():
+            above = first * 4 * math.prod(self._shapes[name][1:])
+            if array.nbytes:
+                cl.enqueue_copy(self._queue, self._held[name], np.ascontiguousarray(array), dst_offset=above)
+
+    def clear(self, names: Sequence[str]) -> None:
+        """As `TrainingKernels`."""
+        for name in names:
+            if size := 4 * math.prod(self._shapes[name]):
+                cl.enqueue_fill_buffer(self._queue, self._held[name], np.zeros(1, np.float32), 0, size)
+
     def _begin(self) -> None:
         """Other splats are there."""
-        self._count, self._drawn = self._shapes["means"][0], None
+        self._count, self._drawn, self._version = self._shapes["means"][0], None, object()
         if math.prod(self._shapes["sh"]) >= 2**32:  # kernels count coefficients in 32 bits
             raise DeviceError(f"{self._count:,} splats are too many to train; use fewer")
 
@@ -152,48 +175,49 @@ class OpenCLTraining:
             buffers = {name: self._held[f"drawn_{name}"] for name in ("quats", "scales", "opacities")}
             buffers["means"] = self._held["means"]
             buffers["colors" if degree == 0 else "sh"] = self._held["drawn_sh"]
-            self._drawn = degree, ResidentArrays(buffers, count, degree, origin)
+            self._drawn, self._version = (degree, ResidentArrays(buffers, count, degree, origin)), object()
         return self._drawn[1]
 
     def loss(
         self, images: Any, view: int, dssim_weight: float
     ) -> tuple[Callable[[], tuple[float, float]], Any]:
         """As `TrainingKernels`."""
-        image = images.device_array("rgb")
-        height, columns, _ = image.shape
-        truth = self._truths[view]
+        rgb, (height, columns, _) = images.device_buffer("rgb")
+        truth, size, strided = self._truths[view], 3 * height * columns, self._lanes > 1
         number, stride = truth.counted, self._stride(columns)
-        slope = self._array("by_rgb", image.shape)
+        grid = (-(-3 * columns // PANEL), -(-height // STRIP)) if strided else (_SUMS,)
+        sums = self._sums_of(math.prod(grid))
+        slot, room = sums.take()
         given = {
-            **{"rgb": image.data, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
-            "by_rgb": slope.data,
-            **{"l1_share": (1 - dssim_weight) / number, "ssim_share": dssim_weight / image.size},
-            **{"width": 3 * columns, "height": height, "stride": stride},
-            **{"images": self._room_for_images(height, columns)},
-            "image_stride": stride * (height + 2 * MARGIN_ROWS),
+            **{"rgb": rgb, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
+            **{"l1_share": (1 - dssim_weight) / number, "sums": room},
         }
-        if self._lanes == 1:
-            groups = _SUMS
-            given["sums"] = self._scratch("loss sums", 12 * groups)
-            self._launch_rows("loss_take", 3 * columns, height, given)
-            for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
-                each = _EACH_ROWS if "columns" in name else 1
-                self._launch_rows(name, 3 * columns, -(-height // each), given)
-            added = self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
-        else:
-            size = -(-3 * columns // PANEL), -(-height // STRIP)
-            groups = math.prod(size)
-            given["sums"] = self._scratch("loss sums", 12 * groups)
-            added = self._enqueue("loss_strips", size, (1, 1), given)
-            self._enqueue("loss_strips_backward", size, (1, 1), given)
+
+        def plan() -> tuple[list[Launch], Array]:
+            slope = self._array("by_rgb", (height, columns, 3))
+            every = given | {
+                **{"by_rgb": slope.data, "ssim_share": dssim_weight / size},
+                **{"width": 3 * columns, "height": height, "stride": stride},
+                **{"images": self._room_for_images(height, columns)},
+                "image_stride": stride * (height + 2 * MARGIN_ROWS),
+            }
+            if strided:
+                kernels = "loss_strips", "loss_strips_backward"
+                return [self._one(kernel, grid, (1, 1), every) for kernel in kernels], slope
+            row = [self._of_rows("loss_take", 3 * columns, height, every)]
+            for kernel in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
+                each = _EACH_ROWS if "columns" in kernel else 1
+                row.append(self._of_rows(kernel, 3 * columns, -(-height // each), every))
+            return [*row, self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), every)], slope
+
+        events, slope = self._again("loss", (height, columns, dssim_weight), given, plan)
+        sums.added(slot, events[0 if strided else -1])
 
         def value() -> tuple[float, float]:
-            sums = np.empty((groups, 3), np.float32)
             self._queue.flush()
             with self._workspace.failing("training"):
-                cl.enqueue_copy(self._workspace.side_queue, sums, given["sums"], wait_for=[added])
-            absolute, squared, similar = sums.sum(axis=0, dtype=np.float64)
-            loss = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / image.size)
+                absolute, squared, similar = sums.read(slot)
+            loss = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / size)
             return float(loss), float(squared / number)
 
         return value, slope
@@ -221,7 +245,8 @@ class OpenCLTraining:
         """As `TrainingKernels`."""
         if (known := self._sights.get(camera)) is None or known[0] is not origin:
             known = self._sights[camera] = origin, _sight(camera, origin)
-        self._launch("count_seen", self._count, known[1] | {"screen": screen.data})
+        given = known[1] | {"screen": screen.data}
+        self._again("count", (), given, lambda: ([self._items("count_seen", self._count, given)], None))
 
     def step(
         self, gradients: Mapping[str, Any], sizes: Mapping[str, float], numbers: Mapping[str, float]
@@ -240,15 +265,22 @@ class OpenCLTraining:
             "rest1": 1 - numbers["beta1"],
             "rest2": 1 - numbers["beta2"],
         }
+
         whole = 0 if self._lanes == 1 or numbers["sparse"] else self._count // 16  # adam_rows.cl
-        if whole:
-            self._launch("adam_shapes_16", whole, given)
-        if 16 * whole < self._count:
-            self._launch("adam_shapes", self._count - 16 * whole, given, 16 * whole)
-        if self._lanes == 1 or self._held["plain"]:
-            self._launch("adam_sh", 3 * self._count * self._held["drawn"], given)
-        else:
-            self._launch("adam_sh_rows", self._count, given)
+
+        def plan() -> tuple[list[Launch], None]:
+            row = []
+            if whole:
+                row.append(self._items("adam_shapes_16", whole, given))
+            if 16 * whole < self._count:
+                row.append(self._items("adam_shapes", self._count - 16 * whole, given, 16 * whole))
+            if self._lanes == 1 or self._held["plain"]:
+                row.append(self._items("adam_sh", 3 * self._count * self._held["drawn"], given))
+            else:
+                row.append(self._items("adam_sh_rows", self._count, given))
+            return row, None
+
+        self._again("step", (whole,), given, plan)
 
     def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
         """As `TrainingKernels`."""
@@ -261,30 +293,53 @@ class OpenCLTraining:
         """The queue on which pictures with derivatives are drawn, after all that is on others."""
         return self._workspace.turn_to(self._workspace.queue)
 
-    def _launch(
-        self, kernel: str, items: int, given: Mapping[str, Any] | None = None, first: int = 0
-    ) -> None:
-        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
-        self._enqueue(kernel, (size,), (_GROUP,), given or {}, first)
+    def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
+        self._enqueue(self._items(kernel, items, given or {}))
 
     def _launch_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> None:
-        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
-        self._enqueue(kernel, (size, rows), (_GROUP, 1), given)
+        self._enqueue(self._of_rows(kernel, items, rows, given))
 
-    def _enqueue(
-        self,
-        kernel: str,
-        size: tuple[int, ...],
-        group: tuple[int, ...],
-        given: Mapping[str, Any],
-        first: int = 0,
-    ) -> cl.Event:
+    def _items(self, kernel: str, items: int, given: Mapping[str, Any], first: int = 0) -> Launch:
+        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
+        return *self._one(kernel, (size,), (_GROUP,), given), first
+
+    def _of_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> Launch:
+        return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP), rows), (_GROUP, 1), given)
+
+    def _one(
+        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
+    ) -> Launch:
+        """A launch: arguments are given here, or held."""
         every = {**self._held, "count": self._count, **given}
-        values = [every[one.name] for one in self._program.source.arguments[kernel]]
-        try:
-            return self._program.launch(self._queue, kernel, size, group, values, first)
-        except cl.Error as error:
-            raise DeviceError(f"{self._workspace.info.title} failed while training: {error}") from error
+        return kernel, size, group, [every[one.name] for one in self._program.source.arguments[kernel]]
+
+    def _enqueue(self, launch: Launch) -> None:
+        with self._workspace.failing("training"):
+            self._program.launch(self._queue, *launch)
+
+    def _again(
+        self,
+        name: str,
+        kind: tuple[Any, ...],
+        given: Mapping[str, Any],
+        plan: Callable[[], tuple[list[Launch], Any]],
+    ) -> tuple[list[cl.Event], Any]:
+        """Launches a part of a step: what the last step launched, where only `given` differs.
+
+        plan: gives the launches for all else, and what comes of them; `kind` tells what they depend on
+            beside the splats and the pool.
+        """
+        known = self._kept.pop(name, None)  # an interrupt on the way leaves none
+        with self._workspace.failing("training"):
+            if known is None or known[0] != (kind, self._version, self._workspace.pool.state):
+                launches = Launches(self._program) if known is None else known[1]
+                row, made = plan()
+                launches.keep(row, given.keys())
+                known = (kind, self._version, self._workspace.pool.state), launches, made
+            known[1].put(given)
+            events = known[1].launch(self._queue)
+        self._kept[name] = known
+        return events, known[2]
 
     def _put(self, what: str, array: np.ndarray) -> cl.Buffer:
         array = np.ascontiguousarray(array)
@@ -298,6 +353,11 @@ class OpenCLTraining:
 
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:
         return self._workspace.pool.array(self._queue, f"training: {name}", shape)
+
+    def _sums_of(self, groups: int) -> LossSums:
+        if groups not in self._sums:
+            self._sums[groups] = LossSums(self._workspace, groups)
+        return self._sums[groups]
 
     def _stride(self, columns: int) -> int:
         return -(-3 * columns // self._lanes) * self._lanes + 2 * MARGIN

@@ -62,6 +62,10 @@ class BufferPool:
         """Bytes of the scratch buffer of that name; 0 if there is none yet."""
         return self._buffers[name].size if name in self._buffers else 0
 
+    def known(self, name: str) -> cl.Buffer | None:
+        """The scratch buffer of that name, as it is."""
+        return self._buffers.get(name)
+
     def lease(self, name: str, size: int) -> cl.Buffer:
         """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
         # taken before it is looked at: images that die meanwhile may give back others

@@ -205,6 +205,8 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
     queue->until = INFINITY;
     return VMASK(queue->from < INFINITY) & pixel_unfinished(pixel, constants);
 }
+//@ drawn
+            if (!VANY(mask)) continue;      // nor is a layer closed for what is not drawn
 //@ blend_arguments
                         , splats, lists[k], k, following
 //@ pass

@@ -36,7 +36,7 @@ kernel void blend(
             vfloat screen;
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
-            if (!VANY(mask)) continue;
+//@@ drawn
             pixel_blend(&pixel, &s, c, mask, screen, &constants
 //@@ blend_arguments
             );

@@ -1,0 +1,242 @@
+"""Pictures with derivatives that are launched again: a training draws thousands of one kind, and to plan each
+takes the host longer than small ones take a GPU."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Callable, Iterable, Mapping, Set
+from copy import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from pyopencl.array import Array
+
+from fidsplat.backends.opencl.images import stats_later
+from fidsplat.backends.opencl.launches import Launches
+from fidsplat.backends.opencl.picture import Picture, numbers_of
+from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.view import View
+
+_VIEWS = 256
+"""whose records stay on the device"""
+_ZERO = np.zeros(1, np.uint32)
+
+
+@dataclass
+class _Kind:
+    """What one picture left to the next: no buffers, which the pool finds by their names."""
+
+    picture: Picture
+    """its numbers"""
+    resident: weakref.ref[Resident]
+    budgets: tuple[int, int]
+    state: object
+    """of the pool"""
+    names: list[str]
+    """of scratch buffers"""
+    leases: list[tuple[str, int]]
+    stages: list[str]
+    """of the launches"""
+    counted: int
+    """which launch counts the pairs"""
+    slots: np.ndarray
+
+
+@dataclass
+class _Back:
+    """How a picture was taken back."""
+
+    kind: _Kind
+    given: frozenset[str]
+    """outputs whose derivatives were on the device"""
+    stages: list[str]
+    asked: int
+    """launches before the number of pairs is asked for"""
+    results: dict[str, weakref.ref[Array]]
+    """which the pool holds"""
+
+
+class Again:
+    """The launches of the last picture that nobody waited for, and of its way back."""
+
+    def __init__(self, workspace: Workspace, forward: Program, backward: Program) -> None:
+        self._workspace = workspace
+        self._forward, self._backward = Launches(forward), Launches(backward)
+        self._kind: _Kind | None = None
+        self._back: _Back | None = None
+        self._last: tuple[Any, ...] = ()
+        self._views: dict[int, tuple[View, cl.Buffer]] = {}
+        """with their records on the device; views are held, so that no other is found by its number"""
+        self._records: dict[bytes, cl.Buffer] = {}
+
+    def keep(self, picture: Picture) -> None:
+        """Remembers a picture that was drawn, if the next can be launched as it was."""
+        self._kind = self._back = None
+        last, view = self._last, picture.view
+        self._last = view.width, view.height, picture.trusted, weakref.ref(picture.resident)
+        # what was no other a picture ago may stay so
+        if self._last != last or picture.counted is None or picture.arrays.keys() != {"view", "slots"}:
+            return
+        pool, launched = self._workspace.pool, picture.launched
+        kernels = [kernel for _, kernel, *_ in launched]
+        of_views = ("uniform", "array")
+        every = [one for name in kernels for one in picture.program.source.arguments[name]]
+        if len(set(kernels)) < len(kernels) or any(one.source in of_views for one in every):
+            return
+        leased = dict(picture.leased)
+        numbers = {name: held for name, held in picture.held.items() if not isinstance(held, cl.Buffer)}
+        names = [name for name in picture.held if name not in numbers and name not in {"view", *leased}]
+        if not self._there(names, picture):
+            return
+        self._forward.keep([one[1:] for one in launched], {"view", *leased, *numbers_of(picture.view)})
+        base = copy(picture)
+        base.held, base.launched, base.events, base.leased, base.uploads = numbers, [], [], [], []
+        base.arrays, base.counted, base.stats = {}, None, dict
+        base.resident = None  # pyright: ignore[reportAttributeAccessIssue]
+        budgets = self._workspace.memory_budget, self._workspace.pair_budget
+        self._kind = _Kind(
+            base,
+            weakref.ref(picture.resident),
+            budgets,
+            pool.state,
+            names,
+            [(name, buffer.size) for name, buffer in picture.leased],
+            [stage for stage, *_ in launched],
+            kernels.index("tile_starts"),
+            picture.arrays["slots"],
+        )
+
+    def draw(self, resident: Resident, view: View, pairs: int) -> Picture | None:
+        """The picture of another view, launched as the one that was kept; None where it does not fit."""
+        kind, workspace = self._kind, self._workspace
+        if kind is None or not self._fits(kind, resident, view, pairs):
+            return None
+        pool, queue = workspace.pool, workspace.turn_to(workspace.queue)
+        workspace.pictures += 1
+        picture = copy(kind.picture)
+        picture.resident, picture.view = resident, view
+        picture.arrays, picture.uploads, picture.launched = {}, [], []
+        picture.leased = [(name, pool.lease(name, size)) for name, size in kind.leases]
+        given = {"view": self._record(picture), **dict(picture.leased), **numbers_of(view)}
+        picture.held = kind.picture.held | {name: pool.known(name) for name in kind.names} | given
+        picture.put("slots", kind.slots)  # pictures of other kinds have theirs in the same buffer
+        tallies = pool.scratch("tallies", 0)  # which are not left as zeros
+        cl.enqueue_fill_buffer(queue, tallies, _ZERO, 0, tallies.size)
+        self._forward.put(given)
+        events = self._forward.launch(queue)
+        queue.flush()
+        picture.events = list(zip(kind.stages, events, strict=True))
+        picture.counted = events[kind.counted]
+        picture.stats = stats_later(workspace, picture.held["counts"], events[-1], resident.count)
+        return picture
+
+    def keep_back(
+        self,
+        picture: Picture,
+        first: int,
+        given: Mapping[str, Any],
+        wanted: Set[str],
+        found: Mapping[str, Array],
+    ) -> None:
+        """Remembers how a picture was taken back.
+
+        Args:
+            first: of its launches those from this one on.
+            given: the outputs' derivatives.
+            wanted: names of the arguments that they are.
+            found: arrays of the results, scratch of the pool.
+        """
+        self._back, kind = None, self._kind
+        on_device = all(isinstance(array, Array) for array in given.values())
+        if kind is None or not on_device or not wanted <= {f"by_{name}" for name in given}:
+            return
+        # the picture's own scratch buffers are where they were, unless somebody has let go of all
+        if not self._is_like(kind, picture) or not self._there(kind.names, picture):
+            return
+        row = picture.launched[first:]
+        kernels = [kernel for _, kernel, *_ in row]
+        if len(set(kernels)) < len(kernels) or "project_backward" not in kernels:
+            return
+        changing = {"view", "log_ceiling", *numbers_of(picture.view), *(name for name, _ in kind.leases)}
+        self._backward.keep([one[1:] for one in row], {*changing, *wanted})
+        kind.state = self._workspace.pool.state
+        asked = kernels.index("project_backward")
+        results = {name: weakref.ref(array) for name, array in found.items()}
+        self._back = _Back(kind, frozenset(given), [stage for stage, *_ in row], asked, results)
+
+    def take_back(
+        self, picture: Picture, given: Mapping[str, Any], ask: Callable[[], None]
+    ) -> dict[str, Array] | None:
+        """Launches the way back of a picture as that which was kept, and gives its results; None where it
+        does not fit.
+
+        ask: whether there was room for all pairs; called when all is launched that does not need to know.
+        """
+        back, pool = self._back, self._workspace.pool
+        if back is None or back.kind is not self._kind or back.kind.state is not pool.state:
+            return None
+        if not self._is_like(back.kind, picture) or given.keys() != back.given:
+            return None
+        if not all(isinstance(array, Array) for array in given.values()):
+            return None
+        found = {name: array for name, held in back.results.items() if (array := held()) is not None}
+        if len(found) < len(back.results):
+            return None
+        held = {name: picture.held[name] for name in ("view", *(name for name, _ in back.kind.leases))}
+        held |= numbers_of(picture.view) | {"log_ceiling": math.log(picture.view.ceiling)}
+        self._backward.put(held | {f"by_{name}": array.data for name, array in given.items()})
+        queue = picture.queue
+        cl.enqueue_fill_buffer(queue, pool.scratch("reserved", 4), _ZERO, 0, 4)
+        events = self._backward.launch(queue, 0, back.asked)
+        ask()
+        events += self._backward.launch(queue, back.asked)
+        picture.events += zip(back.stages, events, strict=True)
+        return found
+
+    def _fits(self, kind: _Kind, resident: Resident, view: View, pairs: int) -> bool:
+        """Whether the picture of a view is launched as the one that was kept."""
+        workspace, before = self._workspace, kind.picture.view
+        return (
+            kind.state is workspace.pool.state
+            and kind.resident() is resident
+            and pairs == kind.picture.trusted
+            and (view.width, view.height, view.samples) == (before.width, before.height, before.samples)
+            and kind.budgets == (workspace.memory_budget, workspace.pair_budget)
+            and not (view.groups or view.shots or view.raster or view.band)
+        )
+
+    def _is_like(self, kind: _Kind, picture: Picture) -> bool:
+        """Whether a picture that was drawn is like the one that was kept."""
+        same = (
+            picture.pairs == kind.picture.pairs
+            and picture.held["big_capacity"] == kind.picture.held["big_capacity"]
+        )
+        return (
+            same
+            and picture.counted is not None
+            and self._fits(kind, picture.resident, picture.view, picture.trusted)
+        )
+
+    def _there(self, names: Iterable[str], picture: Picture) -> bool:
+        """Whether a picture's buffers are those that the pool has by these names."""
+        return all(picture.held[name] is self._workspace.pool.known(name) for name in names)
+
+    def _record(self, picture: Picture) -> cl.Buffer:
+        """The record `View` of a picture on the device; those of other views stay there."""
+        view = picture.view
+        if id(view) not in self._views:
+            if len(self._views) >= _VIEWS:
+                self._views.clear()
+                self._records.clear()
+            record = picture.record(0, picture.rows)
+            key = record.tobytes()
+            if key not in self._records:
+                self._records[key] = buffer = self._workspace.pool.fresh("a view", record.nbytes)
+                cl.enqueue_copy(picture.queue, buffer, record)
+            self._views[id(view)] = view, self._records[key]
+        return self._views[id(view)][1]

@@ -1,0 +1,228 @@
+"""A step's launches are kept from the last, and losses are asked for when others have followed: the bits are
+those of steps of which each is planned and waited for."""
+
+import math
+import threading
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from training_scene import QUICK, scene
+
+import fidsplat as fs
+from fidsplat.backends.gradients import TooLittleRoom
+from fidsplat.backends.opencl import gradients_again
+from fidsplat.backends.opencl.launches import Launches
+from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.prepare import prepare
+from fidsplat.train import Trainer, TrainingError
+from fidsplat.train.losses import Loss
+
+BACKEND = "opencl"
+STEADY = {**QUICK, "iterations": 40, "densify_from": 99, "sh_degree": 1}
+
+
+@pytest.fixture
+def on_groups(renderer, monkeypatch):
+    """The device with the schedule of GPUs, whose pictures nobody waits for."""
+    backend = renderer.backend
+    monkeypatch.setattr(backend, "shape", next(iter(backend.shapes("schedule").values())))
+    backend.limit_memory(backend.memory_budget)
+    yield renderer
+    monkeypatch.undo()
+    backend.limit_memory(backend.memory_budget)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return scene()
+
+
+def splats_of(trainer):
+    return {name: array.tobytes() for name, array in trainer._work.store().values.items()}
+
+
+def test_steps_are_launched_again_with_the_same_bits(on_groups, dataset, monkeypatch):
+    """Also where pictures of another kind come in between, and where their buffers are let go."""
+    again, planned = (Trainer(dataset, on_groups, **STEADY) for _ in range(2))
+    launched = []
+    for _ in range(8):
+        again.step()
+    launch = Program.launch
+    monkeypatch.setattr(Program, "launch", lambda *given: launched.append(given[2]) or launch(*given))
+    for _ in range(6):  # not to iteration 16, where the degree grows
+        again.step()
+    assert not launched
+    again.evaluate()
+    on_groups.backend.release_scratch()
+    assert launched
+    for _ in range(6):
+        again.step()
+    launched.clear()
+    again.step()
+    assert not launched
+    again.run()
+    monkeypatch.setattr(gradients_again.Again, "keep", lambda *_: None)
+    monkeypatch.setattr(Launches, "put", put_all)
+    planned.run()
+    assert splats_of(again) == splats_of(planned)
+    for name, array in planned.history.items():
+        np.testing.assert_array_equal(again.history[name], array)
+
+
+put = Launches.put
+
+
+def put_all(self, given):
+    """Sets every argument, whatever it was."""
+    for place in self._places.values():
+        place.mark = None
+    put(self, given)
+
+
+def test_a_picture_with_more_pairs_than_there_is_room_for_is_not_launched_as_the_last(on_groups, monkeypatch):
+    """Splats that have grown since fill more tiles: the kept launches say so, and it is drawn with room."""
+    wide, losses, refused = scene(size=(80, 64)), [], []
+    take_back = gradients_again.Again.take_back
+
+    def told(self, picture, given, ask):
+        try:
+            return take_back(self, picture, given, ask)
+        except TooLittleRoom:
+            refused.append(picture)
+            raise
+
+    monkeypatch.setattr(gradients_again.Again, "take_back", told)
+    for kept in (True, False):
+        if not kept:
+            monkeypatch.setattr(gradients_again.Again, "keep", lambda *_: None)
+        trainer = Trainer(wide, on_groups, **STEADY)
+        kernels, splats = trainer._work._kernels, trainer._work.store()
+        splats.values["log_scales"] -= np.float32(2.5)
+        trainer._work.load(splats)
+        for _ in range(6):
+            trainer.step()
+        large = np.exp(trainer._work.store().values["log_scales"] + np.float32(2.5))
+        cl.enqueue_copy(on_groups.backend.queue, kernels._held["drawn_scales"], large)
+        losses.append([trainer.step().loss for _ in range(3)])
+        assert len(refused) == 1
+    assert losses[0] == losses[1]
+
+
+def test_steps_are_those_of_a_run_that_tells_them_later(renderer, dataset):
+    """At the end of a run all are told, in their order."""
+    settings = {**QUICK, "iterations": 40}
+    prompt, late, at_once = (Trainer(dataset, renderer, **settings) for _ in range(3))
+    told, ahead = [], []
+    prompt.run(lambda step: ahead.append(prompt.iteration - step.iteration))
+    late.run(told.append, prompt=False)
+    steps = [at_once.step() for _ in range(40)]
+    assert told == steps
+    assert set(ahead) == {0}
+    assert splats_of(prompt) == splats_of(late) == splats_of(at_once)
+
+
+def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoint(
+    renderer, dataset, tmp_path, monkeypatch
+):
+    """Others have followed by then: there is no step, no file and no checkpoint any more."""
+    file = tmp_path / "scene.training.npz"
+    trainer = Trainer(dataset, renderer, checkpoint=file, **STEADY)
+    trainer.step()
+    trainer.save_checkpoint()
+    kept, loss, views = file.read_bytes(), trainer._work.loss, []
+
+    def failing(images, view):
+        value, slope = loss(images, view)
+        views.append(dataset.views[view].name)
+        if len(views) == 4:
+            value = lambda: Loss(math.nan, 0.1)  # noqa: E731
+        return value, slope
+
+    monkeypatch.setattr(trainer._work, "loss", failing)
+    monkeypatch.setattr("fidsplat.train.trainer._TOLD_SECONDS", 60.0)
+    with pytest.raises(
+        TrainingError, match=r"the loss is nan at iteration 5, in the view (\S+); .*is whole"
+    ) as seen:
+        trainer.run()
+    assert f"in the view {views[3]}" in str(seen.value)
+    assert len(views) > 5
+    for after in (trainer.step, trainer.run, trainer.cloud, trainer.save_checkpoint, lambda: trainer.history):
+        with pytest.raises(TrainingError, match="at iteration 5"):
+            after()
+    assert file.read_bytes() == kept
+    again = Trainer(dataset, renderer, checkpoint=file, **STEADY)
+    assert again.iteration == 1
+
+
+def test_an_interrupt_keeps_the_losses_that_nobody_has_asked_for(renderer, dataset, monkeypatch):
+    whole, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
+    whole.run()
+    monkeypatch.setattr("fidsplat.train.trainer._TOLD_SECONDS", 60.0)
+    make, calls = stopped._work.step, []
+
+    def interrupted(*given):
+        make(*given)
+        calls.append(None)
+        if len(calls) == 20:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(stopped._work, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run()
+    done = stopped.iteration
+    assert done == 19
+    np.testing.assert_array_equal(stopped.history["losses"], whole.history["losses"][:done])
+
+
+@pytest.mark.parametrize("losses", [{}, {"normal_from": 24, "distortion_from": 30, "distortion_weight": 1.0}])
+def test_what_a_run_draws_next_is_compiled_meanwhile(renderer, dataset, monkeypatch, losses):
+    """Each set of kernels before the first iteration that draws by it, and all that are drawn by."""
+    begun, drawn = [], []
+    backend = renderer.backend
+    differentiate = backend.differentiate
+    monkeypatch.setattr(
+        backend, "compile_ahead", lambda features: begun.append((trainer.iteration + 1, features))
+    )
+    trainer = Trainer(dataset, renderer, **{**STEADY, "sh_degree": 2, **losses})
+    monkeypatch.setattr(
+        trainer, "_differentiate", lambda features: drawn.append(features) or differentiate(features)
+    )
+    trainer.run()
+    wanted = list(dict.fromkeys(drawn))
+    assert [features for _, features in begun] == wanted[1:]
+    changes = [1, 16, 25, 31] if losses else [1, 16]
+    assert [iteration for iteration, _ in begun] == changes
+
+
+def test_compiling_in_the_background_gives_what_is_asked_for_and_its_errors(renderer, dataset, monkeypatch):
+    """What fails there is an error where it is needed."""
+    backend = renderer.backend
+    capture = fs.Capture(dataset.views[0].camera, quality="surfel")
+    cloud = fs.marker("apriltag:36h11:5", size=0.16, mixture="fitted").cloud
+    features, _ = prepare(cloud, capture)
+    monkeypatch.setattr(backend, "_gradients", {})
+    where, made = [], backend.pipeline
+
+    def seen(*given):
+        where.append(threading.current_thread())
+        return made(*given)
+
+    monkeypatch.setattr(backend, "pipeline", seen)
+    for _ in range(2):
+        backend.compile_ahead(features)
+    found = backend.differentiate(features)
+    assert backend.differentiate(features) is found
+    assert [thread is threading.main_thread() for thread in where] == [False, True, True]
+    backend.compile_ahead(features)  # it is there
+    assert len(where) == 3
+
+    monkeypatch.setattr(backend, "_gradients", {})
+
+    def failing(*_):
+        raise fs.DeviceError("no compiler")
+
+    monkeypatch.setattr(backend, "pipeline", failing)
+    backend.compile_ahead(features)
+    with pytest.raises(fs.DeviceError, match="no compiler"):
+        backend.differentiate(features)
