@@ -102,6 +102,35 @@ def test_walls_beside_the_camera_draw_no_streaks(renderer):
     assert alpha[:, 42:].max() < 1e-3
 
 
+def test_disks_far_beside_the_picture_that_are_widened_into_it(renderer):
+    """Their near ends, which a sample's depth brings nearer still, are in the picture: one by one, since all
+    that they show is their rims."""
+    generator, count = np.random.default_rng(4), 120
+    outward = generator.uniform((-10.0, -0.2, 0.0), (10.0, 0.2, 0.0), (count, 3))
+    towards = outward + np.array([0.0, 0.0, 1.0])
+    away = generator.uniform(1.0, 3.0, (count, 1)) / np.linalg.norm(towards, axis=1, keepdims=True)
+    along = towards / np.linalg.norm(towards, axis=1, keepdims=True) + 0.01 * outward
+    beside = np.cross(along, np.array([0, 1, 0]) + 0.3 * generator.normal(size=(count, 3)))
+    along, beside = (axis / np.linalg.norm(axis, axis=1, keepdims=True) for axis in (along, beside))
+    turns = np.stack([along, beside, np.cross(along, beside)], axis=2)
+    quats = np.array([matrix_to_quaternion(turn) for turn in turns])
+    means = away * towards
+    scales = np.linalg.norm(means, axis=1)[:, None] * generator.uniform((0.1, 0.02), (0.16, 0.08), (count, 2))
+    camera, reference = (
+        fs.Camera.look_at(40, 30, math.radians(4), (0, 0, 0), (0, 0, 1)),
+        fs.Renderer("reference"),
+    )
+    quality, shown = PIXEL.with_(alpha_cutoff=1e-8), 0
+    for k in np.flatnonzero(np.abs(outward[:, 0]) > 1):
+        disk = fs.SplatCloud(
+            means[k : k + 1], quats[k : k + 1], scales[k : k + 1], [0.99], colors=[(1, 1, 1)]
+        )
+        if reference.render(disk, camera, ("alpha",), quality)["alpha"].max() > 1e-7:
+            shown += 1
+            assert renderer.render(disk, camera, ALL_OUTPUTS, quality)["alpha"].any()
+    assert shown > 5
+
+
 def test_splats_whose_centres_lie_beyond_the_fold(renderer):
     """There is no image of theirs to be widened."""
     cloud = random_splats(150, 1, depth=(0.3, 4.0), scale=(0.02, 0.5), across=3.0)

@@ -130,7 +130,8 @@ def test_what_does_not_fit_at_once_is_drawn_in_bands_of_what_each_sees(stores, m
     by_pixel = fs.Capture(
         before_the_wall(), more, "order=pixel", fog=fs.Fog(0.2, (0.5, 0.6, 0.7)), sensor=sensor
     )
-    for capture in (fs.Capture(before_the_wall(), outputs=outputs), sampled, by_pixel, moved):
+    widened = fs.Capture(before_the_wall(), outputs=outputs, quality="lowpass=pixel,alpha_cutoff=1e-8")
+    for capture in (fs.Capture(before_the_wall(), outputs=outputs), sampled, by_pixel, widened, moved):
         drawn.clear()
         ours, whole = limited.render(resident, capture), plain.render(cloud, capture)
         for output in capture.outputs:

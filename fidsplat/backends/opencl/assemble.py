@@ -133,6 +133,8 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         # disks and 3D Gaussians among each other are not asked: their images are bounded otherwise
         if "lowpass_screen" in layouts and "thickness" not in layouts:
             files.append(LAYOUTS["beside"].file)
+        if "lowpass_pixel" in layouts and "thickness" not in layouts:
+            files.append(LAYOUTS["beside_pixel"].file)
         if "ellipsoids_alone" in layouts:
             files.append(LAYOUTS["beside_ewa"].file)
     if at_once:

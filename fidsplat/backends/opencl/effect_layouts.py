@@ -133,6 +133,7 @@ LAYOUTS: dict[str, Layout] = {
     # what several of them share
     "beside": Layout("part/beside.cl"),
     "beside_ewa": Layout("part/beside_ewa.cl"),
+    "beside_pixel": Layout("part/beside_pixel.cl"),
     "chord": Layout("part/chord.cl"),
     "conic": Layout("part/conic.cl", behind=(("ellipsoids_alone", "conic_facing"),)),
     "conic_facing": Layout("part/conic_facing.cl"),
