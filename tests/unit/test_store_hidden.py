@@ -239,8 +239,8 @@ def test_the_largest_in_rectangles():
 def test_a_needle_that_ewa_draws_into_a_wide_picture_is_on_it():
     focal = 1000 / math.tan(math.radians(80))
     camera = fs.Camera.pinhole(2000, 2, focal, focal, 1000, 1)
-    sigmas = np.array([[1e-3, 1e-3, 0.26 / 4.8]], np.float32)
-    means = np.array([[-7.3, 0, 1]], np.float32)
+    sigmas = np.array([[1e-3, 1e-3, 0.06]], np.float32)
+    means = np.array([[-7.6, 0, 1]], np.float32)
     needle = fs.SplatCloud(means, [[1, 0, 0, 0]], sigmas, [0.99], colors=[[1, 1, 1]])
     nowhere_finished = ends.TileEnds(np.full((1, 125), np.inf, np.float32), (16, 16))
     features, shot = prepare(needle, fs.Capture(camera, quality=fs.Quality(ellipsoid="ewa")))
