@@ -10,6 +10,7 @@ from store_views import TURNED, look, made_store, splats
 import fidsplat as fs
 from fidsplat.backends import ends
 from fidsplat.backends.prepare import prepare
+from fidsplat.effects.select import with_tile_ends
 from fidsplat.rotations import rigid_matrix
 from fidsplat.store import hidden, pieces
 from fidsplat.store.streamed import Streamed
@@ -224,6 +225,39 @@ def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(n
             only = lambda sigmas, i=i: tuple(each[i : i + 1] for each in boxes(sigmas))  # noqa: E731
             assert not ends.hidden(view, features, only, largest[i : i + 1], given).any()
             depths[row, column] = -np.inf
+
+
+@pytest.mark.parametrize("schedule", ["own", "groups"])
+@pytest.mark.parametrize("order", ["centre", "pixel"])
+def test_a_tile_ends_where_all_of_its_pixels_are_finished(order, schedule):
+    """Opaque boxes over parts of tiles: no tile ends before that, and none ends nearer than what it shows."""
+    generator, backend = np.random.default_rng(3), fs.Renderer("opencl").backend
+    if schedule == "groups":
+        backend.shape = backend.shapes("schedule")["groups"]
+    means = np.column_stack([generator.uniform(-1.5, 1.5, (60, 2)), generator.uniform(2.0, 4.0, 60)])
+    sizes = generator.uniform(0.03, 0.6, (60, 2))
+    upright, opaque = np.tile([1.0, 0, 0, 0], (60, 1)), np.ones(60)
+    cloud = fs.SplatCloud(means, upright, sizes, opaque, colors=np.ones((60, 3))).with_boxes(True)
+    camera = fs.Camera.pinhole(96, 64, 60.0, 60.0, 48.0, 32.0)
+    capture = fs.Capture(camera, outputs=("alpha", "depth"), quality=f"lowpass=none,order={order}")
+    features, shot = prepare(cloud, capture)
+    images = backend.pipeline(with_tile_ends(features)).render(backend.upload(cloud), shot)
+    found = backend.tile_ends_of(images)
+    height, width = found.tile
+    rows, columns = found.depths.shape
+    tiles = [(row, column) for row in range(rows) for column in range(columns)]
+    alpha, depth = (images.read(name).reshape(64, 96) for name in ("alpha", "depth"))
+    finished = np.zeros((rows, columns), bool)
+    for row, column in tiles:
+        own = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+        finished[row, column] = (alpha[own] >= 1 - 1e-4).all()
+        if finished[row, column]:
+            assert found.depths[row, column] >= depth[own].max()
+    assert 3 < finished.sum() < len(tiles) - 3
+    ends_known = np.isfinite(found.depths)
+    assert not (ends_known & ~finished).any()
+    # groups look at batches of a list by centres, and these lists are shorter than one
+    assert np.array_equal(ends_known, finished) or (order, schedule) == ("centre", "groups")
 
 
 def test_the_largest_in_rectangles():
