@@ -195,19 +195,24 @@ def test_a_scene_that_begins_to_move_gets_a_clock(viewer, tmp_path):
         keys = f"{{time = 0.5, {place}}}, {{time = {end}, {place.replace('[0, 0, 0]', '[0.3, 0, 0]')}}}"
         return still.replace("size = 0.4\n", f"size = 0.4\nmotion = [{keys}]\n")
 
+    def write(text):
+        """At once: a viewer that looks while a file is written sees an empty scene, without a clock."""
+        (tmp_path / "next.toml").write_text(text)
+        (tmp_path / "next.toml").replace(path)
+
     assert "time" not in sliders
-    path.write_text(moving(2.5))
+    write(moving(2.5))
     assert until(lambda: "readout_ms" in sliders and len(shown) == before + 3)
     assert (sliders["time"].min, sliders["time"].max) == (0.0, 2.5), "of keyframes, and where the clock is"
     sliders["time"].value = 2.5
     assert until(lambda: viewer.session.drawn.settings.time == 2.5)
-    path.write_text(moving(4.0))
+    write(moving(4.0))
     assert until(lambda: sliders["time"].max == 4.0)
     assert (sliders["time"].min, sliders["time"].value, len(shown)) == (0.5, 2.5, before + 3)
-    path.write_text(still)
+    write(still)
     assert until(lambda: not sliders.keys() & {"time", "exposure_ms", "readout_ms"})
     assert until(lambda: len(shown) == before)
-    path.write_text(moving(2.5))
+    write(moving(2.5))
     assert until(lambda: "time" in sliders)
 
 
