@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from measuring import PROGRESS, facts, keep, options
-from store_views import placed
+from store_views import path_of, placed
 
 import fidsplat as fs
 from fidsplat.detail import measure_detail
@@ -75,7 +75,7 @@ def main() -> None:
     asked = parser.parse_args()
     city, folder = City(int(asked.splats), asked.houses), Path(asked.folder)
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"city-{int(asked.splats)}-{asked.houses}.fss"
+    path = path_of(city, folder)
     if not path.exists():
         fs.build_store([city.source], path)
     renderer = fs.Renderer(asked.device, int(asked.memory_budget))

@@ -30,6 +30,11 @@ from fidsplat.store.city import City
 from fidsplat.store.streamed import Streamed
 
 
+def path_of(city: City, folder: Path) -> Path:
+    """Where the city's store is kept."""
+    return folder / f"city-{city.splats}-{city.houses}.fss"
+
+
 def placed(store: fs.Store, city: City, places: int, folder: Path) -> fs.Store:
     """The city so many times, on a grid of streets."""
     if places == 1:
@@ -143,7 +148,7 @@ def main() -> None:
     asked = parser.parse_args()
     city, folder = City(int(asked.splats), asked.houses), Path(asked.folder)
     folder.mkdir(parents=True, exist_ok=True)
-    path, built = folder / f"city-{int(asked.splats)}-{asked.houses}.fss", None
+    path, built = path_of(city, folder), None
     renderer = fs.Renderer(asked.device)
     if not path.exists():
         begun, cpu = time.perf_counter(), time.process_time()

@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fidsplat.backends.seen import BRIGHTEST, ROOM, Boxes, Extent, Turned
+from fidsplat.backends.seen import BRIGHTEST, ROOM, Boxes, Extent, Turned, drawn_to, ewa_reach
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
@@ -64,7 +64,7 @@ def least_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
     assert extent is not None  # `can_hide`
     if "compose_ordered" in features.names:
         return Turned(view, *boxes(0.0)).nearest(view)
-    return extent.nearest(view, boxes)
+    return extent.nearest(view, Turned(view, *boxes(extent.depths)))
 
 
 def hidden(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TileEnds) -> np.ndarray:
@@ -96,8 +96,7 @@ def _everywhere(count: int, band: tuple[int, int], columns: int) -> tuple[np.nda
 
 def _extent(view: View, features: FeatureSet) -> Extent | None:
     """How far splats show, those that stand for others too."""
-    radius = ROOM * math.sqrt(max(2.0 * (math.log(BRIGHTEST) - view.log_cut), 0.0))
-    return Extent.of(view, features, max(radius, _RANGE * ROOM))
+    return Extent.of(view, features, max(drawn_to(view, BRIGHTEST), _RANGE * ROOM))
 
 
 def _on_picture(
@@ -109,15 +108,12 @@ def _on_picture(
     assert extent is not None  # `can_hide`
     radius, margin = extent.radius, extent.margin
     low, high = _projected(view, *boxes(radius))
-    if {"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names:
-        # the derivative at the centre may draw a splat larger than it is
-        turned = Turned(view, *boxes(0.0))
+    wide = ewa_reach(view, features, radius, reach[:, None])
+    if wide is not None:
         least, most = _projected(view, *boxes(0.0))
-        slope = 1.0 if view.parallel else math.hypot(1.0, max(map(abs, view.slopes)))
-        wide = max(view.focal_x, view.focal_y) * slope * radius * reach[:, None]
         if not view.parallel:
             with np.errstate(divide="ignore", invalid="ignore"):
-                nearest = turned.nearest(view)[:, None]
+                nearest = Turned(view, *boxes(0.0)).nearest(view)[:, None]
                 wide = np.where(nearest > 0, wide / nearest, np.inf)
         low, high = np.minimum(low, least - wide), np.maximum(high, most + wide)
     return low - margin, high + margin

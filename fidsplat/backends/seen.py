@@ -93,9 +93,10 @@ class Extent:
         margin = max(plain.margin, larger * radius * _ACROSS + 2.0)
         return Extent(larger * radius, margin, radius / nearer, nearer)
 
-    def nearest(self, view: View, boxes: Boxes) -> np.ndarray:
-        """(n,) metres: below the depths of all that splats in boxes show, and of their sort keys."""
-        nearest = Turned(view, *boxes(self.depths)).nearest(view)
+    def nearest(self, view: View, turned: Turned) -> np.ndarray:
+        """(n,) metres: below the depths of all that splats in boxes to `depths` standard deviations show, and
+        of their sort keys."""
+        nearest = turned.nearest(view)
         return np.minimum(self.nearer * nearest, nearest)
 
 
@@ -105,12 +106,25 @@ def _widened(features: FeatureSet) -> bool:
 
 def _radius(view: View, features: FeatureSet) -> float:
     """Standard deviations to which splats are drawn."""
-    log_opacity = math.log(BRIGHTEST) if _widened(features) else 0.0
-    return ROOM * math.sqrt(max(2.0 * (log_opacity - view.log_cut), 0.0))
+    return drawn_to(view, BRIGHTEST if _widened(features) else 1.0)
+
+
+def drawn_to(view: View, opacity: float) -> float:
+    """Standard deviations to which splats of at most this opacity are drawn, with room."""
+    return ROOM * math.sqrt(max(2.0 * (math.log(opacity) - view.log_cut), 0.0))
+
+
+def ewa_reach(view: View, features: FeatureSet, radius: float, reach: np.ndarray) -> np.ndarray | None:
+    """(n,) samples, times the depth [m] where rays meet: how far beside their centres splats are drawn by the
+    derivative there, which may be further than they reach, to `radius` of their standard deviations, the
+    largest `reach` (n,) [m]; None where splats are not drawn so."""
+    if not {"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names:
+        return None
+    slope = 1.0 if view.parallel else math.hypot(1.0, max(map(abs, view.slopes)))
+    return max(view.focal_x, view.focal_y) * slope * radius * reach
 
 
 def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
-    ewa = bool({"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names)
     extent = Extent.of(view, features)
     if extent is None:
         # nothing of a splat whose centre lies behind the near plane is widened
@@ -120,14 +134,14 @@ def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) 
     centers = Turned(view, *boxes(0.0))
     whole = Turned(view, *boxes(radius))
     made = whole.furthest(view) >= view.near * (1 - _ROUNDING)
-    made &= extent.nearest(view, boxes) <= view.far * (1 + _ROUNDING)
+    deep = whole if extent.depths == radius else Turned(view, *boxes(extent.depths))
+    made &= extent.nearest(view, deep) <= view.far * (1 + _ROUNDING)
     if view.raster is None:
-        half_spaces, slope = _pinhole_sides(view, margin)
-        for normal, offset in half_spaces:
+        wide = ewa_reach(view, features, radius, reach)
+        for normal, offset in _pinhole_sides(view, margin):
             inside = whole.beyond(normal) + offset >= 0
-            if ewa:  # the derivative at the centre may draw a splat larger than it is
-                focal = max(view.focal_x, view.focal_y)
-                inside |= centers.beyond(normal) + offset + focal * slope * radius * reach >= 0
+            if wide is not None:
+                inside |= centers.beyond(normal) + offset + wide >= 0
             made &= inside
         return made
     lens = view.raster.lens
@@ -197,9 +211,9 @@ class Turned:
         return (distance <= self._radius) | (off - around <= angle)
 
 
-def _pinhole_sides(view: View, margin: float) -> tuple[list[tuple[np.ndarray, float]], float]:
+def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
     """The sides of the picture as half spaces of the camera's frame, normal . p + offset >= 0 within, wider
-    by `margin` samples; and the largest factor by which EWA stretches a splat."""
+    by `margin` samples."""
     sides = []
     rows = (0, view.height) if view.band is None else view.band
     grid = ((0, view.focal_x, view.center_x, (0, view.width)), (1, view.focal_y, view.center_y, rows))
@@ -213,8 +227,7 @@ def _pinhole_sides(view: View, margin: float) -> tuple[list[tuple[np.ndarray, fl
                 continue
             normal[2] = sign * (center - side)
             sides.append((normal, 0.0))
-    steepest = max(map(abs, view.slopes))
-    return sides, 1.0 if view.parallel else math.hypot(1.0, steepest)
+    return sides
 
 
 def _turned_by(view: View) -> float:

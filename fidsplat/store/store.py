@@ -183,10 +183,8 @@ class Store(Summarised):
         center, half = (low + high) / 2, (high - low) / 2
         turns = self.poses[:, :3, :3]
         middles = center @ np.swapaxes(turns, 1, 2) + self._moves[:, None]
-        # 1e-6 of the way for the rounding of placed centres to float32
-        around = half @ np.swapaxes(np.abs(turns), 1, 2)
-        around = around + 1e-6 * (np.abs(middles) + around)
-        return (middles - around).reshape(-1, 3), (middles + around).reshape(-1, 3)
+        low, high = _rounded(middles, half @ np.swapaxes(np.abs(turns), 1, 2))
+        return low.reshape(-1, 3), high.reshape(-1, 3)
 
     def placed_boxes(
         self, low: np.ndarray, high: np.ndarray, places: np.ndarray
@@ -196,9 +194,7 @@ class Store(Summarised):
         turns = self.poses[places, :3, :3]
         center, half = (low + high) / 2, (high - low) / 2
         middles = np.einsum("kij,kj->ki", turns, center) + self._moves[places]
-        around = np.einsum("kij,kj->ki", np.abs(turns), half)
-        around = around + 1e-6 * (np.abs(middles) + around)  # as `boxes`
-        return middles - around, middles + around
+        return _rounded(middles, np.einsum("kij,kj->ki", np.abs(turns), half))
 
     @cached_property
     def _moves(self) -> np.ndarray:
@@ -294,6 +290,13 @@ class Store(Summarised):
         if self.poses is None or place is None:
             return made
         return moved(made, self.poses[place], self._moves[place])
+
+
+def _rounded(middles: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corners of placed boxes, with room for the rounding of placed centres to float32: a
+    millionth of the way."""
+    around = around + 1e-6 * (np.abs(middles) + around)
+    return middles - around, middles + around
 
 
 def _read_poses(folder: Path, crc: int | None) -> np.ndarray:
