@@ -169,7 +169,7 @@ static inline int waiting_end(Pixel *pixel, global const Splat *splats, const Bl
     return pixel_unfinished(pixel, constants);
 }
 //@ blend_arguments
-                                , splats, lists[batch + which], lists[batch + which]
+                                , splats, lists[batch + which], lists[batch + which], s.nearest
                                 , staged[k + 1 < listed ? places[cell][k + 1] : length - 1].splat.nearest
 //@ pass
     local int again;

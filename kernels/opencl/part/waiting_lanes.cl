@@ -28,12 +28,17 @@ typedef struct {                    // apart from what is to stay in registers
 } Queue;
 typedef struct {
     Entry held;
+    int some;                       // whether anything waits
     Queue *queue;
 } Waiting;
+typedef struct {                    // depths of a splat's plane over the tile, as blending has them
+    wide ax, ay, d0, dx, dy, z_numerator, z_center, low, high;
+} Ahead;
 
 static inline void waiting_start(Waiting *waiting) {
     const Entry none = {(vfloat)NONE};      // and the rest 0, which shows nothing
     waiting->held = none;
+    waiting->some = 0;
 }
 
 static inline void queue_start(Queue *queue) {
@@ -53,7 +58,7 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
         pixels[block].waiting.queue = &queues[block];
     }
 //@ blocks_parameters
-                                   , int which, int *keys
+                                   , int which, int *keys, Ahead *ahead
 //@ blocks_nearest
         vfloat least = s->nearest;
 //@@ camera_blocks_nearest
@@ -64,6 +69,7 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
         const uint length = min(end - chunk, (uint)CHUNK);
         // of each splat its blocks, and its least depth in each of them, rounded down to have its place in the chunk as last bits
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
+        Ahead ahead[CHUNK];
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
             FETCH_AHEAD(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]);
@@ -71,7 +77,9 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
             const Splat s = splats[lists[chunk + which]];
             const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
-            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which]);
+            const Ahead same = {0, 0, 0, 0, 0, 0, s.nearest, s.nearest, s.nearest};
+            ahead[which] = same;
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which], ahead + which);
         }
         const wide after = chunk + length < end ? splats[lists[chunk + length]].nearest : INFINITY;
         for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
@@ -91,14 +99,19 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
                 for (int other = 0; other < count; other++) places -= VMASK(some > unsorted[other]);
                 for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&places)[lane]] = unsorted[first + lane];
             }
-            sorted[count] = 0x7F800000;         // infinity
-            wide nearest[CHUNK + LANES];        // what follows comes no nearer
-            for (int first = 0; first < count; first += LANES)
-                VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)after), nearest + first);
+            vfloat nearest[CHUNK + 1];          // at each pixel: from there on nothing comes nearer
+            nearest[count] = after;
+            const vfloat block_x = (float)(x0 + LEFT(block)) + BLOCK_X, block_y = (float)(y0 + TOP(block)) + BLOCK_Y;
+            for (int next = count; next-- > 0;) {
+                const Ahead a = ahead[sorted[next] & (CHUNK - 1)];
+                vfloat d = FMA((vfloat)a.dy, block_y - a.ay, FMA((vfloat)a.dx, block_x - a.ax, (vfloat)a.d0));
+                vfloat z = VMIN(VMAX(a.z_numerator * (1.0f / d), (vfloat)a.low), (vfloat)a.high);
+                nearest[next] = VMIN(VSELECT((vfloat)a.z_center, z, VMASK(d > 0.0f)), nearest[next + 1]);
+            }
             Pixel pixel = pixels[block];
             for (int next = 0; next < count; next++) {
                 const uint k = chunk + (uint)(sorted[next] & (CHUNK - 1));
-                const wide following = nearest[next];
+                const vfloat coming = nearest[next], following = nearest[next + 1];
                 const Splat s = splats[lists[k]];
                 wide half_r2 = s.log_opacity - constants.log_cut;
 //@ walk_end
@@ -108,7 +121,7 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
     }
 //@ compose_functions
 // Composites what waits nearer than `nearest`, but what shares an entry with something further.
-static inline void waiting_leave(Pixel *pixel, wide nearest, const BlendConstants *constants) {
+static inline void waiting_leave(Pixel *pixel, vfloat nearest, const BlendConstants *constants) {
     Queue *queue = pixel->waiting.queue;
     int left = 0;
     for (; left < queue->count; left++) {
@@ -169,7 +182,7 @@ static inline void waiting_queue(Waiting *waiting, Entry *own) {
 }
 
 // Takes a fragment of the splat at `place` in the list, with nothing to come before `nearest`.
-static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opacity, const Seen *seen, uint splat, uint place,
+static inline void waiting_take(Pixel *pixel, vfloat nearest, vfloat z, vfloat opacity, const Seen *seen, uint splat, uint place,
                                 vint mask, global const Splat *splats, const BlendConstants *constants) {
     Waiting *waiting = &pixel->waiting;
     vint here = (vint)(int)place;
@@ -178,6 +191,13 @@ static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opa
         mask &= VMASK(z < queue->until) | (VMASK(z == queue->until) & VMASK(here < queue->until_place));
         mask &= VMASK(z > queue->from) | (VMASK(z == queue->from) & VMASK(here >= queue->from_place));
         if (!VANY(mask)) return;
+    }
+    if (!waiting->some) {
+        if (!VANY(mask & VMASK(z >= nearest))) {
+            composite(pixel, seen, opacity, mask, constants);
+            return;
+        }
+        waiting->some = 1;
     }
     Entry own = {VSELECT((vfloat)NONE, z, mask), opacity, here};
     own.shown.seen = *seen;
@@ -189,6 +209,12 @@ static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opa
         if (VANY(leaves)) waiting_queue(waiting, &own);
         waiting_leave(pixel, nearest, constants);
     }
+    const vint held = VMASK(waiting->held.z > NONE);
+    if (queue->count == 0 && !VANY(held & VMASK(waiting->held.z >= nearest))) {
+        composite(pixel, &waiting->held.shown.seen, waiting->held.opacity, held, constants);
+        waiting->held.z = NONE;
+        waiting->some = 0;
+    }
 }
 
 //@@ plane_functions
@@ -199,6 +225,7 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
     Entry *held = &pixel->waiting.held;
     composite(pixel, &held->shown.seen, held->opacity, VMASK(held->z > NONE), constants);
     held->z = NONE;
+    pixel->waiting.some = 0;
     Queue *queue = pixel->waiting.queue;
     queue->from = queue->until;
     queue->from_place = queue->until_place;
@@ -208,7 +235,7 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
 //@ drawn
             if (!VANY(mask)) continue;      // nor is a layer closed for what is not drawn
 //@ blend_arguments
-                        , splats, lists[k], k, following
+                        , splats, lists[k], k, coming, following
 //@ pass
     do {
 //@ pass_end

@@ -25,7 +25,7 @@
 //@ start
     waiting_start(&pixel->waiting);
 //@ blend_parameters
-                               , global const Splat *splats, uint splat, uint place, wide following
+                               , global const Splat *splats, uint splat, uint place, vfloat coming, vfloat following
 //@ compose
 //@@ compose_plane
     waiting_take(pixel, following, seen.z, opacity, &seen, splat, place, mask, splats, constants);

@@ -17,7 +17,11 @@
         depth_reach = reach * (BOX_HERE ? PLANE_RADIUS : PLANE_RADIUS / radius);
     }
 //@ plane_blocks_nearest
-        least = s->nearest;         // in no other order: a plane's stand together
+        if (s->plane >= 0) {
+            least = s->nearest;         // in no other order: a plane's stand together
+            const Ahead same = {0, 0, 0, 0, 0, 0, s->nearest, s->nearest, s->nearest};
+            *ahead = same;
+        }
 //@ see_depth
     seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types
@@ -88,7 +92,7 @@ static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, 
 //@ plane_functions
 // Nothing more comes of the open layer's plane: it waits, nearer by a little more than depths are rounded, so that it lies
 // before splats of no plane that lie in it.
-static inline void layer_close(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
+static inline void layer_close(Pixel *pixel, vfloat nearest, global const Splat *splats, const BlendConstants *constants) {
     const Layer *open = &pixel->open;
     if (open->plane < 0) return;
     vfloat z = fmax(FMA(fabs(open->mean.z), (vfloat)-0x1p-16f, open->mean.z), (vfloat)open->nearest);
@@ -100,7 +104,7 @@ static inline void layer_close(Pixel *pixel, wide nearest, global const Splat *s
     layer_close(pixel, INFINITY, splats, constants);
 //@ compose_plane
     if (s->plane != pixel->open.plane) {
-        layer_close(pixel, s->nearest, splats, constants);
+        layer_close(pixel, coming, splats, constants);
         pixel->open.plane = s->plane;
         pixel->open.nearest = s->nearest;
         pixel->open.place = place;
