@@ -6,6 +6,8 @@
 // A tile's list is walked through in chunks, and of a chunk block after block: so what waits at a block stays in the cache, and
 // each block has the chunk's splats in the order of their least depth there, which is mostly that of their fragments.
 //@ compose_types
+#define LOOK_FURTHER 4
+#define CROWD 4
 #define CHUNK 128                   // splats, a multiple of 64 and a power of two
 #define NOTHING INFINITY            // the depth where nothing waits in the queue
 #define NONE (-INFINITY)            // and where nothing is held
@@ -28,17 +30,12 @@ typedef struct {                    // apart from what is to stay in registers
 } Queue;
 typedef struct {
     Entry held;
-    int some;                       // whether anything waits
     Queue *queue;
 } Waiting;
-typedef struct {                    // depths of a splat's plane over the tile, as blending has them
-    wide ax, ay, d0, dx, dy, z_numerator, z_center, low, high;
-} Ahead;
 
 static inline void waiting_start(Waiting *waiting) {
     const Entry none = {(vfloat)NONE};      // and the rest 0, which shows nothing
     waiting->held = none;
-    waiting->some = 0;
 }
 
 static inline void queue_start(Queue *queue) {
@@ -58,7 +55,7 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
         pixels[block].waiting.queue = &queues[block];
     }
 //@ blocks_parameters
-                                   , int which, int *keys, Ahead *ahead
+                                   , int which, int *keys
 //@ blocks_nearest
         vfloat least = s->nearest;
 //@@ camera_blocks_nearest
@@ -69,7 +66,6 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
         const uint length = min(end - chunk, (uint)CHUNK);
         // of each splat its blocks, and its least depth in each of them, rounded down to have its place in the chunk as last bits
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
-        Ahead ahead[CHUNK];
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
             FETCH_AHEAD(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]);
@@ -77,9 +73,7 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
             const Splat s = splats[lists[chunk + which]];
             const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
-            const Ahead same = {0, 0, 0, 0, 0, 0, s.nearest, s.nearest, s.nearest};
-            ahead[which] = same;
-            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which], ahead + which);
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which]);
         }
         const wide after = chunk + length < end ? splats[lists[chunk + length]].nearest : INFINITY;
         for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
@@ -99,19 +93,44 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
                 for (int other = 0; other < count; other++) places -= VMASK(some > unsorted[other]);
                 for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&places)[lane]] = unsorted[first + lane];
             }
-            vfloat nearest[CHUNK + 1];          // at each pixel: from there on nothing comes nearer
-            nearest[count] = after;
-            const vfloat block_x = (float)(x0 + LEFT(block)) + BLOCK_X, block_y = (float)(y0 + TOP(block)) + BLOCK_Y;
-            for (int next = count; next-- > 0;) {
-                const Ahead a = ahead[sorted[next] & (CHUNK - 1)];
-                vfloat d = FMA((vfloat)a.dy, block_y - a.ay, FMA((vfloat)a.dx, block_x - a.ax, (vfloat)a.d0));
-                vfloat z = VMIN(VMAX(a.z_numerator * (1.0f / d), (vfloat)a.low), (vfloat)a.high);
-                nearest[next] = VMIN(VSELECT((vfloat)a.z_center, z, VMASK(d > 0.0f)), nearest[next + 1]);
-            }
+            sorted[count] = 0x7F800000;         // infinity
+            wide nearest[CHUNK + LANES];        // what follows comes no nearer
+            for (int first = 0; first < count; first += LANES)
+                VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)after), nearest + first);
+            vfloat depths[CHUNK + 1];           // the same at each pixel, where it is asked for: before `known`
+            int known = 0, crowded = 0;
             Pixel pixel = pixels[block];
             for (int next = 0; next < count; next++) {
+                vfloat following = nearest[next];
+                if (next < known) following = depths[next];
+                const vfloat held = pixel.waiting.held.z;
+                crowded |= pixel.waiting.queue->count >= CROWD;
+                if (RARELY(crowded) && VANY(VMASK(held >= following))) {
+                    int end = max(known, next + 1), first = end;
+                    while (end < count && VANY(VMASK(held >= nearest[end - 1]))) end++;
+                    if (end > first) {
+                        known = end = min(count, next + 1 + LOOK_FURTHER * (end - next - 1));
+                        depths[end - 1] = nearest[end - 1];
+                        while (--end > next) {
+                            const Splat s = splats[lists[chunk + (uint)(sorted[end] & (CHUNK - 1))]];
+                            wide half_r2 = s.log_opacity - constants.log_cut;
+            vfloat x = (float)(x0 + LEFT(block)) + BLOCK_X - (vfloat)s.ax, y = (float)(y0 + TOP(block)) + BLOCK_Y - (vfloat)s.ay;
+            vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
+            vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
+            vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
+            Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
+//@@ cross
+            vfloat screen;
+            vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+//@@ mask
+                            vfloat z = see(&s, c, 1.0f / c.d).z;
+//@@ plane_ahead
+                            depths[end - 1] = VSELECT(depths[end], VMIN(z, depths[end]), mask);
+                        }
+                        following = depths[next];
+                    }
+                }
                 const uint k = chunk + (uint)(sorted[next] & (CHUNK - 1));
-                const vfloat coming = nearest[next], following = nearest[next + 1];
                 const Splat s = splats[lists[k]];
                 wide half_r2 = s.log_opacity - constants.log_cut;
 //@ walk_end
@@ -192,13 +211,6 @@ static inline void waiting_take(Pixel *pixel, vfloat nearest, vfloat z, vfloat o
         mask &= VMASK(z > queue->from) | (VMASK(z == queue->from) & VMASK(here >= queue->from_place));
         if (!VANY(mask)) return;
     }
-    if (!waiting->some) {
-        if (!VANY(mask & VMASK(z >= nearest))) {
-            composite(pixel, seen, opacity, mask, constants);
-            return;
-        }
-        waiting->some = 1;
-    }
     Entry own = {VSELECT((vfloat)NONE, z, mask), opacity, here};
     own.shown.seen = *seen;
     entry_exchange(&own, &waiting->held, mask & ~entry_before(&own, &waiting->held));
@@ -208,12 +220,6 @@ static inline void waiting_take(Pixel *pixel, vfloat nearest, vfloat z, vfloat o
     else {
         if (VANY(leaves)) waiting_queue(waiting, &own);
         waiting_leave(pixel, nearest, constants);
-    }
-    const vint held = VMASK(waiting->held.z > NONE);
-    if (queue->count == 0 && !VANY(held & VMASK(waiting->held.z >= nearest))) {
-        composite(pixel, &waiting->held.shown.seen, waiting->held.opacity, held, constants);
-        waiting->held.z = NONE;
-        waiting->some = 0;
     }
 }
 
@@ -225,7 +231,6 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
     Entry *held = &pixel->waiting.held;
     composite(pixel, &held->shown.seen, held->opacity, VMASK(held->z > NONE), constants);
     held->z = NONE;
-    pixel->waiting.some = 0;
     Queue *queue = pixel->waiting.queue;
     queue->from = queue->until;
     queue->from_place = queue->until_place;
@@ -235,7 +240,7 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
 //@ drawn
             if (!VANY(mask)) continue;      // nor is a layer closed for what is not drawn
 //@ blend_arguments
-                        , splats, lists[k], k, coming, following
+                        , splats, lists[k], k, (vfloat)VAS_FLOAT(in_order((vint)sorted[next] & -CHUNK)), following
 //@ pass
     do {
 //@ pass_end

@@ -5,13 +5,10 @@
     real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
     real determinant = view->focal_x * view->focal_y * su * sv * offset;   // of M: exact where tw . k0 cancels
 //@ camera_blocks_nearest
-        // not of what is no disk, whose depths are others
-        if (conic_h == (float)half_r2) {
-            vfloat middle = d - around_d;
-            least = VSELECT(least, VMIN(VMAX(s->z_numerator / middle, (vfloat)(s->z_center - s->z_reach)), (vfloat)(s->z_center + s->z_reach)), VMASK(middle > 0.0f));
-            const Ahead plane = {s->ax, s->ay, s->d0, s->dx, s->dy, s->z_numerator, s->z_center, s->z_center - s->z_reach, s->z_center + s->z_reach};
-            *ahead = plane;
-        }
+        // depth is z_numerator / D, within the splat's range, and D at most `d` here; not where D may be 0, nor of what is no disk
+        vint met = VMASK(d > 2.0f * around_d) & VMASK((vfloat)s->z_numerator > 0.0f) & VMASK((vfloat)conic_h == (vfloat)(float)half_r2);
+        vfloat depth = fmin((1.0f - BLOCKS_SLACK) * s->z_numerator / d, (vfloat)(s->z_center + s->z_reach));
+        least = VSELECT(least, fmax(depth, least), met);
 //@ camera_dot
         // The dot is never the larger weight of a splat that is wider than it wherever the dot reaches: there D is at least
         // `least`, in front of the near plane, and (n_u^2 + n_v^2) / D^2 at most the squared distance.

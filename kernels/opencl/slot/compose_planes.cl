@@ -17,11 +17,10 @@
         depth_reach = reach * (BOX_HERE ? PLANE_RADIUS : PLANE_RADIUS / radius);
     }
 //@ plane_blocks_nearest
-        if (s->plane >= 0) {
-            least = s->nearest;         // in no other order: a plane's stand together
-            const Ahead same = {0, 0, 0, 0, 0, 0, s->nearest, s->nearest, s->nearest};
-            *ahead = same;
-        }
+        if (s->plane >= 0) least = s->nearest;         // in no other order: a plane's stand together
+//@ plane_ahead
+                            z = s.plane >= 0 ? (vfloat)s.nearest : z;
+                            mask |= s.plane >= 0 ? (vint)-1 : (vint)0;
 //@ see_depth
     seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types
