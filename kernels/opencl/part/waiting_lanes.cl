@@ -8,6 +8,7 @@
 //@ compose_types
 #define LOOK_FURTHER 4
 #define CROWD 4
+#define POOL 2048
 #define CHUNK 128                   // splats, a multiple of 64 and a power of two
 #define NOTHING INFINITY            // the depth where nothing waits in the queue
 #define NONE (-INFINITY)            // and where nothing is held
@@ -48,6 +49,18 @@ static inline void queue_start(Queue *queue) {
 
 // Bits of a depth as a whole number that is sorted as it is, and back.
 static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFFF); }
+
+// Depths as whole numbers, rounded down as keys of a block are.
+static inline uint rounded_key(wide depth) { return sortable((float)depth) & -CHUNK; }
+
+static inline wide depth_of_key(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
+
+// The least of these blocks.
+static inline uint least_key(const int *keys, uint blocks) {
+    int least = 0x7FFFFFFF;
+    for (; blocks != 0; blocks &= blocks - 1) least = min(least, keys[31 - clz(blocks & -blocks)]);
+    return (uint)(least & -CHUNK) ^ 0x80000000u;
+}
 //@ lanes_start
     Queue queues[BLOCKS];
     for (int block = 0; block < (empty ? 1 : BLOCKS); block++) {
@@ -62,20 +75,58 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
 //@@ plane_blocks_nearest
         VSTORE((in_order(VAS_INT(least)) & -CHUNK) | which, keys + first);
 //@ walk
-    for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base; chunk < end && alive; chunk += CHUNK) {
-        const uint length = min(end - chunk, (uint)CHUNK);
+    ulong pool[POOL];           // splats that were read too early: their least depths in the tile and places, the furthest first
+    int pooled = 0;
+    bool by_tile = false;
+    for (uint read = starts[tile] - base, end = starts[tile + 1] - base; (read < end || pooled > 0) && alive;) {
+        uint places[CHUNK], length = 0, next_read = end;
+        wide after = INFINITY;
+        bool reads = read < end && pooled <= POOL - CHUNK
+                     && (pooled < CHUNK || pool[pooled - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
+        if (reads) {
+            for (; length < CHUNK && read < end; length++) places[length] = read++;
+        } else {
+            for (; length < CHUNK && pooled > 0; length++) places[length] = (uint)pool[--pooled];
+            if (pooled > 0) after = depth_of_key((uint)(pool[pooled - 1] >> 32));
+        }
+        if (read < end) after = fmin(after, splats[lists[read]].nearest);
         // of each splat its blocks, and its least depth in each of them, rounded down to have its place in the chunk as last bits
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
+        uint behind = 0;
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
-            FETCH_AHEAD(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]);
-            FETCH_AHEAD((global const char *)(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]) + 64);
-            const Splat s = splats[lists[chunk + which]];
+            global const Splat *ahead = splats + lists[places[min(which + AHEAD_SPLATS, length - 1)]];
+            FETCH_AHEAD(ahead);
+            FETCH_AHEAD((global const char *)ahead + 64);
+            const Splat s = splats[lists[places[which]]];
+            behind += s.z_center >= after;
             const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
             touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which]);
         }
-        const wide after = chunk + length < end ? splats[lists[chunk + length]].nearest : INFINITY;
+        if (reads && (by_tile || behind > CHUNK / 4)) {
+            ulong batch[CHUNK], ordered[CHUNK];
+            int taken = 0, far = 0;
+            for (uint which = 0; which < length; which++)
+                if (touched[which] & alive) {
+                    uint least = least_key(keys[which], touched[which] & alive);
+                    far += least >= rounded_key(after);
+                    batch[taken++] = (ulong)least << 32 | places[which];
+                }
+            if (by_tile || far > CHUNK / 4) {
+                for (int k = 0; k < taken; k++) {
+                    int before = 0;
+                    for (int other = 0; other < taken; other++) before += batch[other] > batch[k];
+                    ordered[before] = batch[k];
+                }
+                int from = pooled - 1;
+                pooled += taken--;
+                for (int to = pooled - 1; taken >= 0; to--)
+                    pool[to] = from >= 0 && pool[from] < ordered[taken] ? pool[from--] : ordered[taken--];
+                by_tile = true;
+                continue;
+            }
+        }
         for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
             const int block = 31 - clz((int)(blocks & -blocks));
             // its splats, sorted by those numbers: the place of each is how many are less
@@ -112,7 +163,7 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
                         known = end = min(count, next + 1 + LOOK_FURTHER * (end - next - 1));
                         depths[end - 1] = nearest[end - 1];
                         while (--end > next) {
-                            const Splat s = splats[lists[chunk + (uint)(sorted[end] & (CHUNK - 1))]];
+                            const Splat s = splats[lists[places[sorted[end] & (CHUNK - 1)]]];
                             wide half_r2 = s.log_opacity - constants.log_cut;
             vfloat x = (float)(x0 + LEFT(block)) + BLOCK_X - (vfloat)s.ax, y = (float)(y0 + TOP(block)) + BLOCK_Y - (vfloat)s.ay;
             vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
@@ -130,7 +181,7 @@ static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFF
                         following = depths[next];
                     }
                 }
-                const uint k = chunk + (uint)(sorted[next] & (CHUNK - 1));
+                const uint k = places[sorted[next] & (CHUNK - 1)];
                 const Splat s = splats[lists[k]];
                 wide half_r2 = s.log_opacity - constants.log_cut;
 //@ walk_end
