@@ -79,6 +79,53 @@ def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):
         assert differing(trace(renderer, picture, shape), wanted, picture.outputs) == 0, name
 
 
+def _faint(count, seed, depth, scale, opacity=0.3, across=2.0):
+    """Splats at random that let light through, so that all of a list is drawn."""
+    generator = np.random.default_rng(seed)
+    means = np.column_stack(
+        [generator.uniform(-across, across, (count, 2)), generator.uniform(*depth, count)]
+    )
+    scales = np.exp(generator.uniform(*np.log(scale), (count, 2)))
+    return splats(means, generator.normal(size=(count, 4)), scales, opacity, generator.random((count, 3)))
+
+
+def _near_elsewhere() -> dict[str, fs.SplatCloud]:
+    """Large splats, whose nearest points lie in other tiles than most of their fragments."""
+    generator = np.random.default_rng(4)
+    nearly_edge_on = [
+        clouds.turned((1, 0, 0) if flat else (0, 1, 0), angle)
+        for flat, angle in zip(generator.random(300) < 0.5, 90 + generator.uniform(-12, 12, 300), strict=True)
+    ]
+    edge_on = _faint(300, 5, (2, 3), (2.0, 3.0), across=0.3)
+    edge_on = splats(edge_on.means, nearly_edge_on, edge_on.scales, 0.3, edge_on.colors)
+    printed = _faint(160, 6, (2.2, 2.2001), (0.02, 0.1), across=0.1).with_planes(0)
+    return {
+        "crossing": _faint(400, 3, (0.5, 4.0), (0.2, 0.8)),
+        # more than are kept together
+        "thousands": _faint(2600, 8, (1.0, 4.0), (1.0, 3.0), 0.01),
+        "edge-on": edge_on,
+        "through the camera": _faint(300, 9, (-0.5, 1.5), (0.5, 4.0), 0.05),
+        "huge": _faint(300, 10, (1.0, 30.0), (50.0, 1000.0), 0.05),
+        "through a sheet": fs.SplatCloud.concatenate(
+            [_faint(100, 7, (1.5, 4.0), (0.3, 1.5), 0.1), printed, _faint(200, 11, (2.5, 4.0), (0.3, 1.5))]
+        ),
+    }
+
+
+NEAR_ELSEWHERE = _near_elsewhere()
+
+
+@pytest.mark.parametrize("name", NEAR_ELSEWHERE)
+def test_bounds_of_what_follows_hide_nothing(renderer, name):
+    """Splats that are put in order for a tile, or looked at before they are drawn, are composited as where what
+    waits is bounded by the whole splats' nearest depths: bit for bit."""
+    # all of the thousands are drawn, of which groups hold eight
+    view = clouds.camera(5, 4, 4.0) if name == "thousands" else clouds.camera(34, 20, 30.0)
+    picture = Picture(NEAR_ELSEWHERE[name], view, fs.Quality(order="pixel"), ("rgb", "depth", "normal"))
+    groups = renderer.backend.shapes("schedule")["groups"]
+    assert differing(trace(renderer, picture, groups), trace(renderer, picture), picture.outputs) == 0
+
+
 def test_of_equal_depths_that_wait_the_first_is_in_front(renderer):
     """A column of pixels shows two splats of one depth before a wall; the next shows the second alone, before
     what waited first: there it is put further in front, here it is not."""

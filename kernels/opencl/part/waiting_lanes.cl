@@ -4,12 +4,19 @@
 // kept by value.
 //
 // A tile's list is walked through in chunks, and of a chunk block after block: so what waits at a block stays in the cache, and
-// each block has the chunk's splats in the order of their least depth there, which is mostly that of their fragments.
+// each block has the chunk's splats in the order of their least depth there, which is mostly that of their fragments. Two things keep
+// fragments from waiting for splats that come near elsewhere only, and cost nothing where splats are small:
+// - Where many of a chunk lie behind what the list has next (large splats, whose nearest points are in other tiles), splats go on to
+//   chunks in the order of their least depths in the tile, as soon as nothing that is still to be read comes nearer.
+// - Where much waits at a block, the splats that follow are looked at before they are drawn: at each pixel the bound is then the very
+//   depth that blending will give them, where they have a fragment.
+// Neither changes the order of fragments, which is by depth and place in the list.
 //@ compose_types
-#define LOOK_FURTHER 4
-#define CROWD 4
-#define POOL 2048
 #define CHUNK 128                   // splats, a multiple of 64 and a power of two
+#define EARLY 2048                  // splats that are read and not yet drawn: of more the nearest are drawn sooner, and wait
+#define MANY (CHUNK / 4)            // splats of a chunk behind what follows, for which the rest of the list is put in order
+#define CROWD 4                     // fragments in a queue, from which on what follows is looked at
+#define FURTHER 4                   // times as many splats as must be, so that it is done once for several that leave
 #define NOTHING INFINITY            // the depth where nothing waits in the queue
 #define NONE (-INFINITY)            // and where nothing is held
 typedef union {
@@ -50,16 +57,28 @@ static inline void queue_start(Queue *queue) {
 // Bits of a depth as a whole number that is sorted as it is, and back.
 static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFFF); }
 
-// Depths as whole numbers, rounded down as keys of a block are.
+// A depth's sort key, rounded down as depths in blocks are, and back.
 static inline uint rounded_key(wide depth) { return sortable((float)depth) & -CHUNK; }
-
 static inline wide depth_of_key(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
 
-// The least of these blocks.
+// The same of a splat whose depths in blocks are `keys`: the least in `blocks`.
 static inline uint least_key(const int *keys, uint blocks) {
     int least = 0x7FFFFFFF;
-    for (; blocks != 0; blocks &= blocks - 1) least = min(least, keys[31 - clz(blocks & -blocks)]);
-    return (uint)(least & -CHUNK) ^ 0x80000000u;
+    for (; blocks != 0; blocks &= blocks - 1) least = min(least, keys[31 - clz((int)(blocks & -blocks))]);
+    return ((uint)least & -CHUNK) ^ 0x80000000u;
+}
+
+// Puts `taken` numbers, at most CHUNK and all different, among the `count` of `early`, the greatest first. Returns how many they are then.
+static inline int early_take(ulong *early, int count, const ulong *batch, int taken) {
+    ulong sorted[CHUNK];
+    for (int k = 0; k < taken; k++) {
+        int before = 0;
+        for (int other = 0; other < taken; other++) before += batch[other] > batch[k];
+        sorted[before] = batch[k];
+    }
+    int old = count - 1, own = taken - 1;
+    for (int to = count + taken - 1; own >= 0; to--) early[to] = old >= 0 && early[old] < sorted[own] ? early[old--] : sorted[own--];
+    return count + taken;
 }
 //@ lanes_start
     Queue queues[BLOCKS];
@@ -75,55 +94,50 @@ static inline uint least_key(const int *keys, uint blocks) {
 //@@ plane_blocks_nearest
         VSTORE((in_order(VAS_INT(least)) & -CHUNK) | which, keys + first);
 //@ walk
-    ulong pool[POOL];           // splats that were read too early: their least depths in the tile and places, the furthest first
-    int pooled = 0;
-    bool by_tile = false;
-    for (uint read = starts[tile] - base, end = starts[tile + 1] - base; (read < end || pooled > 0) && alive;) {
-        uint places[CHUNK], length = 0, next_read = end;
-        wide after = INFINITY;
-        bool reads = read < end && pooled <= POOL - CHUNK
-                     && (pooled < CHUNK || pool[pooled - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
-        if (reads) {
+    ulong early[EARLY];         // splats that are read and not drawn: their least depths in the tile and their places, the furthest first
+    int count_early = 0;
+    bool ordered = false;       // whether all go there first
+    for (uint read = starts[tile] - base, end = starts[tile + 1] - base; (read < end || count_early > 0) && alive;) {
+        uint places[CHUNK], listed[CHUNK], length = 0;      // in the list, and which splats
+        // until what is to come next is known: a chunk of splats before all that is not read
+        const bool reads = read < end && count_early <= EARLY - CHUNK
+                           && (count_early < CHUNK || early[count_early - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
+        if (reads)
             for (; length < CHUNK && read < end; length++) places[length] = read++;
-        } else {
-            for (; length < CHUNK && pooled > 0; length++) places[length] = (uint)pool[--pooled];
-            if (pooled > 0) after = depth_of_key((uint)(pool[pooled - 1] >> 32));
-        }
-        if (read < end) after = fmin(after, splats[lists[read]].nearest);
+        else
+            for (; length < CHUNK && count_early > 0; length++) places[length] = (uint)early[--count_early];
+//@@ chunk_end
+        wide after = read < end ? splats[lists[read]].nearest : INFINITY;
+        if (!reads && count_early > 0) after = fmin(after, depth_of_key((uint)(early[count_early - 1] >> 32)));
+        for (uint which = 0; which < length; which++) listed[which] = lists[places[which]];
         // of each splat its blocks, and its least depth in each of them, rounded down to have its place in the chunk as last bits
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
         uint behind = 0;
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
-            global const Splat *ahead = splats + lists[places[min(which + AHEAD_SPLATS, length - 1)]];
+            global const Splat *ahead = splats + listed[min(which + AHEAD_SPLATS, length - 1)];
             FETCH_AHEAD(ahead);
             FETCH_AHEAD((global const char *)ahead + 64);
-            const Splat s = splats[lists[places[which]]];
+            const Splat s = splats[listed[which]];
             behind += s.z_center >= after;
             const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
             touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which]);
         }
-        if (reads && (by_tile || behind > CHUNK / 4)) {
-            ulong batch[CHUNK], ordered[CHUNK];
+        // what lies behind by its centre is asked where it lies here
+        if (reads && (ordered || behind > MANY)) {
+            ulong batch[CHUNK];
             int taken = 0, far = 0;
-            for (uint which = 0; which < length; which++)
-                if (touched[which] & alive) {
-                    uint least = least_key(keys[which], touched[which] & alive);
-                    far += least >= rounded_key(after);
-                    batch[taken++] = (ulong)least << 32 | places[which];
-                }
-            if (by_tile || far > CHUNK / 4) {
-                for (int k = 0; k < taken; k++) {
-                    int before = 0;
-                    for (int other = 0; other < taken; other++) before += batch[other] > batch[k];
-                    ordered[before] = batch[k];
-                }
-                int from = pooled - 1;
-                pooled += taken--;
-                for (int to = pooled - 1; taken >= 0; to--)
-                    pool[to] = from >= 0 && pool[from] < ordered[taken] ? pool[from--] : ordered[taken--];
-                by_tile = true;
+            for (uint which = 0; which < length; which++) {
+                const uint blocks = (uint)touched[which] & alive;
+                if (blocks == 0) continue;
+                const uint least = least_key(keys[which], blocks);
+                far += least >= rounded_key(after);
+                batch[taken++] = (ulong)least << 32 | places[which];
+            }
+            if (ordered || far > MANY) {
+                ordered = true;
+                count_early = early_take(early, count_early, batch, taken);
                 continue;
             }
         }
@@ -148,43 +162,29 @@ static inline uint least_key(const int *keys, uint blocks) {
             wide nearest[CHUNK + LANES];        // what follows comes no nearer
             for (int first = 0; first < count; first += LANES)
                 VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)after), nearest + first);
-            vfloat depths[CHUNK + 1];           // the same at each pixel, where it is asked for: before `known`
-            int known = 0, crowded = 0;
+            vfloat depths[CHUNK];               // the same at each pixel, of those before `known`
             Pixel pixel = pixels[block];
-            for (int next = 0; next < count; next++) {
-                vfloat following = nearest[next];
-                if (next < known) following = depths[next];
-                const vfloat held = pixel.waiting.held.z;
+            // Where much waits, what follows is looked at first: from `ahead` back to the splat after `next`, until no splat beyond
+            // comes before what may leave, which is no further than what is held.
+            int known = 0, crowded = 0;
+            for (int next = 0, ahead = 0; next < count;) {
+                const vfloat following = next < known ? depths[next] : (vfloat)nearest[next], held = pixel.waiting.held.z;
                 crowded |= pixel.waiting.queue->count >= CROWD;
-                if (RARELY(crowded) && VANY(VMASK(held >= following))) {
-                    int end = max(known, next + 1), first = end;
-                    while (end < count && VANY(VMASK(held >= nearest[end - 1]))) end++;
-                    if (end > first) {
-                        known = end = min(count, next + 1 + LOOK_FURTHER * (end - next - 1));
-                        depths[end - 1] = nearest[end - 1];
-                        while (--end > next) {
-                            const Splat s = splats[lists[places[sorted[end] & (CHUNK - 1)]]];
-                            wide half_r2 = s.log_opacity - constants.log_cut;
-            vfloat x = (float)(x0 + LEFT(block)) + BLOCK_X - (vfloat)s.ax, y = (float)(y0 + TOP(block)) + BLOCK_Y - (vfloat)s.ay;
-            vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
-            vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
-            vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
-            Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
-//@@ cross
-            vfloat screen;
-            vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
-//@@ mask
-                            vfloat z = see(&s, c, 1.0f / c.d).z;
-//@@ plane_ahead
-                            depths[end - 1] = VSELECT(depths[end], VMIN(z, depths[end]), mask);
-                        }
-                        following = depths[next];
+                if (RARELY(crowded) && ahead == next && VANY(VMASK(held >= following))) {
+                    const int first = max(known, next + 1);
+                    int last = first;
+                    while (last < count && VANY(VMASK(held >= nearest[last - 1]))) last++;
+                    if (last > first) {
+                        known = min(next + 1 + FURTHER * (last - next - 1), count);
+                        ahead = known - 1;
+                        depths[ahead] = nearest[ahead];
                     }
                 }
-                const uint k = places[sorted[next] & (CHUNK - 1)];
-                const Splat s = splats[lists[k]];
+                const int which = sorted[ahead] & (CHUNK - 1);
+                const Splat s = splats[listed[which]];
                 wide half_r2 = s.log_opacity - constants.log_cut;
 //@ walk_end
+                ahead = ++next;
             }
             pixels[block] = pixel;
         }
@@ -289,9 +289,19 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
     return VMASK(queue->from < INFINITY) & pixel_unfinished(pixel, constants);
 }
 //@ drawn
-            if (!VANY(mask)) continue;      // nor is a layer closed for what is not drawn
+            if (ahead > next) {
+                vfloat z = see(&s, c, 1.0f / c.d).z;
+//@@ plane_ahead
+                depths[ahead - 1] = VSELECT(depths[ahead], VMIN(z, depths[ahead]), mask);
+                ahead--;
+                continue;
+            }
+            if (!VANY(mask)) {              // nor is a layer closed for what is not drawn
+                ahead = ++next;
+                continue;
+            }
 //@ blend_arguments
-                        , splats, lists[k], k, (vfloat)VAS_FLOAT(in_order((vint)sorted[next] & -CHUNK)), following
+                        , splats, listed[which], places[which], VMIN(VAS_FLOAT(in_order((vint)sorted[next] & -CHUNK)), (vfloat)after), following
 //@ pass
     do {
 //@ pass_end

@@ -17,10 +17,23 @@
         depth_reach = reach * (BOX_HERE ? PLANE_RADIUS : PLANE_RADIUS / radius);
     }
 //@ plane_blocks_nearest
-        if (s->plane >= 0) least = s->nearest;         // in no other order: a plane's stand together
+        if (s->plane >= 0) least = s->nearest;      // a plane's stand together, in each block
 //@ plane_ahead
-                            z = s.plane >= 0 ? (vfloat)s.nearest : z;
-                            mask |= s.plane >= 0 ? (vint)-1 : (vint)0;
+                if (s.plane >= 0) {                 // its layer may be nearer than its fragment, and be where that is not
+                    z = s.nearest;
+                    mask = -1;
+                }
+//@ chunk_end
+        // and in one chunk, unless they fill several: the next begins with the first of them
+        const int plane = splats[lists[places[length - 1]]].plane;
+        if (plane >= 0 && ((read < end && splats[lists[read]].plane == plane)
+                           || (count_early > 0 && splats[lists[(uint)early[count_early - 1]]].plane == plane))) {
+            uint before = length;
+            while (before > 0 && splats[lists[places[before - 1]]].plane == plane) before--;
+            if (before > 0 && reads) read -= length - before;
+            if (before > 0 && !reads) count_early += length - before;
+            if (before > 0) length = before;
+        }
 //@ see_depth
     seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types
