@@ -98,6 +98,7 @@ def _near_elsewhere() -> dict[str, fs.SplatCloud]:
     ]
     edge_on = _faint(300, 5, (2, 3), (2.0, 3.0), across=0.3)
     edge_on = splats(edge_on.means, nearly_edge_on, edge_on.scales, 0.3, edge_on.colors)
+    planes = np.where(generator.random(400) < 0.5, generator.integers(0, 40, 400), -1)
     printed = _faint(160, 6, (2.2, 2.2001), (0.02, 0.1), across=0.1).with_planes(0)
     return {
         "crossing": _faint(400, 3, (0.5, 4.0), (0.2, 0.8)),
@@ -108,6 +109,8 @@ def _near_elsewhere() -> dict[str, fs.SplatCloud]:
         "edge-on": edge_on,
         "through the camera": _faint(300, 9, (-0.5, 1.5), (0.5, 4.0), 0.05),
         "huge": _faint(300, 10, (1.0, 30.0), (50.0, 1000.0), 0.05),
+        # as layers lie nearer than what of them is looked at
+        "bent sheets": _faint(400, 13, (1.0, 3.0), (0.2, 0.8)).with_planes(planes),
         "through a sheet": fs.SplatCloud.concatenate(
             [_faint(100, 7, (1.5, 4.0), (0.3, 1.5), 0.1), printed, _faint(200, 11, (2.5, 4.0), (0.3, 1.5))]
         ),
