@@ -56,9 +56,9 @@ def asked(monkeypatch):
     monkeypatch.setattr(hidden, "_RESTS", 0)
     monkeypatch.setattr(pieces, "ROWS", 24)
 
-    def noted(self, whole, fits, draw):
-        made = drawn(self, whole, fits, draw)
-        counts.append((whole.count if made is None else made[0].count, whole.count))
+    def noted(self, whole, *given):
+        made = drawn(self, whole, *given)
+        counts.append((whole.count if made is None else made[0][0].count, whole.count))
         return made
 
     monkeypatch.setattr(hidden.Hidden, "drawn", noted)

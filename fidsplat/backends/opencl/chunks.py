@@ -74,13 +74,13 @@ class OpenCLChunks:
         """Bytes of all slots."""
         return self._size * self._rows * sum(self.widths.values())
 
-    def gather(self, chunks: Sequence[Chunk]) -> GatheredChunks:
+    def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> GatheredChunks:
         """As `ChunkCache.gather`."""
         with self._lock:
             self._drawn = {chunk.key for chunk in chunks}
             if not self.widths:
                 self._learn(chunks[0].load())
-        return GatheredChunks(self, chunks)
+        return GatheredChunks(self, chunks, first_id)
 
     def bring(self, chunks: Sequence[Chunk]) -> None:
         """As `ChunkCache.bring`."""
@@ -241,9 +241,10 @@ class GatheredChunks:
     or, where that would take more than its part of the memory budget, some splats at a time for every
     picture (`streamed`)."""
 
-    def __init__(self, cache: OpenCLChunks, chunks: Sequence[Chunk]) -> None:
+    def __init__(self, cache: OpenCLChunks, chunks: Sequence[Chunk], first_id: int) -> None:
         whole, workspace = cache.whole, cache.workspace
         self._cache, self._chunks, self._workspace = cache, chunks, workspace
+        self._first_id = first_id
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
         self.count = int(self._ends[-1])
         self.origin, self.sh_degree, self.has_planes = whole.origin, whole.sh_degree, whole.has_planes
@@ -295,7 +296,8 @@ class GatheredChunks:
         if first == end:
             return
         if name == "splat_ids":
-            cl.enqueue_copy(self._workspace.queue, target, np.arange(first, end, dtype=np.int32))
+            ids = self._first_id + np.arange(first, end, dtype=np.int32)
+            cl.enqueue_copy(self._workspace.queue, target, ids)
             return
         lowest = int(np.searchsorted(self._ends, first, side="right"))
         highest = int(np.searchsorted(self._ends, end, side="left")) + 1

@@ -239,8 +239,9 @@ class OpenCLPipeline:
     def _images(self, view: View, drawn: Drawn, repeat: Repeat | None = None) -> OpenCLImages:
         size = view.height // view.samples, view.width // view.samples
         tile = self.shape.tile_height, self.shape.tile_width
-        grid = -(-view.height // tile[0]), -(-view.width // tile[1])
-        return OpenCLImages(self.workspace, self.features.images, size, drawn, repeat, (grid, tile))
+        tiles = (-(-view.height // tile[0]), -(-view.width // tile[1])), tile
+        outputs = self.features.images
+        return OpenCLImages(self.workspace, outputs, size, drawn, repeat, tiles, view.samples)
 
     def _first(
         self,
