@@ -90,7 +90,7 @@ class Hidden:
                 images, ends = kept[0], kept[1].replaced(tiles, ends)
             self._last = whole.view, ends
             here = ends.within(tiles)
-            missing = _without(band.missing, whole.hidden(here))
+            missing = _without(band.missing, band.hidden(here))
             few = whole.count_of(missing) <= bands[0].count // _SOME
             lacking = band.lacking(here, missing) if few else []
             if few and not lacking:
@@ -98,7 +98,7 @@ class Hidden:
                 return bands, images
             if few and _whole_pixels(whole.view, ends):
                 tiles = band.shown(lacking, here)
-                again = whole.ended(ends.within(tiles))
+                again = whole.within(*_rows(tiles, whole, ends)).ended(ends.within(tiles))
                 if again.count <= bands[0].count // _SOME:
                     bands, kept = [*bands, again], (images, ends)
                     continue
@@ -113,6 +113,12 @@ class Hidden:
                 break
         self._rest = _RESTS
         return None
+
+
+def _rows(tiles: np.ndarray, whole: Band, ends: TileEnds) -> tuple[int, int]:
+    """The rows of pixels [first, end) of a view in which some tiles lie."""
+    rows, height = np.flatnonzero(tiles.any(axis=1)), ends.tile[0] // whole.view.samples
+    return max(int(rows[0]) * height, whole.rows[0]), min((int(rows[-1]) + 1) * height, whole.rows[1])
 
 
 def _whole_pixels(view: View, ends: TileEnds) -> bool:

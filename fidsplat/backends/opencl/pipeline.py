@@ -155,7 +155,7 @@ class OpenCLPipeline:
             stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
             shape = self._listing(resident, plan, stack)
             pipeline = self if shape is self.shape else self._other(self.features, shape)
-            pool.make_way((pipeline, "views", resident.count, plan), workspace.memory_budget - plan.held)
+            pool.make_way((pipeline, "views", resident.room, plan), workspace.memory_budget - plan.held)
 
             def start(view: View, pipeline=pipeline, stack=stack, plan=plan) -> Picture:
                 return Picture(workspace, pipeline.program, pipeline.shape, resident, view, plan, stack=stack)
@@ -214,7 +214,7 @@ class OpenCLPipeline:
         splat += SORTED if shape.lists == "ordered" else 0
         channels = 4 + sum(one.channels for one, _ in source.samples)
         tables = table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
-        return resident.count * splat + tables + 4 * channels * samples, samples
+        return resident.room * splat + tables + 4 * channels * samples, samples
 
     def _kind(self, view: View) -> tuple[Any, ...]:
         """What pictures have in common whose launches differ in numbers alone."""
@@ -253,7 +253,7 @@ class OpenCLPipeline:
     ) -> Picture:
         """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
         pool = self.workspace.pool
-        kind = self, view.width, view.height, resident.count, plan
+        kind = self, view.width, view.height, resident.room, plan
         # what this picture takes besides is planned for; that of its own kind is there already
         pool.make_way(kind, self.workspace.memory_budget - plan.held)
         picture = self._draw(resident, view, plan, trusted)
@@ -343,7 +343,7 @@ class OpenCLPipeline:
             fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._slopes)
         workspace, record = self.workspace, source.records["Splat"].itemsize
         budget, largest = workspace.memory_budget, workspace.device.max_mem_alloc_size
-        return plan_of(resident.count, record, upload, fixed, shape.lists, budget, largest)
+        return plan_of(resident.room, record, upload, fixed, shape.lists, budget, largest)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.

@@ -30,7 +30,8 @@ class Resident:
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         self._workspace = workspace
-        self.count = len(cloud)
+        self.count = self.room = len(cloud)
+        """its splats, and those for which pictures have buffers"""
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None

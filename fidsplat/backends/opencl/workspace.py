@@ -66,13 +66,14 @@ class BufferPool:
         """The scratch buffer of that name, as it is."""
         return self._buffers.get(name)
 
-    def lease(self, name: str, size: int) -> cl.Buffer:
-        """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
+    def lease(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
+        """A buffer for somebody who gives it back (`give_back`) when it is not needed any more. larger:
+        whether it may have more bytes."""
         # taken before it is looked at: images that die meanwhile may give back others
         spare = self._spare.get(name, [])
         while spare:
             buffer = spare.pop()
-            if buffer.size == max(size, _LEAST):
+            if buffer.size == max(size, _LEAST) or (larger and buffer.size > size):
                 return buffer  # else it was of a picture of another size
         return self.fresh(name, size)
 
