@@ -59,6 +59,8 @@ class OpenCLChunks:
         self._free: list[int] = []
         self._slots: OrderedDict[Hashable, int] = OrderedDict()
         """by chunk, least recently used first"""
+        self.token = object()
+        """what tells it from others, which is not to keep it"""
         self._changes = 0
         """how often a chunk has lost its slot"""
         self._drawn: set[Hashable] = set()
@@ -261,6 +263,7 @@ class GatheredChunks:
         self.kept: dict[Hashable, Any] = {}
         """as that of a Resident"""
         self.fixed = True
+        self.alike = cache.token
         self.neighbours = True
         self._buffers: dict[str, cl.Buffer] = {}
         self._leased: list[tuple[str, cl.Buffer]] = []

@@ -253,9 +253,10 @@ class OpenCLPipeline:
     ) -> Picture:
         """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
         pool = self.workspace.pool
-        kind = self, view.width, view.height, resident.room, plan
+        alike = resident.alike if not plan.chunk else None
+        kind = self, view.width, view.height, alike or (resident.room, plan)
         # what this picture takes besides is planned for; that of its own kind is there already
-        pool.make_way(kind, self.workspace.memory_budget - plan.held)
+        pool.make_way(kind, self.workspace.memory_budget - plan.held, resident.room)
         picture = self._draw(resident, view, plan, trusted)
         whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
         if key is not None and whole and self.shape.lists != "ordered" and resident.count:
@@ -268,7 +269,7 @@ class OpenCLPipeline:
     def _repeat(self, resident: Resident, view: View, kept: Kept) -> OpenCLImages | None:
         """The next picture of a kind; None where nothing is left of the last."""
         workspace, plan = self.workspace, kept.plan
-        workspace.pool.make_way(kept.kind, workspace.memory_budget - plan.held)
+        workspace.pool.make_way(kept.kind, workspace.memory_budget - plan.held, resident.room)
         if not TiledLists.capacity(workspace):
             return None
         queue, recording = workspace.turn_to(workspace.repeat_queue), kept.recording

@@ -60,6 +60,8 @@ class Resident:
         """what is kept of pictures that were drawn of it, by their kind"""
         self.fixed = True
         """whether its arrays stay as they are; a picture of others cannot be drawn again later"""
+        self.alike: object = None
+        """the same for all whose pictures take smaller buffers where they are fewer"""
         self.neighbours = False
         """whether splats that follow each other lie near each other, as those of stores do"""
         total = self.count * self._bytes_of(self._arrays)

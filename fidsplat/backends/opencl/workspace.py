@@ -55,6 +55,7 @@ class BufferPool:
         self._spare: dict[str, list[cl.Buffer]] = {}
         self._zeroed: set[str] = set()
         self._kind: Hashable = None
+        self._splats = 0
         self.state = object()
         """another object whenever a scratch buffer is replaced or let go"""
 
@@ -91,12 +92,14 @@ class BufferPool:
         spare = [buffer for buffers in list(self._spare.values()) for buffer in list(buffers)]
         return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
 
-    def make_way(self, kind: Hashable, size: int) -> None:
+    def make_way(self, kind: Hashable, size: int, splats: int = 0) -> None:
         """Before a picture: lets go of what pictures of another kind have left, if that is more than `size`
-        bytes. Pictures of one kind take buffers of the same sizes."""
-        if kind != self._kind and self.memory_bytes > size:
+        bytes. Pictures of one kind take buffers of the same sizes, or smaller ones for fewer splats."""
+        if kind == self._kind and splats <= self._splats:
+            return
+        if self.memory_bytes > size:
             self.clear()
-        self._kind = kind
+        self._kind, self._splats = kind, splats
 
     def forget_zeros(self) -> None:
         """After a failure: nobody knows what is left in buffers of zeros."""
