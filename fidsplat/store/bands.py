@@ -62,13 +62,7 @@ class Band:
         return Band(scene, view, features, pixels, (first // view.samples, end // view.samples))
 
     def within(self, first: int, end: int) -> Band:
-        """Some of its rows, drawn of all that they see; fewer rows of the pieces alone that those see, as
-        chunks are often as high as a band."""
-        made = self.of_rows(first, end)
-        return made if made.rows == self.rows else made.cut_to(None)
-
-    def of_rows(self, first: int, end: int) -> Band:
-        """Some of its rows, drawn of all chunks that they see."""
+        """Fewer of its rows, drawn of all that they see."""
         return replace(self, rows=(first, end), some=None, pieces=None)
 
     def drawn_of(self, some: Nodes) -> Band:
@@ -80,8 +74,8 @@ class Band:
             made.__dict__["seen"] = self.seen  # a cached property
         return made
 
-    def cut_to(self, ends: TileEnds | None) -> Band:
-        """It, drawn of those pieces alone that may show where its tiles end there, or anywhere."""
+    def cut_to(self, ends: TileEnds) -> Band:
+        """It, drawn of those pieces alone that may show where its tiles end there."""
         pieces = self.scene.pieces(self.nodes)
         return self._kept(replace(self, pieces=tuple((each, self._needed(each, ends)) for each in pieces)))
 
@@ -104,13 +98,12 @@ class Band:
         hidden = self.hidden(ends)
         return self.drawn_of(tuple(a & ~b for a, b in zip(self.nodes, hidden, strict=True))).cut_to(ends)
 
-    def _needed(self, pieces: Pieces, ends: TileEnds | None) -> np.ndarray:
-        """(k,) bool: which pieces may show where tiles end there, or anywhere."""
+    def _needed(self, pieces: Pieces, ends: TileEnds) -> np.ndarray:
+        """(k,) bool: which pieces may show where tiles end there."""
         if not len(pieces.nodes):
             return np.zeros(0, bool)
         shows = seen(self.view, self.features, pieces.boxes, pieces.reach)
-        if ends is not None:
-            shows &= ~hidden(self.view, self.features, pieces.boxes, pieces.reach, ends)
+        shows &= ~hidden(self.view, self.features, pieces.boxes, pieces.reach, ends)
         return shows | pieces.always
 
     @cached_property

@@ -98,7 +98,7 @@ class Hidden:
                 return bands, images
             if few and _whole_pixels(whole.view, ends):
                 tiles = band.shown(lacking, here)
-                again = whole.of_rows(*_rows(tiles, whole, ends)).ended(ends.within(tiles))
+                again = whole.within(*_rows(tiles, whole, ends)).ended(ends.within(tiles))
                 if again.count <= bands[0].count // _SOME:
                     bands, kept = [*bands, again], (images, ends)
                     continue
