@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,10 +54,17 @@ class Drawn:
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage."""
         self.queue.finish()
-        timings: dict[str, float] = {}
-        for stage, event in self.events or ():
-            timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
-        return timings
+        return _milliseconds(self.events or ())
+
+
+def _milliseconds(
+    events: Iterable[tuple[str, cl.Event]], of: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """What launches that are done took by stage, and others before them."""
+    timings = dict(of or {})
+    for stage, event in events:
+        timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
+    return timings
 
 
 class Repeat:
@@ -119,8 +126,8 @@ class OpenCLImages:
         self._outputs = {output.name: output for output in outputs}
         self._timings: dict[str, float] = {}
         self._tiles, self._samples = tiles, samples
-        self._added: list[dict[str, int]] = []
-        """counts of the pictures of which tiles were taken"""
+        self._added: list[tuple[dict[str, int], list[tuple[str, cl.Event]]]] = []
+        """counts and launches of the pictures of which tiles were taken"""
         self._leased = drawn.leased
         weakref.finalize(self, workspace.pool.give_back, self._leased)
 
@@ -188,7 +195,7 @@ class OpenCLImages:
                     )
             if copied is not None:
                 copied.wait()  # the other's buffers may be the next picture's
-            self._added.append(dict(others.stats()))
+            self._added.append((dict(others.stats()), others.events or []))
 
     def _pixels_of(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
         """Rectangles [top, bottom) x [left, right) of pixels that together are some tiles, row by row."""
@@ -214,7 +221,7 @@ class OpenCLImages:
         with self._workspace.failing("drawing"):
             drawn = self.settle()
             if drawn.events is not None or self._repeat is None:
-                return drawn.timings()
+                return _milliseconds((one for _, events in self._added for one in events), drawn.timings())
             with self._workspace.lock:
                 self._timings = self._timings or self._repeat.timings()
             return self._timings
@@ -223,7 +230,7 @@ class OpenCLImages:
     def stats(self) -> Mapping[str, int]:
         with self._workspace.failing("drawing"):
             stats = dict(self.settle().stats())
-            for added in self._added:
+            for added, _ in self._added:
                 stats = {name: number + added[name] for name, number in stats.items()}
             return stats
 
