@@ -113,7 +113,7 @@ class Render:
             scene = load_source(self.source, self.quality, progress)
         with _named(self.source, "render.outputs", names is None):
             check_words(scene.outputs, None)
-        of_scene = _named(self.source, "render.device", self.device is None)
+        of_scene = _named(self.source, "render.device", self.device is None and scene.device is not None)
         with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device, memory)
         choice = self._measured(scene, renderer) if budget else None
@@ -182,10 +182,10 @@ def _named(source: str, key: str, of_scene: bool) -> Iterator[None]:
 def _names(out: str | None, source: Path):
     """A function from an output's name and a suffix to the file that it goes to, in a folder known to be
     writable."""
-    if out == "" or not source.name:
-        raise InputError(
-            "an empty name; give a scene (.toml) or splat file (.ply), and a PNG file or a folder"
-        )
+    if not source.name:
+        raise InputError(f"cannot draw {source}, a folder: give a scene file (.toml) or a splat file in it")
+    if out == "":
+        raise InputError("-o is empty; give a PNG file or a folder")
     file = path_of(out) if out is not None else Path(source.name).with_suffix(".png")
     if file.suffix.lower() in _OTHER_PICTURES:
         raise InputError(f"pictures are written as PNG: name {file.with_suffix('.png')}, or a folder")
@@ -224,5 +224,6 @@ def load_source(source: str, quality: str | None, progress: "Progress") -> "Scen
         cloud = fs.load_splats(source, progress)
         return fs.Scene([cloud], camera=framing_camera(cloud))
     raise InputError(
-        f"cannot draw {source}: give a scene file (.toml), a splat file (.ply) or a store (.fss)"
+        f"cannot draw {source}: give a scene file (.toml), a store ({SUFFIX}) or a splat file "
+        f"({', '.join(FORMATS)})"
     )

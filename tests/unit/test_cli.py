@@ -62,7 +62,8 @@ def test_help_loads_nothing_heavy():
     [
         ([], "try `fidsplat demo` first"),
         ([], "demo, devices, info, marker, render, view, fly, detect"),
-        (["mraker"], "Available subcommands: demo, devices"),
+        (["mraker"], "unknown command 'mraker' (did you mean 'marker'?); known: demo, devices"),
+        (["store", "biuld", "a.ply"], "(did you mean 'build'?); known: build, place"),
         (["marker"], "SPEC"),
         (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),
         (["marker", "qr:a", "--size", "big"], "--size is 'big'; give a number; see fidsplat marker"),
@@ -98,6 +99,7 @@ def test_words_that_make_no_command(words, says, capsys):
         (["render", "missing.toml"], "missing.toml"),
         (["render", "missing.ply"], "missing.ply"),
         (["render", "scene.yaml"], "scene.yaml"),
+        (["render", "."], "cannot draw ., a folder: give a scene file"),
         (["render", "missing.ply", "--outputs", "rgb,dpth"], "depth"),
         (["render", "missing.ply", "--quality", "best"], "standard"),
         (["render", "missing.ply", "-o", "picture.jpg"], "picture.png"),
