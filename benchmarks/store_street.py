@@ -41,9 +41,9 @@ def drive(renderer: fs.Renderer, store: fs.Store, quality: str, path: list[fs.Ca
     rows, resident, counts = [], renderer.upload(store), []
     drawn = Hidden.drawn
 
-    def noted(self, whole, fits, draw):
+    def noted(self, whole, *given):
         counts.append(whole.count)
-        return drawn(self, whole, fits, draw)
+        return drawn(self, whole, *given)
 
     Hidden.drawn = noted
     try:

@@ -136,6 +136,11 @@ def _parse(words: list[str]):
         about = inspect.cleandoc(kind.__doc__)
         known, words = getattr(kind, "PARTS", {}), words[1:]
     if known and not hasattr(kind, "run"):  # a group, and no word that leads on
+        if words and not words[0].startswith("-"):
+            from fidsplat.errors import unknown
+
+            _fail(f"{unknown('command', words[0], known)}; see {program} --help", 2)
+            raise SystemExit(2)
         kind = _any_of(known)
     said = io.StringIO()
     try:

@@ -53,7 +53,16 @@ def drop_report(dropped: dict[str, int], n: int, source) -> str:
     """What a warning says about splats that are left out."""
     parts = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
     start = "" if source is None else f"{source}: "
-    return f"{start}{sum(dropped.values())} of {n} splats left out ({parts})"
+    total = sum(dropped.values())
+    hints = [hint for reason, hint in _STORED.items() if 4 * dropped.get(reason, 0) > n]
+    return f"{start}{total} of {n} splats left out ({parts}){''.join(f'; {hint}' for hint in hints)}"
+
+
+_STORED = {
+    "scale not above 0": "scales are standard deviations in metres: take exp() of logarithms",
+    "opacity outside [0, 1]": "opacities are from 0 to 1: take the sigmoid of logits",
+}
+"""what trainers keep instead, as files do: said where more than a quarter of all are left out for it"""
 
 
 def square_of(quats: np.ndarray) -> np.ndarray:
@@ -84,6 +93,13 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     if name == "scales":
         wanted += f" or {(shape[0], 3)}"
     raise InputError(f"{name} must have the shape {wanted}, but its shape is {array.shape}")
+
+
+def check_scale(colors: np.ndarray) -> np.ndarray:
+    """Colours, which are no bytes: white would be 255 times as light as the brightest paper."""
+    if colors.dtype == np.uint8 and colors.size and colors.max() > 1:
+        raise InputError("colors are bytes up to 255, but 1 is white: give colors / 255")
+    return colors
 
 
 def whole_numbers(labels, n: int, name: str = "labels") -> np.ndarray:

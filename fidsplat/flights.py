@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from fidsplat import __version__
-from fidsplat.cameras import Motion, Trajectory
+from fidsplat.cameras import Motion, Shutter, Trajectory
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, from_json, path_of, writable_folder
-from fidsplat.formats import save_trajectory
+from fidsplat.formats import load_trajectory, save_trajectory
 from fidsplat.provenance import digest_of
 from fidsplat.render import Renderer
 from fidsplat.scalars import real_array
@@ -30,6 +30,7 @@ from fidsplat.vision.video import write_video
 
 RECORD = "flight.json"
 SHEET = "contact-sheet.png"
+POSES = "trajectory.tum"
 _COLUMNS, _ROWS = 4, 3
 
 
@@ -208,8 +209,22 @@ class FlightFolder:
             stream.write((json.dumps(facts, indent=2) + "\n").encode())
 
     def _save_poses(self) -> None:
-        save_trajectory(self.flight.path, self.folder / "trajectory.tum")
+        save_trajectory(self.flight.path, self.folder / POSES)
         camera, names = self.flight.capture.camera, self.pictures()
         if camera is not None and camera.lens is None:
             images = [str(file.relative_to(self.folder)) for file in names]
             save_trajectory(self.flight.path, self.folder / "transforms.json", camera, images)
+
+
+def seen_in_flight(scene: Scene, picture: Path) -> Scene:
+    """The scene with its camera and its clock as they were in a picture of a flight's folder; as it is for
+    any other picture."""
+    folder = picture.parent.parent
+    if not picture.stem.isdigit() or not (folder / RECORD).is_file():
+        return scene
+    path, number = load_trajectory(folder / POSES), int(picture.stem)
+    if number >= len(path):
+        return scene
+    shutter = Shutter() if scene.shutter is None else scene.shutter
+    shutter = replace(shutter, time=float(path.times[number]))
+    return replace(scene, camera_motion=path.inverse(), shutter=shutter)

@@ -349,7 +349,7 @@ class Renderer:
                 return Frame(draw(pipeline, data, view), capture.outputs)
 
             def part(one: PartOfView) -> Frame:
-                images = draw(pipeline, one.data, one.view) if one.images is None else one.images
+                images = one.images or draw(pipeline, one.data, one.view)
                 return Frame(images, capture.outputs, one.ids)
 
             return stacked(data.parts(view, features, capture.quality, pipeline), part)

@@ -73,9 +73,12 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     if not scale > 0 or not np.isfinite(scale):
         raise InputError(f"{name} must be a rotation with a positive scale, but its scale is {scale:g}")
     rotation = linear / scale
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-6:
+    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if off > 1e-6:
+        rounded = "; give more digits" if off < 0.01 else ""
         raise InputError(
-            f"{name} must be a rotation with one uniform scale; its columns are skew or of unequal length"
+            f"{name} must be a rotation with one uniform scale; its columns are skew or of unequal length, "
+            f"by {off:.1g} where 1e-06 is allowed{rounded}"
         )
     if np.linalg.det(rotation) < 0:
         raise InputError(

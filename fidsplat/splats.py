@@ -12,6 +12,7 @@ from fidsplat.cloud_arrays import (
     as_single,
     check_one_footprint,
     check_origin,
+    check_scale,
     check_shape,
     choose_origin,
     drop_report,
@@ -101,7 +102,7 @@ class SplatCloud(PickledByFields, Summarised):
         if (colors is None) == (sh is None):
             raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
         if colors is not None:
-            arrays["colors"] = real_numbers("colors", colors)
+            arrays["colors"] = check_scale(real_numbers("colors", colors))
             shapes["colors"] = (n, 3)
         else:
             arrays["sh"] = real_numbers("sh", sh)

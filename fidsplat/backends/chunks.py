@@ -60,8 +60,9 @@ class ChunkCache(Protocol):
         """Device memory that it takes."""
         ...
 
-    def gather(self, chunks: Sequence[Chunk]) -> ResidentData:
-        """These, in this order, to be drawn; what is not on the device is brought there."""
+    def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> ResidentData:
+        """These, in this order, to be drawn; what is not on the device is brought there. first_id: of the
+        first splat, in `splat_id`."""
         ...
 
     def bring(self, chunks: Sequence[Chunk]) -> None:

@@ -11,7 +11,7 @@ of pixels or outputs.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -34,6 +34,14 @@ class TileEnds:
     tile: tuple[int, int]
     """rows and columns of samples in a tile"""
 
+    def within(self, tiles: np.ndarray) -> TileEnds:
+        """Where some tiles (rows, columns) bool were finished: in the others nothing shows."""
+        return replace(self, depths=np.where(tiles, self.depths, np.float32(-np.inf)))
+
+    def replaced(self, tiles: np.ndarray, other: TileEnds) -> TileEnds:
+        """With the ends of some tiles (rows, columns) bool from another picture."""
+        return replace(self, depths=np.where(tiles, other.depths, self.depths))
+
     @staticmethod
     def of_keys(keys: np.ndarray, tile: tuple[int, int]) -> TileEnds:
         """From the kernels' sortable keys (rows, columns) uint32, all bits set: not finished."""
@@ -49,6 +57,11 @@ class GivesTileEnds(Protocol):
 
     def tile_ends_of(self, images: object) -> TileEnds:
         """Where the tiles of a picture were finished; waits until it is drawn."""
+        ...
+
+    def take_tiles(self, images: object, other: object, tiles: np.ndarray) -> None:
+        """Some tiles (rows, columns) bool of another picture of the same view into this one, and its counts.
+        Pixels must not have samples in more than one tile."""
         ...
 
 
@@ -73,25 +86,39 @@ def hidden(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, en
     Args:
         boxes, reach: as `seen` takes them.
     """
-    least = least_keys(view, features, boxes)
-    furthest = _Largest(ends.depths)
+    least, spans = least_keys(view, features, boxes), _spans(view, features, boxes, reach, ends)
+    return least > _Largest(ends.depths).within(*spans)
+
+
+def shown(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TileEnds) -> np.ndarray:
+    """(rows, columns) bool: the tiles of a picture with these ends in which splats of the boxes may show.
+
+    Args:
+        boxes, reach: as `seen` takes them.
+    """
+    made = np.zeros(ends.depths.shape, bool)
+    least, spans = least_keys(view, features, boxes), _spans(view, features, boxes, reach, ends)
+    for depth, top, bottom, left, right in zip(least, *spans, strict=True):
+        made[top:bottom, left:right] |= ends.depths[top:bottom, left:right] >= depth
+    return made
+
+
+def _spans(
+    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TileEnds
+) -> tuple[np.ndarray, ...]:
+    """The rows [top, bottom) and columns [left, right) of tiles that boxes can touch, (n,) int64 each."""
     columns = ends.depths.shape[1]
     first, end = (0, view.height) if view.band is None else view.band
     band = first // ends.tile[0], -(-end // ends.tile[0])
     if view.raster is not None:
-        return least > furthest.within(*_everywhere(len(least), band, columns))
+        return tuple(np.full(len(reach), side, np.int64) for side in (*band, 0, columns))
     low, high = _on_picture(view, features, boxes, reach)
     with np.errstate(invalid="ignore"):
         left = np.clip(np.floor((low[:, 0] - 1) / ends.tile[1]), 0, columns)
         right = np.clip(np.floor(high[:, 0] / ends.tile[1]) + 1, 0, columns)
         top = np.clip(np.floor((low[:, 1] - 1) / ends.tile[0]), *band)
         bottom = np.clip(np.floor(high[:, 1] / ends.tile[0]) + 1, *band)
-    spans = (each.astype(np.int64) for each in (top, bottom, left, right))
-    return least > furthest.within(*spans)
-
-
-def _everywhere(count: int, band: tuple[int, int], columns: int) -> tuple[np.ndarray, ...]:
-    return tuple(np.full(count, side, np.int64) for side in (*band, 0, columns))
+    return tuple(each.astype(np.int64) for each in (top, bottom, left, right))
 
 
 def _extent(view: View, features: FeatureSet) -> Extent | None:

@@ -54,15 +54,23 @@ class BrownConrady:
 
     @classmethod
     def opencv(cls, coefficients) -> BrownConrady:
-        """From OpenCV's distCoeffs: 4, 5, 8 or 12 numbers (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4).
+        """From OpenCV's distCoeffs: 4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty).
 
         Raises:
-            InputError: another count (a tilted sensor's 14 are not offered).
+            InputError: another count, or a sensor that is tilted: tx and ty, which calibrateCamera gives as 0
+                with CALIB_RATIONAL_MODEL, must be 0.
         """
         order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
         values = np.ravel(coefficients).tolist()
-        if len(values) not in (4, 5, 8, 12):
-            raise InputError(f"distortion has {len(values)} coefficients; OpenCV's orders have 4, 5, 8 or 12")
+        if len(values) not in (4, 5, 8, 12, 14):
+            raise InputError(
+                f"distortion has {len(values)} coefficients; OpenCV's orders have 4, 5, 8, 12 or 14"
+            )
+        if any(values[12:]):
+            raise InputError(
+                f"the last two distortion coefficients, {values[12]:g} and {values[13]:g}, tilt the sensor, "
+                "which is not offered; calibrate without CALIB_TILTED_MODEL"
+            )
         return cls(**dict(zip(order, values, strict=False)))
 
     @property

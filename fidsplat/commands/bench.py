@@ -10,6 +10,7 @@ from fidsplat.commands.output import (
     json_text,
     option,
     print_table,
+    progress_bar,
     say,
     writable_file,
 )
@@ -98,9 +99,8 @@ class Bench:
         interrupted, measuring = False, None
         devices = self.device or (default_device(),)
         frames = len(scenes) * len(set(devices)) * self.repeats
-        with Progress(
-            *Progress.get_default_columns(), TextColumn("{task.fields[now]}"), console=where, transient=True
-        ) as progress:
+        columns = (*Progress.get_default_columns(), TextColumn("{task.fields[now]}"))
+        with progress_bar(where, *columns) as progress:
             task = progress.add_task("frames", total=frames, now="")
             try:
                 measuring = Measuring(

@@ -8,6 +8,7 @@ import tyro
 
 from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
 from fidsplat.errors import InputError
+from fidsplat.files import path_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -26,8 +27,8 @@ class Detect:
     Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
     printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker and board of
     that scene was seen from its camera, how far that is from the truth, and the means: of a scene that moves,
-    from where things are at its shutter's time, when the middle row is exposed. Boards, and markers of one
-    bundle, give one pose.
+    from where things are at its shutter's time, when the middle row is exposed; in the folder of a flight,
+    from where its camera was in each picture. Boards, and markers of one bundle, give one pose.
 
     Examples:
       fidsplat detect photo.jpg
@@ -35,6 +36,7 @@ class Detect:
       fidsplat detect flight.mp4 stills/ --json
       fidsplat detect run.mcap --topic /front/image_raw
       fidsplat detect scene.png --scene scene.toml --json
+      fidsplat detect fidsplat-flight --scene scene.toml
     """
 
     images: Annotated[
@@ -111,14 +113,17 @@ class Detect:
             from fidsplat.logs import log_pictures
 
             return log_pictures(path, self.topic)
+        from fidsplat.flights import RECORD
         from fidsplat.vision.images import pictures
 
-        return pictures(path)
+        folder = path_of(path)
+        return pictures(folder / "rgb" if (folder / RECORD).is_file() else path)
 
     def _one(
         self, name: str, image: "np.ndarray", scene: "Scene | None"
     ) -> tuple[dict[str, Any], list["Reading"], list["BundleReading"]]:
         """What one picture shows, for JSON, and the readings of the scene's markers and bundles."""
+        from fidsplat.flights import seen_in_flight
         from fidsplat.vision.bundles import read_bundles
         from fidsplat.vision.detect import detect
         from fidsplat.vision.readback import read_back
@@ -127,6 +132,7 @@ class Detect:
         facts: dict[str, Any] = {"image": name, "width": image.shape[1], "height": image.shape[0]}
         if scene is None:
             return facts | {"detections": [_said(code) for code in detect(image, families)]}, [], []
+        scene = seen_in_flight(scene, Path(name))
         try:
             readings, others = read_back(image, scene, families=families)
         except InputError as error:

@@ -135,6 +135,13 @@ def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable
     where.print(table)
 
 
+def progress_bar(where: Console, *columns: Any) -> Any:
+    """A bar that goes when it is done; none in a file or a pipe, where it would leave an empty line."""
+    from rich.progress import Progress
+
+    return Progress(*columns, console=where, transient=True, disable=not where.is_interactive)
+
+
 @contextmanager
 def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str, float], None]]:
     """What to call with words and the share that is done, 0 to 1; a bar shows it once that many seconds
@@ -142,9 +149,7 @@ def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str,
 
     Short work prints nothing, and long work between two calls is seen too: a thread watches the time.
     """
-    from rich.progress import Progress
-
-    shown = Progress(console=where, transient=True)
+    shown = progress_bar(where)
     task = shown.add_task("", total=1.0)
     timer = threading.Timer(after, shown.start)
     timer.daemon = True
@@ -162,10 +167,10 @@ def counted(
     name: str, steps: Iterable[T], total: int, done: int = 0, words: Callable[[T], str] = lambda step: ""
 ) -> Iterator[T]:
     """The steps, each once it is done, counted by a bar on stderr that says what the last was."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console(True), transient=True) as progress:
+    with progress_bar(console(True), *columns) as progress:
         bar = progress.add_task(name, total=total, completed=done)
         for step in steps:
             progress.update(bar, advance=1, description=f"{name} {words(step)}".strip())

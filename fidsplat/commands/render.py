@@ -113,7 +113,7 @@ class Render:
             scene = load_source(self.source, self.quality, progress)
         with _named(self.source, "render.outputs", names is None):
             check_words(scene.outputs, None)
-        of_scene = _named(self.source, "render.device", self.device is None)
+        of_scene = _named(self.source, "render.device", self.device is None and scene.device is not None)
         with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device, memory)
         choice = self._measured(scene, renderer) if budget else None
@@ -224,5 +224,6 @@ def load_source(source: str, quality: str | None, progress: "Progress") -> "Scen
         cloud = fs.load_splats(source, progress)
         return fs.Scene([cloud], camera=framing_camera(cloud))
     raise InputError(
-        f"cannot draw {source}: give a scene file (.toml), a splat file (.ply) or a store (.fss)"
+        f"cannot draw {source}: give a scene file (.toml), a store ({SUFFIX}) or a splat file "
+        f"({', '.join(FORMATS)})"
     )

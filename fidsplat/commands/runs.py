@@ -37,9 +37,9 @@ def flown(folder: Path) -> tuple[str, str]:
     Raises:
         InputError: it is no folder of `fidsplat fly`, or what was drawn is not there any more.
     """
-    from fidsplat.flights import RECORD
+    from fidsplat.flights import POSES, RECORD
 
-    poses = folder / "trajectory.tum"
+    poses = folder / POSES
     try:
         source = from_json((folder / RECORD).read_text("utf-8"))["source"]
         file = folder / source

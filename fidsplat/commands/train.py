@@ -18,6 +18,7 @@ from fidsplat.commands.output import (
     late_progress,
     new_file,
     option,
+    progress_bar,
     switch,
     tell,
     writable_file,
@@ -134,13 +135,13 @@ def _bytes(gibibytes: float) -> int:
 @contextmanager
 def _bar(trainer: Trainer) -> Iterator:
     """A progress bar, and what to call with each step."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
     columns = (
         *(TextColumn("training"), BarColumn(), MofNCompleteColumn()),
         *(TextColumn("{task.description}"), TimeRemainingColumn()),
     )
-    with Progress(*columns, console=console(True), transient=True) as bars:
+    with progress_bar(console(True), *columns) as bars:
         task = bars.add_task("", total=trainer.settings.iterations, completed=trainer.iteration)
         first, begun = trainer.iteration, time.perf_counter()
         mean = {"loss": 0.0, "psnr": 0.0}

@@ -140,7 +140,8 @@ def e2(renderer: Renderer) -> Found:
             mean = [[(at[0] - VIEW.cx) / VIEW.fx, (at[1] - VIEW.cy) / VIEW.fy, 1.0]]
             stats = renderer.render(splats(mean, (1, 0, 0, 0), (1e-6, 1e-6)), VIEW, quality=CATALOGUED).stats
             pairs, visible = pairs + stats["pairs"], visible + stats["visible"]
-    yield Finding("splats off the picture that are not culled", visible, 0)
+    if not renderer.device.always_float64:  # the reference has no bounds
+        yield Finding("splats off the picture that are not culled", visible, 0)
     yield Finding("tiles that list them", pairs, 0)
 
 
@@ -224,7 +225,8 @@ def e4(renderer: Renderer) -> Found:
             wrong += not empty
             counted += frame.stats["visible"] + frame.stats["pairs"]
     yield Finding("pictures of nothing that are not the background", wrong, 0)
-    yield Finding("splats and pairs counted in them", counted, 0)
+    if not renderer.device.always_float64:
+        yield Finding("splats and pairs counted in them", counted, 0)
 
 
 @case("E5", "memory that nothing has written", "all buffers filled with 0xFF before the picture")

@@ -109,7 +109,7 @@ def _parse(file: Path) -> dict:
     if len(content) > MAX_BYTES:
         raise InputError(f"{file} is longer than {MAX_BYTES} bytes, which no scene file is")
     try:
-        text = content.decode("utf-8")
+        text = content.decode("utf-8-sig")  # editors of Windows mark a file as UTF-8
         if any(match["long"] for match in _LONG_KEY.finditer(text)):
             raise InputError(
                 f"{file} is not a scene file: a dotted key has more than {MAX_PARTS} parts; scene files have "

@@ -3,7 +3,7 @@ sees."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from fidsplat.backends.base import Images, ResidentData
-from fidsplat.backends.ends import TileEnds, hidden
+from fidsplat.backends.ends import TileEnds, hidden, shown
 from fidsplat.backends.seen import seen
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
@@ -32,11 +32,12 @@ class PartOfView:
     rows: tuple[int, int]
     """of pixels, [first, end)"""
     view: View
-    data: ResidentData
+    data: ResidentData | None
+    """None if it is drawn already"""
     ids: Callable[[], np.ndarray]
     """the indices in the whole (n,) int32 of its splats"""
     images: Images | None = None
-    """if it is drawn already"""
+    """if it is"""
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,24 @@ class Band:
         pieces = self.scene.pieces(self.nodes)
         return self._kept(replace(self, pieces=tuple((each, self._needed(each, ends)) for each in pieces)))
 
-    def lacks_pieces(self, ends: TileEnds) -> bool:
-        """Whether a piece of its nodes that it was not drawn of may show."""
-        return any((self._needed(each, ends) & ~drawn).any() for each, drawn in self.pieces or ())
+    def lacking(self, ends: TileEnds, missing: Nodes) -> list[Pieces]:
+        """The pieces that may show where tiles end there and that it was not drawn of: of its nodes, and of
+        some that are missing."""
+        own = [each.only(self._needed(each, ends) & ~drawn) for each, drawn in self.pieces or ()]
+        others = (each.only(self._needed(each, ends)) for each in self.scene.pieces(missing))
+        return [each for each in (*own, *others) if len(each.nodes)]
+
+    def shown(self, pieces: Sequence[Pieces], ends: TileEnds) -> np.ndarray:
+        """(rows, columns) bool: the tiles that end there in which pieces may show."""
+        made = np.zeros(ends.depths.shape, bool)
+        for each in pieces:
+            made |= shown(self.view, self.features, each.boxes, each.reach, ends)
+        return made
+
+    def ended(self, ends: TileEnds) -> Band:
+        """It, drawn of what may show where its tiles end there."""
+        hidden = self.hidden(ends)
+        return self.drawn_of(tuple(a & ~b for a, b in zip(self.nodes, hidden, strict=True))).cut_to(ends)
 
     def _needed(self, pieces: Pieces, ends: TileEnds) -> np.ndarray:
         """(k,) bool: which pieces may show where tiles end there."""

@@ -2,8 +2,9 @@
 drawn, nor read. The picture is bit for bit that of all (fidsplat/backends/ends.py).
 
 A view is drawn of some of what lies in it, those nodes that the last view did not find hidden, or the
-nearest; then all others are held against the ends of its tiles. If each is hidden, the picture is done; else
-those that are not are added, and it is drawn again. So along a path one time mostly does.
+nearest; then all others are held against the ends of its tiles. If each is hidden, the picture is done. If a
+few are not, the tiles in which they may show are drawn again, of what may show there; if many are not, they
+are added, and the whole is drawn again.
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ _RESTS = 16
 _LOOKS, _SLACK = 4, 4.0
 """directions of a tile, across and down, in which the last view's ends are looked up; and by how many times
 the way that the camera has moved they are taken to be further"""
+_SOME = 2
+"""what is missing is drawn by itself, in the tiles in which it may show, where that takes so many times fewer
+splats than the whole picture"""
 _ROUNDS = 12
 """drawn as often as that, a view is drawn of all that may show"""
 
@@ -59,38 +63,67 @@ class Hidden:
         """What a view is drawn of first."""
         last = self._last
         ends = None if last is None else _carried(*last, whole.view)
-        if ends is None:
-            return whole.drawn_of(_nearest(whole, whole.nodes, _FIRST))
-        return whole.drawn_of(_without(whole.nodes, whole.hidden(ends))).cut_to(ends)
+        return whole.drawn_of(_nearest(whole, whole.nodes, _FIRST)) if ends is None else whole.ended(ends)
 
     def drawn(
         self,
         whole: Band,
-        fits: Callable[[Band], bool],
-        draw: Callable[[Band], tuple[Images, TileEnds]],
-    ) -> tuple[Band, Images] | None:
-        """A view drawn of what is not hidden, and its picture. None where it is to be drawn of all that it
-        sees: little is hidden, or what is not does not fit."""
-        band = self.begun(whole)
+        fits: Callable[[Band, int], bool],
+        draw: Callable[[Band, int], tuple[Images, TileEnds]],
+        take: Callable[[Images, Images, np.ndarray], None],
+    ) -> tuple[list[Band], Images] | None:
+        """A view drawn of what is not hidden: what it was drawn of, and its picture. None where it is to be
+        drawn of all that it sees: little is hidden, or what is not does not fit.
+
+        Args:
+            fits, draw: are given the index of the first splat, by which others' come before.
+            take: takes the tiles (rows, columns) bool of another picture into one.
+        """
+        bands, kept, tiles = [self.begun(whole)], None, np.array(True)
         for _ in range(_ROUNDS):
-            if not fits(band):
+            band, before = bands[-1], sum(each.count for each in bands[:-1])
+            if not fits(band, before):
                 break
-            images, ends = draw(band)
+            images, ends = draw(band, before)
+            if kept is not None:
+                take(kept[0], images, tiles)
+                images, ends = kept[0], kept[1].replaced(tiles, ends)
             self._last = whole.view, ends
-            behind = whole.hidden(ends)
-            missing = _without(band.missing, behind)
-            if not (any(each.any() for each in missing) or band.lacks_pieces(ends)):
-                self._rest = _RESTS if band.count > _FUTILE * whole.count else 0
-                return band, images
-            images = None  # its buffers are free for the next
-            left = band.count + whole.count_of(missing)
-            more = _nearest(whole, missing, max(_FIRST, int(_GROWTH * band.count)))
-            shown = zip(_without(band.nodes, behind), more, strict=True)
-            band = whole.drawn_of(tuple(a | b for a, b in shown)).cut_to(ends)
-            if left > _FUTILE * whole.count and band.count > max(whole.count // _SMALL, _CHEAP):
+            here = ends.within(tiles)
+            missing = _without(band.missing, band.hidden(here))
+            few = whole.count_of(missing) <= bands[0].count // _SOME
+            lacking = band.lacking(here, missing) if few else []
+            if few and not lacking:
+                self._rest = _RESTS if bands[0].count > _FUTILE * whole.count else 0
+                return bands, images
+            if few and _whole_pixels(whole.view, ends):
+                tiles = band.shown(lacking, here)
+                again = whole.within(*_rows(tiles, whole, ends)).ended(ends.within(tiles))
+                if again.count <= bands[0].count // _SOME:
+                    bands, kept = [*bands, again], (images, ends)
+                    continue
+            images = kept = None  # its buffers are free for the next
+            tiles, behind = np.array(True), whole.hidden(ends)
+            missing = _without(bands[0].missing, behind)
+            left = bands[0].count + whole.count_of(missing)
+            more = _nearest(whole, missing, max(_FIRST, int(_GROWTH * bands[0].count)))
+            shown = zip(_without(bands[0].nodes, behind), more, strict=True)
+            bands = [whole.drawn_of(tuple(a | b for a, b in shown)).cut_to(ends)]
+            if left > _FUTILE * whole.count and bands[0].count > max(whole.count // _SMALL, _CHEAP):
                 break
         self._rest = _RESTS
         return None
+
+
+def _rows(tiles: np.ndarray, whole: Band, ends: TileEnds) -> tuple[int, int]:
+    """The rows of pixels [first, end) of a view in which some tiles lie."""
+    rows, height = np.flatnonzero(tiles.any(axis=1)), ends.tile[0] // whole.view.samples
+    return max(int(rows[0]) * height, whole.rows[0]), min((int(rows[-1]) + 1) * height, whole.rows[1])
+
+
+def _whole_pixels(view: View, ends: TileEnds) -> bool:
+    """Whether every pixel has its samples in one tile."""
+    return not any(side % view.samples for side in ends.tile)
 
 
 def _without(nodes: Nodes, others: Nodes) -> Nodes:

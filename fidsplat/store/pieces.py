@@ -9,7 +9,7 @@ import numpy as np
 
 from fidsplat.store.store import Store
 
-ROWS = 4096
+ROWS = 1024
 """splats of a piece"""
 
 

@@ -33,7 +33,7 @@ class Residency:
         self._cache = (
             backend.chunk_cache(scene, scene.largest_chunk) if isinstance(backend, KeepsChunks) else None
         )
-        self._there: tuple[Selection, ResidentData] | None = None
+        self._there: tuple[Selection, int, ResidentData] | None = None
         self._bands, self._hidden = Bands(), Hidden()
         self._fetching: threading.Thread | None = None
         self.nodes = 0
@@ -47,7 +47,7 @@ class Residency:
     @property
     def memory_bytes(self) -> int:
         """Device memory of what is there."""
-        return 0 if self._there is None else self._there[1].memory_bytes
+        return 0 if self._there is None else self._there[-1].memory_bytes
 
     def parts(
         self, view: View, features: FeatureSet, quality: Quality, pipeline: Pipeline
@@ -60,31 +60,32 @@ class Residency:
         """
         whole = Band.of(self.scene, view, features, self.scene.pixels_of(quality))
 
-        def fits(band: Band) -> bool:
-            return not isinstance(pipeline, KnowsRoom) or pipeline.fits(self._data(band.selection), band.view)
+        def fits(band: Band, first_id: int = 0) -> bool:
+            data = self._data(band.selection, first_id)
+            return not isinstance(pipeline, KnowsRoom) or pipeline.fits(data, band.view)
 
-        def drawn(band: Band, images: Images | None = None) -> PartOfView:
-            self.nodes += len(band.selection)
-            ids = partial(self.scene.ids, band.selection)
-            return PartOfView(band.rows, band.view, self._data(band.selection), ids, images)
+        def numbered(bands: Sequence[Band]) -> Callable[[], np.ndarray]:
+            self.nodes += sum(len(band.selection) for band in bands)
+            return lambda: np.concatenate([self.scene.ids(band.selection) for band in bands])
 
         self.nodes = 0
         backend = self._backend
         if not self._hidden.expects(whole):
             self._hidden.passed()
-        elif isinstance(backend, GivesTileEnds) and can_hide(view, features):
+        elif self._asks(view, features) and isinstance(backend, GivesTileEnds):
             asking = backend.pipeline(with_tile_ends(features))
 
-            def draw(band: Band) -> tuple[Images, TileEnds]:
-                images = asking.render(self._data(band.selection), band.view)
+            def draw(band: Band, first_id: int) -> tuple[Images, TileEnds]:
+                images = asking.render(self._data(band.selection, first_id), band.view)
                 return images, backend.tile_ends_of(images)
 
-            shown = self._hidden.drawn(whole, fits, draw)
+            shown = self._hidden.drawn(whole, fits, draw, backend.take_tiles)
             if shown is not None:
-                yield drawn(*shown)
+                bands, images = shown
+                yield PartOfView(whole.rows, whole.view, None, numbered(bands), images)
                 return
         for band in self._bands.cut(whole, fits):
-            yield drawn(band)
+            yield PartOfView(band.rows, band.view, self._data(band.selection), numbered([band]))
 
     def of(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
@@ -100,16 +101,21 @@ class Residency:
         self.nodes = len(selection)
         return self._data(selection), partial(self.scene.ids, selection)
 
-    def _data(self, selection: Selection) -> ResidentData:
-        if self._there is None or self._there[0] != selection:
+    def _data(self, selection: Selection, first_id: int = 0) -> ResidentData:
+        if self._there is None or self._there[:2] != (selection, first_id):
             self._there = None  # before the next is there, so that both need not fit
-            self._there = selection, self._brought(selection)
-        return self._there[1]
+            self._there = selection, first_id, self._brought(selection, first_id)
+        return self._there[-1]
 
-    def _brought(self, selection: Selection) -> ResidentData:
+    def _brought(self, selection: Selection, first_id: int) -> ResidentData:
         if self._cache is None:
             return self._backend.upload(self.scene.part(selection))
-        return self._cache.gather(self.scene.chunks(selection, self._cache.places))
+        return self._cache.gather(self.scene.chunks(selection, self._cache.places), first_id)
+
+    def _asks(self, view: View, features: FeatureSet) -> bool:
+        """Whether it can be told what is hidden."""
+        tells = isinstance(self._backend, GivesTileEnds) and isinstance(self._backend, KeepsChunks)
+        return tells and can_hide(view, features)
 
     def read_ahead(self, captures: Iterator[Capture]) -> Iterator[Capture]:
         """The captures, each when what the next needs is being brought."""
@@ -143,7 +149,7 @@ class Residency:
         if self._fetching is not None and self._fetching.is_alive():
             return
 
-        asks = isinstance(self._backend, GivesTileEnds) and can_hide(view, features)
+        asks = self._asks(view, features)
 
         def work() -> None:
             with suppress(FidsplatError, OSError, MemoryError):

@@ -121,7 +121,7 @@ def _with(table: str, key: str, values: list[float]) -> str:
 
 def _parsed(text: str) -> Any:
     try:
-        return tomllib.loads(text)
+        return tomllib.loads(text.removeprefix("\ufeff"))
     except (ValueError, RecursionError):
         return None
 

@@ -105,6 +105,12 @@ class Viewer:
             self.server: Any = guarded(
                 lambda: viser.ViserServer(host, port, label="fidsplat", verbose=False), host
             )
+        if port and self.server.get_port() != port:  # taken by another since it was looked at
+            with _silent():
+                self.server.stop()
+            self.session.close()
+            check_port(host, port)
+            raise InputError(f"cannot listen on {host}, port {port}: it was in use; give another --port")
         self.server.gui.configure_theme(dark_mode=True, show_logo=False)
         self.server.gui.main_panel.dock_right()
         self._nodes = Nodes(self.server.scene)

@@ -275,7 +275,7 @@ def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, me
     pool, taken, planned = own.backend.pool, [], []
     fresh, make_way = pool.fresh, pool.make_way
     monkeypatch.setattr(pool, "fresh", lambda what, size: taken.append((what, size)) or fresh(what, size))
-    monkeypatch.setattr(pool, "make_way", lambda kind, way: planned.append(way) or make_way(kind, way))
+    monkeypatch.setattr(pool, "make_way", lambda kind, *way: planned.append(way[0]) or make_way(kind, *way))
     some = random_splats(60000, seed=3, depth=(1.0, 6.0), scale=(1e-3, 1e-2), sh_degree=1)
     some = some.with_boxes(np.arange(60000) < 30000) if name == "boxes before a lens" else some
     quality = fs.Quality(alpha_cutoff=1 / 255)

@@ -9,7 +9,7 @@ from sampling import in_turn
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.errors import DeviceError
-from fidsplat.hard_cases import catalogue, check
+from fidsplat.hard_cases import catalogue, check, e_inputs
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, splats, turned
@@ -147,6 +147,13 @@ def test_arithmetic(renderer, reference):
 
 def test_the_reference_agrees_with_itself(reference):
     assert check.run_check(reference, catalogue.all_cases("A")[:2]).passed
+
+
+@pytest.mark.parametrize("found", [e_inputs.e2, e_inputs.e4])
+def test_the_reference_culls_nothing_and_holds(found, reference):
+    findings = [each for each in found(reference) if isinstance(each, Finding)]
+    assert findings
+    assert all(each.holds for each in findings), findings
 
 
 @in_turn()

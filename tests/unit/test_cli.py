@@ -62,7 +62,8 @@ def test_help_loads_nothing_heavy():
     [
         ([], "try `fidsplat demo` first"),
         ([], "demo, devices, info, marker, render, view, fly, detect"),
-        (["mraker"], "Available subcommands: demo, devices"),
+        (["mraker"], "unknown command 'mraker' (did you mean 'marker'?); known: demo, devices"),
+        (["store", "biuld", "a.ply"], "(did you mean 'build'?); known: build, place"),
         (["marker"], "SPEC"),
         (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),
         (["marker", "qr:a", "--size", "big"], "--size is 'big'; give a number; see fidsplat marker"),

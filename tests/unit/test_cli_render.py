@@ -228,6 +228,12 @@ def test_scene_files_that_are_wrong(scene, tmp_path, change, says, capsys):
     assert err.count("\n") == 1
 
 
+def test_a_device_of_the_environment_is_not_the_scenes(scene, monkeypatch, capsys):
+    monkeypatch.setenv("FIDSPLAT_DEVICE", "vulkan")
+    assert main(["render", scene]) == 2
+    assert capsys.readouterr().err.startswith("fidsplat: unknown device 'vulkan'")
+
+
 def test_a_scene_needs_a_camera(scene, tmp_path, capsys):
     (tmp_path / "scene.toml").write_text("[render]\n")
     assert main(["render", scene]) == 2

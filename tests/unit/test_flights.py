@@ -79,6 +79,22 @@ def test_each_picture_is_that_of_its_pose(here):
     assert (here / "out" / "contact-sheet.png").exists()
 
 
+def test_a_flights_pictures_are_read_from_where_its_camera_was(here, capsys):
+    (here / "scene.toml").write_text(SCENE.replace("33", "160").replace("24", "120"))
+    assert fly("--times", "0,0.2,0.5") == 0
+    capsys.readouterr()
+    for folder in ("out", "out/rgb"):
+        assert main(["detect", folder, "--scene", "scene.toml", "--json"]) == 0
+        said = json.loads(capsys.readouterr().out)
+        assert [one["image"] for one in said["pictures"]] == [f"out/rgb/{k:06d}.png" for k in range(3)]
+        assert said["means"]["found"] == 3
+        assert said["means"]["position_error_mm"] < 2  # by the scene's own camera it would be 70
+    copied = here / "alone.png"
+    copied.write_bytes((here / "out/rgb/000002.png").read_bytes())
+    assert main(["detect", "alone.png", "--scene", "scene.toml", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["means"]["position_error_mm"] > 140
+
+
 def test_the_shutter_sees_the_camera_move(here):
     """Pictures of a flight are blurred along it, each about its own time."""
     flight = small_flight(shutter=fs.Shutter(exposure_time=0.2, sub_poses=2))

@@ -95,6 +95,12 @@ def test_beyond_the_fold_nothing_is_seen():
     assert BrownConrady(k1=0.2, k4=-0.1).fold == pytest.approx(math.sqrt(10), rel=0.5)
 
 
+def test_opencv_fills_its_rational_model_up_with_zeros():
+    """calibrateCamera gives 14 numbers for CALIB_RATIONAL_MODEL, which has 8."""
+    eight = [0.1, -0.2, 0.001, 0.002, 0.03, 0.04, -0.05, 0.06]
+    assert BrownConrady.opencv([eight + [0.0] * 6]) == BrownConrady.opencv(eight)
+
+
 def test_a_lens_that_does_nothing_is_none():
     assert fs.Camera.pinhole(64, 48, 50, 50, 32, 24, lens=BrownConrady()).lens is None
 
@@ -105,7 +111,11 @@ def test_a_lens_that_does_nothing_is_none():
         (lambda: BrownConrady(k1=math.nan), "k1 must be a finite number"),
         (lambda: Fisheye(k2="a"), "k2 must be a finite number"),
         (lambda: BrownConrady(k6=-1e300), r"k6 must be .*at most 1e\+12, not -1e\+300"),
-        (lambda: BrownConrady.opencv([1, 2, 3]), "3 coefficients.*4, 5, 8 or 12"),
+        (lambda: BrownConrady.opencv([1, 2, 3]), "3 coefficients.*4, 5, 8, 12 or 14"),
+        (
+            lambda: BrownConrady.opencv([0.1] * 12 + [0, 0.02]),
+            "last two distortion coefficients, 0 and 0.02, tilt",
+        ),
         (
             lambda: fs.Camera.pinhole(64, 48, 20, 20, 32, 24, lens=BrownConrady(k1=-0.5, p2=0.01)),
             r"distortion \(k1 = -0.5, p2 = 0.01\) cannot be inverted in .* focal length \(20 pixels\)",

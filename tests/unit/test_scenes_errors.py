@@ -155,7 +155,14 @@ def test_the_second_of_two_is_named(refused):
             "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1], [0, 0, 0, 1]]",
             r"world_to_camera\[2\] must be a list of 4",
         ),
-        ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]", "world_to_camera must be a rotation"),
+        (
+            "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]",
+            "world_to_camera must be a rotation .* by 1 where 1e-06 is allowed$",
+        ),
+        (
+            "[[0.9553, -0.2955, 0, 0], [0.2955, 0.9553, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+            "by 5e-05 where 1e-06 is allowed; give more digits",
+        ),
         ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]", "must have the last row"),
         ("{}", "must be a list of 4 rows of 4 numbers, not a table"),
     ],
@@ -183,6 +190,13 @@ def test_a_matrix_wrong(refused, rows, words):
 )
 def test_what_is_no_scene_file(refused, content, words):
     refused(content, words)
+
+
+def test_the_mark_of_editors_is_no_text(tmp_path):
+    """Windows' editors begin a file in UTF-8 with a byte order mark."""
+    path = tmp_path / "scene.toml"
+    path.write_text("[render]\nbackground = [0.5, 0.25, 0.0]\n", "utf-8-sig")
+    assert fs.Scene.load(path).background == (0.5, 0.25, 0.0)
 
 
 def test_dots_that_join_no_keys_are_read(tmp_path):

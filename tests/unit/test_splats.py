@@ -138,6 +138,33 @@ def test_a_bad_splat_is_left_out_counted_and_reported(name, column, value, reaso
     assert np.array_equal(cloud.means, given["means"][[0, 1, 3, 4, 5]])
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "hint"),
+    [
+        ("scales", -3.0, "scales are standard deviations in metres: take exp() of logarithms"),
+        ("opacities", 2.0, "opacities are from 0 to 1: take the sigmoid of logits"),
+    ],
+)
+def test_what_files_hold_instead_is_hinted_at(name, value, hint):
+    given = parts()
+    given[name][:2] = value
+    with pytest.warns(UserWarning, match="2 of 6 splats left out") as caught:
+        fs.SplatCloud(**given)
+    assert str(caught[0].message).endswith(f"; {hint}")
+    given[name][0] = given[name][2]  # one of six is a stray
+    with pytest.warns(UserWarning, match=r"1 of 6 splats left out \([^()]*: 1\)$"):
+        fs.SplatCloud(**given)
+
+
+def test_bytes_are_no_colours():
+    given = parts()
+    given["colors"] = np.full((6, 3), 255, np.uint8)
+    with pytest.raises(fs.InputError, match=r"bytes up to 255, but 1 is white: give colors / 255"):
+        fs.SplatCloud(**given)
+    given["colors"] = np.ones((6, 3), np.uint8)
+    assert fs.SplatCloud(**given).colors.max() == 1
+
+
 def test_float64_that_float32_cannot_hold_is_left_out():
     given = parts()
     given["scales"] = given["scales"].astype(float)

@@ -56,9 +56,9 @@ def asked(monkeypatch):
     monkeypatch.setattr(hidden, "_RESTS", 0)
     monkeypatch.setattr(pieces, "ROWS", 24)
 
-    def noted(self, whole, fits, draw):
-        made = drawn(self, whole, fits, draw)
-        counts.append((whole.count if made is None else made[0].count, whole.count))
+    def noted(self, whole, *given):
+        made = drawn(self, whole, *given)
+        counts.append((whole.count if made is None else made[0][0].count, whole.count))
         return made
 
     monkeypatch.setattr(hidden.Hidden, "drawn", noted)
@@ -126,6 +126,51 @@ def test_the_same_view_is_drawn_once(town, asked, monkeypatch):
     assert first > 1
     renderer.render(resident, view())
     assert len(times) == 1
+
+
+@pytest.mark.parametrize("way", ["centres", "pixels", "samples", "odd samples", "groups", "bands"])
+def test_what_is_missing_is_drawn_in_its_tiles_alone(town, asked, monkeypatch, way):
+    """The last view's ends are taken too near, so that some of what shows is not drawn at first."""
+    monkeypatch.setattr(hidden, "_SLACK", -6.0)
+    monkeypatch.setattr(hidden, "_SOME", 1)
+    renderer, taken, path = fs.Renderer("opencl"), [], [view(), view(0.02, 0.1), view(0.03, 0.5)]
+    backend = type(renderer.backend)
+    take, outputs = backend.take_tiles, ALL_OUTPUTS if way != "groups" else ("rgb", "splat_id")
+
+    def noted(self, images, other, tiles):
+        own, others = (dict(each.stats) for each in (images, other))
+        take(self, images, other, tiles)
+        assert images.stats == {name: own[name] + others[name] for name in own}
+        taken.append(tiles.mean())
+
+    monkeypatch.setattr(backend, "take_tiles", noted)
+    if way == "groups":
+        renderer.backend.shape = renderer.backend.shapes("schedule")["groups"]
+    quality = {**WAYS, "odd samples": "samples=3", "groups": "", "bands": ""}[way] or None
+    drawing = fs.SeveralDevices(["opencl", "opencl"]) if way == "bands" else renderer
+    resident, cloud = drawing.upload(town), town.cloud()
+    for camera in path:
+        frame = drawing.render(resident, camera, quality=quality, outputs=outputs)
+        whole = renderer.render(cloud, camera, quality=quality, outputs=outputs)
+        for output in whole:
+            assert np.array_equal(frame[output], whole[output]), output
+    # pixels with samples in two tiles are drawn with the whole picture
+    assert bool(taken) == (way != "odd samples")
+    assert not taken or min(taken) < 0.4
+
+
+def test_views_of_about_as_many_splats_take_no_new_memory(town, asked, monkeypatch):
+    renderer, fresh = fs.Renderer("opencl"), []
+    pool, resident = renderer.backend.pool, renderer.upload(town)
+    make, counts = pool.fresh, []
+    monkeypatch.setattr(pool, "fresh", lambda name, size: fresh.append(name) or make(name, size))
+    for along in (0.0, 0.1, 0.2, 0.3, 0.0):
+        fresh.clear()
+        frame = renderer.render(resident, view(along=along))
+        assert frame["rgb"].any()
+        counts.append(frame.stats["splats"])
+    assert len(set(counts[:4])) == 4
+    assert fresh == []
 
 
 def test_of_what_lets_light_through_nothing_is_hidden(tmp_path, asked, monkeypatch):

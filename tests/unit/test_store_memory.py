@@ -183,10 +183,24 @@ def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypat
         # room is left for all that the cache may come to take, whatever it holds yet
         empty = limited.backend.chunk_cache(resident.data.scene, cache._rows)
         gathered = empty.gather(resident.data.scene.chunks(resident.data.scene.everything(), True))
-        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * len(store)
+        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * gathered.room
+        assert len(store) <= gathered.room <= 9 / 8 * len(store)
         assert empty.memory_bytes == 0
         del limited, resident, frame, cache, empty, gathered
         gc.collect()
+
+
+def test_pictures_of_fewer_splats_take_what_those_of_more_have_left():
+    pool = fs.Renderer("opencl").backend.pool
+    pool.clear()
+    pool.make_way("stores", 1 << 30, 100)
+    for splats, kept in ((90, True), (100, True), (101, False)):
+        pool.scratch("records", 1 << 20)
+        pool.make_way("stores", 0, splats)
+        assert bool(pool.memory_bytes) == kept
+    pool.scratch("records", 1 << 20)
+    pool.make_way("others", 0, 1)
+    assert not pool.memory_bytes
 
 
 def test_bands_that_fitted_together_are_drawn_together():

@@ -45,6 +45,11 @@ def test_a_moved_marker_goes_back_into_its_file(number):
     assert placed(new, number, POSE, "") == new
 
 
+def test_the_mark_of_an_editor_stays():
+    new = placed("\ufeff" + FILE, 0, POSE, "scene.toml")
+    assert new == "\ufeff" + placed(FILE, 0, POSE, "scene.toml")
+
+
 @pytest.mark.parametrize(
     ("text", "number"),
     [(FILE, 2), ('markers = [{spec = "a", size = 1.0}]\n', 0), ("x = '''\n[[markers]]\n'''", 0), ("[", 0)],

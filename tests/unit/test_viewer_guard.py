@@ -61,6 +61,27 @@ def test_a_port_in_use_is_said():
             check_port("127.0.0.1", none)
 
 
+def test_a_port_that_another_takes_meanwhile_is_said(monkeypatch):
+    """Between our look and viser's, which takes the next port without a word."""
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    from fidsplat.viewer import server
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        looks = []
+        monkeypatch.setattr(server, "check_port", lambda *place: looks.append(place))
+        with pytest.raises(fs.InputError, match=f"port {port}: it was in use; give another --port"):
+            server.Viewer(
+                fs.Scene(camera=fs.Camera.look_at(8, 8, 1.0, (0, 0, -1), (0, 0, 0))),
+                None,
+                "reference",
+                port=port,
+            )
+        assert looks == [("127.0.0.1", port)] * 2
+
+
 @pytest.mark.parametrize(
     ("host", "words"),
     [

@@ -7,6 +7,7 @@ into arrays in the order of the scene, which decides ties of depth: so the pictu
 from __future__ import annotations
 
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -58,6 +59,8 @@ class OpenCLChunks:
         self._free: list[int] = []
         self._slots: OrderedDict[Hashable, int] = OrderedDict()
         """by chunk, least recently used first"""
+        self.token = object()
+        """what tells it from others, which is not to keep it"""
         self._changes = 0
         """how often a chunk has lost its slot"""
         self._drawn: set[Hashable] = set()
@@ -74,13 +77,13 @@ class OpenCLChunks:
         """Bytes of all slots."""
         return self._size * self._rows * sum(self.widths.values())
 
-    def gather(self, chunks: Sequence[Chunk]) -> GatheredChunks:
+    def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> GatheredChunks:
         """As `ChunkCache.gather`."""
         with self._lock:
             self._drawn = {chunk.key for chunk in chunks}
             if not self.widths:
                 self._learn(chunks[0].load())
-        return GatheredChunks(self, chunks)
+        return GatheredChunks(self, chunks, first_id)
 
     def bring(self, chunks: Sequence[Chunk]) -> None:
         """As `ChunkCache.bring`."""
@@ -236,26 +239,38 @@ class OpenCLChunks:
             self.widths[name] = array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
 
 
+def _roomy(count: int) -> int:
+    """At least as many, and at most an eighth more: one of a few numbers."""
+    step = 1 << max(count.bit_length() - 4, 0)
+    return -(-count // step) * step
+
+
 class GatheredChunks:
     """What a picture is drawn of, as `Resident`: copied out of slots when a picture first asks for an array,
     or, where that would take more than its part of the memory budget, some splats at a time for every
     picture (`streamed`)."""
 
-    def __init__(self, cache: OpenCLChunks, chunks: Sequence[Chunk]) -> None:
+    def __init__(self, cache: OpenCLChunks, chunks: Sequence[Chunk], first_id: int) -> None:
         whole, workspace = cache.whole, cache.workspace
         self._cache, self._chunks, self._workspace = cache, chunks, workspace
+        self._first_id = first_id
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
         self.count = int(self._ends[-1])
+        self.room = _roomy(self.count)
+        """splats for which pictures have buffers: those of the next view, of about as many, are the same"""
         self.origin, self.sh_degree, self.has_planes = whole.origin, whole.sh_degree, whole.has_planes
         self.footprint, self.ellipsoids, self.planes = whole.footprint, whole.ellipsoids, whole.planes
         self.kept: dict[Hashable, Any] = {}
         """as that of a Resident"""
         self.fixed = True
+        self.alike = cache.token
         self.neighbours = True
         self._buffers: dict[str, cl.Buffer] = {}
+        self._leased: list[tuple[str, cl.Buffer]] = []
+        weakref.finalize(self, workspace.pool.give_back, self._leased)
         self._copies: tuple[int, int, Copies | None] = (0, 0, None)
         """of splats [first, end), as they were copied last"""
-        total, widest = self.count * sum(cache.widths.values()), self.count * max(cache.widths.values())
+        total, widest = self.room * sum(cache.widths.values()), self.room * max(cache.widths.values())
         self.streamed = (
             total > workspace.memory_budget // _WHOLE or widest > workspace.device.max_mem_alloc_size
         )
@@ -264,7 +279,7 @@ class GatheredChunks:
         """As that of a Resident: what the cache may take stays."""
         asked, stays = {*names, *self._buffers}, self._cache.reserved_bytes
         each = sum(self._width(name) for name in asked)
-        return (stays, each) if self.streamed else (stays + self.count * each, 0)
+        return (stays, each) if self.streamed else (stays + self.room * each, 0)
 
     @property
     def memory_bytes(self) -> int:
@@ -279,7 +294,10 @@ class GatheredChunks:
             self._fill(name, first, end, buffer)
             return buffer
         if name not in self._buffers:
-            whole = self._workspace.pool.fresh(f"the splats' {name}", self.count * width)
+            # that of the last view, if it is large enough: to have new memory takes as long as to fill it
+            label = f"the splats' {name}"
+            whole = self._workspace.pool.lease(label, self.room * width, larger=True)
+            self._leased.append((label, whole))
             self._fill(name, 0, self.count, whole)
             self._cache.wait()  # pictures may be drawn on another queue
             self._buffers[name] = whole
@@ -295,7 +313,8 @@ class GatheredChunks:
         if first == end:
             return
         if name == "splat_ids":
-            cl.enqueue_copy(self._workspace.queue, target, np.arange(first, end, dtype=np.int32))
+            ids = self._first_id + np.arange(first, end, dtype=np.int32)
+            cl.enqueue_copy(self._workspace.queue, target, ids)
             return
         lowest = int(np.searchsorted(self._ends, first, side="right"))
         highest = int(np.searchsorted(self._ends, end, side="left")) + 1

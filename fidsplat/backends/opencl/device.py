@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
@@ -96,6 +97,10 @@ class OpenCLBackend(Workspace):
     def tile_ends_of(self, images: OpenCLImages) -> TileEnds:
         """As `GivesTileEnds`."""
         return images.tile_ends()
+
+    def take_tiles(self, images: OpenCLImages, other: OpenCLImages, tiles: np.ndarray) -> None:
+        """As `GivesTileEnds`."""
+        images.take_tiles(other, tiles)
 
     def unsupported(self, features: FeatureSet) -> str:
         """Blending in float64 where the device has none; empty for all else."""

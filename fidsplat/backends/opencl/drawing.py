@@ -74,13 +74,17 @@ def _blended(picture: Picture) -> Iterator[None]:
     for name, channels, _ in _buffers_of(picture):
         picture.take(name, 4 * picture.held["channel_stride"] * channels)
     if any(one.name == "tile_ends" for one in picture.program.source.arguments["blend"]):
-        picture.lease("tile_ends", 4 * picture.tiles)
+        ends = picture.lease("tile_ends", 4 * picture.tiles)
+        if view.band is not None:  # beside which nothing is finished
+            cl.enqueue_fill_buffer(
+                picture.queue, ends, np.full(1, 0xFFFFFFFF, np.uint32), 0, 4 * picture.tiles
+            )
     # not an attribute: in a cycle, all that this picture holds would wait for the garbage collector
     lists = LISTS["chunked" if picture.plan.chunk else shape.lists](picture)
     group = shape.blend_items
     for first, end in lists.bands():
         picture.launch("blend", "blend", (end - first) * group, group, band_first=first)
-        if end == picture.tiles:
+        if end == lists.end:
             if "backdrop" in picture.program.source.arguments:
                 picture.launch_grid("resolve", "backdrop", view.width, view.height)
             yield

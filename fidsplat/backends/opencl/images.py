@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,10 +54,17 @@ class Drawn:
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage."""
         self.queue.finish()
-        timings: dict[str, float] = {}
-        for stage, event in self.events or ():
-            timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
-        return timings
+        return _milliseconds(self.events or ())
+
+
+def _milliseconds(
+    events: Iterable[tuple[str, cl.Event]], of: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """What launches that are done took by stage, and others before them."""
+    timings = dict(of or {})
+    for stage, event in events:
+        timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
+    return timings
 
 
 class Repeat:
@@ -111,12 +118,16 @@ class OpenCLImages:
         drawn: Drawn,
         repeat: Repeat | None = None,
         tiles: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0)),
+        samples: int = 1,
     ) -> None:
-        """size: rows and columns of pixels. tiles: rows and columns of them, and samples of one."""
+        """size: rows and columns of pixels. tiles: rows and columns of them, and samples of one. samples:
+        of a pixel, across."""
         self._workspace, self._size, self._drawn, self._repeat = workspace, size, drawn, repeat
         self._outputs = {output.name: output for output in outputs}
         self._timings: dict[str, float] = {}
-        self._tiles = tiles
+        self._tiles, self._samples = tiles, samples
+        self._added: list[tuple[dict[str, int], list[tuple[str, cl.Event]]]] = []
+        """counts and launches of the pictures of which tiles were taken"""
         self._leased = drawn.leased
         weakref.finalize(self, workspace.pool.give_back, self._leased)
 
@@ -164,6 +175,36 @@ class OpenCLImages:
             cl.enqueue_copy(queue, keys, drawn.buffer("tile_ends"), wait_for=drawn.done())
         return TileEnds.of_keys(keys, tile)
 
+    def take_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
+        """As `GivesTileEnds`. Raises DeviceError as `read`."""
+        with self._workspace.failing("drawing"):
+            own, others = self.settle(), other.settle()
+            queue, copied = self._workspace.read_queue, None
+            after = [*own.done(), *others.done()]
+            for output in self._outputs.values():
+                width = 4 * output.channels  # bytes of a pixel
+                row_bytes = self._size[1] * width
+                source, target = (drawn.buffer(f"{output.name}_out") for drawn in (others, own))
+                for top, bottom, left, right in self._pixels_of(tiles):
+                    region, corner = ((right - left) * width, bottom - top, 1), (left * width, top, 0)
+                    pitches = (row_bytes, row_bytes * self._size[0])
+                    copied = cl.enqueue_copy(
+                        *(queue, target, source),
+                        **{"src_origin": corner, "dst_origin": corner, "region": region},
+                        **{"src_pitches": pitches, "dst_pitches": pitches, "wait_for": after},
+                    )
+            if copied is not None:
+                copied.wait()  # the other's buffers may be the next picture's
+            self._added.append((dict(others.stats()), others.events or []))
+
+    def _pixels_of(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
+        """Rectangles [top, bottom) x [left, right) of pixels that together are some tiles, row by row."""
+        (rows, columns), (height, width) = self._size, (side // self._samples for side in self._tiles[1])
+        for row, wanted in enumerate(tiles):
+            sides = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]]).astype(np.int8)))
+            for first, end in sides.reshape(-1, 2).tolist():
+                yield row * height, min((row + 1) * height, rows), first * width, min(end * width, columns)
+
     def wait(self) -> None:
         """Until the device has drawn it.
 
@@ -180,7 +221,7 @@ class OpenCLImages:
         with self._workspace.failing("drawing"):
             drawn = self.settle()
             if drawn.events is not None or self._repeat is None:
-                return drawn.timings()
+                return _milliseconds((one for _, events in self._added for one in events), drawn.timings())
             with self._workspace.lock:
                 self._timings = self._timings or self._repeat.timings()
             return self._timings
@@ -188,7 +229,10 @@ class OpenCLImages:
     @property
     def stats(self) -> Mapping[str, int]:
         with self._workspace.failing("drawing"):
-            return self.settle().stats()
+            stats = dict(self.settle().stats())
+            for added, _ in self._added:
+                stats = {name: number + added[name] for name, number in stats.items()}
+            return stats
 
     def settle(self) -> Drawn:
         """What is drawn, for certain with room for all of it."""

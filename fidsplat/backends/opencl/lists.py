@@ -36,6 +36,8 @@ class Lists:
         self.picture, self.shape = picture, picture.shape
         self.big = 0
         """big splats for which there is room"""
+        self.end = picture.tiles
+        """the last range of tiles ends there"""
 
     def make_room(self, words: int, needed: int = 0) -> None:
         """Takes `words` words of zeroed tallies, and room for at least `needed` big splats."""
@@ -50,10 +52,15 @@ class Lists:
         tallies = picture.take("tallies", 4 * words)
         cl.enqueue_fill_buffer(picture.queue, tallies, np.zeros(1, np.uint32), 0, 4 * words)
 
+    def room(self, count: int) -> int:
+        """Places of so many splats of each view."""
+        resident = self.picture.resident
+        return self.picture.views * (resident.room if count == resident.count else count)
+
     def project(self, first: int, end: int) -> None:
         """Records, keys and windows of splats [first, end)."""
         picture, count = self.picture, end - first
-        source, places = picture.program.source, picture.views * count
+        source, places = picture.program.source, self.room(count)
         picture.take("splats", places * source.records["Splat"].itemsize)
         picture.take("keys", KEYS * places)
         windows = picture.take("windows", WINDOWS * places)
@@ -73,6 +80,12 @@ class OrderedLists(Lists):
     def __init__(self, picture: Picture) -> None:
         super().__init__(picture)
         self._stats: dict[str, int] = {}
+        self.first = 0
+        """tiles before it are in rows that nobody wants"""
+        if picture.view.band is not None and picture.views == 1:
+            first, end = picture.view.band
+            self.first = first // self.shape.tile_height * picture.tiles_x
+            self.end = -(-end // self.shape.tile_height) * picture.tiles_x
         self._count = picture.resident.count
 
     def stats(self) -> Callable[[], dict[str, int]]:
@@ -94,7 +107,7 @@ class OrderedLists(Lists):
         pairs = int(words[_PAIRS]) | int(words[_PAIRS + 1]) << 32
         self._stats = {"splats": picture.resident.count, "visible": visible, "pairs": pairs}
         picture.pairs = pairs
-        yield from self._list(0, picture.tiles, pairs)
+        yield from self._list(self.first, self.end, pairs)
 
     def _list(self, first: int, end: int, pairs: int) -> Iterator[tuple[int, int]]:
         """Lists the tiles [first, end), in as many bands as the budget of pairs asks for."""
@@ -104,7 +117,10 @@ class OrderedLists(Lists):
             totals = picture.read("bin totals", np.uint32, (picture.tiles,))[first:end]
             bands = cut(totals, picture.workspace.pair_budget, first)
         for start, stop, listed in bands:
-            picture.take("lists", 4 * listed)
+            known, most = picture.pool.size("lists") // 4, picture.workspace.pair_budget
+            # where the last view needed less, the next may need more
+            room = max(listed, min(listed * 9 // 8, most)) if 0 < known < listed else listed
+            picture.take("lists", 4 * room)
             band = {"band_first": start, "band_end": stop, "count": self._count}
             table, views = picture.held["bin table"], picture.views
             picture.launch("bin", "bin_emit", self.shape.chunks, 1, views, table=table, **band)
@@ -115,10 +131,11 @@ class OrderedLists(Lists):
         picture, views = self.picture, self.picture.views
         count, bins = self._count, 1 << self.shape.radix_bits
         table = picture.take("sort table", 4 * bins * self.shape.chunks * views)
-        keys, order = picture.held["keys"], picture.take("order 0", 4 * count * views)
+        size = 4 * self.room(count)
+        keys, order = picture.held["keys"], picture.take("order 0", size)
         for number, shift in enumerate(range(0, 32, self.shape.radix_bits)):
-            keys_out = picture.take(f"sorted keys {number % 2}", 4 * count * views)
-            order_out = picture.take(f"order {(number + 1) % 2}", 4 * count * views)
+            keys_out = picture.take(f"sorted keys {number % 2}", size)
+            order_out = picture.take(f"order {(number + 1) % 2}", size)
             digit = {"keys": keys, "count": count, "first": number == 0, "shift": shift, "table": table}
             picture.launch("sort", "sort_count", self.shape.chunks, 1, views, **digit)
             digit |= {"starts": self._starts("sort", table, bins, _VISIBLE, views), "indices": order}
@@ -160,7 +177,7 @@ class ChunkedLists(OrderedLists):
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects and sorts; yields ranges of tiles (first, end), each when its lists are on the device."""
         picture = self.picture
-        rows = [(0, picture.tiles_y)]
+        rows = [(self.first // picture.tiles_x, self.end // picture.tiles_x)]
         visible = pairs = 0
         while rows:
             top, end = rows.pop(0)

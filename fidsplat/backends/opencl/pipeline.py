@@ -155,7 +155,7 @@ class OpenCLPipeline:
             stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
             shape = self._listing(resident, plan, stack)
             pipeline = self if shape is self.shape else self._other(self.features, shape)
-            pool.make_way((pipeline, "views", resident.count, plan), workspace.memory_budget - plan.held)
+            pool.make_way((pipeline, "views", resident.room, plan), workspace.memory_budget - plan.held)
 
             def start(view: View, pipeline=pipeline, stack=stack, plan=plan) -> Picture:
                 return Picture(workspace, pipeline.program, pipeline.shape, resident, view, plan, stack=stack)
@@ -214,7 +214,7 @@ class OpenCLPipeline:
         splat += SORTED if shape.lists == "ordered" else 0
         channels = 4 + sum(one.channels for one, _ in source.samples)
         tables = table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
-        return resident.count * splat + tables + 4 * channels * samples, samples
+        return resident.room * splat + tables + 4 * channels * samples, samples
 
     def _kind(self, view: View) -> tuple[Any, ...]:
         """What pictures have in common whose launches differ in numbers alone."""
@@ -239,8 +239,9 @@ class OpenCLPipeline:
     def _images(self, view: View, drawn: Drawn, repeat: Repeat | None = None) -> OpenCLImages:
         size = view.height // view.samples, view.width // view.samples
         tile = self.shape.tile_height, self.shape.tile_width
-        grid = -(-view.height // tile[0]), -(-view.width // tile[1])
-        return OpenCLImages(self.workspace, self.features.images, size, drawn, repeat, (grid, tile))
+        tiles = (-(-view.height // tile[0]), -(-view.width // tile[1])), tile
+        outputs = self.features.images
+        return OpenCLImages(self.workspace, outputs, size, drawn, repeat, tiles, view.samples)
 
     def _first(
         self,
@@ -252,9 +253,10 @@ class OpenCLPipeline:
     ) -> Picture:
         """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
         pool = self.workspace.pool
-        kind = self, view.width, view.height, resident.count, plan
+        alike = resident.alike if not plan.chunk else None
+        kind = self, view.width, view.height, alike or (resident.room, plan)
         # what this picture takes besides is planned for; that of its own kind is there already
-        pool.make_way(kind, self.workspace.memory_budget - plan.held)
+        pool.make_way(kind, self.workspace.memory_budget - plan.held, resident.room)
         picture = self._draw(resident, view, plan, trusted)
         whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
         if key is not None and whole and self.shape.lists != "ordered" and resident.count:
@@ -267,7 +269,7 @@ class OpenCLPipeline:
     def _repeat(self, resident: Resident, view: View, kept: Kept) -> OpenCLImages | None:
         """The next picture of a kind; None where nothing is left of the last."""
         workspace, plan = self.workspace, kept.plan
-        workspace.pool.make_way(kept.kind, workspace.memory_budget - plan.held)
+        workspace.pool.make_way(kept.kind, workspace.memory_budget - plan.held, resident.room)
         if not TiledLists.capacity(workspace):
             return None
         queue, recording = workspace.turn_to(workspace.repeat_queue), kept.recording
@@ -342,7 +344,7 @@ class OpenCLPipeline:
             fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._slopes)
         workspace, record = self.workspace, source.records["Splat"].itemsize
         budget, largest = workspace.memory_budget, workspace.device.max_mem_alloc_size
-        return plan_of(resident.count, record, upload, fixed, shape.lists, budget, largest)
+        return plan_of(resident.room, record, upload, fixed, shape.lists, budget, largest)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.

@@ -30,7 +30,8 @@ class Resident:
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         self._workspace = workspace
-        self.count = len(cloud)
+        self.count = self.room = len(cloud)
+        """its splats, and those for which pictures have buffers"""
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
@@ -59,6 +60,8 @@ class Resident:
         """what is kept of pictures that were drawn of it, by their kind"""
         self.fixed = True
         """whether its arrays stay as they are; a picture of others cannot be drawn again later"""
+        self.alike: object = None
+        """the same for all whose pictures take smaller buffers where they are fewer"""
         self.neighbours = False
         """whether splats that follow each other lie near each other, as those of stores do"""
         total = self.count * self._bytes_of(self._arrays)

@@ -60,6 +60,7 @@ class ResidentArrays:
         self, buffers: Mapping[str, cl.Buffer], count: int, sh_degree: int, origin: np.ndarray
     ) -> None:
         self._buffers, self.count, self.origin = dict(buffers), count, origin
+        self.room, self.alike = count, None
         self.sh_degree = sh_degree
         self.kept: dict[Hashable, Any] = {}
 

@@ -55,6 +55,7 @@ class BufferPool:
         self._spare: dict[str, list[cl.Buffer]] = {}
         self._zeroed: set[str] = set()
         self._kind: Hashable = None
+        self._splats = 0
         self.state = object()
         """another object whenever a scratch buffer is replaced or let go"""
 
@@ -66,13 +67,14 @@ class BufferPool:
         """The scratch buffer of that name, as it is."""
         return self._buffers.get(name)
 
-    def lease(self, name: str, size: int) -> cl.Buffer:
-        """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
+    def lease(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
+        """A buffer for somebody who gives it back (`give_back`) when it is not needed any more. larger:
+        whether it may have more bytes."""
         # taken before it is looked at: images that die meanwhile may give back others
         spare = self._spare.get(name, [])
         while spare:
             buffer = spare.pop()
-            if buffer.size == max(size, _LEAST):
+            if buffer.size == max(size, _LEAST) or (larger and buffer.size > size):
                 return buffer  # else it was of a picture of another size
         return self.fresh(name, size)
 
@@ -90,12 +92,14 @@ class BufferPool:
         spare = [buffer for buffers in list(self._spare.values()) for buffer in list(buffers)]
         return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
 
-    def make_way(self, kind: Hashable, size: int) -> None:
+    def make_way(self, kind: Hashable, size: int, splats: int = 0) -> None:
         """Before a picture: lets go of what pictures of another kind have left, if that is more than `size`
-        bytes. Pictures of one kind take buffers of the same sizes."""
-        if kind != self._kind and self.memory_bytes > size:
+        bytes. Pictures of one kind take buffers of the same sizes, or smaller ones for fewer splats."""
+        if kind == self._kind and splats <= self._splats:
+            return
+        if self.memory_bytes > size:
             self.clear()
-        self._kind = kind
+        self._kind, self._splats = kind, splats
 
     def forget_zeros(self) -> None:
         """After a failure: nobody knows what is left in buffers of zeros."""
