@@ -182,10 +182,10 @@ def _named(source: str, key: str, of_scene: bool) -> Iterator[None]:
 def _names(out: str | None, source: Path):
     """A function from an output's name and a suffix to the file that it goes to, in a folder known to be
     writable."""
-    if out == "" or not source.name:
-        raise InputError(
-            "an empty name; give a scene (.toml) or splat file (.ply), and a PNG file or a folder"
-        )
+    if not source.name:
+        raise InputError(f"cannot draw {source}, a folder: give a scene file (.toml) or a splat file in it")
+    if out == "":
+        raise InputError("-o is empty; give a PNG file or a folder")
     file = path_of(out) if out is not None else Path(source.name).with_suffix(".png")
     if file.suffix.lower() in _OTHER_PICTURES:
         raise InputError(f"pictures are written as PNG: name {file.with_suffix('.png')}, or a folder")

@@ -99,6 +99,7 @@ def test_words_that_make_no_command(words, says, capsys):
         (["render", "missing.toml"], "missing.toml"),
         (["render", "missing.ply"], "missing.ply"),
         (["render", "scene.yaml"], "scene.yaml"),
+        (["render", "."], "cannot draw ., a folder: give a scene file"),
         (["render", "missing.ply", "--outputs", "rgb,dpth"], "depth"),
         (["render", "missing.ply", "--quality", "best"], "standard"),
         (["render", "missing.ply", "-o", "picture.jpg"], "picture.png"),
