@@ -85,6 +85,7 @@ class Localise:
         page = write_report(folder, asked, device, found)
         self._record(asked, renderer)
         rows, length = table_of(found), found[names[0]]["length_m"]
+        rows = rows.iloc[:, :6]  # as many as a terminal has room for; the page has all
         return tell(
             self.json,
             {"run": sweep.results.run, "variants": found},

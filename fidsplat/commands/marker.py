@@ -29,7 +29,7 @@ class Marker:
 
     SPEC is one of
       apriltag:FAMILY:ID   16h5, 25h9, 36h10, 36h11         apriltag:36h11:5
-      aruco:FAMILY:ID      4x4_50 ... 7x7_1000, original    aruco:4x4_50:7
+      aruco:FAMILY:ID      4x4_50 ... original, mip_36h12   aruco:4x4_50:7
       qr:TEXT              the smallest code that fits      qr:https://example.org
       qr-vN-L:TEXT         version N, error level L M Q H   qr-v22-L:TEXT
       image:FILE           any one-bit picture              image:logo.png
