@@ -58,6 +58,27 @@ class DifferentiablePipeline(Protocol):
         ...
 
 
+class TakenBack(Protocol):
+    """A picture that was taken back as far as the sums over its tiles, until the device draws another one."""
+
+    def gradients(self) -> dict[str, Any]:
+        """What `DifferentiablePipeline.backward` gives.
+
+        Raises:
+            InputError: another picture has been drawn since.
+            DeviceError: the device runs out of memory or fails.
+        """
+        ...
+
+
+class TrainedPipeline(DifferentiablePipeline, Protocol):
+    """One whose derivatives `TrainingKernels` take, without an array of them."""
+
+    def take_back(self, images: Any, gradients: Mapping[str, Any]) -> TakenBack:
+        """As `backward`, for `TrainingKernels.step`."""
+        ...
+
+
 class TrainingKernels(Protocol):
     """The work of a training step around the picture (`fidsplat.train`), on arrays of the device.
 
@@ -112,20 +133,29 @@ class TrainingKernels(Protocol):
         arrays of the device, which hold until the next call."""
         ...
 
-    def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add derivatives (n,) by places on the screen to their sums, and who was seen."""
+    def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
+        """Add derivatives by places on the screen to their sums, and who was seen by the camera.
+
+        taken: what `TrainedPipeline.take_back` gave.
+        """
         ...
 
     def step(
-        self, gradients: Mapping[str, Any], sizes: Mapping[str, float], numbers: Mapping[str, float]
+        self,
+        taken: Any,
+        sizes: Mapping[str, float],
+        numbers: Mapping[str, float],
+        camera: Camera | None,
+        origin: np.ndarray,
     ) -> None:
-        """A step of Adam by what `DifferentiablePipeline.backward` gave.
+        """A step of Adam by what `TrainedPipeline.take_back` gave.
 
         Args:
             sizes: of the step, by `means`, `scales`, `quats`, `logits`, `sh` (of degree 0), `rest`.
             numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
                 `opacity_penalty`, added to the derivatives; `sparse`: 1 where splats rest that the picture
                 does not depend on.
+            camera: counts first, as `count` does, unless None.
         """
         ...
 

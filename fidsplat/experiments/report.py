@@ -77,6 +77,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
             {f"`{_COMMANDS.get(name, name)}`": summary for name, summary in summaries.items()}
         ),
         "training_seconds": TRAINING_SECONDS,
+        "notes": list(dict.fromkeys(note for summary in summaries.values() for note in summary.notes)),
     }
     write_page(page, folder, "results.md.j2", context)
     return [page, *files, missed, *sorted(folder.glob("*.svg"))]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.base import Images, ResidentData
-from fidsplat.backends.derivatives import TrainingKernels
+from fidsplat.backends.derivatives import TakenBack, TrainingKernels
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.densify import Plan, reset_logits
@@ -88,12 +88,23 @@ class DeviceWork:
         """Derivatives of the loss of normals by depths and normals, times its weight."""
         return self._kernels.surface(images, view, self._cameras[view], weight)
 
-    def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
-        """Adds the gradients on the screen to their sums."""
-        self._kernels.count(gradients["screen"], camera, origin)
+    def take_back(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> TakenBack:
+        """What `count` and `step` take of a picture, from the derivatives by it."""
+        return pipeline.take_back(images, slopes)
 
-    def step(self, gradients: Mapping[str, Any], rate: Mapping[str, float], step: int) -> None:
-        """One step of Adam."""
+    def count(self, taken: TakenBack, camera: Camera, origin: np.ndarray) -> None:
+        """Adds the gradients on the screen to their sums."""
+        self._kernels.count(taken, camera, origin)
+
+    def step(
+        self,
+        taken: TakenBack,
+        rate: Mapping[str, float],
+        step: int,
+        camera: Camera | None,
+        origin: np.ndarray,
+    ) -> None:
+        """One step of Adam; before it, with a camera, what `count` does."""
         settings, count = self._settings, max(1, self._number)
         by_names = {
             "means": "means",
@@ -113,7 +124,7 @@ class DeviceWork:
             "scale_penalty": settings.scale_penalty / (2 * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
         }
-        self._kernels.step(gradients, sizes, numbers)
+        self._kernels.step(taken, sizes, numbers, camera, origin)
 
     def shake(self, iteration: int, rate: float) -> None:
         """Moves the means at random (`fidsplat.train.mcmc.shake`)."""

@@ -79,14 +79,27 @@ class HostWork:
         _, by_depth, by_normal = normal_loss(images.read("depth"), images.read("normal"), counted, *lens)
         return {"depth": by_depth, "normal": by_normal}
 
+    def take_back(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> dict[str, Any]:
+        """What `count` and `step` take of a picture, from the derivatives by it."""
+        return pipeline.backward(images, slopes)
+
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""
         splats = self._splats
         splats.gradients += on_host(gradients["screen"])
         splats.seen += seen(splats, camera, origin)
 
-    def step(self, gradients: Mapping[str, Any], rate: Mapping[str, float], step: int) -> None:
-        """One step of Adam."""
+    def step(
+        self,
+        gradients: Mapping[str, Any],
+        rate: Mapping[str, float],
+        step: int,
+        camera: Camera | None,
+        origin: np.ndarray,
+    ) -> None:
+        """One step of Adam; before it, with a camera, what `count` does."""
+        if camera is not None:
+            self.count(gradients, camera, origin)
         given = {name: on_host(array) for name, array in gradients.items()}
         inner = inner_gradients(self._splats, given, self._settings)
         if self._settings.sparse_adam:

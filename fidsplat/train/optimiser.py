@@ -1,5 +1,5 @@
 """Adam (Kingma and Ba 2015) on the splats' values before their activations. The kernels' twin is
-kernels/opencl/train/adam.cl."""
+kernels/opencl/project_step.cl."""
 
 from __future__ import annotations
 

@@ -222,13 +222,13 @@ class Trainer:
         number = self._view_at(iteration)
         view = self.dataset.views[number]
         try:
-            value, gradients = self._compared(iteration, number, waits=False)
+            value, taken = self._compared(iteration, number, waits=False)
         except TooLittleRoom:
-            value, gradients = self._compared(iteration, number, waits=True)
+            value, taken = self._compared(iteration, number, waits=True)
         self._waiting.append((iteration, view.name, value))
         if not late or len(self._waiting) > self._work.late or self._due(iteration):
             self._settle()  # not before: the device goes on meanwhile
-        self._change(gradients, iteration, view)
+        self._change(taken, iteration, view)
         made.iteration = iteration
         made.history["counts"][iteration - 1] = len(self._work)
 
@@ -265,10 +265,8 @@ class Trainer:
             count = int(self._made.history["counts"][iteration - 1])
             yield Step(iteration, view, loss.value, loss.psnr, count)
 
-    def _compared(
-        self, iteration: int, number: int, waits: bool
-    ) -> tuple[Callable[[], Loss], dict[str, Any]]:
-        """Draws a view: what waits for its loss, and the derivatives of all losses by the splats.
+    def _compared(self, iteration: int, number: int, waits: bool) -> tuple[Callable[[], Loss], Any]:
+        """Draws a view: what waits for its loss, and the picture taken back, from which splats learn.
 
         waits: as `DifferentiablePipeline.forward`.
         """
@@ -293,7 +291,7 @@ class Trainer:
             view = self.dataset.views[number]
             counts = np.ones(view.picture.shape[:2], np.float32) if view.mask is None else view.mask
             slopes["distortion"] = counts * np.float32(by_distortions / counts.size)
-        return value, pipeline.backward(images, slopes)
+        return value, self._work.take_back(pipeline, images, slopes)
 
     def _stored(self) -> Splats:
         self._settle()
@@ -355,18 +353,18 @@ class Trainer:
         if iteration % settings.reset_every == 0:
             self._work.reset()
 
-    def _change(self, gradients: dict[str, Any], iteration: int, view: TrainingView) -> None:
+    def _change(self, taken: Any, iteration: int, view: TrainingView) -> None:
         """The optimiser's step; none where the default rule makes splats next, as in the authors' trainer, in
         which new splats have no gradient yet."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
-        if not mcmc_runs:
-            if iteration < settings.densify_until:
-                self._work.count(gradients, view.camera, self.dataset.origin)
-            if self._due(iteration):
-                return
+        origin = self.dataset.origin
+        if not mcmc_runs and self._due(iteration):
+            self._work.count(taken, view.camera, origin)
+            return
+        camera = view.camera if not mcmc_runs and iteration < settings.densify_until else None
         self._made.adam_step += 1
         rate = rates(settings, iteration, self.dataset.extent)
-        self._work.step(gradients, rate, self._made.adam_step)
+        self._work.step(taken, rate, self._made.adam_step, camera, origin)
         if mcmc_runs:
             if self._due(iteration):
                 self._work.load(mcmc.moved(self._work.store(), settings, iteration))

@@ -6,9 +6,6 @@
 // The schedules (schedule/*_backward.cl) walk a tile's list forward for T, in the arithmetic of blending and with its
 // decisions, and then back, CHUNK splats at a time.
 
-//@@ struct Moments
-#define FIELDS (sizeof(Moments) / sizeof(float))
-
 //@@ compose_types
 typedef struct {            // uniforms of the blend stage
     wide log_cut, ceiling, stop, filter;
@@ -215,21 +212,6 @@ static inline uint tile_rank(uint2 window, global const Bounds *big_bounds, int 
     return rank;
 }
 #endif
-
-// How many tiles a splat has.
-static inline uint tile_count(uint2 window, uint big_capacity, global const Bounds *big_bounds, int width, int height) {
-    if (window.y != 0) return popcount(window.y);
-    if (window.x >= big_capacity) return 0;
-    const Bounds b = big_bounds[window.x];
-    int y0, y1;
-    bounds_rows(&b, height, &y0, &y1);
-    uint tiles = 0;
-    for (int row = y0 / TILE_H; row * TILE_H < y1; row++) {
-        TileSpan span = tile_span(&b, row, width, height);
-        tiles += max(span.last - span.first + 1, 0);
-    }
-    return tiles;
-}
 
 #if LANES > 1
 // For each row of tiles of a big splat, how many tiles it has above, less its first column.

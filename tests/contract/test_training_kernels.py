@@ -6,16 +6,21 @@ from types import SimpleNamespace
 import numpy as np
 import pyopencl.array
 import pytest
+from derivative_errors import random_loss
 from training_scene import scene
 
+import fidsplat as fs
 from fidsplat.backends.derivatives import Trains
 from fidsplat.backends.gradients import on_host
 from fidsplat.backends.opencl import training
+from fidsplat.backends.prepare import prepare
+from fidsplat.errors import InputError
+from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.train import TrainSettings
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
 from fidsplat.train.losses import picture_loss
-from fidsplat.train.optimiser import rates
+from fidsplat.train.optimiser import moved_by, rates
 from fidsplat.train.parameters import NAMES, Splats
 
 BACKEND = "opencl"
@@ -52,7 +57,7 @@ def works(renderer, views):
 
 def splats():
     random = np.random.default_rng(0)
-    shapes = {"means": (3,), "log_scales": (2,), "quats": (4,), "logits": (), "sh": (9, 3)}
+    shapes = {"means": (3,), "log_scales": (2,), "quats": (4,), "logits": (), "sh": (16, 3)}
     made = Splats.of({name: random.normal(size=(COUNT, *shape)) for name, shape in shapes.items()})
     for group in (made.first, made.second):
         for array in group.values():
@@ -146,51 +151,108 @@ def test_loss_of_normals(renderer, views, works):
             np.testing.assert_allclose(found[name].get(), array, rtol=1e-4, atol=1e-5 * np.abs(array).max())
 
 
-@pytest.mark.parametrize(("strategy", "sparse"), [("default", False), ("default", True), ("mcmc", False)])
-def test_adam_and_what_is_drawn(renderer, works, strategy, sparse):
-    """At degree 0, which has plain colours, then at degrees 1 and 2; every third splat has no derivative but
-    in the last step; one has none but by its mean, one none but by its colour."""
-    device, host = works(strategy=strategy, sh_degree=2, sparse_adam=sparse)
-    random, rate = np.random.default_rng(2), rates(TrainSettings(), 100, 1.5)
-    for step, degree in ((1, 0), (2, 0), (3, 1), (4, 2)):
-        shown = [work.resident(degree, np.zeros(3)) for work in (device, host)]
-        color = "sh" if degree else "colors"
-        for name in ("means", "quats", "scales", "opacities", color):
-            shape = (COUNT, -1)
-            a, b = (read(renderer, one, name).reshape(shape) for one in shown)
-            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6, err_msg=f"{name} before step {step}")
-        shapes = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": ()}
-        shapes[color] = ((degree + 1) ** 2, 3) if degree else (3,)
-        gradients = {name: random.normal(0, 0.1, (COUNT, *shape)) for name, shape in shapes.items()}
-        for name, array in gradients.items():
-            if step < 4:
-                array[::3] = 0
-            for row in {1, 2} - {{"means": 1, color: 2}.get(name)}:
-                array[row] = 0
-        before = host.store().chosen(np.arange(0, COUNT, 3))
-        device.step({name: on_device(renderer, array) for name, array in gradients.items()}, rate, step)
-        host.step(gradients, rate, step)
+@pytest.mark.parametrize(
+    ("strategy", "sparse", "lanes"),
+    [
+        ("default", False, 0),
+        ("default", True, 0),
+        ("mcmc", False, 0),
+        ("default", False, 1),
+        ("default", True, 1),
+    ],
+)
+def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lanes):
+    """By the derivatives that the same picture has in arrays. At degree 0, which has plain colours, then at
+    degrees 2 and 3; a third of the splats are behind the camera but in the last step. Of a solid wall the
+    picture depends by its colour alone; in the second step, by depths, by its place; then, black, no more."""
+    device, host = works(lanes, strategy=strategy, sh_degree=3, sparse_adam=sparse)
+    view, origin = views[2], np.zeros(3)
+    rate, counted = rates(TrainSettings(), 100, 1.5), view.camera if strategy == "default" else None
+    for step, degree in ((1, 0), (2, 0), (3, 2), (4, 3)):
+        for work in (device, host):
+            work.load(before_a_wall(view.camera, 0.5 if step == 1 else -9.0, step < 4))
+        shown = drawn_alike(renderer, device, host, degree, f"before step {step}")
+        by = ("depth",) if step == 2 else ("rgb",)
+        taken = taken_back(renderer, device, view, shown, lanes, by)
+        gradients = {name: on_host(array) for name, array in taken.gradients().items()}
+        idle = ~moved_by(gradients)
+        assert step == 4 or (idle[::3].all() and idle.mean() < 0.6)
+        assert idle[1] == (step > 2)
+        if step < 3:
+            by = {name: bool(gradients[name][1].any()) for name in ("opacities", "colors", "means")}
+            assert by == {"opacities": False, "colors": step == 1, "means": step == 2}
+        before = host.store().chosen(np.flatnonzero(idle))
+        device.step(taken, rate, step, counted, origin)
+        host.step(gradients, rate, step, counted, origin)
         agree(device, host)
-        rested = device.store().chosen(np.arange(0, COUNT, 3))
+        drawn_alike(renderer, device, host, degree, f"after step {step}")
+        rested = device.store().chosen(np.flatnonzero(idle))
         same = [np.array_equal(rested.first[name], before.first[name]) for name in NAMES]
-        assert all(same) == (sparse and step < 4)
+        assert all(same) == (sparse or not idle.any())
+
+
+def drawn_alike(renderer, device, host, degree, when):
+    """What the device draws, which is what its twin does."""
+    shown = [work.resident(degree, np.zeros(3)) for work in (device, host)]
+    for name in ("means", "quats", "scales", "opacities", "sh" if degree else "colors"):
+        a, b = (read(renderer, one, name).reshape(COUNT, -1) for one in shown)
+        np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-6, err_msg=f"{name} {when}")
+    return shown[0]
+
+
+def before_a_wall(camera, color=0.5, behind=True):
+    """Small splats, each third behind the camera, before a solid wall that fills the picture."""
+    made = splats()
+    made.values["means"][:] = np.random.default_rng(6).uniform(-0.5, 0.5, (COUNT, 3))
+    made.values["log_scales"] -= np.float32(2.5)
+    if behind:
+        made.values["means"][::3] = 3 * camera.position
+    made.values["means"][1] = -0.5 * camera.position
+    made.values["log_scales"][1], made.values["logits"][1] = 4, 9
+    made.values["quats"][1] = matrix_to_quaternion(camera.world_to_camera[:3, :3].T)
+    made.values["sh"][1], made.values["sh"][1, 0] = 0, color
+    return made
+
+
+def taken_back(renderer, device, view, resident, lanes, outputs=("rgb",)):
+    """A picture of splats on the device, taken back from a random loss of these outputs."""
+    capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
+    features, seen = prepare(resident, capture)
+    shape = next(iter(renderer.backend.shapes("schedule").values())) if lanes == 1 else None
+    pipeline = renderer.backend.differentiate(features, shape)
+    images = pipeline.forward(resident, seen)
+    loss = random_loss(features, seen)
+    return device.take_back(pipeline, images, {name: loss[name] for name in outputs})
 
 
 @pytest.mark.parametrize("sparse", [False, True])
-def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, works, sparse):
+def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, views, works, sparse):
     """In every bit: after a stop it is made again from the values."""
-    random, rate = np.random.default_rng(4), rates(TrainSettings(), 100, 1.5)
-    device, _ = works(sh_degree=2, sparse_adam=sparse)
+    rate, view = rates(TrainSettings(), 100, 1.5), views[2]
+    device, _ = works(sh_degree=3, sparse_adam=sparse)
+    device.load(before_a_wall(view.camera))
     names = ("means", "quats", "scales", "opacities", "sh")
-    shapes = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (), "sh": (9, 3)}
     for step in range(1, 6):
-        device.resident(2, np.zeros(3))
-        gradients = {name: random.normal(0, 0.1, (COUNT, *shape)) for name, shape in shapes.items()}
-        device.step({name: on_device(renderer, array) for name, array in gradients.items()}, rate, step)
-    went_on = [read(renderer, device.resident(2, np.zeros(3)), name) for name in names]
+        taken = taken_back(renderer, device, view, device.resident(3, np.zeros(3)), 0)
+        device.step(taken, rate, step, None, np.zeros(3))
+    went_on = [read(renderer, device.resident(3, np.zeros(3)), name) for name in names]
     device.load(device.store())
     for name, array in zip(names, went_on, strict=True):
-        np.testing.assert_array_equal(read(renderer, device.resident(2, np.zeros(3)), name), array, name)
+        np.testing.assert_array_equal(read(renderer, device.resident(3, np.zeros(3)), name), array, name)
+
+
+def test_a_step_by_a_picture_that_was_followed_is_refused(renderer, views, works):
+    device, _ = works(sh_degree=2)
+    device.load(before_a_wall(views[2].camera))
+    resident = device.resident(2, np.zeros(3))
+    late, last = (taken_back(renderer, device, views[2], resident, 0) for _ in range(2))
+    kept = device.store().values["means"].tobytes()
+    with pytest.raises(InputError, match="before the next picture"):
+        device.step(late, rates(TrainSettings(), 100, 1.5), 1, None, np.zeros(3))
+    with pytest.raises(InputError, match="before the next picture"):
+        late.gradients()
+    assert device.store().values["means"].tobytes() == kept
+    assert last.gradients()["means"].get().any()
 
 
 def read(renderer, resident, name):
@@ -202,14 +264,18 @@ def read(renderer, resident, name):
 
 
 def test_who_is_seen(renderer, views, works):
+    """Where splats are made next, and do not move."""
     device, host = works()
-    random, origin = np.random.default_rng(3), np.array([0.2, 0.1, -0.3])
+    origin = np.array([0.2, 0.1, -0.3])
     for view in views:
-        screen = random.uniform(size=COUNT)
-        device.resident(0, origin)
-        device.count({"screen": on_device(renderer, screen)}, view.camera, origin)
-        host.count({"screen": screen}, view.camera, origin)
+        taken = taken_back(renderer, device, view, device.resident(0, origin), 0)
+        gradients = taken.gradients()
+        device.count(taken, view.camera, origin)
+        host.count(gradients, view.camera, origin)
     agree(device, host)
+    kept = device.store()
+    assert kept.values["means"].tobytes() == splats().values["means"].tobytes()
+    assert (kept.gradients > splats().gradients).any()
     counted = host.store().seen - splats().seen
     assert {0.0, 1.0, 2.0, 3.0} >= set(np.rint(counted).tolist()) > {0.0}
 

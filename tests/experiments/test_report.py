@@ -262,6 +262,14 @@ def test_a_report_that_is_made_again_has_the_same_tables(tmp_path):
     assert len(first.runs) == 1
 
 
+def test_notes_of_tables_stand_on_the_page(tmp_path):
+    folder = tmp_path / "kept"
+    (made, *_) = make_report([Path(__file__).parents[2] / "docs" / "results"], folder)
+    notes = read_summary(folder / "angles.csv").notes
+    assert notes
+    assert all(note in made.read_text() for note in notes)
+
+
 def test_a_table_with_words_for_numbers_is_one_line(tmp_path):
     whole = (Path(__file__).parents[2] / "docs" / "results" / "counts.csv").read_text().splitlines()
     assert ",48,52," in whole[3]

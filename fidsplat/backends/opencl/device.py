@@ -147,7 +147,7 @@ class OpenCLBackend(Workspace):
     def compile_ahead(self, features: FeatureSet) -> None:
         """As `CompilesAhead`."""
         if self._own[1].get(features) not in self._gradients:
-            self._ahead.begin(features, lambda: self.differentiate(features))
+            self._ahead.begin(features, lambda: self.differentiate(features).prepare_step())
 
     def training(self) -> OpenCLTraining:
         """As `Trains`."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from copy import copy
 from typing import Any
 
@@ -20,8 +21,15 @@ from fidsplat.backends.gradients import (
 )
 from fidsplat.backends.opencl.counts import pairs_of
 from fidsplat.backends.opencl.gradients_again import Again
-from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of, group_of, tape_bytes
+from fidsplat.backends.opencl.gradients_source import (
+    assemble_gradients,
+    assemble_step,
+    chunk_of,
+    group_of,
+    tape_bytes,
+)
 from fidsplat.backends.opencl.images import OpenCLImages
+from fidsplat.backends.opencl.launches import Launches
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
@@ -31,7 +39,7 @@ from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
 from fidsplat.errors import DeviceError, InputError
 
-_GROUP = 64  # RESERVED, POSED and ADDED of the kernels
+_GROUP = 64  # RESERVED, POSED, ADDED and STEPPED of the kernels
 _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # of floats too
 
@@ -52,6 +60,39 @@ class OpenCLDifferentiable(DifferentiableImages):
         return self.picture.held[f"{name}_out"], gradient_shape(name, self.picture.view)
 
 
+@contextmanager
+def _failing(picture: Picture) -> Iterator[None]:
+    """Takes the device for oneself, and says what it fails at."""
+    try:
+        with picture.workspace.lock:
+            yield
+    except cl.Error as error:
+        title = picture.workspace.info.title
+        raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
+
+
+class TakenBack:
+    """As `fidsplat.backends.derivatives.TakenBack`."""
+
+    def __init__(self, of: OpenCLGradients, images: OpenCLDifferentiable, picture: Picture) -> None:
+        self._of, self._images, self._picture = of, images, picture
+
+    def gradients(self) -> dict[str, Any]:
+        """As `DifferentiablePipeline.backward`."""
+        with self._last():
+            return self._of.sum_up(self._picture)
+
+    def step(self, given: Mapping[str, Any]) -> None:
+        """Launches kernels/opencl/project_step.cl. given: its arguments but for the picture's."""
+        with self._last():
+            self._of.step(self._picture, given)
+
+    def _last(self) -> AbstractContextManager[None]:
+        if not self._images.last:
+            raise InputError(NOT_THE_LAST)
+        return _failing(self._picture)
+
+
 class OpenCLGradients:
     """Compiled stages and their derivatives."""
 
@@ -65,6 +106,8 @@ class OpenCLGradients:
         self._pairs = 0
         """for which there is room"""
         self._again = Again(pipeline.workspace, pipeline.program, self.program)
+        self._step: tuple[int, Launches] | None = None
+        """number of splats, and what was launched for so many"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """As `DifferentiablePipeline`: GPUs need not wait where pictures were taken back before."""
@@ -80,41 +123,32 @@ class OpenCLGradients:
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """As `DifferentiablePipeline`: pyopencl arrays."""
+        with images.picture.workspace.lock:
+            return self.take_back(images, gradients).gradients()
+
+    def take_back(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TakenBack:
+        """As `TrainedPipeline`."""
         check_gradients(self._pipeline.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)
         picture = images.picture
-        try:
-            with picture.workspace.lock:
-                return self._backward(picture, gradients)
-        except cl.Error as error:
-            title = picture.workspace.info.title
-            raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
+        with _failing(picture):
+            return TakenBack(self, images, self._backward(picture, gradients))
 
-    def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        if drawn.counted is not None:
-            found = self._again.take_back(drawn, gradients, lambda: self._ask(drawn))
-            if found is not None:
-                return found
-        picture, first = copy(drawn), len(drawn.launched)  # its buffers and events, with other kernels
-        picture.program = self.program
-        view, shape, count, pairs = picture.view, self._pipeline.shape, picture.resident.count, picture.pairs
+    def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> Picture:
+        if drawn.counted is not None and self._again.take_back(drawn, gradients, lambda: self._ask(drawn)):
+            return self._with_slots(drawn)
+        first = len(drawn.launched)
+        picture = self._with_slots(drawn)
+        view, shape, count = picture.view, self._pipeline.shape, picture.resident.count
         self._take_gradients(picture, gradients)
-        posed = -(-count // _GROUP)  # work-groups that sum up the pose
-        record = self.source.records["Moments"].itemsize
-        real = self.source.scalars.dtype("real").itemsize
         tile = shape.tile_width * shape.tile_height
-        picture.take("splat_slots", 4 * count)
-        picture.take("moments", record * pairs)
         features, in_groups = self._pipeline.features, shape.schedule == "group"
-        chunks = pairs // chunk_of(features, shape) + picture.tiles
+        chunks = picture.pairs // chunk_of(features, shape) + picture.tiles
         picture.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
-        picture.take("tile_sums", 3 * real * picture.tiles)
-        picture.take("group_sums", 6 * real * posed)
         reserved = picture.take("reserved", 8)
         if not in_groups:
             picture.take("big_rows", 4 * picture.held["big_capacity"] * -(-view.height // shape.tile_height))
-        found = self._room_for_results(picture)
 
         cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 8)
         if count:
@@ -131,6 +165,26 @@ class OpenCLGradients:
         items = group_of(features, shape)
         picture.launch("blend backward", "blend_backward", groups * items, items, log_ceiling=ceiling)
         self._ask(drawn)
+        if drawn.counted is not None:
+            wanted = {f"by_{name}" for name in GRADIENT_OUTPUTS} & self._wanted
+            self._again.keep_back(picture, first, gradients, wanted)
+        return picture
+
+    def _with_slots(self, drawn: Picture) -> Picture:
+        """The picture with the kernels of the way back, and what those leave that go through tiles."""
+        picture = copy(drawn)
+        picture.program = self.program
+        picture.take("splat_slots", 4 * picture.resident.count)
+        picture.take("moments", self.source.records["Moments"].itemsize * picture.pairs)
+        picture.take("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * picture.tiles)
+        return picture
+
+    def sum_up(self, picture: Picture) -> dict[str, Any]:
+        """The derivatives of a picture that was taken back."""
+        count, real = picture.resident.count, self.source.scalars.dtype("real").itemsize
+        posed = -(-count // _GROUP)  # work-groups that sum up the pose
+        picture.take("group_sums", 6 * real * posed)
+        found = self._room_for_results(picture)
         if count:
             arrays: dict[str, Any] = {
                 name: picture.resident.part(name, 0, count) for name in self._cloud_arrays
@@ -139,10 +193,31 @@ class OpenCLGradients:
         given: dict[str, Any] = {name: found[name].data for name in ("background", "pose")}
         given |= {"tiles": picture.tiles, "groups": posed}
         picture.launch("project backward", "add_up", (3 + 6) * _GROUP, _GROUP, **given)
-        if drawn.counted is not None:
-            wanted = {f"by_{name}" for name in GRADIENT_OUTPUTS} & self._wanted
-            self._again.keep_back(picture, first, gradients, wanted, found)
         return found
+
+    def prepare_step(self) -> None:
+        """Compiles what `step` launches, which those do not need who only ask for derivatives."""
+        if self._step is None:
+            source = assemble_step(self._pipeline.features, self._pipeline.shape)
+            self._step = 0, Launches(Program(self._pipeline.workspace, source))
+
+    def step(self, picture: Picture, given: Mapping[str, Any]) -> None:
+        """The step of a training by a picture that was taken back, with arguments that are its own."""
+        self.prepare_step()
+        assert self._step is not None
+        known, launches = self._step
+        count = picture.resident.count
+        arguments = launches.arguments("project_step")
+        every = {**given, "count": count}
+        values = {one.name: every[one.name] if one.name in every else picture.value(one) for one in arguments}
+        if known != count:
+            self._step = 0, launches  # an interrupt on the way leaves none
+            size = (max(1, -(-count // _GROUP)) * _GROUP,)
+            launches.keep([("project_step", size, (_GROUP,), list(values.values()))], values)
+            self._step = count, launches
+        launches.put(values)
+        (event,) = launches.launch(picture.queue)
+        picture.events.append(("project backward", event))
 
     def _ask(self, drawn: Picture) -> None:
         """Whether there was room for all pairs: with too little of it lists were left empty, and splats have

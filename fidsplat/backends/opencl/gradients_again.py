@@ -55,10 +55,6 @@ class _Back:
     given: frozenset[str]
     """outputs whose derivatives were on the device"""
     stages: list[str]
-    asked: int
-    """launches before the number of pairs is asked for"""
-    results: dict[str, weakref.ref[Array]]
-    """which the pool holds"""
 
 
 class Again:
@@ -141,7 +137,6 @@ class Again:
         first: int,
         given: Mapping[str, Any],
         wanted: Set[str],
-        found: Mapping[str, Array],
     ) -> None:
         """Remembers how a picture was taken back.
 
@@ -149,7 +144,6 @@ class Again:
             first: of its launches those from this one on.
             given: the outputs' derivatives.
             wanted: names of the arguments that they are.
-            found: arrays of the results, scratch of the pool.
         """
         self._back, kind = None, self._kind
         on_device = all(isinstance(array, Array) for array in given.values())
@@ -160,43 +154,34 @@ class Again:
             return
         row = picture.launched[first:]
         kernels = [kernel for _, kernel, *_ in row]
-        if len(set(kernels)) < len(kernels) or "project_backward" not in kernels:
+        if len(set(kernels)) < len(kernels):
             return
         changing = {"view", "log_ceiling", *numbers_of(picture.view), *(name for name, _ in kind.leases)}
         self._backward.keep([one[1:] for one in row], {*changing, *wanted})
         kind.state = self._workspace.pool.state
-        asked = kernels.index("project_backward")
-        results = {name: weakref.ref(array) for name, array in found.items()}
-        self._back = _Back(kind, frozenset(given), [stage for stage, *_ in row], asked, results)
+        self._back = _Back(kind, frozenset(given), [stage for stage, *_ in row])
 
-    def take_back(
-        self, picture: Picture, given: Mapping[str, Any], ask: Callable[[], None]
-    ) -> dict[str, Array] | None:
-        """Launches the way back of a picture as that which was kept, and gives its results; None where it
-        does not fit.
+    def take_back(self, picture: Picture, given: Mapping[str, Any], ask: Callable[[], None]) -> bool:
+        """Launches the way back of a picture as that which was kept; whether it fits.
 
-        ask: whether there was room for all pairs; called when all is launched that does not need to know.
+        ask: whether there was room for all pairs; called when all is launched.
         """
         back, pool = self._back, self._workspace.pool
         if back is None or back.kind is not self._kind or back.kind.state is not pool.state:
-            return None
+            return False
         if not self._is_like(back.kind, picture) or given.keys() != back.given:
-            return None
+            return False
         if not all(isinstance(array, Array) for array in given.values()):
-            return None
-        found = {name: array for name, held in back.results.items() if (array := held()) is not None}
-        if len(found) < len(back.results):
-            return None
+            return False
         held = {name: picture.held[name] for name in ("view", *(name for name, _ in back.kind.leases))}
         held |= numbers_of(picture.view) | {"log_ceiling": math.log(picture.view.ceiling)}
         self._backward.put(held | {f"by_{name}": array.data for name, array in given.items()})
         queue = picture.queue
         cl.enqueue_fill_buffer(queue, pool.scratch("reserved", 4), _ZERO, 0, 4)
-        events = self._backward.launch(queue, 0, back.asked)
-        ask()
-        events += self._backward.launch(queue, back.asked)
+        events = self._backward.launch(queue)
         picture.events += zip(back.stages, events, strict=True)
-        return found
+        ask()
+        return True
 
     def _fits(self, kind: _Kind, resident: Resident, view: View, pairs: int) -> bool:
         """Whether the picture of a view is launched as the one that was kept."""

@@ -1,9 +1,11 @@
-"""The text of the program `gradients`: put together as assemble.py does, when derivatives are asked for.
+"""The text of the programs `gradients` and `step`: put together as assemble.py does, when they are asked for.
 
 What only draws never has it: the programs `lists` and `picture` are the same with derivatives and without.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 from fidsplat.backends.opencl.assemble import (
     Declarations,
@@ -24,15 +26,37 @@ _STAGES = (
     "math",
     "splat",
     "bounds",
+    "moments",
     "blend_backward",
     "schedule/{}_cells",
     "schedule/{}_backward",
+    "set_up_backward",
     "project_backward",
+)
+_STEP_STAGES = (
+    "prelude",
+    "math",
+    "splat",
+    "bounds",
+    "moments",
+    "set_up_backward",
+    "train/drawn",
+    "train/adam",
+    "project_step",
 )
 
 
 def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
     """The source of the derivatives of these features on a device of this shape."""
+    return _assembled("gradients", _STAGES, features, shape)
+
+
+def assemble_step(features: FeatureSet, shape: DeviceShape) -> Source:
+    """The source of a training's step by them, which takes the place of the last of their stages."""
+    return _assembled("step", _STEP_STAGES, features, shape)
+
+
+def _assembled(name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape) -> Source:
     layouts = [LAYOUTS[name] for name in layouts_of(features) if name in LAYOUTS]
     declared = _Declarations(
         features, layouts, KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
@@ -46,9 +70,9 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
         "CHUNK": chunk_of(features, shape),
     }
     writer = Writer([file for file in files if file], declared, numbers)
-    text = writer.program("gradients", [stage.format(shape.schedule) for stage in _STAGES])
+    text = writer.program(name, [stage.format(shape.schedule) for stage in stages])
     arguments = {kernel: declared.arguments(kernel) for kernel in kernels_in(text)}
-    return Source({"gradients": text}, declared.records, arguments, (), declared.scalars)
+    return Source({name: text}, declared.records, arguments, (), declared.scalars)
 
 
 def chunk_of(features: FeatureSet, shape: DeviceShape) -> int:

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import pyopencl as cl
 
+from fidsplat.backends.opencl.declare import Argument
 from fidsplat.backends.opencl.program import Program, put_argument
 from fidsplat.backends.opencl.workspace import token_of
 
@@ -39,6 +40,10 @@ class Launches:
         self._places: dict[str, _Place] = {}
         """of the arguments that may change"""
 
+    def arguments(self, kernel: str) -> tuple[Argument, ...]:
+        """Of a kernel of the program."""
+        return self._program.source.arguments[kernel]
+
     def keep(self, row: Sequence[Launch], changing: Collection[str]) -> None:
         """The launches from now on, each of another kernel. changing: names of arguments that `put` may
         change."""
@@ -51,7 +56,7 @@ class Launches:
             kernel = self._kernels[name]
             offset = (first[0], *(0 for _ in size[1:])) if first and first[0] else None
             made.append((kernel, size, group, offset))
-            arguments = self._program.source.arguments[name]
+            arguments = self.arguments(name)
             for index, (argument, value) in enumerate(zip(arguments, values, strict=True)):
                 scalar = self._program.type_of(name, index)
                 put_argument(kernel, index, value, scalar)
@@ -72,7 +77,6 @@ class Launches:
                 put_argument(kernel, index, value, scalar)
             place.mark = mark
 
-    def launch(self, queue: cl.CommandQueue, first: int = 0, end: int | None = None) -> list[cl.Event]:
-        """The launches [first, end), in their order."""
-        row = self._row[first:end]
-        return [cl.enqueue_nd_range_kernel(queue, *one) for one in row]
+    def launch(self, queue: cl.CommandQueue) -> list[cl.Event]:
+        """The launches in their order."""
+        return [cl.enqueue_nd_range_kernel(queue, *one) for one in self._row]

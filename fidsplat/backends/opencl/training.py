@@ -33,6 +33,11 @@ _SUMS, _SUMMED = 512, 128
 _EACH_ROWS = 4
 """that a work-item of its passes over columns takes (EACH_ROWS there)"""
 _REMEMBERED = ("first_", "second_")
+_STEP_NUMBERS = (
+    *("beta1", "beta2", "rest1", "rest2", "root", "epsilon", "scale_penalty", "opacity_penalty"),
+    *(f"size_{name}" for name in ("means", "scales", "quats", "logits", "sh", "rest")),
+)
+"""of a step of Adam (kernels/opencl/project_step.cl)"""
 
 
 class _Truth(NamedTuple):
@@ -242,46 +247,37 @@ class OpenCLTraining:
         self._launch_rows("surface_depths", width, height, given)
         return found
 
-    def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
+    def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
         """As `TrainingKernels`."""
-        if (known := self._sights.get(camera)) is None or known[0] is not origin:
-            known = self._sights[camera] = origin, _sight(camera, origin)
-        given = known[1] | {"screen": screen.data}
-        self._again("count", (), given, lambda: ([self._items("count_seen", self._count, given)], None))
+        self._seen(camera, origin)
+        nothing = dict.fromkeys(_STEP_NUMBERS, 0.0)
+        self._step(taken, nothing | {"counted": 1, "move": 0, "sparse": 0})
 
     def step(
-        self, gradients: Mapping[str, Any], sizes: Mapping[str, float], numbers: Mapping[str, float]
+        self,
+        taken: Any,
+        sizes: Mapping[str, float],
+        numbers: Mapping[str, float],
+        camera: Camera | None,
+        origin: np.ndarray,
     ) -> None:
         """As `TrainingKernels`."""
-        by_color = gradients["colors"] if "colors" in gradients else gradients["sh"]
-        given: dict[str, Any] = {
-            "by_means": gradients["means"].data,
-            "by_scales": gradients["scales"].data,
-            "by_quats": gradients["quats"].data,
-            "by_opacities": gradients["opacities"].data,
-            "by_sh": by_color.data,
-            **{f"size_{name}": size for name, size in sizes.items()},
-            **numbers,
-            "sparse": int(numbers["sparse"]),
-            "rest1": 1 - numbers["beta1"],
-            "rest2": 1 - numbers["beta2"],
-        }
+        if camera is not None:
+            self._seen(camera, origin)
+        given = {f"size_{name}": size for name, size in sizes.items()} | dict(numbers)
+        given |= {"rest1": 1 - numbers["beta1"], "rest2": 1 - numbers["beta2"]}
+        given |= {"counted": int(camera is not None), "move": 1, "sparse": int(numbers["sparse"])}
+        self._step(taken, given)
 
-        whole = 0 if self._lanes == 1 or numbers["sparse"] else self._count // 16  # adam_rows.cl
+    def _step(self, taken: Any, given: Mapping[str, Any]) -> None:
+        taken.step({**self._held, **given})
 
-        def plan() -> tuple[list[Launch], None]:
-            row = []
-            if whole:
-                row.append(self._items("adam_shapes_16", whole, given))
-            if 16 * whole < self._count:
-                row.append(self._items("adam_shapes", self._count - 16 * whole, given, 16 * whole))
-            if self._lanes == 1 or self._held["plain"]:
-                row.append(self._items("adam_sh", 3 * self._count * self._held["drawn"], given))
-            else:
-                row.append(self._items("adam_sh_rows", self._count, given))
-            return row, None
-
-        self._again("step", (whole,), given, plan)
+    def _seen(self, camera: Camera, origin: np.ndarray) -> None:
+        """Counts who is seen, as splats are before the step."""
+        if (known := self._sights.get(camera)) is None or known[0] is not origin:
+            known = self._sights[camera] = origin, _sight(camera, origin)
+        given = known[1]
+        self._again("count", (), given, lambda: ([self._items("count_seen", self._count, given)], None))
 
     def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
         """As `TrainingKernels`."""

@@ -12,7 +12,7 @@ MARGIN, MARGIN_ROWS = 16, 5
 """zeros around an image, floats of a row and rows"""
 PANEL, STRIP = 128, 64
 """values of a row and rows that a work-item takes, on CPUs (kernels/opencl/train/loss_strips.cl)"""
-_STEPS = ("surface", "adam", "pick", "shake")
+_STEPS = ("surface", "drawn", "activate", "pick", "shake")
 
 _PICTURE = takes(
     "int width height  // values of a row: three of a pixel; rows",
@@ -24,11 +24,6 @@ _IMAGES = takes("out float images")
 _SURFACE = takes(
     "int width height  // of the picture",
     "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
-)
-_ADAM = takes(
-    "float beta1 beta2 rest1 rest2 root epsilon",
-    "int sparse  // splats that the picture does not depend on rest",
-    "in float by_means by_opacities by_sh",
 )
 _DRAWN_SH = takes("uint count drawn all", "int plain")
 
@@ -52,8 +47,6 @@ _LOSS_STRIPS: dict[str, tuple[Argument, ...]] = {
         *("float l1_share ssim_share", "in float images", "out float by_rgb"),
     ),
 }
-_ADAM_ROWS = {"adam_shapes_16": "adam_shapes", "adam_sh_rows": "adam_sh"}
-"""kernels of CPUs that have the arguments of others"""
 _KERNELS: dict[str, tuple[Argument, ...]] = {
     "surface_normals": takes(
         _SURFACE,
@@ -70,24 +63,6 @@ _KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float drawn_quats drawn_scales drawn_opacities",
     ),
     "activate_sh": takes(_DRAWN_SH, "in float sh", "out float drawn_sh"),
-    "adam_shapes": takes(
-        "uint count drawn",
-        _ADAM,
-        "float size_means size_scales size_quats size_logits  // rates of this step",
-        "float scale_penalty opacity_penalty",
-        "in float by_scales by_quats",
-        "out float means first_means second_means",
-        "out float log_scales first_log_scales second_log_scales",
-        "out float quats first_quats second_quats",
-        "out float logits first_logits second_logits",
-        "out float drawn_quats drawn_scales drawn_opacities",
-    ),
-    "adam_sh": takes(
-        _DRAWN_SH,
-        _ADAM,
-        "float size_sh size_rest  // rates of this step, of degree 0 and above",
-        "out float sh first_sh second_sh drawn_sh",
-    ),
     "pick": takes(
         "uint count row kept",
         "in uint rows",
@@ -99,8 +74,8 @@ _KERNELS: dict[str, tuple[Argument, ...]] = {
         "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
         "float move_x move_y move_z  // camera-space position of the means' zero [m]",
         "float focal_x focal_y center_x center_y near width height",
-        "in float means drawn_scales screen",
-        "out float gradients seen",
+        "in float means drawn_scales",
+        "out float seen",
     ),
     "shake": takes(
         "uint count seed_low seed_high iteration purpose",
@@ -123,8 +98,7 @@ def training_source(lanes: int, float64: bool, fast_fma: bool) -> Source:
     if lanes == 1:
         steps, kernels = ("loss_values", "loss", *_STEPS), _LOSS | _KERNELS
     else:
-        steps, kernels = ("loss_values", "loss_strips", *_STEPS, "adam_rows"), _LOSS_STRIPS | _KERNELS
-        kernels |= {name: kernels[of] for name, of in _ADAM_ROWS.items()}
+        steps, kernels = ("loss_values", "loss_strips", *_STEPS), _LOSS_STRIPS | _KERNELS
     numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
     head = "".join(f"#define {name} {value}\n" for name, value in numbers.items())
     files = ("prelude.cl", "math.cl", *(f"train/{step}.cl" for step in steps))

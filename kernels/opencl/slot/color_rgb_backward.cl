@@ -1,5 +1,11 @@
-// One RGB colour per splat.
+// One RGB colour per splat: one term, whose derivative has nothing to do with what it is.
+//@ functions
+#define SH_TERMS 1
+#define PLAIN 1
+#define CLOUD_TERMS 0
+#define BY_TERMS by_colors
 //@ color_backward
-    by_colors[3 * i] = (float)total.r;
-    by_colors[3 * i + 1] = (float)total.g;
-    by_colors[3 * i + 2] = (float)total.b;
+    own.basis[0] = 1;
+    own.color[0] = (float)total.r;
+    own.color[1] = (float)total.g;
+    own.color[2] = (float)total.b;

@@ -1,5 +1,8 @@
 // Spherical harmonics: by the coefficients and, through the direction, by the centre and the camera's.
 //@ functions
+#define PLAIN 0
+#define CLOUD_TERMS sh
+#define BY_TERMS by_sh
 // Derivatives by the direction of sum_k by[k] Y_k.
 static inline real3_ sh_basis_backward(real3_ d, const wide *by) {
     wide x = (wide)d.x, y = (wide)d.y, z = (wide)d.z, by_x = 0.0f, by_y = 0.0f, by_z = 0.0f;
@@ -30,22 +33,20 @@ static inline real3_ sh_basis_backward(real3_ d, const wide *by) {
     return slope;
 }
 //@ color_backward
-    global float *by_terms = by_sh + (size_t)i * SH_TERMS * 3;
-    if (!drawn) {
-        for (int k = 0; k < 3 * SH_TERMS; k++) by_terms[k] = 0.0f;
-    } else {
+    {
         real3_ ray = {means[3 * i] - view->eye[0], means[3 * i + 1] - view->eye[1], means[3 * i + 2] - view->eye[2]};
         real length = sqrt(dot3(ray, ray)), inverse = length > 0 ? 1 / length : 0;
         ray = scaled(inverse, ray);
-        wide basis[SH_TERMS], by_basis[SH_TERMS];
-        sh_basis(ray, basis);
+        sh_basis(ray, own.basis);
         // colours below 0 are clamped, and have no derivative
         const Splat s = splats[i];
-        wide by[3] = {s.r > 0.0f ? (wide)total.r : 0.0f, s.g > 0.0f ? (wide)total.g : 0.0f, s.b > 0.0f ? (wide)total.b : 0.0f};
+        own.color[0] = s.r > 0.0f ? (float)total.r : 0.0f;
+        own.color[1] = s.g > 0.0f ? (float)total.g : 0.0f;
+        own.color[2] = s.b > 0.0f ? (float)total.b : 0.0f;
+        wide by_basis[SH_TERMS];
         for (int k = 0; k < SH_TERMS; k++) {
-            global const float *term = sh + ((size_t)i * SH_TERMS + k) * 3;
-            by_basis[k] = by[0] * term[0] + by[1] * term[1] + by[2] * term[2];
-            for (int c = 0; c < 3; c++) by_terms[3 * k + c] = (float)(basis[k] * by[c]);
+            global const float *term = terms + ((size_t)i * row + k) * 3;
+            by_basis[k] = own.color[0] * term[0] + own.color[1] * term[1] + own.color[2] * term[2];
         }
         real3_ slope = sh_basis_backward(ray, by_basis);
         by_ray = scaled(inverse, add3(slope, scaled(-dot3(slope, ray), ray)));

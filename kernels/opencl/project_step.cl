@@ -1,0 +1,130 @@
+// Adam's step by the derivatives of set_up_backward.cl, which are in no memory but a work-group's own: what a training does with them
+// in place of project_backward.
+// Index space: one work-item per splat, in groups of STEPPED.
+// Reads:  view, splats, keys, windows, big_bounds, splat_slots, moments. Changes: where `counted` the sums of derivatives by places on
+// the screen; where splats `move` their values, Adam's running means, and what is drawn of them.
+#define STEPPED 64
+#define VALUES (3 * SH_TERMS)       // of a splat's colour that are drawn
+#if LANES > 1 && !PLAIN
+#define TERMS_ROOM 16               // a whole vector
+#else
+#define TERMS_ROOM SH_TERMS
+#endif
+kernel __attribute__((reqd_work_group_size(STEPPED, 1, 1))) void project_step(
+//@@ arguments project_step
+) {
+    local float by_means[3 * STEPPED], by_scales[2 * STEPPED], by_quats[4 * STEPPED], by_opacities[STEPPED];
+    local float by_colors[3 * STEPPED], basis[TERMS_ROOM * STEPPED];
+    local uchar rests[STEPPED];
+    uint i = get_global_id(0), item = get_local_id(0), first = get_group_id(0) * STEPPED;
+    if (i < count) {
+        const Slopes own = slopes_of(
+            i, view, means, drawn_quats, drawn_scales, drawn_opacities, sh, all, splats, keys, windows, big_capacity, big_bounds, width,
+            height, splat_slots, moments
+        );
+        if (counted) gradients[i] += own.screen;
+        for (int k = 0; k < 3; k++) by_means[3 * item + k] = own.mean[k];
+        for (int k = 0; k < 2; k++) by_scales[2 * item + k] = own.scale[k];
+        for (int k = 0; k < 4; k++) by_quats[4 * item + k] = own.quat[k];
+        by_opacities[item] = own.opacity;
+        for (int k = 0; k < 3; k++) by_colors[3 * item + k] = own.color[k];
+        for (int k = 0; k < SH_TERMS; k++) basis[TERMS_ROOM * item + k] = own.basis[k];
+        // what the picture does not depend on stays as it is, its running means too
+        bool depends = own.opacity != 0.0f;
+        for (int k = 0; k < 3; k++) depends |= own.mean[k] != 0.0f || own.basis[0] * own.color[k] != 0.0f;
+        rests[item] = sparse && !depends;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (!move) return;
+
+#if LANES > 1
+    // of whole rows of 16 splats the first steps for all
+    bool together = !sparse && (i | 15) < count;
+    if (together && item % 16 == 0) {
+        for (uint k = 3 * item, at = 3 * i; k < 3 * item + 48; k += 16, at += 16)
+            vstore16(ADAM_16(means, at, vload16(0, by_means + k), (float16)size_means), 0, means + at);
+        for (uint k = 2 * item, at = 2 * i; k < 2 * item + 32; k += 16, at += 16) {
+            float16 gradient = (vload16(0, by_scales + k) + scale_penalty) * vload16(0, drawn_scales + at);
+            float16 value = ADAM_16(log_scales, at, gradient, (float16)size_scales);
+            vstore16(value, 0, log_scales + at);
+            vstore16(exp(value), 0, drawn_scales + at);
+        }
+        for (uint k = 4 * item, at = 4 * i; k < 4 * item + 64; k += 16, at += 16) {
+            float16 q = vload16(0, quats + at), by = vload16(0, by_quats + k);
+            float16 length = sqrt(sums_of_4(q * q)), turn = q / length;
+            by = (by - turn * sums_of_4(turn * by)) / length;
+            q = ADAM_16(quats, at, by, (float16)size_quats);
+            vstore16(q, 0, quats + at);
+            vstore16(units(q), 0, drawn_quats + at);
+        }
+        float16 opacity = vload16(0, drawn_opacities + i);
+        float16 gradient = (vload16(0, by_opacities + item) + opacity_penalty) * opacity * (1.0f - opacity);
+        float16 value = ADAM_16(logits, i, gradient, (float16)size_logits);
+        vstore16(value, 0, logits + i);
+        vstore16(sigmoids(value), 0, drawn_opacities + i);
+    }
+#else
+    bool together = false;
+#endif
+    if (i < count && !together && !rests[item]) {
+        for (uint k = 0; k < 3; k++) ADAM(means, 3 * i + k, by_means[3 * item + k], size_means);
+        for (uint k = 0; k < 2; k++) {
+            uint at = 2 * i + k;
+            ADAM(log_scales, at, (by_scales[2 * item + k] + scale_penalty) * drawn_scales[at], size_scales);
+            drawn_scales[at] = EXP(log_scales[at]);
+        }
+        float4 q = vload4(i, quats), by = vload4(item, by_quats);
+        float length = sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w);
+        float4 turn = q / length;
+        by = (by - turn * (turn.x * by.x + turn.y * by.y + turn.z * by.z + turn.w * by.w)) / length;
+        ADAM(quats, 4 * i, by.x, size_quats);
+        ADAM(quats, 4 * i + 1, by.y, size_quats);
+        ADAM(quats, 4 * i + 2, by.z, size_quats);
+        ADAM(quats, 4 * i + 3, by.w, size_quats);
+        vstore4(unit(vload4(i, quats)), i, drawn_quats);
+        float opacity = drawn_opacities[i];
+        ADAM(logits, i, (by_opacities[item] + opacity_penalty) * opacity * (1.0f - opacity), size_logits);
+        drawn_opacities[i] = sigmoid(logits[i]);
+    }
+
+    // drawn colours are the values themselves where all of them are drawn and none is plain
+    const bool apart = PLAIN || SH_TERMS < all;
+#if LANES > 1 && !PLAIN
+    if (i < count && !rests[item]) {
+        size_t row = i * (size_t)(3 * all), shown = i * (size_t)VALUES;
+        // value k is of term k / 3 and colour k % 3; places beyond the last term are multiplied too, and not used
+        float16 b = vload16(0, basis + TERMS_ROOM * item), c = 0.0f;
+        c.s012 = vload3(item, by_colors);
+        const float16 by[3] = {
+            b.s0001112223334445 * c.s0120120120120120,
+            b.s55666777888999aa * c.s1201201201201201,
+            b.sabbbcccdddeeefff * c.s2012012012012012,
+        };
+        uint k = 0;
+        for (; k + 16 <= VALUES; k += 16) {
+            float16 size = size_rest;
+            if (k == 0) size.s012 = size_sh;
+            float16 value = ADAM_16(sh, row + k, by[k / 16], size);
+            vstore16(value, 0, sh + row + k);
+            if (apart) vstore16(value, 0, drawn_sh + shown + k);
+        }
+        float last[16];
+        vstore16(by[k / 16 % 3], 0, last);
+        for (; k < VALUES; k++) {
+            float value = ADAM(sh, row + k, last[k % 16], k < 3 ? size_sh : size_rest);
+            if (apart) drawn_sh[shown + k] = value;
+        }
+    }
+#else
+    // the group's coefficients one after the other, as they lie in memory
+    for (uint k = item; k < min(count - first, (uint)STEPPED) * VALUES; k += STEPPED) {
+        uint which = k / VALUES, within = k % VALUES;
+        if (rests[which]) continue;
+        size_t at = (first + which) * (size_t)(3 * all) + within;
+        float gradient = basis[TERMS_ROOM * which + within / 3] * by_colors[3 * which + within % 3];
+        if (PLAIN) gradient = SH_C0 * sh[at] + 0.5f > 0.0f ? SH_C0 * gradient : 0.0f;
+        float value = ADAM(sh, at, gradient, within < 3 ? size_sh : size_rest);
+        if (apart) drawn_sh[(size_t)first * VALUES + k] = PLAIN ? plain_color(value) : value;
+    }
+#endif
+}

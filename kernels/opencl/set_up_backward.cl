@@ -1,0 +1,122 @@
+// The derivatives of the set-up: from those by a splat's record, which its tiles have left in its slots, to those by its mean,
+// rotation, scales, opacity and colour, and by the camera's pose. What project.cl decides is taken as it was; the common factor
+// of a record's forms has no derivative, as nothing depends on it.
+
+#define SMALLEST_SCALE 1e-20f   // as in project.cl
+
+//@@ camera
+//@@ functions
+
+//@@ struct Totals
+typedef char totals_have_the_fields_of_moments[sizeof(Totals) / sizeof(real) == FIELDS ? 1 : -1];
+
+static inline real3_ add3(real3_ a, real3_ b) {
+    real3_ c = {a.x + b.x, a.y + b.y, a.z + b.z};
+    return c;
+}
+
+static inline real3_ scaled(real s, real3_ a) {
+    real3_ b = {s * a.x, s * a.y, s * a.z};
+    return b;
+}
+
+static inline real3_ rotate_to_camera(global const View *view, real3_ v) {
+    global const real *r = view->rotation;
+    real3_ c = {r[0] * v.x + r[1] * v.y + r[2] * v.z, r[3] * v.x + r[4] * v.y + r[5] * v.z,
+                r[6] * v.x + r[7] * v.y + r[8] * v.z};
+    return c;
+}
+
+static inline real3_ rotate_to_world(global const View *view, real3_ v) {
+    global const real *r = view->rotation;
+    real3_ c = {r[0] * v.x + r[3] * v.y + r[6] * v.z, r[1] * v.x + r[4] * v.y + r[7] * v.z,
+                r[2] * v.x + r[5] * v.y + r[8] * v.z};
+    return c;
+}
+
+typedef struct {            // derivatives by what the cloud has of a splat
+    float mean[3], quat[4], scale[2], opacity;
+    float color[3], basis[SH_TERMS];    // by a term of the colour: what the term is worth times one of `color`
+    float screen;
+    real3_ turned, moved;               // its part of those by the pose
+} Slopes;
+
+// Of splat i; zeros where it is not drawn. terms: of colours that have some, in rows of so many.
+static inline Slopes slopes_of(
+    uint i, global const View *view, global const float *means, global const float *quats, global const float *scales,
+    global const float *opacities, global const float *terms, uint row, global const Splat *splats, global const uint *keys,
+    global const uint2 *windows, uint big_capacity, global const Bounds *big_bounds, int width, int height,
+    global const uint *splat_slots, global const float *moments
+) {
+    Slopes own = {{0}};
+    if (keys[i] >= OUTSIDE) return own;
+    Totals total = {0};
+    global const float *slot = moments + (size_t)splat_slots[i] * FIELDS;
+    uint tiles = tile_count(windows[i], big_capacity, big_bounds, width, height);
+    for (uint tile = 0; tile < tiles; tile++, slot += FIELDS)
+        for (uint field = 0; field < FIELDS; field++) ((real *)&total)[field] += slot[field];
+    real3_ by_ray = {0, 0, 0};       // by the way from the eye to the centre, in the world's axes
+//@@ color_backward
+    real by_log = total.log_opacity;
+    real w = quats[4 * i], x = quats[4 * i + 1], y = quats[4 * i + 2], z = quats[4 * i + 3];
+    real s = REAL(2.0) / (w * w + x * x + y * y + z * z);
+    real3_ tangent_u = {1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)};
+    real3_ tangent_v = {s * (x * y - w * z), 1 - s * (x * x + z * z), s * (y * z + w * x)};
+    real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+    real3_ unit_a = rotate_to_camera(view, tangent_u), unit_b = rotate_to_camera(view, tangent_v);
+    real3_ p = rotate_to_camera(view, mean);
+    p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
+    real pz = p.z, su = fmax(scales[2 * i], SMALLEST_SCALE), sv = fmax(scales[2 * i + 1], SMALLEST_SCALE);
+    real3_ a = scaled(su, unit_a), b = scaled(sv, unit_b);
+    real offset = dot3(cross3(unit_a, unit_b), p);
+
+    // the forms, as project.cl and the camera have them
+    real x_offset = view->center_x - (splats[i].ax + REAL(0.5)), y_offset = view->center_y - (splats[i].ay + REAL(0.5));
+    real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {a.z, b.z, p.z};
+    real3_ tu = image_row(view->focal_x, x_offset, row_x, tw), tv = image_row(view->focal_y, y_offset, row_y, tw);
+    real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);
+    real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));
+    real scale = (offset < 0 ? -1 : 1) / steepest, n_scale = scale * REAL(0.70710678118654752440);
+    real facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
+
+    real3_ by_k0 = {n_scale * total.nu0, n_scale * total.nv0, facing * total.d0};
+    real3_ by_kx = {n_scale * total.nux, n_scale * total.nvx, facing * total.dx};
+    real3_ by_ky = {n_scale * total.nuy, n_scale * total.nvy, facing * total.dy};
+    real3_ by_tu = add3(cross3(tv, by_k0), cross3(by_ky, tw));
+    real3_ by_tv = add3(cross3(by_k0, tu), cross3(tw, by_kx));
+    real3_ by_tw = add3(cross3(by_kx, tv), cross3(tu, by_ky));
+//@@ camera_backward
+    by_tw = add3(by_tw, add3(scaled(x_offset, by_tu), scaled(y_offset, by_tv)));
+    real3_ by_a = {view->focal_x * by_tu.x, view->focal_y * by_tv.x, by_tw.x};
+    real3_ by_b = {view->focal_x * by_tu.y, view->focal_y * by_tv.y, by_tw.y};
+    real3_ by_p = {view->focal_x * by_tu.z, view->focal_y * by_tv.z, by_tw.z};
+    // by the centre's place in the picture, in half pictures
+    real across_x = by_tu.z * view->width, across_y = by_tv.z * view->height;
+    own.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
+//@@ disk_backward
+    real by_su = scales[2 * i] >= SMALLEST_SCALE ? dot3(by_a, unit_a) : 0;
+    real by_sv = scales[2 * i + 1] >= SMALLEST_SCALE ? dot3(by_b, unit_b) : 0;
+    real3_ by_unit_a = scaled(su, by_a), by_unit_b = scaled(sv, by_b);
+//@@ facet_backward
+    own.turned = add3(cross3(p, by_p), add3(cross3(unit_a, by_unit_a), cross3(unit_b, by_unit_b)));
+    own.moved = add3(by_p, rotate_to_camera(view, by_ray));
+    real3_ by_mean = add3(rotate_to_world(view, by_p), by_ray);
+    real3_ by_u = rotate_to_world(view, by_unit_a);
+    real3_ by_v = rotate_to_world(view, by_unit_b);
+    // tangents are 1 - s (y y + z z) and so on with s = 2 / |q|^2
+    real by_s = -by_u.x * (y * y + z * z) + by_u.y * (x * y + w * z) + by_u.z * (x * z - w * y)
+                + by_v.x * (x * y - w * z) - by_v.y * (x * x + z * z) + by_v.z * (y * z + w * x);
+    real inward = -s * by_s;
+    own.quat[0] = (float)(s * (by_u.y * z - by_u.z * y - by_v.x * z + by_v.z * x + inward * w));
+    own.quat[1] = (float)(s * (by_u.y * y + by_u.z * z + by_v.x * y - 2 * by_v.y * x + by_v.z * w + inward * x));
+    own.quat[2] = (float)(s * (-2 * by_u.x * y + by_u.y * x - by_u.z * w + by_v.x * x + by_v.z * z + inward * y));
+    own.quat[3] = (float)(s * (-2 * by_u.x * z + by_u.y * w + by_u.z * x - by_v.x * w - 2 * by_v.y * z + by_v.z * y
+                                       + inward * z));
+    own.mean[0] = (float)by_mean.x;
+    own.mean[1] = (float)by_mean.y;
+    own.mean[2] = (float)by_mean.z;
+    own.scale[0] = (float)by_su;
+    own.scale[1] = (float)by_sv;
+    own.opacity = (float)(by_log / opacities[i]);
+    return own;
+}

@@ -1,0 +1,42 @@
+// Splats before their activations: what is drawn of them, and who is seen.
+
+// Index space: one work-item per splat. Reads: the values. Writes: unit quaternions, scales, opacities.
+kernel void activate(
+//@@ arguments activate
+) {
+    size_t i = get_global_id(0);
+    if (i >= count) return;
+    vstore4(unit(vload4(i, quats)), i, drawn_quats);
+    for (size_t k = 2 * i; k < 2 * i + 2; k++) drawn_scales[k] = EXP(log_scales[k]);
+    drawn_opacities[i] = sigmoid(logits[i]);
+}
+
+// Index space: one work-item per splat and drawn coefficient of a channel. Reads: sh, of `all` coefficients. Writes: the first
+// `drawn` of them, side by side; of degree 0, where `plain`, the colours that they mean.
+kernel void activate_sh(
+//@@ arguments activate_sh
+) {
+    uint k = get_global_id(0);
+    if (k >= count * 3 * drawn) return;
+    float value = sh[k / (3 * drawn) * 3 * all + k % (3 * drawn)];
+    drawn_sh[k] = plain ? plain_color(value) : value;
+}
+
+// Index space: one work-item per splat. Reads: means, scales. Changes: how often a splat was seen: a sphere of three standard deviations
+// around it reaches into the picture.
+kernel void count_seen(
+//@@ arguments count_seen
+) {
+    size_t i = get_global_id(0);
+    if (i >= count) return;
+    float3 p = vload3(i, means);
+    float x = turn_00 * p.x + turn_01 * p.y + turn_02 * p.z + move_x;
+    float y = turn_10 * p.x + turn_11 * p.y + turn_12 * p.z + move_y;
+    float z = turn_20 * p.x + turn_21 * p.y + turn_22 * p.z + move_z;
+    float reach = 3.0f * fmax(drawn_scales[2 * i], drawn_scales[2 * i + 1]);
+    // of pixels times depth, so that nothing is divided by a depth of 0
+    float u = focal_x * x + center_x * z, v = focal_y * y + center_y * z;
+    bool inside = z > near && u + focal_x * reach > 0.0f && u - focal_x * reach < width * z && v + focal_y * reach > 0.0f
+        && v - focal_y * reach < height * z;
+    seen[i] += inside ? 1.0f : 0.0f;
+}
