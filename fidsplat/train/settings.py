@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Any
 
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 from fidsplat.harmonics import MAX_DEGREE
 from fidsplat.quality import Quality, whole_number
 
@@ -187,3 +187,11 @@ class TrainSettings:
 def _put(settings: TrainSettings, name: str, value: Any) -> None:
     """Sets a field of settings that are being made."""
     object.__setattr__(settings, name, value)
+
+
+def settings_with(settings: TrainSettings | None, changes: dict[str, Any]) -> TrainSettings:
+    """Settings, the defaults if None, with some changed. Raises InputError for one that does not exist."""
+    for name in changes:
+        if name not in TrainSettings.__dataclass_fields__:
+            raise InputError(unknown("training setting", name, TrainSettings.__dataclass_fields__))
+    return TrainSettings(**{**({} if settings is None else vars(settings)), **changes})

@@ -7,6 +7,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
-from fidsplat.errors import DeviceError, InputError, unknown
+from fidsplat.errors import DeviceError, InputError
 from fidsplat.files import ordinary_file, writable_folder
 from fidsplat.formats import save_ply
 from fidsplat.quality import Quality
@@ -36,7 +37,7 @@ from fidsplat.train.optimiser import rates
 from fidsplat.train.parameters import Splats, TrainingError, first_splats, splats_from
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.scores import ViewScore, scored
-from fidsplat.train.settings import TrainSettings
+from fidsplat.train.settings import TrainSettings, settings_with
 
 _SOLID = ("rgb", "alpha", "depth", "normal")
 """outputs of pictures whose depths and normals are in the loss"""
@@ -94,7 +95,7 @@ class Trainer:
         **changes: Any,
     ) -> None:
         self.dataset = dataset
-        self.settings = _settings(settings, changes)
+        self.settings = settings_with(settings, changes)
         self.renderer = Renderer() if renderer is None else renderer
         self.checkpoint = None if checkpoint is None else _writable(checkpoint)
         backend = self.renderer.backend
@@ -148,7 +149,7 @@ class Trainer:
 
         Raises:
             InputError: all iterations are done.
-            TrainingError: the loss is not finite, or no splat is left.
+            TrainingError: the loss is not finite, no splat is left, or making splats was stopped before.
             DeviceError: the device fails or lacks memory.
         """
         self._advance(late=False)
@@ -349,9 +350,11 @@ class Trainer:
         if settings.strategy == "mcmc" or not self._due(iteration):
             return
         self._settle()
-        self._work.make(densify.plan(self._work.shapes(), settings, iteration, self.dataset.extent))
-        if iteration % settings.reset_every == 0:
-            self._work.reset()
+        made = densify.plan(self._work.shapes(), settings, iteration, self.dataset.extent)
+        with self._not_half():
+            self._work.make(made)
+            if iteration % settings.reset_every == 0:
+                self._work.reset()
 
     def _change(self, taken: Any, iteration: int, view: TrainingView) -> None:
         """The optimiser's step; none where the default rule makes splats next, as in the authors' trainer, in
@@ -366,13 +369,26 @@ class Trainer:
         rate = rates(settings, iteration, self.dataset.extent)
         self._work.step(taken, rate, self._made.adam_step, camera, origin)
         if mcmc_runs:
-            if self._due(iteration):
-                self._work.load(mcmc.moved(self._work.store(), settings, iteration))
-            self._work.shake(iteration, rate["means"])
+            with self._not_half():
+                if self._due(iteration):
+                    self._work.load(mcmc.moved(self._work.store(), settings, iteration))
+                self._work.shake(iteration, rate["means"])
 
-    def _what_is_kept(self) -> str:
+    @contextmanager
+    def _not_half(self) -> Iterator[None]:
+        """Splats are made and taken away: if that ends on the way (no memory, an interrupt), nobody draws or
+        keeps what is there, arrays of two lengths maybe."""
+        try:
+            yield
+        except BaseException:
+            self._failure = TrainingError(
+                f"making splats was stopped after iteration {self.iteration}; {self._what_is_kept('')}"
+            )
+            raise
+
+    def _what_is_kept(self, advice: str = "; lower the rates, or check the data set's cameras") -> str:
         if self.checkpoint is None or not self.checkpoint.exists():
-            return "nothing was kept; lower the learning rates, or check the data set's cameras"
+            return f"nothing was kept{advice}"
         return f"the checkpoint {self.checkpoint} is whole, as it was written last"
 
 
@@ -381,11 +397,3 @@ def _writable(checkpoint: str | Path) -> Path:
     file = ordinary_file(checkpoint)
     writable_folder(file.parent)
     return file
-
-
-def _settings(settings: TrainSettings | None, changes: dict[str, Any]) -> TrainSettings:
-    given = {} if settings is None else vars(settings)
-    for name in changes:
-        if name not in TrainSettings.__dataclass_fields__:
-            raise InputError(unknown("training setting", name, TrainSettings.__dataclass_fields__))
-    return TrainSettings(**{**given, **changes})

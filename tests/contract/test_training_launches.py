@@ -155,6 +155,38 @@ def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoi
     assert again.iteration == 1
 
 
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_no_memory_while_splats_are_made(renderer, dataset, tmp_path, monkeypatch, strategy):
+    """Arrays of two lengths are neither drawn nor kept: the last checkpoint stays, and gives the same run."""
+    settings = {**QUICK, "iterations": 24, "sh_degree": 1, "strategy": strategy, "growth": 1.5}
+    file, pool = tmp_path / "run.training.npz", renderer.backend.pool
+    whole = Trainer(dataset, renderer, **settings)
+    whole.run()
+    trainer, fresh, asked = Trainer(dataset, renderer, checkpoint=file, **settings), pool.fresh, []
+    for _ in range(15):
+        trainer.step()
+    trainer.save_checkpoint()
+    kept = file.read_bytes()
+
+    def full(name, size):
+        asked.append(name)
+        if len(asked) == 4:
+            raise fs.DeviceError("no memory")
+        return fresh(name, size)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pool, "fresh", full)
+        with pytest.raises(fs.DeviceError, match="no memory"):
+            trainer.run()
+    for after in (trainer.step, trainer.run, trainer.cloud, trainer.save_checkpoint):
+        with pytest.raises(TrainingError, match=r"making splats was stopped .* whole"):
+            after()
+    assert file.read_bytes() == kept
+    again = Trainer(dataset, renderer, checkpoint=file, **settings)
+    again.run()
+    assert splats_of(again) == splats_of(whole)
+
+
 def test_an_interrupt_keeps_the_losses_that_nobody_has_asked_for(renderer, dataset, monkeypatch):
     whole, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
     whole.run()
