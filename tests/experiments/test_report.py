@@ -130,6 +130,7 @@ def test_the_report_says_what_was_measured(reported):
         "| QR Small, 1 m | 0.5 (1/2) |",
         "`angles`, 8 | a device |",
         "3 trainings of 7000 iterations",
+        "Tilts are not of all markers for QR Small, 9.\n",
         "other random numbers (QR Small on 9 views) end 0.50 dB apart\n(median), at most 0.50",
         "| QR Small, 9 | 33.8/0.99 | 33.5/0.990 | 0.050 | 75.4 | 80.0 | 82.0 | 5000 | 386 | 7.0 |",
         "- QR Small: none; 9 views end 2.0 degrees before, 7 s\n",
