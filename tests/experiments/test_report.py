@@ -263,6 +263,12 @@ def test_a_report_that_is_made_again_has_the_same_tables(tmp_path):
     assert len(first.runs) == 1
 
 
+def test_what_all_was_shown_to_the_detectors_is_not_named(tmp_path):
+    write(tmp_path, "angles", SCANS)
+    write(tmp_path, "trained", TRAININGS[:1])
+    assert "Tilts are not of all" not in make_report([tmp_path], tmp_path / "page.md")[0].read_text()
+
+
 def test_notes_of_tables_stand_on_the_page(tmp_path):
     folder = tmp_path / "kept"
     (made, *_) = make_report([Path(__file__).parents[2] / "docs" / "results"], folder)
