@@ -34,6 +34,17 @@ def test_both_ways_of_listing_give_the_same_lists(backend, scale):
     assert np.array_equal(tiled["rgb"], ordered["rgb"])
 
 
+def test_of_a_whole_picture_no_splat_lies_beside_its_band(backend):
+    """Of large ones behind the camera, and where the last tiles reach below the picture: a splat that lies
+    beside a band has no window, and lists would be made of whatever memory holds."""
+    cloud = random_splats(3000, seed=7, depth=(-4, 4), scale=(0.1, 0.5), across=3.0)
+    camera = fs.Camera.pinhole(33, 17, 30.0, 30.0, 5.0, 3.0)
+    features, view = prepare(cloud, fs.Capture(camera, quality=fs.Quality(lowpass="pixel")))
+    assert view.height % backend.shape.tile_height
+    trace = backend.pipeline(features).trace(backend.upload(cloud), view)
+    assert not (trace["keys"] == CULLED - 1).any()
+
+
 @pytest.mark.parametrize(
     ("lists", "budget"), [("ordered", 0), ("tiled", 0), ("gathered", 0), ("gathered", 5000)]
 )

@@ -17,8 +17,9 @@
         if (to_x + left * p.z < -around * (view->focal_x + fabs(left)) || to_x + right * p.z > around * (view->focal_x + fabs(right))
             || to_y + above * p.z < -around * (view->focal_y + fabs(above))
             || to_y + below * p.z > around * (view->focal_y + fabs(below))) return;
-        if (to_y + above_band * p.z < -around * (view->focal_y + fabs(above_band))
-            || to_y + below_band * p.z > around * (view->focal_y + fabs(below_band))) {
+        // not of a picture that is whole: its splats are listed as they are, and its last rows of tiles may reach below it
+        if ((view->band > 0 && to_y + above_band * p.z < -around * (view->focal_y + fabs(above_band)))
+            || (view->band_end < view->height && to_y + below_band * p.z > around * (view->focal_y + fabs(below_band)))) {
             keys[at] = OUTSIDE;
             return;
         }
