@@ -270,7 +270,21 @@ def _trained(rows: Frame, seen: Frame | None, scans: Frame | None) -> dict:
     if len(numbers := set(found["rows"]["markers"])) == 1:  # that needs no column
         found["markers"] = f", {numbers.pop()} of each"
         found["rows"] = found["rows"].drop(columns="markers")
-    return found | {"spread": _spread(every), "enough": _enough(found["rows"])}
+    unread = "" if scans is None else _unread(rows, scans)
+    return found | {"spread": _spread(every), "unread": unread, "enough": _enough(found["rows"])}
+
+
+def _unread(rows: Frame, scans: Frame) -> str:
+    """Of which categories and numbers of views not all that was trained was shown to the detectors."""
+    markers, lacking = ["category", "views", "marker"], {}
+    scans = scans.assign(views=pd.to_numeric(scans["method"].str.extract(r"^2dgs-(\d+)$")[0]))
+    shown = set(scans[markers].itertuples(index=False, name=None))
+    for category, count, marker in sorted(rows[markers].itertuples(index=False, name=None)):
+        if (category, count, marker) not in shown:
+            lacking.setdefault(category, {})[str(count)] = None
+    return "; ".join(
+        f"{CATEGORIES[category].title}, {', '.join(lacking[category])}" for category in category_order(lacking)
+    )
 
 
 def _spread(rows: Frame) -> dict | None:

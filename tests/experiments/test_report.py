@@ -130,6 +130,7 @@ def test_the_report_says_what_was_measured(reported):
         "| QR Small, 1 m | 0.5 (1/2) |",
         "`angles`, 8 | a device |",
         "3 trainings of 7000 iterations",
+        "Tilts are not of all markers for QR Small, 9.\n",
         "other random numbers (QR Small on 9 views) end 0.50 dB apart\n(median), at most 0.50",
         "| QR Small, 9 | 33.8/0.99 | 33.5/0.990 | 0.050 | 75.4 | 80.0 | 82.0 | 5000 | 386 | 7.0 |",
         "- QR Small: none; 9 views end 2.0 degrees before, 7 s\n",
@@ -260,6 +261,12 @@ def test_a_report_that_is_made_again_has_the_same_tables(tmp_path):
     load([tmp_path])["counts"].write(tmp_path / "counts.csv")
     assert (tmp_path / "counts.csv").read_bytes() == text
     assert len(first.runs) == 1
+
+
+def test_what_all_was_shown_to_the_detectors_is_not_named(tmp_path):
+    write(tmp_path, "angles", SCANS)
+    write(tmp_path, "trained", TRAININGS[:1])
+    assert "Tilts are not of all" not in make_report([tmp_path], tmp_path / "page.md")[0].read_text()
 
 
 def test_notes_of_tables_stand_on_the_page(tmp_path):
