@@ -283,7 +283,8 @@ def _unread(rows: Frame, scans: Frame) -> str:
         if (category, count, marker) not in shown:
             lacking.setdefault(category, {})[str(count)] = None
     return "; ".join(
-        f"{CATEGORIES[category].title}, {', '.join(lacking[category])}" for category in category_order(lacking)
+        f"{CATEGORIES[category].title}, {', '.join(lacking[category])}"
+        for category in category_order(lacking)
     )
 
 

@@ -12,6 +12,7 @@ from training_scene import QUICK, scene
 import fidsplat as fs
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.opencl import gradients_again
+from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.launches import Launches
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.prepare import prepare
@@ -153,6 +154,23 @@ def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoi
     assert file.read_bytes() == kept
     again = Trainer(dataset, renderer, checkpoint=file, **STEADY)
     assert again.iteration == 1
+
+
+def test_an_interrupt_while_the_step_is_compiled_counts_nobody_twice(renderer, dataset, monkeypatch):
+    whole, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
+    whole.step()
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(OpenCLGradients, "prepare_step", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            stopped.step()
+    stopped.step()
+    ours, theirs = (trainer._work.store() for trainer in (stopped, whole))
+    assert np.array_equal(ours.seen, theirs.seen)
+    assert np.array_equal(ours.gradients, theirs.gradients)
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])

@@ -82,6 +82,10 @@ class TakenBack:
         with self._last():
             return self._of.sum_up(self._picture)
 
+    def prepare_step(self) -> None:
+        """Before `step`: compiles what it launches."""
+        self._of.prepare_step()
+
     def step(self, given: Mapping[str, Any]) -> None:
         """Launches kernels/opencl/project_step.cl. given: its arguments but for the picture's."""
         with self._last():
@@ -203,8 +207,7 @@ class OpenCLGradients:
 
     def step(self, picture: Picture, given: Mapping[str, Any]) -> None:
         """The step of a training by a picture that was taken back, with arguments that are its own."""
-        self.prepare_step()
-        assert self._step is not None
+        assert self._step is not None  # `prepare_step`
         known, launches = self._step
         count = picture.resident.count
         arguments = launches.arguments("project_step")

@@ -249,9 +249,7 @@ class OpenCLTraining:
 
     def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
         """As `TrainingKernels`."""
-        self._seen(camera, origin)
-        nothing = dict.fromkeys(_STEP_NUMBERS, 0.0)
-        self._step(taken, nothing | {"counted": 1, "move": 0, "sparse": 0})
+        self._step(taken, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"move": 0, "sparse": 0}, camera, origin)
 
     def step(
         self,
@@ -262,15 +260,15 @@ class OpenCLTraining:
         origin: np.ndarray,
     ) -> None:
         """As `TrainingKernels`."""
-        if camera is not None:
-            self._seen(camera, origin)
         given = {f"size_{name}": size for name, size in sizes.items()} | dict(numbers)
         given |= {"rest1": 1 - numbers["beta1"], "rest2": 1 - numbers["beta2"]}
-        given |= {"counted": int(camera is not None), "move": 1, "sparse": int(numbers["sparse"])}
-        self._step(taken, given)
+        self._step(taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin)
 
-    def _step(self, taken: Any, given: Mapping[str, Any]) -> None:
-        taken.step({**self._held, **given})
+    def _step(self, taken: Any, given: Mapping[str, Any], camera: Camera | None, origin: np.ndarray) -> None:
+        taken.prepare_step()  # takes seconds once: an interrupt there finds nobody counted
+        if camera is not None:
+            self._seen(camera, origin)
+        taken.step({**self._held, **given, "counted": int(camera is not None)})
 
     def _seen(self, camera: Camera, origin: np.ndarray) -> None:
         """Counts who is seen, as splats are before the step."""
