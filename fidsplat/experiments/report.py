@@ -282,10 +282,7 @@ def _unread(rows: Frame, scans: Frame) -> str:
     for category, count, marker in sorted(rows[markers].itertuples(index=False, name=None)):
         if (category, count, marker) not in shown:
             lacking.setdefault(category, {})[str(count)] = None
-    return "; ".join(
-        f"{CATEGORIES[category].title}, {', '.join(lacking[category])}"
-        for category in category_order(lacking)
-    )
+    return "; ".join(f"{CATEGORIES[c].title}, {', '.join(lacking[c])}" for c in category_order(lacking))
 
 
 def _spread(rows: Frame) -> dict | None:
