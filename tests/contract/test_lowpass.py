@@ -131,6 +131,15 @@ def test_disks_far_beside_the_picture_that_are_widened_into_it(renderer):
     assert shown > 5
 
 
+def test_splats_that_reach_into_a_band(renderer):
+    """From above, from below and from behind the camera: a band shows them as the whole picture does."""
+    cloud, camera = random_splats(600, 3, depth=(-1.0, 4.0), scale=(0.01, 0.5)), CAMERA
+    whole = renderer.render(cloud, camera, quality=PIXEL)["rgb"]
+    for band in ((0, 16), (16, 40), (40, 59)):
+        rows = renderer.render_band(band, cloud, camera, quality=PIXEL)["rgb"][slice(*band)]
+        assert np.array_equal(rows, whole[slice(*band)]), band
+
+
 def test_splats_whose_centres_lie_beyond_the_fold(renderer):
     """There is no image of theirs to be widened."""
     cloud = random_splats(150, 1, depth=(0.3, 4.0), scale=(0.02, 0.5), across=3.0)
