@@ -61,7 +61,8 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 // shares the tiles.
 #define WALK_ITEMS 256
 
-// The rectangle of tiles that a big splat may touch. Counts and lists both come from this, so they agree.
+// The rectangle of tiles that a big splat may touch. Counts and lists both come from this, so they agree, also with `tile_count`
+// (moments.cl), by which derivatives have their places.
 typedef struct { int top, left, columns, cells, tiles_x; } Walk;
 
 static inline Walk walk_of(const Bounds *b, int width, int height) {
@@ -69,6 +70,9 @@ static inline Walk walk_of(const Bounds *b, int width, int height) {
     float x0, x1;
     bounds_rows(b, height, &y0, &y1);
     bounds_span(b, -INFINITY, INFINITY, &x0, &x1);
+    // a row's chord may be rounded to be wider than the widest, but never beyond these: tile_span gives no tile that is not here
+    x0 = fmin(x0, b->ex - b->hx);
+    x1 = fmax(x1, b->ex + b->hx);
     int first = clamp(pixel_above(x0 - 0.5f, width), 0, width - 1), last = clamp(pixel_below(x1 - 0.5f, width), first, width - 1);
     Walk walk = {y0 / TILE_H, first / TILE_W, last / TILE_W - first / TILE_W + 1, 0, (width + TILE_W - 1) / TILE_W};
     walk.cells = ((y1 - 1) / TILE_H - walk.top + 1) * walk.columns;

@@ -29,8 +29,8 @@ CAMERAS = {
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "a6f3275c0d7be003931136b735f939fce97650572b51fa26bb6b1a6b30750b9a",
     ("lanes", OUTPUTS): "eef58cdab079ef0d1c7281517ffcc219a1b0d1acc6737c08fb015c1962c4f15e",
-    ("group", ("rgb",)): "92203e01f99343530257d68458ece40e1eb559b961321378192eb66ae595421e",
-    ("group", OUTPUTS): "d5e55319fb753a925e000f959c8e76f085e178ca972114c1c42b0c62b5915cbd",
+    ("group", ("rgb",)): "69655e806127ec11f96a185661041f8df66f9dd8c3afaa09f10ff220fddf9cc9",
+    ("group", OUTPUTS): "9f16b682d003c24d9e88d6db38dcb8dadc5d7eb7422486e16339b22685607812",
 }
 
 

@@ -1,0 +1,34 @@
+"""A splat has a place for its derivatives for each tile that lists it, and none besides: of one too many nobody
+would have written what is added up, and other splats' numbers stand there, others on each run."""
+
+import numpy as np
+import pyopencl as cl
+
+import fidsplat as fs
+from fidsplat.backends.opencl.counts import pairs_of
+from fidsplat.backends.prepare import prepare
+from fidsplat.random_clouds import random_splats
+
+BACKEND = "opencl"
+# found among 160,000 random ones: the chord of a row of tiles was rounded to be wider than the widest of all
+WIDE = fs.SplatCloud(
+    means=[[1.4574198, 0.11504277, 2.0842366]],
+    quats=[[0.70251703, -0.14637895, 0.6260615, -0.3051065]],
+    scales=[[0.54311776, 0.02383298]],
+    opacities=[0.99],
+    colors=[[0.5, 0.5, 0.5]],
+)
+
+
+def test_splats_have_a_place_for_each_tile_that_lists_them(renderer):
+    backend, camera = renderer.backend, fs.Camera.look_at(800, 800, 1.0, (0, 0, 0), (0, 0, 3.0))
+    features, view = prepare(WIDE, fs.Capture(camera))
+    random = random_splats(300, 0, scale=(0.02, 0.6), depth=(1.5, 4.0), sh_degree=None)
+    for shape in (None, *backend.shapes("schedule").values()):
+        pipeline = backend.differentiate(features, shape=shape)
+        for cloud in (WIDE, random):
+            images = pipeline.forward(backend.upload(cloud), view)
+            pipeline.backward(images, {"rgb": np.ones((800, 800, 3), np.float32)})
+            picture, words = images.picture, np.empty(1, np.uint32)
+            cl.enqueue_copy(picture.queue, words, picture.pool.known("reserved"))
+            assert words[0] == pairs_of(picture) > 32, (shape, len(cloud))
