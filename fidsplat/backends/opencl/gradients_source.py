@@ -93,8 +93,7 @@ def tape_bytes(features: FeatureSet, shape: DeviceShape) -> int:
 
 def group_of(features: FeatureSet, shape: DeviceShape) -> int:
     """Work-items that take a chunk of a tile's list back. Half as many where outputs beside rgb keep more of
-    pixels: with distortion's, 256 would not fit into the 48 KiB of local memory that NVIDIA's OpenCL has;
-    with those of depths and normals they fit, and gave wrong derivatives all the same (H100, driver 580)."""
+    pixels: with distortion's, 256 would not fit into the 48 KiB of local memory that NVIDIA's OpenCL has."""
     if shape.schedule == "lanes":
         return 1
     return min(shape.tile_width * shape.tile_height, 128 if features.outputs else 256)

@@ -267,6 +267,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             fragments[which * STRIDE + (top + 4 * each) * TILE_W + column] = (float2)(light, opacity);
         }
     }
+    // each work-item reads what it has written itself; yet without a barrier NVIDIA's compiler (driver 580) has read before it wrote
+    barrier(CLK_LOCAL_MEM_FENCE);
     for (uint bits = mine, which; bits != 0; bits ^= 1u << which) {
         which = 31 - clz((int)bits);
         for (int each = 0; each < EACH; each++) {
