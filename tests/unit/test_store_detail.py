@@ -15,7 +15,7 @@ from fidsplat.cli import main
 from fidsplat.detail import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.store import plan
 from fidsplat.store.city import PITCH, City, flight
-from fidsplat.store.detail import MARGIN, Detail, load_details, save_details
+from fidsplat.store.detail import MARGIN, Detail, load_details, pixels, save_details
 from fidsplat.store.sources import sample, splats_of
 from fidsplat.store.streamed import Streamed
 from fidsplat.vision import read_back
@@ -41,16 +41,16 @@ def seen_from(away, size=(48, 32)):
     return fs.Camera.look_at(*size, 1.0, middle + away * np.array([0.6, -0.5, 0.6]), middle)
 
 
-def chosen(store, camera, pixels):
+def chosen(store, camera, limits):
     streamed = Streamed([store])
     features, view = prepare(streamed, fs.Capture(camera, quality=QUALITY))
-    return streamed.select([view], features, pixels).nodes[0], view
+    return streamed.select([view], features, limits).nodes[0], view
 
 
-@pytest.mark.parametrize("pixels", [0.05, 0.3, 1.0, 4.0])
+@pytest.mark.parametrize("limit", [0.05, 0.3, 1.0, 4.0])
 @pytest.mark.parametrize("away", [20.0, 200.0, 2000.0])
-def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, pixels, away):
-    numbers, view = chosen(store, seen_from(away), pixels)
+def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, limit, away):
+    numbers, view = chosen(store, seen_from(away), limit)
     nodes = store.nodes
     covered: list[int] = []
     for number in numbers:
@@ -66,7 +66,7 @@ def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, p
                 2
             ]
             # the middle lies no nearer than the nearest point, by which it was chosen
-            assert nodes["size"][number] * view.focal_x / depth <= pixels
+            assert nodes["size"][number] * view.focal_x / depth <= limit
     assert len(covered) == len(set(covered))
     if away >= 200:  # all of the city is in the picture
         assert sorted(covered) == np.flatnonzero(nodes["level"] == 0).tolist()
@@ -141,14 +141,24 @@ def test_a_picture_at_no_allowed_error_is_exact(store, renderer):
     assert np.array_equal(ours, renderer.render(store.cloud(), camera, quality=QUALITY)["rgb"])
 
 
+def measured(level, sizes, errors):
+    return Detail("pixel", level, sizes, errors, 3, "here", "today")
+
+
 def test_sizes_that_no_view_met_are_not_promised():
-    detail = Detail("pixel", 1, (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1), 3, "here", "today")
-    assert detail.pixels(0.001) == 0.0
-    assert detail.pixels(MARGIN * 0.002) == 0.2
-    assert detail.pixels(0.1) == 0.2
-    assert detail.pixels(MARGIN * 0.1) == 0.8
+    one = measured(1, (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1))
+    assert pixels([one], 1, 0.001) == 0.0
+    assert pixels([one], 1, MARGIN * 0.002) == 0.2
+    assert pixels([one], 1, 0.1) == 0.2
+    assert pixels([one], 1, MARGIN * 0.1) == 0.8
     # what was worse at a smaller size counts at a larger one
-    assert Detail("pixel", 1, (0.1, 0.2), (0.5, 0.001), 3, "here", "today").pixels(0.01) == 0.0
+    assert pixels([measured(1, (0.1, 0.2), (0.5, 0.001))], 1, 0.01) == 0.0
+
+
+def test_what_the_levels_beside_it_err_by_counts_for_a_level():
+    errors = {1: (0.001, None), 2: (None, 0.003), 3: (0.1, 0.2), 5: (0.001, 0.002)}
+    every = [measured(level, (0.1, 0.2), own) for level, own in errors.items()]
+    assert [pixels(every, level, 0.01) for level in range(7)] == [0.0, 0.2, 0.0, 0.0, 0.0, 0.2, 0.0]
 
 
 def test_what_was_measured_with_another_store_does_not_count(tmp_path):
