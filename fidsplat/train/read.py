@@ -12,6 +12,7 @@ from fidsplat.errors import InputError
 from fidsplat.files import from_json, path_of
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
 from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.flat import flat_view
 from fidsplat.train.transforms import Found, has_transforms, load_transforms
 from fidsplat.vision.images import read_image, read_over
 
@@ -102,7 +103,7 @@ def _model(
     for i, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
         tell(words, i / len(model.names))
         picture = read_over(folder / "images" / name, background)
-        views.append(TrainingView(name, camera, picture, _mask(folder / "masks" / name)))
+        views.append(flat_view(name, camera, picture, _mask(folder / "masks" / name)))
     return views, model.points, model.colors
 
 
@@ -114,7 +115,6 @@ def _mask(mask: Path) -> np.ndarray | None:
 
 
 def _background(folder: Path) -> Background:
-
     for name in NOTES:
         file = folder / name
         if file.is_file():
