@@ -185,6 +185,8 @@ def _text_images(lines: list[str]) -> Iterator[_View]:
     for line in lines[::2]:
         if line:
             words = line.split(maxsplit=9)
+            if len(words) < 10:
+                raise ValueError(f"the line {line!r} has {len(words)} of the 10 words of an image")
             yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 
 

@@ -1,6 +1,7 @@
 """Data sets from disk: what is read, and what is said about those that cannot be trained on."""
 
 import json
+import shutil
 import struct
 from dataclasses import replace
 
@@ -323,13 +324,36 @@ def test_views_that_are_held_out(made, folder):
 
 
 def test_random_points_lie_where_the_cameras_look(made):
-    low, high = looked_at([view.camera for view in made.views])
+    low, high, faced = looked_at([view.camera for view in made.views])
+    assert faced
     assert np.abs(low + high).max() < 1e-9  # all look at 0
     found = made.with_random_points(500, 3)
     assert (found.points > low).all()
     assert (found.points < high).all()
     assert (made.with_random_points(500, 3).points == found.points).all()
     assert (made.with_random_points(500, 4).points != found.points).any()
+
+
+@pytest.mark.parametrize("way", ["around", "ahead", "beside"])
+def test_random_points_lie_before_cameras_that_look_at_no_one_place(made, way):
+    """A room from its middle, a drive, a row of cameras that look the same way."""
+    along = np.linspace(-1, 1, 8)
+    around = [np.array([np.sin(3 * a), 0, np.cos(3 * a)]) for a in along]
+    places = {
+        "around": [(place, 9 * place) for place in around],
+        "ahead": [((0, 0, a), (0, 0, 9)) for a in along],
+        "beside": [((a, 0, 0), (a, 0, 9)) for a in along],
+    }[way]
+    cameras = [fs.Camera.look_at(24, 18, 0.9, *place) for place in places]
+    views = tuple(replace(made.views[0], camera=camera) for camera in cameras)
+    none = np.zeros((0, 3))
+    found = Dataset(way, views, (), none, none.astype(np.uint8)).with_random_points(400, 0)
+    for number, camera in enumerate(cameras):
+        at = camera.project(found.points)
+        assert ((at > 0) & (at < (24, 18))).all(axis=1)[number::8].all()
+        depths = (found.points - camera.position)[number::8] @ camera.world_to_camera[2, :3]
+        assert 0 < depths.min() < 0.5 * found.extent
+        assert 2.5 * found.extent < depths.max() < 3 * found.extent
 
 
 def test_scenes_far_from_the_origin_have_one_of_their_own(made):
@@ -443,13 +467,30 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert main([*words[:-1], "3"]) == 2
     assert "number of iterations" in capsys.readouterr().err
     assert main([*words[:-1], "3", "--overwrite"]) == 0
-    for wrong in (["-o", "a.png"], ["--random-points", "-1"], ["--within-memory", "0"]):
+    for wrong, said in (
+        (["-o", "a.png"], "-o is a.png"),
+        (["--random-points", "-1"], "--random-points is -1; it must"),
+        (["--random-points", "99999999999"], "--random-points is 99999999999; it must"),
+        (["--within-memory", "0"], "--within-memory is 0"),
+        (["--within-memory", "1e-6"], "alone take 0.0001 GiB of the 1e-06 GiB"),
+    ):
         assert main([*words, *wrong]) == 2
+        assert said in capsys.readouterr().err
+    shutil.rmtree(folder / "test")
+    words[3] = str(tmp_path / "c.ply")
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "PSNR" not in printed
+    assert "no view was held out: --hold-out 8" in " ".join(printed.split())
 
 
 @pytest.mark.parametrize(
     ("name", "line", "words"),
-    [("cameras", "1 PINHOLE 64 48 50", "with 1 parameters"), ("points3D", "1 0 0 0 9", "not enough")],
+    [
+        ("cameras", "1 PINHOLE 64 48 50", "with 1 parameters"),
+        ("points3D", "1 0 0 0 9", "not enough"),
+        ("images", "1 1 0 0 0 0", "'1 1 0 0 0 0' has 6 of the 10 words"),
+    ],
 )
 def test_lines_of_a_colmap_model_that_end_early(folder, name, line, words):
     model = folder / "sparse/0"
