@@ -59,3 +59,15 @@ def unknown(what: str, name: object, known: Iterable[str], within: str = "", lik
     listed = (repr(name) if ", " in name else name for name in names)
     valid = f"known: {', '.join(listed)}" if names else "none is known here"
     return f"unknown {what} {shown}{hint}; {valid}"
+
+
+def bytes_words(size: float) -> str:
+    """Bytes as errors say them, to three digits where they are few."""
+    if size < 2**20:
+        return f"{size / 2**10:.3g} KiB"
+    return f"{size / 2**20:.3g} MiB" if size < 100 * 2**20 else f"{size / 2**20:.0f} MiB"
+
+
+def several(count: int, things: str) -> str:
+    """A number of things, "1 chunk" of "chunks"."""
+    return f"{count:,} {things if count != 1 else things.removesuffix('s')}"

@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fidsplat.backends.seen import BRIGHTEST, ROOM, Boxes, Extent, Turned, drawn_to, ewa_reach
+from fidsplat.backends.seen import ROOM, Boxes, Extent, Turned, ewa_reach
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
@@ -122,8 +122,8 @@ def _spans(
 
 
 def _extent(view: View, features: FeatureSet) -> Extent | None:
-    """How far splats show, those that stand for others too."""
-    return Extent.of(view, features, max(drawn_to(view, BRIGHTEST), _RANGE * ROOM))
+    """How far splats show, or have depths of their own."""
+    return Extent.of(view, features, _RANGE * ROOM)
 
 
 def _on_picture(

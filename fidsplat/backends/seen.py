@@ -25,7 +25,7 @@ Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
 ROOM = 1.01
 """how much further splats are taken to reach: for rounding, and what bounds are padded with"""
 BRIGHTEST = 4.0
-"""most opacity, of splats that stand for others under the low-pass `pixel` (fidsplat/store/merge.py)"""
+"""most opacity, of splats that stand for others (fidsplat/store/merge.py)"""
 _ACROSS, _ALONG = 0.5, 1 / 8
 """standard deviations of what a sample sees under the low-pass `pixel`: across its ray in samples, and along
 it as a share of the depth (kernels/opencl/slot/lowpass_pixel.cl)"""
@@ -79,7 +79,7 @@ class Extent:
         """That of a view's splats, to `least` standard deviations at least; None where nothing bounds it:
         under the low-pass `pixel` behind distorted lenses, which stretch without limit at their fold, to
         parallel rays, whose footprint has no end, and at cut-offs as low as 1e-13."""
-        radius = max(_radius(view, features), least)
+        radius = max(drawn_to(view), least)
         # a dot of the low-pass, or what EWA widens a splat by
         plain = Extent(radius, radius * view.samples + 2.0, radius)
         if not _widened(features):
@@ -104,14 +104,9 @@ def _widened(features: FeatureSet) -> bool:
     return "lowpass_pixel" in features.names
 
 
-def _radius(view: View, features: FeatureSet) -> float:
-    """Standard deviations to which splats are drawn."""
-    return drawn_to(view, BRIGHTEST if _widened(features) else 1.0)
-
-
-def drawn_to(view: View, opacity: float) -> float:
-    """Standard deviations to which splats of at most this opacity are drawn, with room."""
-    return ROOM * math.sqrt(max(2.0 * (math.log(opacity) - view.log_cut), 0.0))
+def drawn_to(view: View) -> float:
+    """Standard deviations to which splats are drawn, with room: those that stand for others reach further."""
+    return ROOM * math.sqrt(2.0 * (math.log(BRIGHTEST) - view.log_cut))
 
 
 def ewa_reach(view: View, features: FeatureSet, radius: float, reach: np.ndarray) -> np.ndarray | None:
@@ -128,7 +123,7 @@ def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) 
     extent = Extent.of(view, features)
     if extent is None:
         # nothing of a splat whose centre lies behind the near plane is widened
-        whole = Turned(view, *boxes(_radius(view, features)))
+        whole = Turned(view, *boxes(drawn_to(view)))
         return whole.furthest(view) >= view.near * (1 - _ROUNDING)
     radius, margin = extent.radius, extent.margin
     centers = Turned(view, *boxes(0.0))

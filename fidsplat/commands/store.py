@@ -22,7 +22,7 @@ from fidsplat.commands.output import (
     switch,
     tell,
 )
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, several
 from fidsplat.files import writable_folder
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Build:
         seconds, store = time.perf_counter() - begun, Store(folder)
         facts = {"store": str(folder), "splats": len(store), "chunks": store.chunks, "bytes": store.nbytes}
         facts |= {"left_out": store.header.dropped, "seconds": seconds}
-        words = f"{len(store):,} splats in {store.chunks:,} chunks, {store.nbytes / 2**20:.1f} MiB, "
+        words = f"{_splats(store)}, {store.nbytes / 2**20:.1f} MiB, "
         left = (f"left out: {count:,}: {why}" for why, count in store.header.dropped.items())
         rate = len(store) / seconds / 1e6
         return tell(self.json, facts, words + f"in {seconds:.1f} s ({rate:.2f} M/s): {folder}", *left)
@@ -118,7 +118,15 @@ class Place:
             poses = _grid(_three("--grid", self.grid, int), _three("--pitch", self.pitch, float))
         store = Store(place_store(self.source, self.out, poses, overwrite=self.overwrite))
         facts = {"store": str(store.path), "places": store.places, "splats": len(store)}
-        return tell(self.json, facts, f"{len(store):,} splats at {store.places:,} places: {store.path}")
+        return tell(
+            self.json,
+            facts,
+            f"{several(len(store), 'splats')} at {several(store.places, 'places')}: {store.path}",
+        )
+
+
+def _splats(store: fs.Store) -> str:
+    return f"{several(len(store), 'splats')} in {several(store.chunks, 'chunks')}"
 
 
 def _three(name: str, text: str | None, kind: type) -> list:
@@ -203,7 +211,8 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows += [
         (
             f"level {one['level']}",
-            f"{one['splats']:,} splats in {one['nodes']:,} nodes, cells of {one['cell_m']:.3g} m",
+            f"{several(one['splats'], 'splats')} in {several(one['nodes'], 'nodes')}, cells of "
+            f"{one['cell_m']:.3g} m",
         )
         for one in facts["levels"]
         if one["level"]
@@ -314,7 +323,7 @@ class StoreDemo:
         whole.save(scene)
         seconds = time.perf_counter() - begun
         facts = {"store": str(path), "scene": str(scene), "splats": len(store), "seconds": seconds}
-        words = f"{len(store):,} splats in {store.chunks:,} chunks, in {seconds:.0f} s: {path}"
+        words = f"{_splats(store)}, in {seconds:.0f} s: {path}"
         return tell(self.json, facts, words, f"fly through it: fidsplat fly {scene}")
 
 
@@ -340,7 +349,7 @@ class Verify:
         with late_progress(console(True)) as progress:
             wrong = store.verify(progress)
         facts = {"store": self.store, "nodes": len(store.nodes), "damaged": wrong}
-        tell(self.json, facts, *(wrong or [f"{self.store} is whole: {len(store.nodes):,} nodes"]))
+        tell(self.json, facts, *(wrong or [f"{self.store} is whole: {several(len(store.nodes), 'nodes')}"]))
         return 1 if wrong else 0
 
 

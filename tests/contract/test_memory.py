@@ -172,9 +172,10 @@ def test_many_big_splats_in_chunks(opencl):
     assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
 
 
-def test_a_budget_below_the_picture_is_an_error_with_a_remedy(opencl, cloud):
-    with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small.*raise memory_budget"):
-        own_device(opencl, 2**20).render(cloud, CAMERA, ALL_OUTPUTS)
+@pytest.mark.parametrize(("budget", "words"), [(2**20, "1 MiB"), (200_000, "195 KiB")])
+def test_a_budget_below_the_picture_is_an_error_with_a_remedy(opencl, cloud, budget, words):
+    with pytest.raises(fs.DeviceError, match=rf"budget of {words} is too small.*raise memory_budget"):
+        own_device(opencl, budget).render(cloud, CAMERA, ALL_OUTPUTS)
 
 
 def test_a_row_of_tiles_with_too_many_splats_is_an_error(opencl):

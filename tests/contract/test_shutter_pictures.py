@@ -165,6 +165,8 @@ def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpas
     """The same bits with and without `shutter_rows`: near, behind, large and far below a pixel."""
     cloud = random_splats(3000, 11, depth=(-2.0, 6.0), scale=(1e-4, 1.0), across=2.0)
     cloud = cloud.with_labels(np.arange(3000) % 7)
+    cloud.opacities.flags.writeable = True
+    cloud.opacities[::9] *= 4  # as of what stands for others in a store
     quality = Quality(lowpass=lowpass, samples=samples)
     camera, shutter = CAMERAS["pinhole"], fs.Shutter(readout=0.5, rows_per_band=3)
     capture = fs.Capture(camera, ALL_OUTPUTS, quality, BACKGROUND, MOTION, shutter)

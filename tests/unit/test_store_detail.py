@@ -119,8 +119,10 @@ def test_errors_grow_with_the_size_of_cells_and_are_kept_beside_the_store(store,
         again.pixels_of(fs.Quality(lowpass="none", detail_error=0.1))
 
 
-def test_pictures_keep_to_the_error_that_is_allowed(store, renderer):
+@pytest.mark.parametrize("device", ["opencl", "warp:cpu"])
+def test_pictures_keep_to_the_error_that_is_allowed(store, renderer, device):
     measure_detail(store, renderer, views=4 * store.levels)
+    renderer = fs.Renderer(device)
     resident = renderer.upload(fs.Store(store.path))
     for away in (300.0, 1500.0):
         camera = seen_from(away)
@@ -223,6 +225,7 @@ def test_a_city_is_the_same_however_it_is_read():
 
 def test_a_city_that_is_too_small_for_levels_is_drawn_exactly(tmp_path, capsys):
     assert main(["store", "demo", "-o", str(tmp_path), "--splats", "50", "--houses", "1"]) == 0
+    assert "50 splats in 1 chunk, in" in capsys.readouterr().out
     assert fs.Scene.load(tmp_path / "city.toml").capture.quality.detail_error == 0
     for options in (["--splats", "nan"], ["--splats", "inf"], ["--splats", "0.5"], ["--views", "-1"]):
         assert main(["store", "demo", "-o", str(tmp_path / "none"), *options]) == 2

@@ -176,7 +176,7 @@ def test_a_needle_that_ewa_draws_into_a_wide_picture_is_seen(reference):
     focal = 1000 / math.tan(math.radians(80))
     camera = fs.Camera.pinhole(2000, 2, focal, focal, 1000, 1)
     capture = fs.Capture(camera, quality=fs.Quality(ellipsoid="ewa"), outputs=("alpha",))
-    sigmas = np.float32([[1e-3, 1e-3, 0.26 / 4.8]])
+    sigmas = np.float32([[1e-3, 1e-3, 0.24 / 4.8]])
     means = np.float32([[-7.3, 0, 1]])
     needle = fs.SplatCloud(means, [[1, 0, 0, 0]], sigmas, [0.99], colors=[[1, 1, 1]])
     assert reference.render(needle, capture)["alpha"].any()

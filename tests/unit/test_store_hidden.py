@@ -164,7 +164,7 @@ def test_views_of_about_as_many_splats_take_no_new_memory(town, asked, monkeypat
     pool, resident = renderer.backend.pool, renderer.upload(town)
     make, counts = pool.fresh, []
     monkeypatch.setattr(pool, "fresh", lambda name, size: fresh.append(name) or make(name, size))
-    for turn, along in ((0.0, 0.0), (0.02, 0.05), (0.05, 0.15), (0.05, 0.2)):
+    for turn, along in ((0.0, 0.0), (0.02, 0.05), (0.06, 0.15), (0.06, 0.2)):
         before = len(fresh)
         frame = renderer.render(resident, view(turn, along))
         assert frame["rgb"].any()

@@ -15,7 +15,7 @@ from fidsplat.backends.opencl.images import Drawn
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.stack import ViewBatch
 from fidsplat.effects.catalogue import Output
-from fidsplat.errors import DeviceError
+from fidsplat.errors import DeviceError, bytes_words
 
 _MOST = {"cpu": 1 << 28}
 """bytes that the views of a part take together, beside their images: more is no faster"""
@@ -40,13 +40,13 @@ class OutputBuffers:
         largest, most = max(bytes_of, key=bytes_of.__getitem__), workspace.device.max_mem_alloc_size
         if bytes_of[largest] > most:
             raise DeviceError(
-                f"{largest} of {views} views takes {bytes_of[largest] / 2**20:.1f} MiB in one piece, and the "
-                f"device gives at most {most / 2**20:.1f} MiB; draw fewer views at once"
+                f"{largest} of {views} views takes {bytes_words(bytes_of[largest])} in one piece, and the "
+                f"device gives at most {bytes_words(most)}; draw fewer views at once"
             )
         if self.nbytes > workspace.memory_budget:
             raise DeviceError(
-                f"the images of {views} views take {self.nbytes / 2**20:.0f} MiB, more than the memory "
-                f"budget of {workspace.memory_budget / 2**20:.0f} MiB; draw fewer views or outputs at once"
+                f"the images of {views} views take {bytes_words(self.nbytes)}, more than the memory "
+                f"budget of {bytes_words(workspace.memory_budget)}; draw fewer views or outputs at once"
             )
         lease = workspace.pool.lease
         self.leased = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fidsplat.errors import DeviceError
+from fidsplat.errors import DeviceError, bytes_words
 
 CHUNK = 1 << 20
 """most splats that are projected at once where a cloud is taken in chunks; a power of two, so that pieces of
@@ -71,8 +71,8 @@ def plan_of(
     capacity = min(capacity, largest // record_bytes, count)
     if capacity < min(_LEAST, count):
         raise DeviceError(
-            f"a memory budget of {budget / 2**20:.0f} MiB is too small: the picture and the cloud alone take "
-            f"{fixed_bytes / 2**20:.0f} MiB; raise memory_budget, or draw a smaller picture or fewer outputs"
+            f"a memory budget of {bytes_words(budget)} is too small: the picture and the cloud alone take "
+            f"{bytes_words(fixed_bytes)}; raise memory_budget, or draw a smaller picture or fewer outputs"
         )
     held = fixed_bytes + pairs + chunk * (each + upload_bytes) + capacity * (each + SORTED)
     return MemoryPlan(chunk, capacity, held)

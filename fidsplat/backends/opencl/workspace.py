@@ -22,7 +22,7 @@ from fidsplat.backends.opencl.memory_plan import PAIR
 from fidsplat.backends.opencl.pages import large_pages
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.cameras.raster import RayRaster
-from fidsplat.errors import DeviceError
+from fidsplat.errors import DeviceError, bytes_words
 
 _LEAST = 16  # bytes; OpenCL has no empty buffers
 _LARGE = 1 << 22  # bytes from which large pages are asked for
@@ -165,8 +165,8 @@ class BufferPool:
         limit = self._device.max_mem_alloc_size
         if size > limit:
             raise DeviceError(
-                f"{name} needs {size / 2**20:.0f} MiB in one piece, but {self._device.name.strip()} gives at "
-                f"most {limit / 2**20:.0f} MiB; use fewer splats or a smaller picture"
+                f"{name} needs {bytes_words(size)} in one piece, but {self._device.name.strip()} gives at "
+                f"most {bytes_words(limit)}; use fewer splats or a smaller picture"
             )
         try:
             buffer = DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
@@ -174,7 +174,7 @@ class BufferPool:
                 self._ask_for_large_pages(buffer)
             return buffer
         except cl.Error as error:
-            raise DeviceError(f"no memory for {name} ({size / 2**20:.0f} MiB): {error}") from error
+            raise DeviceError(f"no memory for {name} ({bytes_words(size)}): {error}") from error
 
     def _ask_for_large_pages(self, buffer: cl.Buffer) -> None:
         """The memory stays the device's, which keeps it until no kernel needs it; this is advice."""

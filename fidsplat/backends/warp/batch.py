@@ -16,7 +16,7 @@ from fidsplat.backends.warp.picture import Into
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import Output
-from fidsplat.errors import DeviceError
+from fidsplat.errors import DeviceError, bytes_words
 
 _MOST = {True: 1 << 31, False: 1 << 28}
 """bytes that the views of a part take together on CUDA, and on the CPU: more is no faster"""
@@ -55,8 +55,8 @@ class WarpBatch:
         self.nbytes = 4 * batch.total * height * width * sum(output.channels for output in outputs)
         if self.nbytes > workspace.memory_budget:
             raise DeviceError(
-                f"the images of {batch.total} views take {self.nbytes / 2**20:.0f} MiB, more than the memory "
-                f"budget of {workspace.memory_budget / 2**20:.0f} MiB; draw fewer views or outputs at once"
+                f"the images of {batch.total} views take {bytes_words(self.nbytes)}, more than the memory "
+                f"budget of {bytes_words(workspace.memory_budget)}; draw fewer views or outputs at once"
             )
         self._images: dict[str, tuple[Output, Any]] = {}
         for output in outputs:

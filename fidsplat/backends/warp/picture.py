@@ -32,7 +32,7 @@ from fidsplat.backends.warp.structs import (
     uniforms,
 )
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace
-from fidsplat.errors import DeviceError
+from fidsplat.errors import DeviceError, bytes_words
 
 # bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
 # sort and lists; of a pair with the scratch of its sort
@@ -254,8 +254,8 @@ class Picture:
         pairs = (workspace.memory_budget - fixed) // _PAIR
         if pairs < 1:
             raise DeviceError(
-                f"a memory budget of {workspace.memory_budget / 2**20:.0f} MiB is too small for "
-                f"{resident.count} splats in this picture, which take {fixed / 2**20:.0f} MiB before their "
+                f"a memory budget of {bytes_words(workspace.memory_budget)} is too small for "
+                f"{resident.count} splats in this picture, which take {bytes_words(fixed)} before their "
                 "lists; raise memory_budget, or use an OpenCL device, which draws a cloud in chunks"
             )
         return min(workspace.pair_budget, pairs)

@@ -10,7 +10,7 @@ import numpy as np
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, nbytes
-from fidsplat.errors import DeviceError, InputError
+from fidsplat.errors import DeviceError, InputError, bytes_words
 from fidsplat.harmonics import MAX_DEGREE
 from fidsplat.splats import SplatCloud
 
@@ -138,9 +138,9 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool, dtype: Any = None) 
     try:
         return wp.array(np.ascontiguousarray(array), dtype=dtype, device=pool.device).flatten()
     except (RuntimeError, MemoryError) as error:
-        size = array.nbytes / 2**20
         raise DeviceError(
-            f"the cloud's {name} need {size:.0f} MiB, which {pool.device} has not; use fewer splats"
+            f"the cloud's {name} need {bytes_words(array.nbytes)}, which {pool.device} has not; use fewer "
+            "splats"
         ) from error
 
 

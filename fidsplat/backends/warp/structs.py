@@ -16,7 +16,7 @@ from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.cameras.raster import RayRaster
-from fidsplat.errors import DeviceError
+from fidsplat.errors import DeviceError, bytes_words
 from fidsplat.surroundings import Gradient, Panorama
 
 _DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
@@ -200,7 +200,7 @@ def _panorama(panorama: Panorama, workspace: Workspace) -> Any:
             held[panorama] = wp.array(image, dtype=wp.vec3, device=workspace.device)
         except (RuntimeError, MemoryError) as error:
             raise DeviceError(
-                f"the panorama needs {image.nbytes / 2**20:.0f} MiB, which {workspace.device} has not; use a "
+                f"the panorama needs {bytes_words(image.nbytes)}, which {workspace.device} has not; use a "
                 "smaller one"
             ) from error
     return held[panorama]

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary, WeakSet
 
 from fidsplat.backends.warp.runtime import load
 from fidsplat.cameras.raster import RayRaster
-from fidsplat.errors import DeviceError
+from fidsplat.errors import DeviceError, bytes_words
 from fidsplat.surroundings import Panorama
 
 
@@ -89,7 +89,7 @@ class ArrayPool:
             return wp.empty(max(size, 1), dtype=dtype, device=self.device)
         except (RuntimeError, MemoryError, ValueError) as error:  # the last: 2^31 elements and more
             raise DeviceError(
-                f"{name} needs {size * wp.types.type_size_in_bytes(dtype) / 2**20:.0f} MiB, which "
+                f"{name} needs {bytes_words(size * wp.types.type_size_in_bytes(dtype))}, which "
                 f"{self.device} has not; use fewer splats or a smaller picture"
             ) from error
 

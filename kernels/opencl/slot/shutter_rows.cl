@@ -1,9 +1,10 @@
 // A picture of several poses seen by a pinhole is projected many times, often for a few rows: splats that lie wholly
 // above or below the rows are culled by their bounding sphere, before what their true bounds take. What is drawn is the
 // same: between the planes through the camera's centre and the rows, widened by the low-pass's dot, lies all of it.
-// Not for boxes and the low-pass `pixel`, which grow in ways that no sphere bounds.
+// Not for boxes and the low-pass `pixel`, which grow in ways that no sphere bounds, and what stands for others, whose opacity may be
+// above 1.
 //@ splat_view
-    {
+    if (opacities[i] <= 1.0f) {
         // the furthest that any opacity reaches, in scales and in samples
         real most = -view->log_cut, dot = sqrt(most / view->filter) + 2;
         real reach = sqrt(2 * most) * fmax(scales[2 * i], scales[2 * i + 1]), fy = view->focal_y;
