@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import fidsplat as fs
 from fidsplat.accuracy import truth
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.seen import sizes
+from fidsplat.budget import Choice
+from fidsplat.budget.prices import load as load_prices
 from fidsplat.cli import main
 from fidsplat.detail import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.store import plan
@@ -253,6 +256,32 @@ def test_a_budget_of_error_turns_detail_too(store, renderer):
     assert np.abs(frame["rgb"] - exact).max() <= 0.08
     assert frame.stats["splats"] < len(store)
     assert np.array_equal(exact, truth(renderer, store.cloud(), capture))
+
+
+def test_a_budget_of_time_alone_turns_detail_too(store, renderer, monkeypatch, tmp_path):
+    """The errors that are tried go up until they would exceed what was found."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    measure_detail(store, renderer, views=4 * store.levels)
+    tried, errors = [], {0.0: None, 1 / 255: 0.2, 4 / 255: 0.03, 16 / 255: 0.1, 0.5: 0.0}
+
+    def found(search, error, ms):
+        base = search.calibration.base
+        tried.append(base.detail_error)
+        if errors[base.detail_error] is None:
+            raise fs.InputError("no quality draws this scene in 1 ms")
+        candidate = load_prices(renderer.device.kind)[0]
+        own = candidate.of(base)
+        return Choice(own, errors[base.detail_error], 1.0, 1.0, "measured", "here", candidate.knobs)
+
+    monkeypatch.setattr(sys.modules["fidsplat.budget.choose"], "_measured", found)
+    asked = {"scene": store, "capture": seen_from(1500.0), "device": renderer}
+    asked["capture"] = fs.Capture(asked["capture"], quality="lowpass=pixel")
+    for _ in range(2):  # the second is kept
+        assert fs.quality_within(ms=1.0, **asked).detail_error == 4 / 255
+    assert tried == [0.0, 1 / 255, 4 / 255]
+    errors[1 / 255] = errors[4 / 255] = errors[16 / 255] = errors[0.5] = None
+    with pytest.raises(fs.InputError, match="in 1 ms"):
+        fs.quality_within(ms=2.0, **asked)
 
 
 def test_a_cloud_in_memory_knows_no_detail(renderer):
