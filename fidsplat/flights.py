@@ -225,6 +225,14 @@ def seen_in_flight(scene: Scene, picture: Path) -> Scene:
     path, number = load_trajectory(folder / POSES), int(picture.stem)
     if number >= len(path):
         return scene
+    return _at(scene, path, float(path.times[number]))
+
+
+def seen_from(scene: Scene, pose: np.ndarray, time: float) -> Scene:
+    """The scene with its camera at a pose (4, 4), camera to world, and its clock at a time [s]."""
+    return _at(scene, Trajectory([time], pose[None]), time)
+
+
+def _at(scene: Scene, path: Trajectory, time: float) -> Scene:
     shutter = Shutter() if scene.shutter is None else scene.shutter
-    shutter = replace(shutter, time=float(path.times[number]))
-    return replace(scene, camera_motion=path.inverse(), shutter=shutter)
+    return replace(scene, camera_motion=path.inverse(), shutter=replace(shutter, time=time))

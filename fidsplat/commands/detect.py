@@ -11,7 +11,7 @@ from fidsplat.errors import InputError
 from fidsplat.files import path_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterator
 
     import numpy as np
 
@@ -27,8 +27,8 @@ class Detect:
     Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
     printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker and board of
     that scene was seen from its camera, how far that is from the truth, and the means: of a scene that moves,
-    from where things are at its shutter's time, when the middle row is exposed; in the folder of a flight,
-    from where its camera was in each picture. Boards, and markers of one bundle, give one pose.
+    from where things are at its shutter's time, when the middle row is exposed; in the folder or the log of
+    a flight, from where its camera was in each picture. Boards, and markers of one bundle, give one pose.
 
     Examples:
       fidsplat detect photo.jpg
@@ -70,8 +70,8 @@ class Detect:
         readings: list[Reading] = []
         bundles: list[BundleReading] = []
         for path in self.images:
-            for name, image in self._pictures(path):
-                result, read, bundled = self._one(name, image, scene)
+            for name, image, then in self._pictures(path, scene):
+                result, read, bundled = self._one(name, image, then)
                 results.append(result)
                 readings += read
                 bundles += bundled
@@ -108,22 +108,44 @@ class Detect:
             print_table(where, f"Against {self.scene}: distance, and errors", heads, against)
         return 0
 
-    def _pictures(self, path: str) -> "Iterable[tuple[str, np.ndarray]]":
+    def _pictures(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
+        """Names, pictures, and the scene as it was in each."""
+        from fidsplat.flights import RECORD, seen_in_flight
+        from fidsplat.vision.images import is_video, pictures
+
         if path.endswith(".mcap") or (Path(path) / "metadata.yaml").is_file():
-            from fidsplat.logs import log_pictures
-
-            return log_pictures(path, self.topic)
-        from fidsplat.flights import RECORD
-        from fidsplat.vision.images import pictures
-
+            yield from self._logged(path, scene)
+            return
+        if scene is not None and is_video(path):
+            raise InputError(
+                f"{path} does not say where its camera was in each picture, as --scene asks; give the folder "
+                "of the flight, or its log"
+            )
         folder = path_of(path)
-        return pictures(folder / "rgb" if (folder / RECORD).is_file() else path)
+        for name, image in pictures(folder / "rgb" if (folder / RECORD).is_file() else path):
+            yield name, image, None if scene is None else seen_in_flight(scene, Path(name))
+
+    def _logged(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
+        from fidsplat.flights import seen_from
+        from fidsplat.logs import log_pictures, log_poses
+
+        poses = {} if scene is None else log_poses(path)
+        for one in log_pictures(path, self.topic):
+            then = scene
+            if scene is not None:
+                pose = poses.get((one.frame, one.stamp))
+                if pose is None:
+                    raise InputError(
+                        f"{path} does not say where the camera of {one.name} was: /tf has no pose of "
+                        f"{one.frame!r} of that time; give its pictures without --scene"
+                    )
+                then = seen_from(scene, pose, one.stamp / 1e9)
+            yield one.name, one.image, then
 
     def _one(
         self, name: str, image: "np.ndarray", scene: "Scene | None"
     ) -> tuple[dict[str, Any], list["Reading"], list["BundleReading"]]:
         """What one picture shows, for JSON, and the readings of the scene's markers and bundles."""
-        from fidsplat.flights import seen_in_flight
         from fidsplat.vision.bundles import read_bundles
         from fidsplat.vision.detect import detect
         from fidsplat.vision.readback import read_back
@@ -132,7 +154,6 @@ class Detect:
         facts: dict[str, Any] = {"image": name, "width": image.shape[1], "height": image.shape[0]}
         if scene is None:
             return facts | {"detections": [_said(code) for code in detect(image, families)]}, [], []
-        scene = seen_in_flight(scene, Path(name))
         try:
             readings, others = read_back(image, scene, families=families)
         except InputError as error:

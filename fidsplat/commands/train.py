@@ -85,8 +85,6 @@ class Train:
 
         if path_of(self.out).suffix.lower() != ".ply":
             raise InputError(f"-o is {self.out}; splats are written as PLY: name a file that ends in .ply")
-        if self.random_points < 0:
-            raise InputError(f"--random-points is {self.random_points}; give at least 1, or 0 for none")
         if self.report is not None:
             need_reports()
         settings = asked(TrainSettings, self)
@@ -122,7 +120,9 @@ class Train:
         rate = facts["iterations_per_second"]
         speed = "nothing was left to do" if rate is None else f"{seconds:.1f} s, {rate:.1f} it/s"
         words = f"{facts['splats']:,} splats after {trainer.iteration:,} iterations ({speed})"
-        table = title, ("view", "PSNR, dB", "SSIM"), rows
+        if not scores:
+            words += "; no view was held out: --hold-out 8 keeps every eighth"
+        table = (title, ("view", "PSNR, dB", "SSIM"), rows) if scores else None
         return tell(self.json, facts, words, facts["file"], *facts.get("report", []), table=table)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.cameras import Camera
+from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens
 from fidsplat.errors import InputError
 from fidsplat.rotations import quaternion_to_matrix
 
@@ -28,9 +28,18 @@ _MODELS = {
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
 """camera models by their numbers: name, parameters"""
-_ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-_PERSPECTIVE = (*_ONE_FOCAL_LENGTH, "PINHOLE", "OPENCV", "FULL_OPENCV")
-"""those that are pinholes where their distortion is 0"""
+_LENSES: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": (BrownConrady, ()),
+    "PINHOLE": (BrownConrady, ()),
+    "SIMPLE_RADIAL": (BrownConrady, ("k1",)),
+    "RADIAL": (BrownConrady, ("k1", "k2")),
+    "OPENCV": (BrownConrady, ("k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": (BrownConrady, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "OPENCV_FISHEYE": (Fisheye, ("k1", "k2", "k3", "k4")),
+    "SIMPLE_RADIAL_FISHEYE": (Fisheye, ("k1",)),
+    "RADIAL_FISHEYE": (Fisheye, ("k1", "k2")),
+}
+"""those that we have, with the last of their parameters; before them stand f or fx and fy, cx and cy"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +60,7 @@ def load_colmap(folder: Path) -> ColmapModel:
     """Read cameras, images and points3D from a folder, binary where both are there; without points3D there
     are no points.
 
-    Raises InputError when a file is missing or damaged, or a camera is no pinhole.
+    Raises InputError when a file is missing or damaged, or a camera has a lens that we lack.
     """
     lenses = dict(_read(folder, "cameras", _binary_cameras, _text_cameras))
     views = sorted(_read(folder, "images", _binary_images, _text_images), key=lambda view: view[0])
@@ -142,11 +151,11 @@ class _Bytes:
         self._place += size
 
 
-_Lens = tuple[str, int, int, tuple[float, ...]]
+_Taken = tuple[str, int, int, tuple[float, ...]]
 _View = tuple[str, int, tuple[float, ...]]
 
 
-def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Lens]]:
+def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Taken]]:
     for _ in range(data.count()):
         number, model, width, height = data.take("iiQQ")
         if model not in _MODELS:
@@ -155,7 +164,7 @@ def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Lens]]:
         yield number, (name, width, height, data.take(f"{parameters}d"))
 
 
-def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Lens]]:
+def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Taken]]:
     for line in filter(None, lines):
         number, model, width, height, *parameters = line.split()
         if len(parameters) != dict(_MODELS.values()).get(model, len(parameters)):
@@ -176,6 +185,8 @@ def _text_images(lines: list[str]) -> Iterator[_View]:
     for line in lines[::2]:
         if line:
             words = line.split(maxsplit=9)
+            if len(words) < 10:
+                raise ValueError(f"the line {line!r} has {len(words)} of the 10 words of an image")
             yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 
 
@@ -192,13 +203,15 @@ def _text_points(lines: list[str]) -> Iterator[tuple]:
         yield tuple(map(float, (x, y, z, r, g, b)))
 
 
-def _camera(lens: _Lens, pose: np.ndarray) -> Camera:
-    model, width, height, values = lens
-    own = 3 if model in _ONE_FOCAL_LENGTH else 4
-    if model not in _PERSPECTIVE or any(values[own:]):
+def _camera(taken: _Taken, pose: np.ndarray) -> Camera:
+    model, width, height, values = taken
+    if model not in _LENSES:
         raise InputError(
-            f"its camera has the model {model} with distortion, and pictures are trained on without; "
-            "undistort them first, e.g. by colmap image_undistorter"
+            f"its camera has the model {model}, and known are {', '.join(_LENSES)}; undistort the pictures "
+            "first, e.g. by colmap image_undistorter"
         )
-    fx, fy, cx, cy = values[:4] if own == 4 else (values[0], *values[:3])
-    return Camera.pinhole(width, height, fx, fy, cx, cy, pose)
+    kind, names = _LENSES[model]
+    own = len(values) - len(names)
+    lens: Lens = kind(**dict(zip(names, values[own:], strict=True)))
+    fx, fy, cx, cy = values[:own] if own == 4 else (values[0], *values[:3])
+    return Camera.pinhole(width, height, fx, fy, cx, cy, pose, lens=lens)

@@ -2,6 +2,6 @@
 
 from fidsplat.logs.files import check_log
 from fidsplat.logs.log import RobotLog
-from fidsplat.logs.reader import log_pictures
+from fidsplat.logs.reader import LogPicture, log_pictures, log_poses
 
-__all__ = ["RobotLog", "check_log", "log_pictures"]
+__all__ = ["LogPicture", "RobotLog", "check_log", "log_pictures", "log_poses"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
 from fidsplat.logs.files import typestore
+from fidsplat.rotations import rigid_matrix
 from fidsplat.vision.images import decoded
 
 try:
@@ -21,14 +24,28 @@ except ImportError as error:
     raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _COLOURS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]), "bgra8": (4, [2, 1, 0]),
             "mono8": (1, [0, 0, 0])}  # fmt: skip
 """channels, and which of them are red, green and blue"""
 
 
-def log_pictures(path: str | os.PathLike[str], topic: str | None = None) -> Iterator[tuple[str, np.ndarray]]:
-    """Names (topic and time) and pictures (h, w, 3) uint8 RGB of a log: rgb8, bgr8, rgba8, bgra8, mono8 and
-    compressed ones, in the order of the log.
+@dataclass(frozen=True)
+class LogPicture:
+    """A picture of a log."""
+
+    name: str
+    """topic and time"""
+    image: np.ndarray
+    """(h, w, 3) uint8 RGB"""
+    frame: str
+    """of its camera"""
+    stamp: int
+    """nanoseconds"""
+
+
+def log_pictures(path: str | os.PathLike[str], topic: str | None = None) -> Iterator[LogPicture]:
+    """Pictures of a log: rgb8, bgr8, rgba8, bgra8, mono8 and compressed ones, in the order of the log.
 
     topic: that one alone; default every topic of such pictures.
 
@@ -36,14 +53,42 @@ def log_pictures(path: str | os.PathLike[str], topic: str | None = None) -> Iter
         InputError: no log, a damaged one, or one without such pictures.
     """
     file, store, found = path_of(path), typestore(), False
-    try:
+    with _damage_told(file):
         for name, kind, time, data in _messages(file):
             if kind not in (_IMAGE, _COMPRESSED) or (topic is not None and name != topic):
                 continue
-            picture = _picture(store.deserialize_cdr(data, kind))
+            message = store.deserialize_cdr(data, kind)
+            picture = _picture(message)
             if picture is not None:
                 found = True
-                yield f"{name} {time / 1e9:.3f} s", picture
+                yield LogPicture(
+                    f"{name} {time / 1e9:.3f} s", picture, message.header.frame_id, _stamp(message.header)
+                )
+    if not found:
+        wanted = f" on {topic}" if topic else ""
+        raise InputError(f"{file} has no colour pictures{wanted}")
+
+
+def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]:
+    """World from frame (4, 4), by frame and nanoseconds: the poses on `/tf` of frames that hang on one which
+    hangs on no other.
+
+    Raises:
+        InputError: no log, a damaged one, or a pose that is none.
+    """
+    file, store, found = path_of(path), typestore(), {}
+    with _damage_told(file):
+        for _, kind, _, data in _messages(file):
+            for one in store.deserialize_cdr(data, kind).transforms if kind == _TRANSFORMS else ():
+                found[one.child_frame_id, _stamp(one.header)] = one
+    hanging = {frame for frame, _ in found}
+    return {key: _pose(one.transform) for key, one in found.items() if one.header.frame_id not in hanging}
+
+
+@contextmanager
+def _damage_told(file: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from error
     except InputError:
@@ -52,9 +97,6 @@ def log_pictures(path: str | os.PathLike[str], topic: str | None = None) -> Iter
         Exception
     ) as error:  # of what reads, decompresses and decodes, five packages with errors of their own
         raise InputError(f"{file} is no log that can be read: {error}") from None
-    if not found:
-        wanted = f" on {topic}" if topic else ""
-        raise InputError(f"{file} has no colour pictures{wanted}")
 
 
 def _messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
@@ -68,6 +110,15 @@ def _messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
         for schema, channel, message in make_reader(stream).iter_messages():
             if schema is not None and channel.message_encoding == "cdr":
                 yield channel.topic, schema.name, message.log_time, message.data
+
+
+def _stamp(header: Any) -> int:
+    return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def _pose(transform: Any) -> np.ndarray:
+    at, turn = transform.translation, transform.rotation
+    return rigid_matrix((at.x, at.y, at.z), (turn.w, turn.x, turn.y, turn.z))
 
 
 def _picture(message: Any) -> np.ndarray | None:

@@ -16,6 +16,8 @@ from fidsplat.train.random_numbers import Purpose, uniform
 
 FAR = 1e4
 """extents from the world's origin beyond which means have an origin of their own: float32 would blur them"""
+_FACING, _AHEAD = 0.5, 3.0
+"""cosine from which cameras look at a point; extents, to which they see where they look at none"""
 _STILL = 1e-9
 """share of a camera's distance from the world's origin, below which movements are what rounding leaves"""
 
@@ -120,20 +122,21 @@ class Dataset:
         return found.hexdigest()
 
     def with_random_points(self, count: int, seed: int) -> Dataset:
-        """The data set with points at random places, in random colours, where its cameras look."""
-        low, high = looked_at([view.camera for view in self.views])
-        draws = uniform(seed, Purpose.POINTS, 0, count)
+        """The data set with points at random places, in random colours, where its cameras look: in a cube,
+        or, where most of them look ahead or around, before each to three extents."""
+        cameras, draws = [view.camera for view in self.views], uniform(seed, Purpose.POINTS, 0, count)
         shades = uniform(seed, Purpose.POINTS, 0, count, draw=1)
-        return replace(
-            self,
-            points=low + draws[:, :3] * (high - low),
-            colors=(shades[:, :3] * 256).astype(np.uint8),
-        )
+        low, high, faced = looked_at(cameras)
+        if faced:
+            points = low + draws[:, :3] * (high - low)
+        else:
+            points = _before(cameras, draws[:, :3], _AHEAD * self.extent)
+        return replace(self, points=points, colors=(shades[:, :3] * 256).astype(np.uint8))
 
 
-def looked_at(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+def looked_at(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool]:
     """Corners (3,), (3,) of the cube around the point that is nearest to the axes of all cameras, as large as
-    they see there."""
+    they see there; and whether it lies before most of them."""
     centers = np.array([camera.position for camera in cameras])
     axes = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -141,13 +144,25 @@ def looked_at(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
     middle = centers.mean(0)
     shift = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers - middle), rcond=1e-6)[0]
     focus = middle + shift
+    away = np.linalg.norm(focus - centers, axis=1)
     reach = np.mean(
         [
-            np.linalg.norm(center - focus) * max(camera.width / camera.fx, camera.height / camera.fy) / 2
-            for center, camera in zip(centers, cameras, strict=True)
+            far * max(camera.width / camera.fx, camera.height / camera.fy) / 2
+            for far, camera in zip(away, cameras, strict=True)
         ]
     )
-    return focus - reach, focus + reach
+    along = np.einsum("ni,ni->n", axes, focus - centers)
+    return focus - reach, focus + reach, bool(along.mean() > _FACING * away.mean())
+
+
+def _before(cameras: Sequence[Camera], draws: np.ndarray, reach: float) -> np.ndarray:
+    """Points (n, 3) in what the cameras see, in turn, at depths up to a reach; draws: (n, 3) in (0, 1)."""
+    points = np.empty(draws.shape)
+    for number, camera in enumerate(cameras):
+        mine = draws[number :: len(cameras)]
+        rays = camera.rays(mine[:, :2] * (camera.width, camera.height)) * (mine[:, 2:] * reach)
+        points[number :: len(cameras)] = camera.position + rays @ camera.world_to_camera[:3, :3]
+    return points
 
 
 def _depths(camera: Camera, points: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ def splats_within(settings: TrainSettings, budget: int, dataset: Dataset) -> Tra
     room = (budget - fixed) // (4 * floats * _COPIES + _WORK)
     if room < 1:
         raise InputError(
-            f"the pictures of {dataset.name} alone take {fixed / 2**30:.2f} GiB of the {budget / 2**30:.2f} "
+            f"the pictures of {dataset.name} alone take {fixed / 2**30:.2g} GiB of the {budget / 2**30:.2g} "
             "GiB that are allowed; allow more, or make them smaller"
         )
     return replace(settings, max_splats=min(settings.max_splats, room))

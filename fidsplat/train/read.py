@@ -11,7 +11,9 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.files import from_json, path_of
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
+from fidsplat.quality import whole_number
 from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.flat import flat_view
 from fidsplat.train.transforms import Found, has_transforms, load_transforms
 from fidsplat.vision.images import read_image, read_over
 
@@ -19,6 +21,7 @@ NOTES = ("dataset.json", "marker.json")
 """files beside a data set of ours that may say its `background`: one display value, or three"""
 _MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """where COLMAP's model may lie in a data set"""
+MOST_POINTS = 2**31 - 1
 HOLD_OUT, ENOUGH = 8, 16
 """every eighth view is held out where no other views are and there are this many"""
 
@@ -53,6 +56,7 @@ def load_dataset(
         raise InputError(f"{folder} is not there; give the folder of a data set")
     if hold_out is not None and (hold_out < 0 or hold_out == 1):
         raise InputError(f"--hold-out is {hold_out}; give 2 or more, every n-th view, or 0 for none")
+    random_points = whole_number("--random-points", random_points, 0, MOST_POINTS)
     tell = progress or (lambda words, share: None)
     found = (load_transforms if has_transforms(folder) else _load_colmap)(folder, tell)
     views, held_out = _divided(found.views, found.held_out, hold_out)
@@ -102,7 +106,7 @@ def _model(
     for i, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
         tell(words, i / len(model.names))
         picture = read_over(folder / "images" / name, background)
-        views.append(TrainingView(name, camera, picture, _mask(folder / "masks" / name)))
+        views.append(flat_view(name, camera, picture, _mask(folder / "masks" / name)))
     return views, model.points, model.colors
 
 
@@ -114,7 +118,6 @@ def _mask(mask: Path) -> np.ndarray | None:
 
 
 def _background(folder: Path) -> Background:
-
     for name in NOTES:
         file = folder / name
         if file.is_file():

@@ -36,7 +36,7 @@ _COUNTS = {
 class TrainSettings:
     """Settings of a training run. Defaults are the constants of the 2DGS authors' trainer (hbb1,
     2d-gaussian-splatting, commit 1920a23), those of `mcmc` gsplat's (`strategy/mcmc.py`, after Kheradmand et
-    al. 2024), so that thresholds and rates known from there mean the same here.
+    al. 2024) but for `mcmc_scale`, so that thresholds and rates known from there mean the same here.
 
     Raises:
         InputError: a value lies outside its range; the message names the range.
@@ -122,8 +122,10 @@ class TrainSettings:
     """mcmc: weight of the mean scale in the loss"""
     mcmc_opacity: float = 0.5
     """mcmc: opacity at first"""
-    mcmc_scale: float = 0.1
-    """mcmc: scales at first, in units of the default rule's"""
+    mcmc_scale: float = 0.5
+    """mcmc: scales at first, in units of the default rule's. gsplat's is 0.1, for 3D Gaussians, which the
+    low-pass blurs; behind that of 2DGS, `screen`, scales of splats far below a pixel have no gradient, and
+    they stay so"""
 
     def __post_init__(self) -> None:
         for name, (least, most) in _COUNTS.items():

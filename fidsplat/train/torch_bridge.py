@@ -55,7 +55,8 @@ def draw(
             `world_to_camera`, in its axes.
 
     Returns:
-        the capture's outputs as float32 tensors, where `means` is.
+        the capture's outputs as float32 tensors, where `means` is. Splats that cannot be drawn are left out
+        with a warning, as a `SplatCloud` does, and have gradients of 0.
 
     Raises:
         DeviceError: the device has no gradients, or fails.
@@ -85,8 +86,10 @@ class _Picture(torch.autograd.Function):
             if capture.camera is None or pose.shape != (6,):
                 raise InputError(f"pose must be 6 numbers, for a capture with a camera, not {pose!r}")
             capture = replace(capture, camera=moved(capture.camera, pose.astype(np.float64)))
-        images, ctx.derivatives = drawn(renderer, SplatCloud(**arrays), capture)
-        ctx.outputs, ctx.pose = capture.outputs, pose
+        # which row a splat came from: those that cannot be drawn are left out
+        cloud = SplatCloud(**arrays, labels=np.arange(len(np.atleast_1d(arrays["means"]))))
+        images, ctx.derivatives = drawn(renderer, cloud, capture)
+        ctx.outputs, ctx.pose, ctx.rows, ctx.count = capture.outputs, pose, cloud.labels, len(tensors[0])
         ctx.like = [None if tensor is None else (tensor.device, tensor.dtype) for tensor in tensors]
         ctx.set_materialize_grads(False)
         return tuple(torch.from_numpy(np.array(image)).to(tensors[0].device) for image in images.values())
@@ -106,5 +109,9 @@ class _Picture(torch.autograd.Function):
                 gradients.append(None)
                 continue
             device, dtype = like
-            gradients.append(torch.from_numpy(np.array(found[name])).to(device=device, dtype=dtype))
+            array = np.array(found[name])
+            if name not in ("background", "pose") and len(ctx.rows) < ctx.count:
+                array = np.zeros((ctx.count, *array.shape[1:]), array.dtype)
+                array[ctx.rows] = found[name]
+            gradients.append(torch.from_numpy(array).to(device=device, dtype=dtype))
         return tuple(gradients)

@@ -9,19 +9,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.cameras import Camera, focal_length
+from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, focal_length
 from fidsplat.errors import InputError
 from fidsplat.files import from_json
 from fidsplat.formats.ply_header import read_header
 from fidsplat.train.dataset import TrainingView
+from fidsplat.train.flat import flat_view
 from fidsplat.vision.images import read_image, read_over
 
 _NAMES = ("transforms.json", "transforms_train.json")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 """the NeRF authors' files name pictures without one"""
-_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""values of `camera_model` that are pinholes where their distortion is 0"""
+_BROWN = ("k1", "k2", "k3", "p1", "p2")
+_LENSES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), _BROWN),
+    "FULL_OPENCV": (*_BROWN, "k4", "k5", "k6"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+"""values of `camera_model`, with the coefficients that are taken with each"""
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _BLACK = (0.0, 0.0, 0.0)
 
 
@@ -46,7 +52,7 @@ def load_transforms(path: Path, tell: Callable[[str, float], None]) -> Found:
 
     Pictures with alpha are put on black.
 
-    Raises InputError for a file that is damaged, a picture that is missing, or a lens with distortion.
+    Raises InputError for a file that is damaged, a picture that is missing, or a lens that we lack.
     """
     file = path if path.is_file() else next(path / name for name in _NAMES if (path / name).is_file())
     table = _table(file)
@@ -87,7 +93,7 @@ def _views(file: Path, table: dict, tell: Callable[[str, float], None], words: s
         if "mask_path" in frame:
             mask = read_image(file.parent / str(frame["mask_path"])).max(axis=2) > 0
         given = {**table, **frame}
-        views.append(TrainingView(name, _camera(f"{file}: {name}", given, picture, matrix), picture, mask))
+        views.append(flat_view(name, _camera(f"{file}: {name}", given, picture, matrix), picture, mask))
     return sorted(views, key=lambda view: view.name)
 
 
@@ -98,16 +104,6 @@ def _picture(file: Path, name: str) -> np.ndarray:
 
 
 def _camera(what: str, given: dict, picture: np.ndarray, camera_to_world: np.ndarray) -> Camera:
-    if any(given.get(name) for name in _DISTORTION):
-        raise InputError(
-            f"{what}: its camera has distortion, and pictures are trained on without; undistort them first"
-        )
-    model = given.get("camera_model", "PINHOLE")
-    if model not in _PINHOLES:
-        raise InputError(
-            f"{what}: its camera_model is {model!r}, and pictures are trained on as pinholes "
-            f"({', '.join(_PINHOLES)}); undistort them first"
-        )
     height, width = picture.shape[:2]
     try:
         stated = int(given.get("w", width)), int(given.get("h", height))
@@ -124,9 +120,25 @@ def _camera(what: str, given: dict, picture: np.ndarray, camera_to_world: np.nda
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = turn, -turn @ pose[:3, 3]
     try:
-        return Camera.pinhole(*stated, fx, fy, cx, cy, world_to_camera)
+        return Camera.pinhole(*stated, fx, fy, cx, cy, world_to_camera, lens=_lens(given))
     except InputError as error:
         raise InputError(f"{what}: {error}") from error
+
+
+def _lens(given: dict) -> Lens:
+    model = given.get("camera_model", "OPENCV_FISHEYE" if given.get("is_fisheye") else "PINHOLE")
+    if model not in _LENSES:
+        raise InputError(
+            f"its camera_model is {model!r}, and known are {', '.join(_LENSES)}; undistort the pictures first"
+        )
+    values = {name: given[name] for name in _COEFFICIENTS if given.get(name)}
+    if others := values.keys() - _LENSES[model]:
+        name = min(others)
+        raise InputError(
+            f"{name} is {values[name]!r}, which the camera_model {model} does not have (it has "
+            f"{', '.join(_LENSES[model])}); undistort the pictures first"
+        )
+    return (Fisheye if model == "OPENCV_FISHEYE" else BrownConrady)(**values)
 
 
 def _points(file: Path, table: dict) -> tuple[np.ndarray, np.ndarray]:

@@ -61,6 +61,12 @@ def read_over(path: str | os.PathLike[str], background: Sequence[float]) -> np.n
     return np.rint(rgba[:, :, :3] * share + over).astype(np.uint8)
 
 
+def is_video(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is a video's, by its ending."""
+    file = path_of(path)
+    return file.suffix.lower() in VIDEOS and file.is_file()
+
+
 def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
     """Names and pictures (h, w, 3) uint8 RGB: of a file, of a folder's files by their names, of a video.
 
@@ -73,7 +79,7 @@ def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
             raise InputError(f"{file} holds no picture; known are {', '.join(PICTURES)}")
         for name in names:
             yield str(name), read_image(name)
-    elif file.suffix.lower() in VIDEOS and file.is_file():
+    elif is_video(file):
         with _silent_opencv():
             video = cv2.VideoCapture(str(file))
             done, frame = video.read()

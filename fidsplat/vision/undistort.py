@@ -1,14 +1,17 @@
 """Pictures that were taken through a lens, as a pinhole would have taken them."""
 
 import math
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
-from fidsplat.cameras import Camera, Orthographic, focal_length, look_at_matrix
+from fidsplat.cameras import Camera, Lens, Orthographic, focal_length, look_at_matrix
 from fidsplat.errors import InputError
 
 MAX_FIELD = math.radians(150)
+_NOWHERE = -1e4
+"""pixels, where nothing is seen"""
 
 
 def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: float) -> Camera:
@@ -58,5 +61,27 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
     y, x = np.mgrid[0.5 : pinhole.height, 0.5 : pinhole.width]
     rays = pinhole.rays(np.stack([x.ravel(), y.ravel()], 1)) @ pinhole.world_to_camera[:3, :3]
     at = camera.project(camera.position + rays).astype(np.float32) - np.float32(0.5)
-    at = np.nan_to_num(at, nan=-1e4).reshape(pinhole.height, pinhole.width, 2)
+    at = np.nan_to_num(at, nan=_NOWHERE).reshape(pinhole.height, pinhole.width, 2)
     return cv2.remap(np.ascontiguousarray(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+
+
+def flattened(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `undistort`, by a pinhole of the same pose, size and focal length, for many pictures of one lens:
+    the picture, and where (h, w) bool all that a pixel is made of lies in it and in its mask (h, w) bool.
+    """
+    lens = camera.lens
+    assert lens is not None  # else it is flat
+    x, y = _found_at(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens)
+    counts = cv2.remap(np.where(mask, np.uint8(255), np.uint8(0)), x, y, cv2.INTER_LINEAR)
+    return cv2.remap(np.ascontiguousarray(image), x, y, cv2.INTER_LINEAR), counts == 255
+
+
+@lru_cache(maxsize=2)
+def _found_at(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens) -> np.ndarray:
+    """x and y (2, h, w) float32, in a lens's picture, of what a pinhole's pixels see."""
+    at = np.empty((2, height, width), np.float32)
+    rays = np.stack([(np.arange(width) + 0.5 - cx) / fx, np.empty(width), np.ones(width)], axis=1)
+    for row in range(height):  # not at once: photographs have millions of pixels
+        rays[:, 1] = (row + 0.5 - cy) / fy
+        at[:, row] = (lens.image(rays) * (fx, fy) + (cx - 0.5, cy - 0.5)).T
+    return np.nan_to_num(at, nan=_NOWHERE)

@@ -95,6 +95,40 @@ def test_a_flights_pictures_are_read_from_where_its_camera_was(here, capsys):
     assert json.loads(capsys.readouterr().out)["means"]["position_error_mm"] > 140
 
 
+def test_a_flights_log_is_read_from_where_its_camera_was(here, capsys):
+    logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
+    (here / "scene.toml").write_text(SCENE.replace("33", "160").replace("24", "120"))
+    assert fly("--times", "0,0.2,0.5", "--log", "run.mcap") == 0
+    capsys.readouterr()
+    assert main(["detect", "run.mcap", "--scene", "scene.toml", "--json"]) == 0
+    means = json.loads(capsys.readouterr().out)["means"]
+    assert means["found"] == 3
+    assert means["position_error_mm"] < 2
+    with logs.RobotLog("blind.mcap") as log:
+        log.image(0.5, "camera", read_image("out/rgb/000002.png"))
+        log.transform(0.25, "camera", np.eye(4))
+    assert main(["detect", "blind.mcap"]) == 0
+    assert main(["detect", "blind.mcap", "--scene", "scene.toml"]) == 2
+    assert "does not say where the camera of /camera/image_raw 0.500 s was" in capsys.readouterr().err
+
+
+def test_poses_of_a_log_are_those_of_frames_in_the_world(here):
+    logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
+    pose = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+    with logs.RobotLog("run.mcap") as log:
+        log.transform(0.5, "robot", pose)
+        log.transform(0.5, "camera", pose, "robot")
+    (found,) = logs.log_poses("run.mcap").items()
+    assert found[0] == ("robot", 500_000_000)
+    np.testing.assert_allclose(found[1], pose, atol=1e-12)
+
+
+def test_a_video_does_not_say_where_its_camera_was(here, capsys):
+    (here / "v.mp4").write_bytes(b"")
+    assert main(["detect", "v.mp4", "--scene", "scene.toml"]) == 2
+    assert "v.mp4 does not say where its camera was" in capsys.readouterr().err
+
+
 def test_the_shutter_sees_the_camera_move(here):
     """Pictures of a flight are blurred along it, each about its own time."""
     flight = small_flight(shutter=fs.Shutter(exposure_time=0.2, sub_poses=2))
@@ -177,8 +211,8 @@ def test_a_log_and_the_truth_beside_the_pictures(here):
     words = ("--rate", "2", "--outputs", "rgb,label", "--log", "run.mcap", "--coco", "truth.json")
     assert fly(*words) == 0
     pictures = list(logs.log_pictures("run.mcap"))
-    assert [name for name, _ in pictures] == [f"/camera/image_raw {t:.3f} s" for t in (0, 0.5, 1)]
-    np.testing.assert_array_equal(pictures[1][1], read_image("out/rgb/000001.png"))
+    assert [one.name for one in pictures] == [f"/camera/image_raw {t:.3f} s" for t in (0, 0.5, 1)]
+    np.testing.assert_array_equal(pictures[1].image, read_image("out/rgb/000001.png"))
     truth = json.loads((here / "truth.json").read_text())
     assert [image["file_name"] for image in truth["images"]] == [f"rgb/00000{k}.png" for k in range(3)]
     moved = [annotation["camera_from_marker"][0][3] for annotation in truth["annotations"]]

@@ -195,5 +195,5 @@ def test_damaged_logs(tmp_path, name):
             data[place] = random.integers(256)
         file.write_bytes(data)
         with contextlib.suppress(fs.InputError):
-            for _, image in log_pictures(path):
+            for image in (one.image for one in log_pictures(path)):
                 assert image.shape[2] == 3

@@ -46,3 +46,24 @@ def test_no_file_takes_the_place_of_a_closed_stream(tmp_path):
     status, _, err = shell(f"fidsplat {words} -o closed.ply <&- >&-", tmp_path)
     assert (status, err) == (0, "")
     assert (tmp_path / "closed.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+
+
+SHORT = """
+import resource
+import fidsplat as fs
+pool = fs.Renderer("opencl:pocl").backend.pool
+held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (held + 2**28, resource.getrlimit(resource.RLIMIT_AS)[1]))
+try:
+    buffers = [pool.fresh("a buffer", 2**26) for _ in range(9)]
+except fs.DeviceError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
+def test_memory_that_runs_out_is_an_error_of_the_device(tmp_path):
+    """PoCL takes a buffer's memory at its first use unless it is told otherwise, and crashes there."""
+    status, out, err = shell(f"{sys.executable} -c '{SHORT}'", tmp_path)
+    assert (status, err) == (0, "")
+    assert out.startswith("no memory for a buffer (64 MiB): ")

@@ -1,7 +1,9 @@
 """Data sets from disk: what is read, and what is said about those that cannot be trained on."""
 
 import json
+import shutil
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import load_colmap
 from fidsplat.train import Dataset, TrainingView, load_dataset
 from fidsplat.train.dataset import looked_at
+from fidsplat.train.flat import flat_view
 from fidsplat.vision.images import read_rgba, write_png
 
 
@@ -161,6 +164,103 @@ def test_points_as_text(made, tmp_path):
             load_dataset(folder)
 
 
+OF_COLMAP = {
+    "SIMPLE_RADIAL": "30 32 24 -0.1",
+    "RADIAL": "30 32 24 0.1 0.05",
+    "OPENCV": "30 31 32 24 -0.2 0.05 0.01 -0.02",
+    "FULL_OPENCV": "30 31 32 24 -0.2 0.05 0.01 -0.02 0.01 0.1 0.02 0.01",
+    "OPENCV_FISHEYE": "30 31 32 24 0.05 -0.01 0.002 0.001",
+    "SIMPLE_RADIAL_FISHEYE": "30 32 24 0.05",
+    "RADIAL_FISHEYE": "30 32 24 0.05 -0.01",
+}
+"""cameras, of 64 x 48 pixels"""
+BROWN, FISHEYE = fs.BrownConrady, fs.Fisheye
+LENSES = {
+    "SIMPLE_RADIAL": BROWN(k1=-0.1),
+    "RADIAL": BROWN(k1=0.1, k2=0.05),
+    "OPENCV": BROWN(k1=-0.2, k2=0.05, p1=0.01, p2=-0.02),
+    "FULL_OPENCV": BROWN(k1=-0.2, k2=0.05, p1=0.01, p2=-0.02, k3=0.01, k4=0.1, k5=0.02, k6=0.01),
+    "OPENCV_FISHEYE": FISHEYE(0.05, -0.01, 0.002, 0.001),
+    "SIMPLE_RADIAL_FISHEYE": FISHEYE(0.05),
+    "RADIAL_FISHEYE": FISHEYE(0.05, -0.01),
+}
+
+
+def taken(camera):
+    """A smooth picture of directions alone, as a camera sees them; grey where it sees nothing."""
+    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
+    rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1))
+    slopes = (rays / rays[:, 2:])[:, :2].reshape(camera.height, camera.width, 2)
+    waves = [np.sin(3 * slopes[..., 0]), np.cos(2 * slopes[..., 1]), np.sin(slopes.sum(2))]
+    return np.nan_to_num(np.rint(127.5 + 100 * np.stack(waves, 2)), nan=127).astype(np.uint8)
+
+
+def flat_as_wanted(view, lens, mask):
+    """Whether a view has the picture that a pinhole would have taken, where what it is made of was there."""
+    camera = view.camera
+    assert camera.lens is None
+    there = np.ones(mask.shape, bool) if view.mask is None else view.mask
+    off = np.abs(view.picture.astype(int) - taken(camera)).max(2)
+    # slopes bend a wave of 100 by 1000 at most; half a pixel's square of it, two roundings
+    assert off[there].max() <= 2 + 1000 / (8 * camera.fx**2) * 8
+    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
+    at = lens.image(camera.rays(np.stack([x.ravel(), y.ravel()], 1)))
+    at = (at * (camera.fx, camera.fy) + (camera.cx, camera.cy) - 0.5).reshape(*mask.shape, 2)
+    low = np.floor(np.nan_to_num(at, nan=-9)).astype(int)
+    whole = np.ones(mask.shape, bool)
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        column, row = low[..., 0] + right, low[..., 1] + down
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        whole &= inside & mask[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)]
+    assert (there | ~whole).all()
+    assert 0.3 < there.mean() < 1
+    assert (there & ~whole).mean() < 0.02  # where a neighbour has no weight
+
+
+@pytest.mark.parametrize("model", OF_COLMAP)
+def test_what_lenses_took_is_flat(folder, tmp_path, model):
+    """Of COLMAP's models and nerfstudio's, with a mask."""
+    for file in folder.rglob("*.bin"):
+        file.unlink()
+    cameras, images = folder / "sparse/0/cameras.txt", folder / "images"
+    number = next(line for line in cameras.read_text().splitlines() if line[:1].isdigit()).split()[0]
+    cameras.write_text(f"{number} {model} 64 48 {OF_COLMAP[model]}\n")
+    f, *middle = map(float, OF_COLMAP[model].split()[: 3 if "RADIAL" in model else 4])
+    lens, pinhole = LENSES[model], (64, 48, f, *middle) if len(middle) == 3 else (64, 48, f, f, *middle)
+    picture = taken(fs.Camera.pinhole(*pinhole, lens=lens))
+    mask = np.ones((48, 64), bool)
+    mask[:12, :20] = False
+    (folder / "masks").mkdir()
+    for file in images.iterdir():
+        write_png(file, picture)
+        write_png(folder / "masks" / f"{file.name}.png", mask)
+    found = load_dataset(folder)
+    for view in found.views:
+        flat_as_wanted(view, lens, mask)
+    if model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
+        return
+    given = {field: value for field, value in vars(lens).items() if value and field != "fold"}
+    frames = [
+        {"file_path": f"images/{view.name}", "mask_path": f"masks/{view.name}.png", "transform_matrix": pose}
+        for view in found.views
+        for pose in [(np.linalg.inv(view.camera.world_to_camera) @ np.diag([1, -1, -1, 1])).tolist()]
+    ]
+    names = dict(zip(("fl_x", "fl_y", "cx", "cy"), pinhole[2:], strict=True))
+    table = {"camera_model": model, "frames": frames, **names, **given}
+    (folder / "transforms.json").write_text(json.dumps(table))
+    for ours, theirs in zip(load_dataset(folder, random_points=9).views, found.views, strict=True):
+        np.testing.assert_array_equal(ours.picture, theirs.picture)
+        np.testing.assert_array_equal(ours.mask, theirs.mask)
+
+
+def test_a_lens_that_sees_all_of_a_flat_picture_leaves_no_mask(made):
+    view = made.views[0]
+    camera = replace(view.camera, lens=BROWN(k1=-0.01))
+    assert flat_view("a.png", camera, view.picture, None).mask is None
+    with pytest.raises(fs.InputError, match=r"2 x 2.*give pictures of the size"):
+        flat_view("a.png", camera, np.zeros((2, 2, 3), np.uint8), None)
+
+
 def test_pictures_of_colmap_are_read_as_they_are_stored(made, folder):
     """Not turned as EXIF says; what is transparent shows the background; 16 bits are cut to 8."""
     import cv2
@@ -201,8 +301,8 @@ def test_cameras_of_a_model_that_cannot_be_used_are_named(folder):
     number = line.split()[0]
     for other, words in (
         (f"{number} PINHOLE 24 18 20", "cameras.txt is damaged.*PINHOLE with 1 parameters"),
-        (f"{number} FOV 24 18 20 20 12 9 0.1", r"image 1\.png: .*FOV with distortion"),
-        (f"{number} SIMPLE_RADIAL 24 18 20 12 9 0.1", r"image 1\.png: .*SIMPLE_RADIAL with distortion"),
+        (f"{number} FOV 24 18 20 20 12 9 0.1", r"image 1\.png: .*the model FOV, .*; undistort the pictures"),
+        (f"{number} SIMPLE_RADIAL 24 18 20 12 9 -9", r"image 1\.png: .*k1 = -9\) cannot be inverted"),
         (f"{number} PINHOLE 24 18 0 20 12 9", r"image 1\.png: "),
     ):
         cameras.write_text(texts[0].replace(line, other))
@@ -224,13 +324,36 @@ def test_views_that_are_held_out(made, folder):
 
 
 def test_random_points_lie_where_the_cameras_look(made):
-    low, high = looked_at([view.camera for view in made.views])
+    low, high, faced = looked_at([view.camera for view in made.views])
+    assert faced
     assert np.abs(low + high).max() < 1e-9  # all look at 0
     found = made.with_random_points(500, 3)
     assert (found.points > low).all()
     assert (found.points < high).all()
     assert (made.with_random_points(500, 3).points == found.points).all()
     assert (made.with_random_points(500, 4).points != found.points).any()
+
+
+@pytest.mark.parametrize("way", ["around", "ahead", "beside"])
+def test_random_points_lie_before_cameras_that_look_at_no_one_place(made, way):
+    """A room from its middle, a drive, a row of cameras that look the same way."""
+    along = np.linspace(-1, 1, 8)
+    around = [np.array([np.sin(3 * a), 0, np.cos(3 * a)]) for a in along]
+    places = {
+        "around": [(place, 9 * place) for place in around],
+        "ahead": [((0, 0, a), (0, 0, 9)) for a in along],
+        "beside": [((a, 0, 0), (a, 0, 9)) for a in along],
+    }[way]
+    cameras = [fs.Camera.look_at(24, 18, 0.9, *place) for place in places]
+    views = tuple(replace(made.views[0], camera=camera) for camera in cameras)
+    none = np.zeros((0, 3))
+    found = Dataset(way, views, (), none, none.astype(np.uint8)).with_random_points(400, 0)
+    for number, camera in enumerate(cameras):
+        at = camera.project(found.points)
+        assert ((at > 0) & (at < (24, 18))).all(axis=1)[number::8].all()
+        depths = (found.points - camera.position)[number::8] @ camera.world_to_camera[2, :3]
+        assert 0 < depths.min() < 0.5 * found.extent
+        assert 2.5 * found.extent < depths.max() < 3 * found.extent
 
 
 def test_scenes_far_from_the_origin_have_one_of_their_own(made):
@@ -304,7 +427,8 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
     for change, words in (
         ({"frames": 3}, "no list of frames"),
         ({"frames": [{"file_path": "a"}]}, "frame 0 needs"),
-        ({"k1": 0.1}, "has distortion"),
+        ({"k1": "wide"}, "k1 must be a finite number"),
+        ({"k4": 0.1}, "k4 is 0.1, which the camera_model PINHOLE does not have .*; undistort the pictures"),
         ({"fl_x": "far"}, "needs fl_x"),
         ({"w": float("inf")}, "needs fl_x"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is 'EQUIRECTANGULAR'"),
@@ -343,13 +467,30 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert main([*words[:-1], "3"]) == 2
     assert "number of iterations" in capsys.readouterr().err
     assert main([*words[:-1], "3", "--overwrite"]) == 0
-    for wrong in (["-o", "a.png"], ["--random-points", "-1"], ["--within-memory", "0"]):
+    for wrong, said in (
+        (["-o", "a.png"], "-o is a.png"),
+        (["--random-points", "-1"], "--random-points is -1; it must"),
+        (["--random-points", "99999999999"], "--random-points is 99999999999; it must"),
+        (["--within-memory", "0"], "--within-memory is 0"),
+        (["--within-memory", "1e-6"], "alone take 0.0001 GiB of the 1e-06 GiB"),
+    ):
         assert main([*words, *wrong]) == 2
+        assert said in capsys.readouterr().err
+    shutil.rmtree(folder / "test")
+    words[3] = str(tmp_path / "c.ply")
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "PSNR" not in printed
+    assert "no view was held out: --hold-out 8" in " ".join(printed.split())
 
 
 @pytest.mark.parametrize(
     ("name", "line", "words"),
-    [("cameras", "1 PINHOLE 64 48 50", "with 1 parameters"), ("points3D", "1 0 0 0 9", "not enough")],
+    [
+        ("cameras", "1 PINHOLE 64 48 50", "with 1 parameters"),
+        ("points3D", "1 0 0 0 9", "not enough"),
+        ("images", "1 1 0 0 0 0", "'1 1 0 0 0 0' has 6 of the 10 words"),
+    ],
 )
 def test_lines_of_a_colmap_model_that_end_early(folder, name, line, words):
     model = folder / "sparse/0"

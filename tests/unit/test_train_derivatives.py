@@ -12,6 +12,7 @@ from fidsplat.train.derivatives import by_pose, drawn, moved
 
 CAMERA = fs.Camera.look_at(24, 18, 0.9, (0.2, 0.1, -2.0), (0.0, 0.0, 0.0))
 OUTPUTS = ("rgb", "alpha", "depth")
+ONES = np.ones((18, 24, 3), np.float32)
 POSES = [np.zeros(6), np.array([1e-4, 0, 0, 0.1, 0, 0]), np.array([0.2, -0.5, 1.1, 0.3, -0.2, 0.4])]
 
 
@@ -106,6 +107,9 @@ class Tensor:
     def to(self, device, dtype=None):
         return Tensor(self.array.astype(dtype or self.dtype))
 
+    def __len__(self):
+        return len(self.array)
+
 
 class Function:
     @classmethod
@@ -147,6 +151,17 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     assert [each is None for each in back] == [True, True, False, True, *[False] * 3, True, True, False]
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors"), (9, "pose")):
         np.testing.assert_array_equal(back[place].numpy(), wanted[name])
+    tensors["scales"] = Tensor(given["scales"] * [[1], [0], [1], [1], [1], [1]])  # one that cannot be drawn
+    with pytest.warns(UserWarning, match="1 of 6 splats left out"):
+        bridge.draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
+    kept = {name: array[[0, 2, 3, 4, 5]] for name, array in given.items()}
+    wanted = drawn(renderer, fs.SplatCloud(**kept), fs.Capture(moved(CAMERA, pose), OUTPUTS))[1](
+        {"rgb": ONES}
+    )
+    back = bridge._Picture.backward(bridge._Picture.context, Tensor(ONES), None, None)
+    for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors")):
+        np.testing.assert_array_equal(np.delete(back[place].numpy(), 1, 0), wanted[name])
+        assert not back[place].numpy()[1].any()
     with pytest.raises(fs.InputError, match="pose must be 6 numbers"):
         bridge.draw(renderer, fs.Capture(CAMERA), **(tensors | {"pose": Tensor(np.zeros(7))}))
 

@@ -47,8 +47,8 @@ class BufferPool:
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
         self._device = device
-        # records that lie anywhere are found in large pages without a walk through the tables of pages
-        self._in_large_pages = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
+        self._is_host = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
+        """whether its memory is the host's"""
         self._buffers: dict[str, cl.Buffer] = {}
         self._arrays: dict[str, Array] = {}
         self._contents: dict[str, weakref.ref[np.ndarray]] = {}
@@ -169,8 +169,13 @@ class BufferPool:
                 f"most {bytes_words(limit)}; use fewer splats or a smaller picture"
             )
         try:
-            buffer = DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
-            if self._in_large_pages and size >= _LARGE:
+            flags = cl.mem_flags.READ_WRITE
+            if self._is_host:
+                # else PoCL takes memory at the first use, and crashes there if none is left
+                flags |= cl.mem_flags.ALLOC_HOST_PTR
+            buffer = DeviceBuffer(self._context, flags, max(size, _LEAST))
+            if self._is_host and size >= _LARGE:
+                # records that lie anywhere are found there without a walk through the tables of pages
                 self._ask_for_large_pages(buffer)
             return buffer
         except cl.Error as error:
