@@ -4,8 +4,8 @@
     python benchmarks/peers/gsplat_training.py r100k_720p r1m_1080p --json gsplat-training.json
     python benchmarks/peers/gsplat_training.py --dataset yard --iterations 2000 --authors
 
-Of scenes: a step of benchmarks/training.py, SH of degree 3, in turn with each peer's: its picture, the same
-loss in PyTorch (0.8 L1 and 0.2 D-SSIM by separable convolutions), `backward`, fused Adam of all values;
+Of scenes: ten steps of benchmarks/training.py, SH of degree 3, in turn with ten of each peer: picture, loss
+(the same, in PyTorch: 0.8 L1 and 0.2 D-SSIM by separable convolutions), `backward`, fused Adam of all values;
 beside it the time of its picture and `backward` alone. Of a data set: a whole training by each with the same
 constants and gsplat's `DefaultStrategy`; PSNR is of the views held out, each drawn by its own renderer, ours
 by gsplat too. (In gsplat 1.5.3 that strategy never resets opacities: its condition is never true. With the
@@ -39,8 +39,10 @@ from fidsplat.vision.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from measuring import facts, keep, options
-from training import WARM, trainer_of
+from training import trainer_of
 
+TURN = 10
+"""steps in a row, as a training makes them: nobody waits for the GPU between"""
 SHARE = 0.2
 """of D-SSIM in the loss"""
 NEAR, FAR = 0.2, 100.0
@@ -204,37 +206,35 @@ def loss_of(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     return (1 - SHARE) * (image - truth).abs().mean() + SHARE * (1 - similar.mean())
 
 
-def finished(work: Callable[[], Any]) -> Callable[[], float]:
-    """What does the work and gives its milliseconds until the GPU is done."""
+def finished(
+    work: Callable[[], Any], finish: Callable[[], Any] = torch.cuda.synchronize
+) -> Callable[[], float]:
+    """What does the work `TURN` times and gives the milliseconds of one until the GPU is done with all."""
 
     def timed() -> float:
-        torch.cuda.synchronize()
+        finish()
         begun = time.perf_counter()
-        work()
-        torch.cuda.synchronize()
-        return (time.perf_counter() - begun) * 1e3
+        for _ in range(TURN):
+            work()
+        finish()
+        return (time.perf_counter() - begun) * 1e3 / TURN
 
     return timed
 
 
 def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[Peer]]) -> dict[str, Any]:
     """Median milliseconds of a step by each, in turn."""
-    trainer = trainer_of(name, renderer, 3, 2 * WARM + repeats)
+    trainer = trainer_of(name, renderer, 3, TURN * (1 + repeats))
     splats = trainer._work.store()
     backend: Any = renderer.backend
 
-    def own() -> None:
-        trainer.step()
-        backend.finish()
-
-    works = {"fidsplat_ms": finished(own)}
+    works = {"fidsplat_ms": finished(trainer.step, backend.finish)}
     for title, kind in kinds.items():
         peer = kind(splats, trainer.settings, trainer.dataset)
         works[f"{title}_ms"] = finished(partial(peer.step, 0, 3))
         works[f"{title}_picture_and_backward_ms"] = finished(partial(peer.step, 0, 3, optimise=False))
     for work in works.values():
-        for _ in range(WARM):
-            work()
+        work()
     rounds = [[work() for work in works.values()] for _ in range(repeats)]
     return {"scene": name, **dict(zip(works, np.median(rounds, axis=0).tolist(), strict=True))}
 
