@@ -125,7 +125,7 @@ def test_the_report_says_what_was_measured(reported):
         "| QR Small | 31.5/0.980 |",
         "| QR Small | 25.4/0.83 | 37.2/0.99 | 33.0/1.000 |",
         "mean over 2 views of each marker",
-        "FLIP is of 5 of 5\ncases, LPIPS of 0 (",
+        "FLIP is of 5 of 5\ncases.",
         "means over a category's markers, 2 of each.",
         "| QR Small, 1 m | 0.5 (1/2) |",
         "`angles`, 8 | a device |",
