@@ -26,13 +26,17 @@ from fidsplat.store.city import City
 ERRORS = (1 / 255, 4 / 255)
 
 
-def path_around(side: float, views: int, size: tuple[int, int]) -> list[fs.Camera]:
-    """Cameras on a spiral away from a city of this side [m]."""
+def path_around(side: float, views: int, size: tuple[int, int], low: bool = False) -> list[fs.Camera]:
+    """Cameras on a spiral away from a city of this side [m]. low: near the ground, from where streets are
+    seen between houses."""
     middle, cameras = np.array([side / 2, 0.0, side / 2]), []
     for number in range(views):
         share = number / max(views - 1, 1)
-        away, turn = side * 0.2 * 500**share, 4 * math.pi * share
-        at = middle + away * np.array([math.cos(turn), -0.3 - 0.4 * share, math.sin(turn)])
+        away, turn, up = side * 0.2 * 500**share, 4 * math.pi * share, 0.3 + 0.4 * share
+        if low:
+            away, turn = side * 0.3 * 200**share, 4.6 * math.pi * share + 0.3
+            up = 0.12 + 0.1 * math.sin(9 * share)
+        at = middle + away * np.array([math.cos(turn), -up, math.sin(turn)])
         cameras.append(fs.Camera.look_at(*size, math.radians(60), at, middle - np.array([0, 5, 0])))
     return cameras
 
@@ -67,18 +71,20 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--splats", type=float, default=4e5)
     parser.add_argument("--houses", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0, help="of the city")
+    parser.add_argument("--low", action="store_true", help="a path low over the ground")
     parser.add_argument("--views", type=int, default=200)
-    parser.add_argument("--measured", type=int, default=30, help="views that errors are measured with")
+    parser.add_argument("--measured", type=int, default=60, help="views that errors are measured with")
     parser.add_argument("--size", default="160x90")
     parser.add_argument("--chunk", type=int, default=4096, help="splats of a chunk; small, as the city is")
     asked = parser.parse_args()
     width, height = map(int, asked.size.split("x"))
-    city, renderer = City(int(asked.splats), asked.houses), fs.Renderer(asked.device)
+    city, renderer = City(int(asked.splats), asked.houses, asked.seed), fs.Renderer(asked.device)
     with tempfile.TemporaryDirectory() as folder:
         path = fs.build_store([city.source], Path(folder) / "city.fss", chunk=asked.chunk)
         store = fs.Store(path)
         details = measure_detail(store, renderer, asked.measured)
-        rows = measure(store, path_around(city.side, asked.views, (width, height)), renderer)
+        rows = measure(store, path_around(city.side, asked.views, (width, height), asked.low), renderer)
     exact = np.mean(rows[0]["s"])
     about = {**facts(renderer), "splats": len(store), "views": asked.views, "size": [width, height]}
     keep({**about, "details": [vars(one) for one in details], "rows": rows}, asked.json)

@@ -1,6 +1,6 @@
-"""Curves of docs/large-scene-figures.md: splats of a store against time, splats that are drawn, and memory.
+"""Curves of docs/large-scenes.md: splats of a store against time, error, splats that are drawn, and memory.
 
-    python benchmarks/store_curves.py benchmarks/results/stores-h100.json docs/images/store-curves.svg
+    python benchmarks/store_curves.py benchmarks/results/stores-cpu.json docs/images/store-curves.svg
 
 Takes what `benchmarks/store_views.py --json` has written: a point for each size of a scene, a colour for each
 view, a dash for the default quality and for each allowed error. A line that several have is drawn once.
@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 
 from fidsplat.experiments.charts import COLOURS, chart, legend_above, plain_ticks
 
 PANELS = (
     ("next view [ms]", lambda row: 1e3 * row["s"][1]),
+    ("largest error of rgb", lambda row: row.get("off", math.nan)),
     ("splats read [million]", lambda row: row["drawn"] / 1e6),
     ("device memory [GiB]", lambda row: row["device_bytes"] / 2**30),
 )
 SHARED = "several of these alike"
-DASHES = ("-", "--", ":")
+DASHES = ("-", "--", ":", "-.")
 
 Series = dict[tuple[str, str], list[dict]]
 
@@ -30,7 +32,7 @@ def series(rows: list[dict]) -> Series:
     found: Series = {}
     for row in sorted(rows, key=lambda row: row["splats"]):
         error = row["error"]
-        quality = "default quality" if error == "standard" else f"error {error:g}" if error else "exact"
+        quality = "default quality" if error == "standard" else f"error {error:.2g}" if error else "exact"
         if "s" in row:
             found.setdefault((row["view"], quality), []).append(row)
     return found
@@ -56,7 +58,7 @@ def main() -> None:
     views, qualities = (list(dict.fromkeys(names)) for names in zip(*found, strict=True))
     colours = dict(zip((SHARED, *views), COLOURS, strict=False))
     dashes = dict(zip(qualities, DASHES, strict=True))
-    with chart(asked.out, len(PANELS), (12.0, 4.6), one_scale=False) as (figure, panels):
+    with chart(asked.out, len(PANELS), (15.0, 4.6), one_scale=False) as (figure, panels):
         for view in (*views, SHARED):
             panels[0].plot([], [], ".-", color=colours[view], label=view)
         for quality in qualities:
@@ -71,9 +73,11 @@ def main() -> None:
                     color=colours[SHARED if alike else view],
                     linestyle="-" if alike else dashes[quality],
                 )
-            axes.set(xscale="log", yscale="log", xlabel="splats of the scene [million]", title=title)
+            axes.set(xscale="log", xlabel="splats of the scene [million]", title=title)
             plain_ticks(axes.xaxis)
-            plain_ticks(axes.yaxis)
+            if "error" not in title:  # which may be 0
+                axes.set_yscale("log")
+                plain_ticks(axes.yaxis)
         legend_above(figure, panels[0])
 
 

@@ -28,7 +28,7 @@ WIDTH, HEIGHT, FOV_X = 320, 180, math.radians(60.0)
 def measure_detail(
     store: Store,
     renderer: Renderer,
-    views: int = 30,
+    views: int = 60,
     lowpass: Sequence[str] = ("pixel",),
     seed: int = 0,
     progress: Callable[[str, float], object] = lambda words, share: None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
@@ -83,7 +83,7 @@ def quality_within(
         ms: milliseconds that nine frames of ten may take, with the splats on the device and the picture left
             there; needs a scene and a camera.
         scene: what is drawn. Of a store half of the error goes to levels of detail (`Quality.detail_error`),
-            if what they cost was measured.
+            if what they cost was measured; with `ms` alone several such errors are tried.
         capture: how; or a camera alone. By default a Scene's own.
         device: a device's name or a Renderer; by default that of `Renderer()`.
 
@@ -125,31 +125,64 @@ def choose(
         assert error is not None
         return _from_list(error, candidates, asked.quality, renderer)
     streamed = scene.streamed if isinstance(scene, Scene) else None
-    if streamed is not None:
-        asked = replace(asked, quality=_with_detail(streamed, asked.quality, error))
+    bases = [asked.quality]
+    if streamed is not None:  # of an error levels of detail have half
+        allowed = [0.0, *DETAILS] if error is None else [min(max(error, 0.0) / 2, DETAILS[-1])]
+        bases = [_with_detail(streamed, asked.quality, detail) for detail in allowed]
+        asked = replace(asked, quality=asked.quality.with_(detail_error=0.0))
     splats = scene.cloud() if isinstance(scene, Scene) and streamed is None else scene
     info = renderer.device
     drawn_by = (info.name, info.title, info.platform, info.version, code_hash())
-    key = _key(drawn_by, (error, ms), asked, streamed.content if streamed else splats)
+    key = _key(drawn_by, (error, ms), asked, bases, streamed.content if streamed else splats)
     kept = _kept(key, asked.quality, info.name)
     if kept is not None:
         return kept
-    search = Search(Calibration(renderer, splats, asked, tell), candidates)
-    choice = _measured(search, error, ms)
+    calibration = Calibration(renderer, splats, asked, tell)
+
+    def measured(base: Quality) -> Choice:
+        calibration.base = base  # the truth of all is the same
+        return _measured(Search(calibration, candidates), error, ms)
+
+    choice = _best_of(dict.fromkeys(bases), measured)
     numbers = {"error": choice.error, "ms": choice.ms, "ms_late": choice.ms_late}
     store.save(key, {"knobs": choice.knobs, **numbers})
     return choice
 
 
-def _with_detail(streamed: Streamed, quality: Quality, error: float | None) -> Quality:
-    """A quality that may spend half of an error on levels of detail, where what they cost was measured."""
-    detailed = quality.with_(detail_error=min((error or 0.0) / 2, 0.5))
+DETAILS = (1 / 255, 4 / 255, 16 / 255, 0.5)
+"""errors of levels of detail that are tried where the time alone is bounded"""
+
+
+def _with_detail(streamed: Streamed, quality: Quality, error: float) -> Quality:
+    """A quality that may spend an error on levels of detail, where what they cost was measured."""
+    detailed = quality.with_(detail_error=error)
     try:
         pixels = streamed.pixels_of(detailed)
         useful = isinstance(pixels, tuple) and any(map(any, pixels))
         return detailed if useful else quality.with_(detail_error=0.0)
     except InputError:
         return quality.with_(detail_error=0.0)
+
+
+def _best_of(bases: Iterable[Quality], choose_with: Callable[[Quality], Choice]) -> Choice:
+    """The choice with the least error, of qualities that allow levels of detail more and more; those that
+    allow more than it has are not tried."""
+    best, refused = None, None
+    for base in bases:
+        if best is not None and best.error <= base.detail_error:
+            break
+        try:
+            choice = choose_with(base)
+        except InputError as error:
+            refused = error
+            continue
+        if best is None or choice.error < best.error:
+            detail = {"detail_error": base.detail_error} if base.detail_error else {}
+            best = replace(choice, knobs=choice.knobs | detail)
+    if best is None:
+        assert refused is not None
+        raise refused
+    return best
 
 
 def check_bounds(error: float | None, ms: float | None) -> None:

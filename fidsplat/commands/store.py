@@ -237,7 +237,7 @@ class Measure:
     """
 
     store: StorePath
-    views: Annotated[int, option("N", "places to look from (default: 30)")] = 30
+    views: Annotated[int, option("N", "places to look from (default: 60)")] = 60
     lowpass: Annotated[str, option("A,B,...", "of pixel, screen, none (default: pixel)")] = "pixel"
     seed: Annotated[int, option("N", "of the places (default: 0)")] = 0
     device: Device = None
@@ -282,7 +282,7 @@ class StoreDemo:
     houses: Annotated[int, option("N", "along a side (default: 8)")] = 8
     seed: Annotated[int, option("N", "of houses and splats (default: 0)")] = 0
     markers: Annotated[int, option("N", "on the walls, 0 to 1,000 (default: 0)")] = 0
-    views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 12)")] = 12
+    views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 24)")] = 24
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False

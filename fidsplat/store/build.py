@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, bytes_words
 from fidsplat.files import atomic_write, from_json
 from fidsplat.formats.collect import Progress
 from fidsplat.store.columns import Columns, nodes_of
@@ -113,8 +113,8 @@ class _Build:
         free, needed = shutil.disk_usage(self.folder).free, self.plan.disk_bytes
         if needed > free:
             raise InputError(
-                f"building takes up to {needed / 2**30:.1f} GiB beside {self.folder}, and {free / 2**30:.1f} "
-                "GiB are free; make room, or build elsewhere"
+                f"building takes up to {bytes_words(needed)} beside {self.folder}, and {bytes_words(free)} "
+                "are free; make room, or build elsewhere"
             )
         fresh = {"plan": self.plan.digest, "lengths": [0] * self.buckets, "dropped": {}}
         return fresh | dict.fromkeys(("windows", "thick", "sorted", "nodes", "level", "merged"), 0)

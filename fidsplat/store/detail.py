@@ -4,7 +4,7 @@ the picture below which cells are not told apart."""
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +13,9 @@ from fidsplat.files import atomic_write, from_json
 from fidsplat.store.layout import header_crc
 
 FILE = "detail.json"
-MARGIN = 1.5
+MARGIN = 3.0
 """how many times below the error that is asked for the largest measured one must lie: that of other views is
-a little larger"""
+larger"""
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,25 @@ class Detail:
     device: str
     date: str
 
-    def pixels(self, error: float) -> float:
-        """The largest size [samples] whose pictures are off by at most `error`; 0: none.
-        Nothing is promised of a size that was not met."""
-        largest, found = 0.0, 0.0
-        for size, measured in zip(self.sizes, self.errors, strict=True):
-            if measured is not None:
-                largest = max(largest, measured)
-                found = size if largest * MARGIN <= error else found
-        return found
+
+def pixels(details: Iterable[Detail], level: int, error: float) -> float:
+    """The largest size [samples] at which cells of a level may stand for those below them, so that pictures
+    are off by at most `error`; 0: none. Nothing is promised of a size that was not met.
+
+    The level above and the one below count too: cells of a size err alike, but few views meet a level's cells
+    where they err most, in the gaps between what they are of.
+    """
+    near = [one for one in details if abs(one.level - level) <= 1]
+    if not any(one.level == level for one in near):
+        return 0.0
+    met = [pair for one in near for pair in zip(one.sizes, one.errors, strict=True)]
+    largest, found = 0.0, 0.0
+    for size in sorted({size for size, _ in met}):
+        measured = [wrong for at, wrong in met if at == size and wrong is not None]
+        if measured:
+            largest = max(largest, *measured)
+            found = size if largest * MARGIN <= error else found
+    return found
 
 
 def save_details(folder: Path, identity: str, details: Sequence[Detail]) -> None:

@@ -200,8 +200,8 @@ def checksum(parts: Mapping[str, np.ndarray]) -> int:
     return crc
 
 
-def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
-    """A column (rows, ...) as it lies in its file, mapped and read-only.
+def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], starts: np.ndarray) -> np.ndarray:
+    """A column (rows, ...) as it lies in its file, mapped and read-only. starts: (n,) the nodes' first rows.
 
     Raises InputError where the file is missing, or shorter or of another kind than the header says.
     """
@@ -214,9 +214,10 @@ def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...]) -> np
         raise InputError(f"cannot read {file}: {error.strerror or error}; the store is not whole") from error
     if found < size:
         lost = max(found - NPY_HEADER, 0) // max(row_bytes(kind, shape[1:]), 1)
+        chunk = max(int(np.searchsorted(starts, lost, "right")) - 1, 0)
         raise InputError(
-            f"{file} is cut short: it has {found} bytes of {size}, so that rows from {lost} on are missing; "
-            "build the store again"
+            f"{file} is cut short: it has {found} bytes of {size}, so that rows from {lost} on are missing, "
+            f"of chunk {chunk} and of all after it; build the store again"
         )
     if begins != wanted or found > size:
         raise InputError(f"{file} is not of this store, or its header is damaged; build the store again")

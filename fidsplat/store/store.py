@@ -16,7 +16,7 @@ from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.splats import SplatCloud
 from fidsplat.store import layout
-from fidsplat.store.detail import Detail, load_details
+from fidsplat.store.detail import Detail, load_details, pixels
 from fidsplat.store.part import StorePart, joined, moved
 from fidsplat.summaries import Summarised, point
 
@@ -160,8 +160,7 @@ class Store(Summarised):
             return (0.0,)  # nothing stands for others: always exact
         measured = [detail for detail in self.details if detail.lowpass == quality.lowpass]
         if measured:
-            found = {detail.level: detail.pixels(quality.detail_error) for detail in measured}
-            return tuple(found.get(level, 0.0) for level in range(self.levels + 1))
+            return tuple(pixels(measured, level, quality.detail_error) for level in range(self.levels + 1))
         raise InputError(
             f"detail_error is {quality.detail_error:g}, but what levels of detail cost {self.path} with "
             f"lowpass={quality.lowpass} was not measured; run `fidsplat store measure {self._folder} "
@@ -276,7 +275,7 @@ class Store(Summarised):
         if len(self.nodes) and (ends.max() > own.rows or self.nodes["first"].min() < 0):
             raise InputError(f"{self._folder}: its index does not fit its header; build the store again")
         return {
-            name: layout.map_column(self._folder, name, kind, (own.rows, *shapes[name]))
+            name: layout.map_column(self._folder, name, kind, (own.rows, *shapes[name]), self.nodes["first"])
             for name, kind in own.columns.items()
         }
 

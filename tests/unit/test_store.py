@@ -104,6 +104,15 @@ def test_a_flipped_bit_is_found_and_its_chunk_named(store, tmp_path, column, row
     assert store.verify() == []
 
 
+def test_a_column_that_is_cut_short_names_the_chunk(store, tmp_path):
+    folder, node = copied(store, tmp_path), store.nodes[3]
+    row = int(node["first"]) + 1
+    file = folder / "quats.npy"
+    file.write_bytes(file.read_bytes()[: 128 + 16 * row])
+    with pytest.raises(fs.InputError, match=f"rows from {row} on are missing, of chunk 3 and of all after"):
+        fs.Store(folder)
+
+
 def test_what_is_no_whole_store_is_refused(store, tmp_path):
     def refused(match):
         with pytest.raises(fs.InputError, match=match):

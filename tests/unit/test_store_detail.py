@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -11,11 +12,13 @@ import fidsplat as fs
 from fidsplat.accuracy import truth
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.seen import sizes
+from fidsplat.budget import Choice
+from fidsplat.budget.prices import load as load_prices
 from fidsplat.cli import main
 from fidsplat.detail import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.store import plan
 from fidsplat.store.city import PITCH, City, flight
-from fidsplat.store.detail import MARGIN, Detail, load_details, save_details
+from fidsplat.store.detail import MARGIN, Detail, load_details, pixels, save_details
 from fidsplat.store.sources import sample, splats_of
 from fidsplat.store.streamed import Streamed
 from fidsplat.vision import read_back
@@ -41,16 +44,16 @@ def seen_from(away, size=(48, 32)):
     return fs.Camera.look_at(*size, 1.0, middle + away * np.array([0.6, -0.5, 0.6]), middle)
 
 
-def chosen(store, camera, pixels):
+def chosen(store, camera, limits):
     streamed = Streamed([store])
     features, view = prepare(streamed, fs.Capture(camera, quality=QUALITY))
-    return streamed.select([view], features, pixels).nodes[0], view
+    return streamed.select([view], features, limits).nodes[0], view
 
 
-@pytest.mark.parametrize("pixels", [0.05, 0.3, 1.0, 4.0])
+@pytest.mark.parametrize("limit", [0.05, 0.3, 1.0, 4.0])
 @pytest.mark.parametrize("away", [20.0, 200.0, 2000.0])
-def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, pixels, away):
-    numbers, view = chosen(store, seen_from(away), pixels)
+def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, limit, away):
+    numbers, view = chosen(store, seen_from(away), limit)
     nodes = store.nodes
     covered: list[int] = []
     for number in numbers:
@@ -66,7 +69,7 @@ def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, p
                 2
             ]
             # the middle lies no nearer than the nearest point, by which it was chosen
-            assert nodes["size"][number] * view.focal_x / depth <= pixels
+            assert nodes["size"][number] * view.focal_x / depth <= limit
     assert len(covered) == len(set(covered))
     if away >= 200:  # all of the city is in the picture
         assert sorted(covered) == np.flatnonzero(nodes["level"] == 0).tolist()
@@ -141,14 +144,24 @@ def test_a_picture_at_no_allowed_error_is_exact(store, renderer):
     assert np.array_equal(ours, renderer.render(store.cloud(), camera, quality=QUALITY)["rgb"])
 
 
+def measured(level, sizes, errors):
+    return Detail("pixel", level, sizes, errors, 3, "here", "today")
+
+
 def test_sizes_that_no_view_met_are_not_promised():
-    detail = Detail("pixel", 1, (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1), 3, "here", "today")
-    assert detail.pixels(0.001) == 0.0
-    assert detail.pixels(MARGIN * 0.002) == 0.2
-    assert detail.pixels(0.1) == 0.2
-    assert detail.pixels(MARGIN * 0.1) == 0.8
+    one = measured(1, (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1))
+    assert pixels([one], 1, 0.001) == 0.0
+    assert pixels([one], 1, MARGIN * 0.002) == 0.2
+    assert pixels([one], 1, 0.1) == 0.2
+    assert pixels([one], 1, MARGIN * 0.1) == 0.8
     # what was worse at a smaller size counts at a larger one
-    assert Detail("pixel", 1, (0.1, 0.2), (0.5, 0.001), 3, "here", "today").pixels(0.01) == 0.0
+    assert pixels([measured(1, (0.1, 0.2), (0.5, 0.001))], 1, 0.01) == 0.0
+
+
+def test_what_the_levels_beside_it_err_by_counts_for_a_level():
+    errors = {1: (0.001, None), 2: (None, 0.003), 3: (0.1, 0.2), 5: (0.001, 0.002)}
+    every = [measured(level, (0.1, 0.2), own) for level, own in errors.items()]
+    assert [pixels(every, level, 0.01) for level in range(7)] == [0.0, 0.2, 0.0, 0.0, 0.0, 0.2, 0.0]
 
 
 def test_what_was_measured_with_another_store_does_not_count(tmp_path):
@@ -243,6 +256,32 @@ def test_a_budget_of_error_turns_detail_too(store, renderer):
     assert np.abs(frame["rgb"] - exact).max() <= 0.08
     assert frame.stats["splats"] < len(store)
     assert np.array_equal(exact, truth(renderer, store.cloud(), capture))
+
+
+def test_a_budget_of_time_alone_turns_detail_too(store, renderer, monkeypatch, tmp_path):
+    """The errors that are tried go up until they would exceed what was found."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    measure_detail(store, renderer, views=4 * store.levels)
+    tried, errors = [], {0.0: None, 1 / 255: 0.2, 4 / 255: 0.03, 16 / 255: 0.1, 0.5: 0.0}
+
+    def found(search, error, ms):
+        base = search.calibration.base
+        tried.append(base.detail_error)
+        if errors[base.detail_error] is None:
+            raise fs.InputError("no quality draws this scene in 1 ms")
+        candidate = load_prices(renderer.device.kind)[0]
+        own = candidate.of(base)
+        return Choice(own, errors[base.detail_error], 1.0, 1.0, "measured", "here", candidate.knobs)
+
+    monkeypatch.setattr(sys.modules["fidsplat.budget.choose"], "_measured", found)
+    asked = {"scene": store, "capture": seen_from(1500.0), "device": renderer}
+    asked["capture"] = fs.Capture(asked["capture"], quality="lowpass=pixel")
+    for _ in range(2):  # the second is kept
+        assert fs.quality_within(ms=1.0, **asked).detail_error == 4 / 255
+    assert tried == [0.0, 1 / 255, 4 / 255]
+    errors[1 / 255] = errors[4 / 255] = errors[16 / 255] = errors[0.5] = None
+    with pytest.raises(fs.InputError, match="in 1 ms"):
+        fs.quality_within(ms=2.0, **asked)
 
 
 def test_a_cloud_in_memory_knows_no_detail(renderer):
