@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -134,7 +135,7 @@ def provenance(summaries: Mapping[str, Summary]) -> Frame:
         [
             {
                 "measured, points": f"{name}, {run['points']}",
-                "on": run["device"] or run["machine"],
+                "on": re.sub(r"OpenCL [\d.]+ ", "", run["device"] or run["machine"]),
                 "commit/code": f"{run['commit'] or 'no'}/{run['code']}",
                 "date": run["date"],
             }
