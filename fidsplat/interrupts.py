@@ -3,9 +3,10 @@
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.machinery import ExtensionFileLoader
 from types import FrameType
+from typing import Any
 
 _LOADING = frozenset({ExtensionFileLoader.create_module.__code__, ExtensionFileLoader.exec_module.__code__})
 _LATER = 0.01
@@ -34,6 +35,32 @@ def raised_in_time() -> Iterator[None]:
         signal.signal(number, _stop)
     try:
         yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def held_back() -> Iterator[Callable[[], KeyboardInterrupt | None]]:
+    """The first SIGINT or SIGTERM waits: what is given returns the exception that it stands for, None where
+    none has come, and is asked between two steps of some work, when nothing is half done. The next one does
+    not wait."""
+    asked: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    before: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in before.items() if callable(handler)}
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        if asked:
+            before[number](number, frame)
+        asked.append(number)
+
+    for number in before:
+        signal.signal(number, hold)
+    try:
+        yield lambda: (Terminated() if asked[0] == signal.SIGTERM else KeyboardInterrupt()) if asked else None
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -19,6 +19,7 @@ from fidsplat.commands.output import (
     new_file,
     option,
     progress_bar,
+    say,
     switch,
     tell,
     writable_file,
@@ -26,6 +27,7 @@ from fidsplat.commands.output import (
 from fidsplat.commands.sweeps import asked, need_reports
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
+from fidsplat.interrupts import held_back
 
 if TYPE_CHECKING:
     from fidsplat.train import Step, Trainer, ViewScore
@@ -41,7 +43,7 @@ class Train:
 
     The same command gives the same file, in every bit, on the same device. A run that was stopped goes on
     where its last checkpoint is, FILE.training.npz beside FILE.ply, which is written every half minute and
-    stays: with more iterations the same command goes on from there. --overwrite begins again.
+    at Ctrl-C, and stays: with more iterations the same command goes on from there. --overwrite begins again.
 
     Examples:
       fidsplat demo views -o yard && fidsplat train yard -o yard.ply --iterations 2000
@@ -101,8 +103,16 @@ class Train:
             renderer = Renderer(self.device)
         trainer = Trainer(dataset, renderer, settings, checkpoint, restart=self.overwrite)
         before, begun = trainer.iteration, time.perf_counter()
-        with _bar(trainer) as step:
-            trainer.run(step, prompt=False)
+        with held_back() as stopped, _bar(trainer) as show:
+
+            def told(step: Step) -> None:
+                show(step)
+                if (stop := stopped()) is not None:
+                    trainer.save_checkpoint()
+                    say(console(True), f"the same command goes on after iteration {trainer.iteration:,}")
+                    raise stop
+
+            trainer.run(told, prompt=False)
         seconds = time.perf_counter() - begun
         trainer.save(file)
         scores = trainer.evaluate()

@@ -1,7 +1,9 @@
 """Data sets from disk: what is read, and what is said about those that cannot be trained on."""
 
 import json
+import os
 import shutil
+import signal
 import struct
 from dataclasses import replace
 
@@ -13,7 +15,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import load_colmap
-from fidsplat.train import Dataset, TrainingView, load_dataset
+from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
 from fidsplat.train.dataset import looked_at
 from fidsplat.train.flat import flat_view
 from fidsplat.vision.images import read_rgba, write_png
@@ -482,6 +484,30 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "PSNR" not in printed
     assert "no view was held out: --hold-out 8" in " ".join(printed.split())
+
+
+def test_a_run_that_is_interrupted_keeps_what_it_has_done(folder, tmp_path, capsys, monkeypatch):
+    """At the step's end, whenever the signal comes; the second one does not wait."""
+    words = ["train", str(folder), "--device", "reference", "--iterations", "6", "-o"]
+    assert main([*words, str(tmp_path / "whole.ply")]) == 0
+    advance, interrupts = Trainer._advance, [1]
+
+    def interrupted(self, late):
+        for _ in range(interrupts[0] if self.iteration == 3 else 0):
+            os.kill(os.getpid(), signal.SIGINT)
+        advance(self, late)
+
+    monkeypatch.setattr(Trainer, "_advance", interrupted)
+    file = tmp_path / "a.ply"
+    assert main([*words, str(file)]) == 130
+    said = capsys.readouterr().err
+    assert "the same command goes on after iteration 4" in said
+    assert not file.exists()
+    assert main([*words, str(file)]) == 0
+    assert file.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    interrupts[0] = 2
+    assert main([*words, str(tmp_path / "b.ply")]) == 130
+    assert list(tmp_path.glob("b.*")) == []
 
 
 @pytest.mark.parametrize(
