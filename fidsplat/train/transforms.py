@@ -4,7 +4,7 @@ transforms_train.json with transforms_test.json. Poses are camera to world with 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,7 +48,8 @@ def has_transforms(path: Path) -> bool:
 
 
 def load_transforms(path: Path, tell: Callable[[str, float], None]) -> Found:
-    """Read the views, those of transforms_test.json beside the file, and the points that it names.
+    """Read the views, the points that the file names, and as views held out those of its val_filenames and
+    test_filenames and of transforms_test.json beside it.
 
     Pictures with alpha are put on black.
 
@@ -56,9 +57,10 @@ def load_transforms(path: Path, tell: Callable[[str, float], None]) -> Found:
     """
     file = path if path.is_file() else next(path / name for name in _NAMES if (path / name).is_file())
     table = _table(file)
-    views = _views(file, table, tell, "pictures")
+    views, held_out = _divided(file, table, _views(file, table, tell, "pictures"))
     test = file.with_name("transforms_test.json")
-    held_out = _views(test, _table(test), tell, "test pictures") if test.is_file() else []
+    if test.is_file():
+        held_out += _views(test, _table(test), tell, "test pictures")
     points, colors = _points(file, table)
     return Found(views, held_out, points, colors, _BLACK)
 
@@ -95,6 +97,24 @@ def _views(file: Path, table: dict, tell: Callable[[str, float], None], words: s
         given = {**table, **frame}
         views.append(flat_view(name, _camera(f"{file}: {name}", given, picture, matrix), picture, mask))
     return sorted(views, key=lambda view: view.name)
+
+
+def _divided(
+    file: Path, table: dict, views: list[TrainingView]
+) -> tuple[list[TrainingView], list[TrainingView]]:
+    """Those to train on and those held out, where the file names them."""
+    known, named = {PurePath(view.name) for view in views}, {}
+    for split in ("train", "val", "test"):
+        names = table.get(f"{split}_filenames") or []
+        if not isinstance(names, list):
+            raise InputError(f"{file}: {split}_filenames must be a list of the file_path of frames")
+        named[split] = {PurePath(str(name)) for name in names}
+        if unknown := named[split] - known:
+            raise InputError(f"{file}: {split}_filenames has {min(unknown)}, which is no frame's file_path")
+    trained = named["train"] or known - named["val"] - named["test"]
+    held_out = (named["val"] | named["test"]) - trained
+    one, other = ([view for view in views if PurePath(view.name) in part] for part in (trained, held_out))
+    return one, other
 
 
 def _picture(file: Path, name: str) -> np.ndarray:

@@ -325,6 +325,28 @@ def test_views_that_are_held_out(made, folder):
     assert many.digest != made.digest
 
 
+def test_views_that_nerfstudio_holds_out(made, tmp_path):
+    """Its lists name pictures with and without "./"."""
+    for number, (lists, trained, held_out) in enumerate(
+        [
+            ({"test_filenames": ["2.png"]}, [1, 3, 4], [2]),
+            ({"val_filenames": ["./2.png"], "test_filenames": ["4.png"]}, [1, 3], [2, 4]),
+            ({"train_filenames": ["./1.png", "3.png"], "val_filenames": ["4.png"]}, [1, 3], [4]),
+        ]
+    ):
+        folder = transforms(made, tmp_path / str(number), **lists)
+        found = load_dataset(folder, random_points=9)
+        for views, wanted in ((found.views, trained), (found.held_out, held_out)):
+            assert [view.name for view in views] == [f"./{name}.png" for name in wanted]
+    for wrong, said in (
+        ({"test_filenames": "2.png"}, "test_filenames must be a list"),
+        ({"val_filenames": ["no.png"]}, "val_filenames has no.png, which is no frame's file_path"),
+    ):
+        folder = transforms(made, tmp_path / next(iter(wrong)), **wrong)
+        with pytest.raises(fs.InputError, match=said):
+            load_dataset(folder, random_points=9)
+
+
 def test_random_points_lie_where_the_cameras_look(made):
     low, high, faced = looked_at([view.camera for view in made.views])
     assert faced
