@@ -1,5 +1,5 @@
-"""A splat has a place for its derivatives for each tile that lists it, and none besides: of one too many nobody
-would have written what is added up, and other splats' numbers stand there, others on each run."""
+"""A splat has a place for its derivatives for each tile that lists it, and none besides: one too many nobody
+would write, and other splats' numbers would be added up, others on each run."""
 
 import numpy as np
 import pyopencl as cl
