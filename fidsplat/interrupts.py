@@ -3,12 +3,20 @@
 import contextlib
 import signal
 import threading
+from abc import ABCMeta
 from collections.abc import Callable, Iterator
 from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 from typing import Any
 
-_LOADING = frozenset({ExtensionFileLoader.create_module.__code__, ExtensionFileLoader.exec_module.__code__})
+_UNFIT = frozenset(
+    {
+        ExtensionFileLoader.create_module.__code__,
+        ExtensionFileLoader.exec_module.__code__,
+        ABCMeta.__instancecheck__.__code__,
+    }
+)
+"""what may not be interrupted, nor what it calls"""
 _LATER = 0.01
 """seconds"""
 
@@ -19,11 +27,13 @@ class Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def raised_in_time() -> Iterator[None]:
-    """SIGINT raises KeyboardInterrupt and SIGTERM Terminated, but not while a library is being loaded.
+    """SIGINT raises KeyboardInterrupt and SIGTERM Terminated, but not while a library is being loaded, or asks
+    what something is.
 
     What such a library calls of Python on its way (NumPy to register types, nanobind for its enums) may
     raise nothing that it does not expect: PyOpenCL aborts the process, NumPy reports a broken installation,
-    others forget the interrupt. It comes again a little later.
+    others forget the interrupt. NumPy takes an interrupted question whether a file is a path for a yes. It
+    comes again a little later.
     """
     if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
         yield
@@ -67,14 +77,14 @@ def held_back() -> Iterator[Callable[[], KeyboardInterrupt | None]]:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    if not _loads_a_library(frame):
+    if not _is_unfit(frame):
         raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
     again = threading.Timer(_LATER, signal.pthread_kill, (threading.main_thread().ident, number))
     again.daemon = True
     again.start()
 
 
-def _loads_a_library(frame: FrameType | None) -> bool:
-    while frame is not None and frame.f_code not in _LOADING:
+def _is_unfit(frame: FrameType | None) -> bool:
+    while frame is not None and frame.f_code not in _UNFIT:
         frame = frame.f_back
     return frame is not None

@@ -24,6 +24,25 @@ sys.setprofile(stop)
 sys.exit(main(["devices"]))
 """
 """sends a signal when PyOpenCL calls Python while it is loaded"""
+IN_A_QUESTION = """
+import abc, os, signal, sys, time
+import numpy as np
+from fidsplat.interrupts import raised_in_time
+
+def stop(frame, event, argument):
+    if event == "call" and frame.f_code is abc.ABCMeta.__instancecheck__.__code__:
+        sys.setprofile(None)
+        os.kill(os.getpid(), signal.SIGINT)
+
+with raised_in_time(), open(os.devnull, "wb") as file:
+    sys.setprofile(stop)
+    try:
+        np.save(file, np.zeros(3))
+        time.sleep(10)
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+"""sends one when NumPy asks whether the file that it saves to is a path"""
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +65,12 @@ def test_a_library_that_is_being_loaded_is_not_interrupted(name, status, said):
         [sys.executable, "-c", IN_A_LIBRARY.format(name=name)], capture_output=True, text=True, check=False
     )
     assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {said}\n")
+
+
+def test_a_question_of_numpys_is_not_interrupted():
+    """It took the exception for a yes, and said that a file is no path."""
+    ended = subprocess.run([sys.executable, "-c", IN_A_QUESTION], capture_output=True, text=True, check=False)
+    assert (ended.stdout, ended.stderr) == ("interrupted\n", "")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")
