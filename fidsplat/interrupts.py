@@ -27,8 +27,8 @@ class Terminated(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def raised_in_time() -> Iterator[None]:
-    """SIGINT raises KeyboardInterrupt and SIGTERM Terminated, but not while a library is being loaded, or asks
-    what something is.
+    """SIGINT raises KeyboardInterrupt and SIGTERM Terminated, but not while a library is being loaded, or
+    asks what something is.
 
     What such a library calls of Python on its way (NumPy to register types, nanobind for its enums) may
     raise nothing that it does not expect: PyOpenCL aborts the process, NumPy reports a broken installation,
