@@ -35,19 +35,10 @@ def raised_in_time() -> Iterator[None]:
     others forget the interrupt. NumPy takes an interrupted question whether a file is a path for a yes. It
     comes again a little later.
     """
-    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     # what a shell starts behind ignores Ctrl-C; None: not set by Python
-    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
-    for number in before:
-        signal.signal(number, _stop)
-    try:
+    before = _handlers(lambda handler: handler not in (signal.SIG_IGN, None))
+    with _handled(before, _stop):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -56,24 +47,36 @@ def held_back() -> Iterator[Callable[[], KeyboardInterrupt | None]]:
     none has come, and is asked between two steps of some work, when nothing is half done. The next one does
     not wait."""
     asked: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: None
-        return
-    before: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    before = {number: handler for number, handler in before.items() if callable(handler)}
+    before = _handlers(callable)
 
     def hold(number: int, frame: FrameType | None) -> None:
         if asked:
             before[number](number, frame)
         asked.append(number)
 
-    for number in before:
-        signal.signal(number, hold)
-    try:
+    with _handled(before, hold):
         yield lambda: (Terminated() if asked[0] == signal.SIGTERM else KeyboardInterrupt()) if asked else None
+
+
+def _handlers(replaced: Callable[[Any], bool]) -> dict[int, Any]:
+    """Those of SIGINT and SIGTERM that may be replaced: none outside the main thread, which alone may handle
+    signals."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    return {number: handler for number, handler in found.items() if replaced(handler)}
+
+
+@contextlib.contextmanager
+def _handled(before: dict[int, Any], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Signals go to another handler than before."""
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, own in before.items():
+            signal.signal(number, own)
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
