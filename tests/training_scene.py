@@ -1,10 +1,13 @@
 """A small scene to train on, and settings by which a few steps show."""
 
+import json
+
 import numpy as np
 
 import fidsplat as fs
+from fidsplat.formats.colmap import save_colmap
 from fidsplat.train import Dataset, Trainer, TrainingView
-from fidsplat.vision.images import to_uint8
+from fidsplat.vision.images import to_uint8, write_png
 
 BACKGROUND = (0.2, 0.3, 0.4)
 QUICK = {
@@ -60,3 +63,14 @@ def run_and_resumed(whole, renderer, settings, steps, folder):
     for name, trainer in (("a", whole), ("b", again)):
         trainer.save(folder / f"{name}.ply")
     return [(folder / f"{name}.ply").read_bytes() for name in "ab"]
+
+
+def write(made, folder):
+    """A data set as fidsplat writes one."""
+    for place, views in ((folder, made.views), (folder / "test", made.held_out)):
+        (place / "images").mkdir(parents=True)
+        for view in views:
+            write_png(place / "images" / view.name, view.picture)
+        names, cameras = [view.name for view in views], [view.camera for view in views]
+        save_colmap(place / "sparse" / "0", names, cameras, made.points, made.colors)
+    (folder / "dataset.json").write_text(json.dumps({"background": BACKGROUND}))

@@ -3,8 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from test_train_data import write
-from training_scene import scene
+from training_scene import scene, write
 
 import fidsplat as fs
 

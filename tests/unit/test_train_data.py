@@ -1,23 +1,17 @@
 """Data sets from disk: what is read, and what is said about those that cannot be trained on."""
 
 import json
-import os
-import shutil
-import signal
 import struct
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from training_scene import BACKGROUND, scene
+from training_scene import BACKGROUND, scene, write
 
 import fidsplat as fs
-from fidsplat.cli import main
-from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import load_colmap
-from fidsplat.train import Dataset, Trainer, TrainingView, load_dataset
+from fidsplat.train import Dataset, TrainingView, load_dataset
 from fidsplat.train.dataset import looked_at
-from fidsplat.train.flat import flat_view
 from fidsplat.vision.images import read_rgba, write_png
 
 
@@ -31,16 +25,6 @@ def folder(made, tmp_path):
     """The data set as fidsplat writes one."""
     write(made, tmp_path / "set")
     return tmp_path / "set"
-
-
-def write(made, folder):
-    for place, views in ((folder, made.views), (folder / "test", made.held_out)):
-        (place / "images").mkdir(parents=True)
-        for view in views:
-            write_png(place / "images" / view.name, view.picture)
-        names, cameras = [view.name for view in views], [view.camera for view in views]
-        save_colmap(place / "sparse" / "0", names, cameras, made.points, made.colors)
-    (folder / "dataset.json").write_text(json.dumps({"background": BACKGROUND}))
 
 
 def transforms(made, folder, **more):
@@ -164,103 +148,6 @@ def test_points_as_text(made, tmp_path):
         (folder / "points.ply").write_text(head + "".join(damaged))
         with pytest.raises(fs.InputError, match=words):
             load_dataset(folder)
-
-
-OF_COLMAP = {
-    "SIMPLE_RADIAL": "30 32 24 -0.1",
-    "RADIAL": "30 32 24 0.1 0.05",
-    "OPENCV": "30 31 32 24 -0.2 0.05 0.01 -0.02",
-    "FULL_OPENCV": "30 31 32 24 -0.2 0.05 0.01 -0.02 0.01 0.1 0.02 0.01",
-    "OPENCV_FISHEYE": "30 31 32 24 0.05 -0.01 0.002 0.001",
-    "SIMPLE_RADIAL_FISHEYE": "30 32 24 0.05",
-    "RADIAL_FISHEYE": "30 32 24 0.05 -0.01",
-}
-"""cameras, of 64 x 48 pixels"""
-BROWN, FISHEYE = fs.BrownConrady, fs.Fisheye
-LENSES = {
-    "SIMPLE_RADIAL": BROWN(k1=-0.1),
-    "RADIAL": BROWN(k1=0.1, k2=0.05),
-    "OPENCV": BROWN(k1=-0.2, k2=0.05, p1=0.01, p2=-0.02),
-    "FULL_OPENCV": BROWN(k1=-0.2, k2=0.05, p1=0.01, p2=-0.02, k3=0.01, k4=0.1, k5=0.02, k6=0.01),
-    "OPENCV_FISHEYE": FISHEYE(0.05, -0.01, 0.002, 0.001),
-    "SIMPLE_RADIAL_FISHEYE": FISHEYE(0.05),
-    "RADIAL_FISHEYE": FISHEYE(0.05, -0.01),
-}
-
-
-def taken(camera):
-    """A smooth picture of directions alone, as a camera sees them; grey where it sees nothing."""
-    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
-    rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1))
-    slopes = (rays / rays[:, 2:])[:, :2].reshape(camera.height, camera.width, 2)
-    waves = [np.sin(3 * slopes[..., 0]), np.cos(2 * slopes[..., 1]), np.sin(slopes.sum(2))]
-    return np.nan_to_num(np.rint(127.5 + 100 * np.stack(waves, 2)), nan=127).astype(np.uint8)
-
-
-def flat_as_wanted(view, lens, mask):
-    """Whether a view has the picture that a pinhole would have taken, where what it is made of was there."""
-    camera = view.camera
-    assert camera.lens is None
-    there = np.ones(mask.shape, bool) if view.mask is None else view.mask
-    off = np.abs(view.picture.astype(int) - taken(camera)).max(2)
-    # slopes bend a wave of 100 by 1000 at most; half a pixel's square of it, two roundings
-    assert off[there].max() <= 2 + 1000 / (8 * camera.fx**2) * 8
-    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
-    at = lens.image(camera.rays(np.stack([x.ravel(), y.ravel()], 1)))
-    at = (at * (camera.fx, camera.fy) + (camera.cx, camera.cy) - 0.5).reshape(*mask.shape, 2)
-    low = np.floor(np.nan_to_num(at, nan=-9)).astype(int)
-    whole = np.ones(mask.shape, bool)
-    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        column, row = low[..., 0] + right, low[..., 1] + down
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        whole &= inside & mask[np.clip(row, 0, camera.height - 1), np.clip(column, 0, camera.width - 1)]
-    assert (there | ~whole).all()
-    assert 0.3 < there.mean() < 1
-    assert (there & ~whole).mean() < 0.02  # where a neighbour has no weight
-
-
-@pytest.mark.parametrize("model", OF_COLMAP)
-def test_what_lenses_took_is_flat(folder, tmp_path, model):
-    """Of COLMAP's models and nerfstudio's, with a mask."""
-    for file in folder.rglob("*.bin"):
-        file.unlink()
-    cameras, images = folder / "sparse/0/cameras.txt", folder / "images"
-    number = next(line for line in cameras.read_text().splitlines() if line[:1].isdigit()).split()[0]
-    cameras.write_text(f"{number} {model} 64 48 {OF_COLMAP[model]}\n")
-    f, *middle = map(float, OF_COLMAP[model].split()[: 3 if "RADIAL" in model else 4])
-    lens, pinhole = LENSES[model], (64, 48, f, *middle) if len(middle) == 3 else (64, 48, f, f, *middle)
-    picture = taken(fs.Camera.pinhole(*pinhole, lens=lens))
-    mask = np.ones((48, 64), bool)
-    mask[:12, :20] = False
-    (folder / "masks").mkdir()
-    for file in images.iterdir():
-        write_png(file, picture)
-        write_png(folder / "masks" / f"{file.name}.png", mask)
-    found = load_dataset(folder)
-    for view in found.views:
-        flat_as_wanted(view, lens, mask)
-    if model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
-        return
-    given = {field: value for field, value in vars(lens).items() if value and field != "fold"}
-    frames = [
-        {"file_path": f"images/{view.name}", "mask_path": f"masks/{view.name}.png", "transform_matrix": pose}
-        for view in found.views
-        for pose in [(np.linalg.inv(view.camera.world_to_camera) @ np.diag([1, -1, -1, 1])).tolist()]
-    ]
-    names = dict(zip(("fl_x", "fl_y", "cx", "cy"), pinhole[2:], strict=True))
-    table = {"camera_model": model, "frames": frames, **names, **given}
-    (folder / "transforms.json").write_text(json.dumps(table))
-    for ours, theirs in zip(load_dataset(folder, random_points=9).views, found.views, strict=True):
-        np.testing.assert_array_equal(ours.picture, theirs.picture)
-        np.testing.assert_array_equal(ours.mask, theirs.mask)
-
-
-def test_a_lens_that_sees_all_of_a_flat_picture_leaves_no_mask(made):
-    view = made.views[0]
-    camera = replace(view.camera, lens=BROWN(k1=-0.01))
-    assert flat_view("a.png", camera, view.picture, None).mask is None
-    with pytest.raises(fs.InputError, match=r"2 x 2.*give pictures of the size"):
-        flat_view("a.png", camera, np.zeros((2, 2, 3), np.uint8), None)
 
 
 def test_pictures_of_colmap_are_read_as_they_are_stored(made, folder):
@@ -462,74 +349,6 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
         (nerf / "other.json").write_text(json.dumps(table | change))
         with pytest.raises(fs.InputError, match=words):
             load_dataset(nerf / "other.json", random_points=5)
-
-
-def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
-    words = [
-        "train",
-        str(folder),
-        "-o",
-        str(tmp_path / "a.ply"),
-        "--device",
-        "reference",
-        "--iterations",
-        "4",
-    ]
-    assert main([*words, "--json", "--report", str(tmp_path / "page")]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert facts["iterations"] == 4
-    assert facts["splats"] == len(fs.load_ply(tmp_path / "a.ply")) == 6
-    assert [view["name"] for view in facts["views"]] == ["0.png"]
-    assert all(
-        (tmp_path / "page" / name).is_file() for name in ("report.md", "training.svg", "held-out-0.png")
-    )
-    first = (tmp_path / "a.ply").read_bytes()
-    words[3] = str(tmp_path / "b.ply")
-    assert main([*words[:-1], "2"]) == 0
-    assert main(words) == 0  # goes on
-    assert (tmp_path / "b.ply").read_bytes() == first
-    assert main([*words[:-1], "3"]) == 2
-    assert "number of iterations" in capsys.readouterr().err
-    assert main([*words[:-1], "3", "--overwrite"]) == 0
-    for wrong, said in (
-        (["-o", "a.png"], "-o is a.png"),
-        (["--random-points", "-1"], "--random-points is -1; it must"),
-        (["--random-points", "99999999999"], "--random-points is 99999999999; it must"),
-        (["--within-memory", "0"], "--within-memory is 0"),
-        (["--within-memory", "1e-6"], "alone take 0.0001 GiB of the 1e-06 GiB"),
-    ):
-        assert main([*words, *wrong]) == 2
-        assert said in capsys.readouterr().err
-    shutil.rmtree(folder / "test")
-    words[3] = str(tmp_path / "c.ply")
-    assert main(words) == 0
-    printed = capsys.readouterr().out
-    assert "PSNR" not in printed
-    assert "no view was held out: --hold-out 8" in " ".join(printed.split())
-
-
-def test_a_run_that_is_interrupted_keeps_what_it_has_done(folder, tmp_path, capsys, monkeypatch):
-    """At the step's end, whenever the signal comes; the second one does not wait."""
-    words = ["train", str(folder), "--device", "reference", "--iterations", "6", "-o"]
-    assert main([*words, str(tmp_path / "whole.ply")]) == 0
-    advance, interrupts = Trainer._advance, [1]
-
-    def interrupted(self, late):
-        for _ in range(interrupts[0] if self.iteration == 3 else 0):
-            os.kill(os.getpid(), signal.SIGINT)
-        advance(self, late)
-
-    monkeypatch.setattr(Trainer, "_advance", interrupted)
-    file = tmp_path / "a.ply"
-    assert main([*words, str(file)]) == 130
-    said = capsys.readouterr().err
-    assert "the same command goes on after iteration 4" in said
-    assert not file.exists()
-    assert main([*words, str(file)]) == 0
-    assert file.read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    interrupts[0] = 2
-    assert main([*words, str(tmp_path / "b.ply")]) == 130
-    assert list(tmp_path.glob("b.*")) == []
 
 
 @pytest.mark.parametrize(
