@@ -99,14 +99,6 @@ def test_every_link_and_picture_is_there(page):
         assert (page.parent / target).exists(), f"{page.name} points at {target}"
 
 
-def test_no_page_is_longer_than_1500_words():
-    """Numbers and names in tables count, their lines do not."""
-    words = {
-        p.name: len(re.findall(r"\S*\w\S*", p.read_text("utf-8"))) for p in PAGES if p.parent.name == "docs"
-    }
-    assert max(words.values()) <= 1500, max(words, key=words.get)
-
-
 @pytest.mark.parametrize("line", ["pip install . && fidsplat demo", "pip install '.[test]' && pytest"])
 def test_the_two_commands_stand_in_the_readme(line):
     assert line in README.read_text("utf-8").splitlines()
