@@ -4,7 +4,7 @@
 
 `ordered` sorts all visible splats by depth and lists them per tile in that order (counting sorts, no
 atomics); `tiled` writes the pairs to their tiles in any order and sorts each tile's list in local memory.
-Both give the same lists. docs/growth.md says which one a device gets, and why.
+Both give the same lists. devlog/growth.md says which one a device gets, and why.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Turns measured figures into the Markdown tables of docs/performance.md, roofline.md and growth.md.
+"""Turns measured figures into the Markdown tables of docs/performance.md, devlog/roofline.md and devlog/growth.md.
 
     python benchmarks/performance_tables.py benchmarks/results/*.json*
-    python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/*.md
+    python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/*.md devlog/*.md
 
 Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
 benchmarks/listing_ways.py --json, benchmarks/large_scenes.py --json, benchmarks/batches.py --json and

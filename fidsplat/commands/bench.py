@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _LEGEND = (
     "ms: median (quartiles) of whole frames, medians of the stages by the device's own clock; splats "
     "resident, picture left on the device. host: until the call returns. x roofline: how many times the "
-    "least that the device's measured best rates allow (docs/roofline.md)."
+    "least that the device's measured best rates allow (devlog/roofline.md)."
 )
 
 

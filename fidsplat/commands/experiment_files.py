@@ -240,7 +240,7 @@ class Report:
 
     Examples:
       fidsplat experiment report
-      fidsplat experiment report results -o docs/results.md
+      fidsplat experiment report results -o devlog/results.md
     """
 
     folders: Annotated[Folders, option("DIR", "folders with results (default: fidsplat-experiments)")] = ()

@@ -7,7 +7,7 @@ Gaussian lacks towards the corners of its module its copies make up, and what st
 neighbours.
 
 It takes a renderer that composites by depth at each pixel (docs/order.md). By the depth of centres the same
-splats hide each other (docs/marker-opacity.md).
+splats hide each other (devlog/marker-opacity.md).
 """
 
 from __future__ import annotations

@@ -9,24 +9,26 @@ from fidsplat.experiments.charts import bars, chart, legend_above
 from fidsplat.experiments.report import make_report
 from fidsplat.experiments.tradeoff.report import write_report
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+FOLDERS = {"accuracy": ROOT / "docs", "results": ROOT / "devlog"}
 
 
 @pytest.mark.parametrize(("name", "write"), [("accuracy", write_report), ("results", make_report)])
 def test_a_page_is_what_its_tables_give(tmp_path, name, write):
-    shutil.copytree(DOCS / name, tmp_path / name)
+    folder = FOLDERS[name]
+    shutil.copytree(folder / name, tmp_path / name)
     write([tmp_path / name], tmp_path / f"{name}.md")
     again = f"make it again: fidsplat {'tradeoff' if name == 'accuracy' else 'experiment'} report"
-    assert (tmp_path / f"{name}.md").read_text() == (DOCS / f"{name}.md").read_text(), again
-    for table in (DOCS / name).glob("*.csv"):
+    assert (tmp_path / f"{name}.md").read_text() == (folder / f"{name}.md").read_text(), again
+    for table in (folder / name).glob("*.csv"):
         assert (tmp_path / name / table.name).read_bytes() == table.read_bytes(), again
 
 
 def test_data_of_pages_are_small():
-    tables = [file for name in ("accuracy", "results") for file in (DOCS / name).glob("*.csv")]
+    tables = [file for name in FOLDERS for file in (FOLDERS[name] / name).glob("*.csv")]
     assert 0 < sum(file.stat().st_size for file in tables) < 300_000
     pictures = [
-        f for name in ("accuracy", "results") for f in (DOCS / name).iterdir() if f.suffix in (".svg", ".png")
+        f for name in FOLDERS for f in (FOLDERS[name] / name).iterdir() if f.suffix in (".svg", ".png")
     ]
     assert max(file.stat().st_size for file in pictures) < 150_000
 

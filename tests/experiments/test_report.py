@@ -271,14 +271,14 @@ def test_what_all_was_shown_to_the_detectors_is_not_named(tmp_path):
 
 def test_notes_of_tables_stand_on_the_page(tmp_path):
     folder = tmp_path / "kept"
-    (made, *_) = make_report([Path(__file__).parents[2] / "docs" / "results"], folder)
+    (made, *_) = make_report([Path(__file__).parents[2] / "devlog" / "results"], folder)
     notes = read_summary(folder / "angles.csv").notes
     assert notes
     assert all(note in made.read_text() for note in notes)
 
 
 def test_a_table_with_words_for_numbers_is_one_line(tmp_path):
-    whole = (Path(__file__).parents[2] / "docs" / "results" / "counts.csv").read_text().splitlines()
+    whole = (Path(__file__).parents[2] / "devlog" / "results" / "counts.csv").read_text().splitlines()
     assert ",48,52," in whole[3]
     (tmp_path / "counts.csv").write_text("\n".join([*whole[:3], whole[3].replace(",48,52,", ",x,52,")]))
     with pytest.raises(fs.InputError, match=r"results of counts .* are damaged .* measure again"):

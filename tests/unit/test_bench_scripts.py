@@ -11,7 +11,7 @@ from growth import Point
 
 from fidsplat.experiments.sweep import read_records
 
-PAGES = Path(__file__).resolve().parents[2] / "docs"
+ROOT = Path(__file__).resolve().parents[2]
 RECORD = {
     "scene": "tag",
     "renderer": "fidsplat",
@@ -157,7 +157,7 @@ def test_a_table_replaces_what_stands_between_its_marks():
 
 
 def test_one_page_has_a_place_for_each_table():
-    pages = [page.read_text("utf-8") for page in PAGES.glob("*.md")]
+    pages = [page.read_text("utf-8") for page in (*ROOT.glob("docs/*.md"), *ROOT.glob("devlog/*.md"))]
     for name in tables.TABLES:
         assert sum(page != tables.insert(page, name, "new") for page in pages) == 1, name
 

@@ -21,6 +21,7 @@ TREE = Path(__file__).resolve().parents[2]
 README = TREE / "README.md"
 EXAMPLES = TREE / "examples"
 PAGES = [README, TREE / "CONTRIBUTING.md", *sorted((TREE / "docs").glob("*.md"))]
+DEVLOG = sorted((TREE / "devlog").glob("*.md"))
 GIVEN = {
     "large-scenes.md",
     "README.md",
@@ -93,7 +94,7 @@ def test_every_block_says_its_language(page):
     assert set(fences[1::2]) <= {""}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *DEVLOG], ids=lambda page: page.name)
 def test_every_link_and_picture_is_there(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text("utf-8")):
         assert (page.parent / target).exists(), f"{page.name} points at {target}"

@@ -5,7 +5,7 @@ sorts over a few contiguous pieces: long sequential walks and no atomics. On GPU
 its tiles while it is projected, pairs are written to the tiles in any order, and each tile's list is sorted
 in local memory: few launches, all of them wide. Of many small views and of stores (`gathered`) tiles are
 counted for thousands of splats at a time, in local memory: where neighbours in memory touch the same tile,
-atomics of its one word wait for each other. docs/growth.md has both ways on both kinds of device.
+atomics of its one word wait for each other. devlog/growth.md has both ways on both kinds of device.
 """
 
 from __future__ import annotations

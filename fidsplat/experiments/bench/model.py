@@ -1,6 +1,6 @@
 """What a frame must at least cost: bytes and operations of each stage, counted from what there is to draw.
 
-docs/roofline.md derives the numbers. They are of the method (2D splats, exact crossing, float32), not of
+devlog/roofline.md derives the numbers. They are of the method (2D splats, exact crossing, float32), not of
 our kernels: what one frame reads once is counted once, and of the fragments only those that are drawn.
 """
 
