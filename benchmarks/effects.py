@@ -1,7 +1,7 @@
 """What each effect costs: a standard random scene without and with it, in turns, splats resident.
 
     python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json FILE]
-    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effect-prices.md
+    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effects.md
 
 Every frame with an effect is followed by one without, the picture left on the device, the queue drained
 before and after each, so that what else the machine does falls on both. The price is the median of the ratios

@@ -168,7 +168,7 @@ def _number(value: float | int | None) -> str:
 
 def main() -> None:
     parser = options(__doc__, repeats=15)
-    parser.add_argument("--scene", metavar="FILE", help="a captured scene, y down, as in docs/real-scene.md")
+    parser.add_argument("--scene", metavar="FILE", help="a captured scene, y down, as in docs/experiments.md")
     parser.add_argument("-o", "--out", type=Path, help="PNG file for the picture")
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--times-only", action="store_true", help="no jumps, and so no picture")

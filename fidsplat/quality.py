@@ -130,7 +130,7 @@ class Quality:
     widened by 0.3 square pixels, at the centre's depth; captures look as they did to their trainers.
     `ewa_antialiased`: their opacity falls as they are widened (Mip-Splatting), for captures trained so.
     `exact`: the largest value along each ray and the depth where it is, under `lowpass`; true near the camera
-    and at wide angles, as 3DGUT and ray tracers have it (docs/ellipsoids.md). Lenses with distortion,
+    and at wide angles, as 3DGUT and ray tracers have it (docs/primitives.md). Lenses with distortion,
     fisheyes and panoramas have `exact` always."""
 
     order: str = "auto"

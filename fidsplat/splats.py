@@ -271,7 +271,7 @@ class SplatCloud(PickledByFields, Summarised):
     def flattened(self) -> "SplatCloud":
         """The cloud with disks in place of its 3D Gaussians: of each, the thinnest axis becomes the normal.
 
-        For renderers of disks alone. Captures of thick splats lose their haze (docs/real-scene.md).
+        For renderers of disks alone. Captures of thick splats lose their haze (docs/experiments.md).
         """
         if self.thickness is None:
             return self

@@ -93,7 +93,7 @@ class Compared(Threaded):
     ] = None
     lpips: Annotated[
         Path | None,
-        option("FILE.npz", "weights for LPIPS in `views`; how to make the file: docs/ground-truth.md"),
+        option("FILE.npz", "weights for LPIPS in `views`; how to make the file: docs/experiments.md"),
     ] = None
 
 

@@ -1,4 +1,4 @@
-"""Group G of the catalogue: 3D Gaussians (docs/ellipsoids.md)."""
+"""Group G of the catalogue: 3D Gaussians (docs/primitives.md)."""
 
 from __future__ import annotations
 

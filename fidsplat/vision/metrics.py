@@ -2,7 +2,7 @@
 
 LPIPS (Zhang et al. 2018) is computed with AlexNet, in NumPy, by weights that the user has: they are no part
 of fidsplat, and nothing here fetches them. `load_lpips` reads a NumPy file with the five convolutions of
-torchvision's AlexNet and the five linear layers of LPIPS version 0.1; docs/ground-truth.md says how it is
+torchvision's AlexNet and the five linear layers of LPIPS version 0.1; docs/experiments.md says how it is
 written with PyTorch and the lpips package.
 """
 
@@ -111,7 +111,7 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
         }
         for name, shape in shapes.items():
             if name not in weights or weights[name].shape != shape:
-                raise InputError(f"{file} needs an array {name} of shape {shape} (see docs/ground-truth.md)")
+                raise InputError(f"{file} needs an array {name} of shape {shape} (see docs/experiments.md)")
 
     def measure(picture: np.ndarray, truth: np.ndarray) -> float:
         total = 0.0

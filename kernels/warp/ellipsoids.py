@@ -1,4 +1,4 @@
-"""3D Gaussians as the disks that have their picture (docs/ellipsoids.md): exact, or as 3DGS draws them."""
+"""3D Gaussians as the disks that have their picture (docs/primitives.md): exact, or as 3DGS draws them."""
 
 from functools import cache
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""3D Gaussians as the disks that have their picture (docs/ellipsoids.md).
+"""3D Gaussians as the disks that have their picture (docs/primitives.md).
 
 `exact`: with W the map that makes the covariance the unit matrix, the disk through the centre p that is
 perpendicular to W p there. A ray's least squared distance is rho / (1 + rho / |W p|^2) of that disk's rho.
