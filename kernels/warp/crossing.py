@@ -137,19 +137,33 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
         return wp.min(exp(s.u[3] - half_rho), view.ceiling)
 
     @wp.func
-    def depth_of(lines: wp.array(dtype=wp.vec4), index: int, c: Crossing, inverse_d: float) -> float:
-        """Depth of ray and plane within the disk's own range; the centre's where the ray misses the plane
-        (numerics B2, B4).
+    def depth_of(
+        lines: wp.array(dtype=wp.vec4), index: int, s: Splat, c: Crossing, inverse_d: float, printed: bool
+    ) -> float:
+        """Depth of ray and plane within the splat's own range; the centre's where the ray meets no plane
+        beyond `near` (numerics B2, B4). In the dot of the low-pass it goes from the plane's to the centre's,
+        as rho of the dot goes to 0 beside that of the plane, unless the splat is `printed` on a plane.
         """
         at = index * each
         center = line_of(lines, at + zc_line)[zc_lane]
         reach = line_of(lines, at + zr_line)[zr_lane]
-        if c.d > 0.0:
-            if wp.static(parallel):
-                return wp.clamp(c.z * inverse_d, center - reach, center + reach)
-            met = line_of(lines, at + z_line)[z_lane] * inverse_d
-            return wp.clamp(met, center - reach, center + reach)
-        return center
+        if not (c.d > 0.0):
+            return center
+        depth_d, beyond_near = float(0.0), bool(False)  # depth times D
+        if wp.static(parallel):
+            depth_d = c.z
+            beyond_near = c.z >= s.plane[3] * c.d
+        else:
+            depth_d = line_of(lines, at + z_line)[z_lane]
+            beyond_near = c.d <= s.v[3]
+        depth = depth_d * inverse_d
+        if wp.static(screen):
+            if not (c.inside and c.q * inverse_d * inverse_d <= c.screen):
+                if not beyond_near:
+                    return center
+                if not printed:
+                    depth = fma(c.screen * (depth_d - center * c.d), c.d / c.q, center)
+        return wp.clamp(depth, center - reach, center + reach)
 
     return SimpleNamespace(
         Crossing=Crossing,

@@ -26,7 +26,7 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
     1, x, y from the anchor; by ln(opacity), by the colour, by the further numbers of the record."""
     names = list(_FORMS)
     names += ("dot_x", "dot_y") if "lowpass_screen" in effects else ()
-    names += ("z_numerator", "z_center", "z_reach") if "ray_depth" in effects else ()
+    names += ("z_numerator", "z_center") if "ray_depth" in effects else ()
     names += ("nx", "ny", "nz") if "normal" in outputs else ()
     return tuple(names)
 
@@ -37,7 +37,8 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     loss_at, opacity_at, back. effects and outputs: as blending has them.
     """
     splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
-    Splat, cross, row_of, opacity_of = splats.Splat, crossing.cross, crossing.row, crossing.opacity_of
+    Splat, Crossing = splats.Splat, crossing.Crossing
+    cross, row_of, opacity_of = crossing.cross, crossing.row, crossing.opacity_of
     screen, exclusive, has_depth = (
         name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth")
     )
@@ -119,20 +120,34 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         return opacity
 
     @wp.func
-    def depth_at(lines: wp.array(dtype=wp.vec4), index: int, inverse_d: float) -> wp.vec4:
-        """Depth of a fragment, and which way it depends on the record: 1 where it is z_numerator / D; else 0,
-        by the centre, and -1, 1 at the ends of the disk's range, by its reach."""
+    def depth_at(
+        lines: wp.array(dtype=wp.vec4),
+        index: int,
+        s: Splat,
+        c: Crossing,
+        inverse_d: float,
+        on_plane: bool,
+        low_pass: float,
+    ):
+        """Depth of a fragment, and its derivatives by z_numerator, z_center, D; by q and by the low-pass's
+        half rho `low_pass`, of which the depth z_center + low_pass (z_numerator - z_center D) D / q of a dot
+        is made. It leaves the splat's range by rounding alone, and then has the centre's derivatives."""
         place = index * each
         center = line_of(lines, place + zc_line)[zc_lane]
         reach = line_of(lines, place + zr_line)[zr_lane]
-        met = line_of(lines, place + z_line)[z_lane] * inverse_d
-        if not (inverse_d > 0.0):
-            return wp.vec4(center, 0.0, 1.0, 0.0)
-        if met < center - reach:
-            return wp.vec4(center - reach, 0.0, 1.0, -1.0)
-        if met > center + reach:
-            return wp.vec4(center + reach, 0.0, 1.0, 1.0)
-        return wp.vec4(met, 1.0, 0.0, 0.0)
+        numerator = line_of(lines, place + z_line)[z_lane]
+        z, by_record, by_dot = center, wp.vec3(0.0, 1.0, 0.0), wp.vec2()
+        if on_plane:
+            met = numerator * inverse_d
+            z = wp.clamp(met, center - reach, center + reach)
+            if met == z:
+                by_record = wp.vec3(inverse_d, 0.0, -z * inverse_d)
+        elif c.d > 0.0 and c.d <= s.v[3]:
+            beyond, taken = numerator - center * c.d, low_pass * c.d / c.q
+            z = wp.clamp(fma(taken, beyond, center), center - reach, center + reach)
+            by_record = wp.vec3(taken, 1.0 - taken * c.d, low_pass / c.q * (beyond - center * c.d))
+            by_dot = wp.vec2(-taken * beyond / c.q, beyond * c.d / c.q)
+        return z, by_record, by_dot
 
     @wp.func
     def back(
@@ -167,12 +182,12 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         weight = light * opacity
         color = wp.vec3(s.c[1], s.c[2], s.c[3])
         worth = wp.dot(loss.light, color)
-        z = wp.vec4()
+        z, by_record, by_dot_depth = float(0.0), wp.vec3(), wp.vec2()
         by_z = float(0.0)
         if wp.static(has_depth):
-            z = depth_at(lines, index, inverse_d)
+            z, by_record, by_dot_depth = depth_at(lines, index, s, c, inverse_d, on_plane, decides)
         if wp.static(depth):
-            worth += fma(loss.depth, z[0], loss.depth_weight)
+            worth += fma(loss.depth, z, loss.depth_weight)
             by_z += weight * loss.depth
         if wp.static(normal):
             facing = wp.vec3(
@@ -184,11 +199,11 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         if wp.static(distortion):
             # dL / dw = g (sum w m^2 + W m^2 - 2 m sum w m), dL / dm = 2 g w (W m - sum w m)
             spread = loss.spread
-            if z[0] > 0.0:
-                nearer = INVERSE_DEPTH / wp.max(z[0], SPREAD_NEAR) - spread[0]
+            if z > 0.0:
+                nearer = INVERSE_DEPTH / wp.max(z, SPREAD_NEAR) - spread[0]
                 worth += loss.distortion * fma(fma(spread[1], nearer, -2.0 * spread[2]), nearer, spread[3])
-            if z[0] > SPREAD_NEAR:
-                inverse_z = 1.0 / z[0]
+            if z > SPREAD_NEAR:
+                inverse_z = 1.0 / z
                 outward = fma(spread[1], fma(INVERSE_DEPTH, inverse_z, -spread[0]), -spread[2])
                 by_z -= 2.0 * INVERSE_DEPTH * weight * loss.distortion * outward * inverse_z * inverse_z
         gain = worth - loss.behind
@@ -205,15 +220,16 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             by_d = plane * half_rho
         m = Moments()
         if wp.static(has_depth):
-            by_met = z[1] * by_z * inverse_d
-            by_d -= by_met * z[0]
-            m[wp.static(at.get("z_numerator", 0))] = by_met
-            m[wp.static(at.get("z_center", 0))] = z[2] * by_z
-            m[wp.static(at.get("z_reach", 0))] = z[3] * by_z
+            m[wp.static(at.get("z_numerator", 0))] = by_z * by_record[0]
+            m[wp.static(at.get("z_center", 0))] = by_z * by_record[1]
+            by_d += by_z * by_record[2]
+            by_nu += 2.0 * by_z * by_dot_depth[0] * nu
+            by_nv += 2.0 * by_z * by_dot_depth[0] * nv
         if wp.static(screen):
             by_dot = 2.0 * view.per_pixel * by_log
             if on_plane:
                 by_dot = 0.0
+            by_dot -= 2.0 * view.per_pixel * by_z * by_dot_depth[1]
             m[wp.static(at.get("dot_x", 0))] = by_dot * (x - s.dot_x)
             m[wp.static(at.get("dot_y", 0))] = by_dot * (y - s.dot_y)
         if wp.static(normal):

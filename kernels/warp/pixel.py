@@ -155,9 +155,11 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         index = lists[place]
         inverse_d = 1.0 / c.d
         opacity = opacity_of(s, c, inverse_d, view)
-        z = float(0.0)
+        z, plane = float(0.0), int(-1)
+        if wp.static(layered):
+            plane = planes[index % view.splats]
         if wp.static(has_depth):
-            z = depth_of(lines, index, c, inverse_d)
+            z = depth_of(lines, index, s, c, inverse_d, plane >= 0)
         if wp.static(opaque):
             nearer = z
             if wp.static(layered):
@@ -169,7 +171,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
             p = pixel
             if not (opacity > 0.0):
                 return p  # of no optical depth: a mean over it would be 0 / 0
-            nearest, plane = nearest_of(lines, index), planes[index % view.splats]
+            nearest = nearest_of(lines, index)
             if plane != p.queue.open.plane:
                 p = waiting.close(p, nearest, lines, lists, view)
                 p.queue.open = layer.begun(plane, place, nearest)

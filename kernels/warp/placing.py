@@ -13,11 +13,11 @@ from .records import BOXES
 
 @cache
 def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
-    """pose, tangents, depth_reach, and the struct Moving of what moves by itself."""
+    """pose, tangents, depth_range, and the struct Moving of what moves by itself."""
     moves, waits, layers = (name in effects for name in ("motion_groups", "compose_pixel", "compose_planes"))
     boxes_too = any(name in effects for name in BOXES)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
-    one, two = real(1.0), real(2.0)
+    half, one, two = real(0.5), real(1.0), real(2.0)
     range_radius, plane_radius = real(math.sqrt(2.0 * math.log(255.0))), real(64.0)
     motion = make_motion(moves)
     Moving = motion.Moving
@@ -45,9 +45,10 @@ def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
         return tangent_u, tangent_v
 
     @wp.func
-    def depth_reach(reach: real, radius: real, plane: int, boxed: bool) -> real:
-        """Half of a splat's depths as blending bounds them. reach: of what is drawn; plane: -1 for none."""
-        found = reach
+    def depth_range(depth: real, reach: real, radius: real, near: real, plane: int, boxed: bool):
+        """Middle and half of the range of a splat's depths as blending bounds them. reach: of what is drawn;
+        plane: -1 for none."""
+        middle, found = depth, reach
         if wp.static(waits):
             # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same at
             # every cut-off
@@ -62,6 +63,10 @@ def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
                     if wp.static(layers):
                         if plane >= 0:
                             found = reach * plane_radius
-        return found
+        if depth < near:
+            # fragments lie beyond `near`
+            furthest = wp.max(near, depth + found)
+            middle, found = half * (furthest + near), half * (furthest - near)
+        return middle, found
 
-    return SimpleNamespace(Moving=Moving, pose=pose, tangents=tangents, depth_reach=depth_reach)
+    return SimpleNamespace(Moving=Moving, pose=pose, tangents=tangents, depth_range=depth_range)

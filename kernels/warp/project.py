@@ -279,15 +279,15 @@ def make_project(
         record[at_box] = as_bits(first_column, end_column)
         record[at_box + 1] = as_bits(row_first, row_end)
         if wp.static(has_depth):
-            record[at_depth + 1] = float(depth)
             plane = int(-1)
             if wp.static(layers):
                 plane = planes[i]
-            depth_reach = placing.depth_reach(reach, radius, plane, boxed)
+            middle, depth_reach = placing.depth_range(depth, reach, radius, near, plane, boxed)
+            record[at_depth + 1] = float(middle)
             record[at_depth + 2] = float(depth_reach)
         key = float(depth)
         if wp.static(waits):
-            key = float(depth) - float(depth_reach)  # as blending bounds depths
+            key = float(middle) - float(depth_reach)  # as blending bounds depths
             if wp.static(layers):
                 if planes[i] >= 0:
                     key = plane_keys[number * plane_count + planes[i]]

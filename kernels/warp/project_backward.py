@@ -72,7 +72,7 @@ def make_project_backward(
     each, fields = layout.lines, len(names)
     at = {name: place for place, name in enumerate(names)}
     Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
-    screen_filter, has_depth, normal = (name in at for name in ("dot_x", "z_reach", "nx"))
+    screen_filter, has_depth, normal = (name in at for name in ("dot_x", "z_center", "nx"))
     terms = max(sh_terms, 1)
     dot_x, z_numerator, nx = (at.get(name, 0) for name in ("dot_x", "z_numerator", "nx"))
 
@@ -186,14 +186,7 @@ def make_project_backward(
         down = wp.float64(view.height) * by_p[1] * per_y
         screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
         if wp.static(has_depth):
-            radius = wp.sqrt(_TWO * (wp.log(wp.float64(opacities[i])) - wp.float64(view.log_cut)))
-            steep = wp.sqrt(a[2] * a[2] + b[2] * b[2])
-            by_reach = total[z_numerator + 2]
             by_p[2] = by_p[2] + total[z_numerator + 1]
-            by_log += by_reach * steep / radius
-            if steep > _ZERO:
-                by_a[2] = by_a[2] + by_reach * radius * a[2] / steep
-                by_b[2] = by_b[2] + by_reach * radius * b[2] / steep
         by_su, by_sv = wp.dot(by_a, unit_a), wp.dot(by_b, unit_b)
         by_scales[i] = wp.vec2(
             wp.where(size[0] >= SMALLEST_SCALE, float(by_su), 0.0),

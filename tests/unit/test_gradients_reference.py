@@ -124,7 +124,8 @@ def test_every_decision_occurs():
     assert {*both.by_dot[both.drawn].tolist()} == {True, False}
     assert made["ceiling"].clamped[made["ceiling"].drawn].any()
     assert (made["edge-on"].missed & made["edge-on"].drawn).any()
-    assert ((made["edge-on"].beyond != 0) & made["edge-on"].drawn).any()
+    # depths between the centre's and the plane's
+    assert (both.by_dot & ~both.missed & both.drawn).any()
     assert not made["opaque"].drawn.all()
 
 

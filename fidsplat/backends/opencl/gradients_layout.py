@@ -135,7 +135,7 @@ LAYOUTS: dict[str, BackwardLayout] = {
     ),
     "stop_exclusive": BackwardLayout("slot/stop_exclusive_backward.cl"),
     "ray_depth": BackwardLayout(
-        "part/ray_depth_backward.cl", moments=(member("float z_numerator z_center z_reach"),)
+        "part/ray_depth_backward.cl", moments=(member("float z_numerator z_center"),)
     ),
     "alpha": BackwardLayout("output/alpha_backward.cl", blend_backward=takes("in float by_alpha  // (h, w)")),
     "depth": BackwardLayout(

@@ -68,9 +68,12 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
             least, most = s.inverse_m2 * q_low / d_high, s.inverse_m2 * q_high / d_low
             d_high = np.where(thick & (d_high > 0), d_high + np.where(ahead, most, np.inf), d_high)
             d_low = np.where(thick & ahead, d_low + least, d_low)
+            q_low = np.where(thick, 2 * nearest * np.maximum(d_low, 0) ** 2, q_low)
+            q_high = np.where(thick, 2 * furthest * d_high**2, q_high)
             weight = np.where(thick, 2 * _WEIGHT, _WEIGHT)  # twice the roundings
         may = (d_high > 0) & (d_low * view.near <= f.dz + e_dz)
         must = (d_low > 0) & (d_high * view.near <= f.dz - e_dz)
+        plane = nearest, furthest
         nearest = np.where(may & (nearest <= s.half_r2 + slack), nearest, np.inf)
         furthest = np.where(must & (furthest <= s.half_r2 - slack), furthest, np.inf)
         near_dz, far_dz = (f.dz, f.dz) if s.depth_forms is None else (f.dz - e_dz, f.dz + e_dz)
@@ -98,17 +101,45 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         most = whole * cover(f.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
         low = np.where(s.box, np.where(must, least, 0.0), low)
         high = np.where(s.box, np.where(may, most, 0.0), high)
-    # no ray to the plane: the centre's depth
-    z_low = np.where(d_low > 0, np.clip(z_low, s.pz - s.reach, s.pz + s.reach), s.pz - s.reach)
-    z_high = np.clip(z_high, s.pz - s.reach, s.pz + s.reach)
-    missed = d_high <= 0
-    z_low, z_high = np.where(missed, s.pz, z_low), np.where(missed, s.pz, z_high)
-    # the ends of the disk's depth range are a sum and a difference of float32; of one that faces the camera
+    z_low = np.where(d_low > 0, z_low, -np.inf)
+    if s.screen:
+        # in the dot; where rounding decides whether that is the larger weight, both, which are the same there
+        in_dot = _of_dot_depth(s, f, (d_low, d_high), (q_low, q_high), (near_dz, far_dz), (dot_low, dot_high))
+        may_plane = s.printed | (plane[0] * (1 - weight) <= dot_high * (1 + weight))
+        may_dot = ~s.printed & (~must | (plane[1] * (1 + weight) >= dot_low * (1 - weight)))
+        z_low = np.minimum(np.where(may_plane, z_low, np.inf), np.where(may_dot, in_dot[0], np.inf))
+        z_high = np.maximum(np.where(may_plane, z_high, -np.inf), np.where(may_dot, in_dot[1], -np.inf))
+    z_low, z_high = np.clip(z_low, s.z_low, s.z_high), np.clip(z_high, s.z_low, s.z_high)
+    # no ray to the plane beyond `near`: the centre's depth, of dots
+    missed = ~must & s.dot
+    z_low = np.where(missed, np.where(may, np.minimum(z_low, s.pz), s.pz), z_low)
+    z_high = np.where(missed, np.where(may, np.maximum(z_high, s.pz), s.pz), z_high)
+    # the ends of the depth range are a sum and a difference of float32; of a disk that faces the camera
     # exactly they are its one depth
-    off = np.where(s.reach > 0, 2.0**-23 * (np.abs(s.pz) + s.reach), 0.0)
-    z_low = np.where(z_low <= s.pz - s.reach, z_low - off, z_low)
-    z_high = np.where(z_high >= s.pz + s.reach, z_high + off, z_high)
+    off = np.where(s.z_high > s.z_low, 2.0**-23 * (np.abs(s.z_low) + np.abs(s.z_high)), 0.0)
+    z_low = np.where(z_low <= s.z_low, z_low - off, z_low)
+    z_high = np.where(z_high >= s.z_high, z_high + off, z_high)
     return Span.of(low, high, z_low, z_high)
+
+
+_Pair = tuple[np.ndarray, np.ndarray]
+"""least and most, (k, n) or (n,)"""
+
+
+def _of_dot_depth(s: Setup, f: Fragments, d: _Pair, q: _Pair, dz: _Pair, dot: _Pair) -> _Pair:
+    """Between which depths (k, n) fragments in the dot of a low-pass may lie, pz + dot (dz - pz d) 2 d / q,
+    with each factor between its least and most."""
+    d = np.maximum(d[0], 0.0), np.maximum(d[1], 0.0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        beyond = dz[0] - np.maximum(s.pz * d[0], s.pz * d[1]), dz[1] - np.minimum(s.pz * d[0], s.pz * d[1])
+        least, most = 2 * dot[0] * d[0] / q[1], 2 * dot[1] * d[1] / q[0]
+        low = s.pz + np.where(beyond[0] < 0, beyond[0] * most, beyond[0] * least)
+        high = s.pz + np.where(beyond[1] > 0, beyond[1] * most, beyond[1] * least)
+    off = 2 * _ROUND * np.abs(s.pz)  # of a difference that is multiplied by a share
+    return (
+        np.where(np.isfinite(f.offset) & ~np.isnan(low), low - off, -np.inf),
+        np.where(np.isfinite(f.offset) & ~np.isnan(high), high + off, np.inf),
+    )
 
 
 def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:

@@ -55,6 +55,10 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         half_rho = np.where(inside, q / (2 * drawn_d * drawn_d), np.inf)
         z = dz / drawn_d
+        if s.screen:
+            # in the dot, from the depth on the plane to the centre's
+            in_dot = s.pz + offset * (dz - s.pz * drawn_d) * (2 * drawn_d / q)
+            z = np.where((half_rho <= offset) | s.printed, z, in_dot)
     if s.screen:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
@@ -62,7 +66,8 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
         visible = (d > 0) & (d * view.near <= dz)
         whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
         alpha = np.where(s.box, np.where(visible, whole * cover(edges, n_u, n_v, d, 0.0), 0.0), alpha)
-    z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
+    met = (drawn_d > 0) & (drawn_d * view.near <= dz)
+    z = np.where(met, np.clip(z, s.z_low, s.z_high), s.pz)
     dx, dy, away = np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), away_of(view, samples, s.anchors)
     return Fragments(dx, dy, away, n_u, n_v, d, dz, offset, alpha, z, edges, edge_terms)
 

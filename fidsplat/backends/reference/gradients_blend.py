@@ -32,9 +32,7 @@ class Decisions:
     clamped: np.ndarray
     """at the ceiling of opacities"""
     missed: np.ndarray
-    """the ray does not meet the plane in front: the depth is the centre's"""
-    beyond: np.ndarray
-    """int: the depth is the nearest of the disk's (-1), the furthest (1), or where the ray meets it (0)"""
+    """the ray does not meet the plane beyond `near`: the depth is the centre's"""
     shown: np.ndarray
     """(k,): enough is covered for depths and normals"""
 
@@ -47,15 +45,13 @@ def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
     inside = (q <= 2 * s.half_r2 * f.d**2) & (f.d > 0) & (f.d * view.near <= f.dz)
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = np.where(inside, q / (2 * f.d**2), np.inf)
-        z = np.where(f.d > 0, f.dz / f.d, s.pz)
     dot = np.where(f.offset <= s.half_r2, f.offset, np.inf) if s.screen else np.full_like(plane, np.inf)
     return Decisions(
         order=s.order,
         drawn=live & (f.alpha > 0),
         by_dot=dot < plane,
         clamped=s.log_opacity - np.minimum(plane, dot) > np.log(view.ceiling),
-        missed=f.d <= 0,
-        beyond=(z > s.pz + s.reach).astype(int) - (z < s.pz - s.reach),
+        missed=(f.d <= 0) | (f.d * view.near > f.dz),
         shown=1 - final >= LEAST_ALPHA,
     )
 
@@ -102,11 +98,13 @@ class Blend:
             pz = self._p[:, 2]
             self._dot_x = x[:, None] - (view.focal_x * self._p[:, 0] / pz + view.center_x)
             self._dot_y = y[:, None] - (view.focal_y * self._p[:, 1] / pz + view.center_y)
-            half_rho = np.where(made.by_dot, self._dot_x**2 + self._dot_y**2, (self._u**2 + self._v**2) / 2)
+            dot, plane = self._dot_x**2 + self._dot_y**2, (self._u**2 + self._v**2) / 2
+            half_rho = np.where(made.by_dot, dot, plane)
+            # in the dot, of the way from the centre's depth to that on the plane
+            self._share = np.where(made.by_dot, dot / plane, 1.0)
+            self._plane = plane
+            z = pz + self._share * (self._z_plane - pz)
             opacity = np.where(made.clamped, view.ceiling, np.exp(log_opacity - half_rho))
-            self._radius = np.sqrt(2 * np.maximum(log_opacity - view.log_cut, 0))
-        self._steep = np.hypot(self._su * self._unit_a[:, 2], self._sv * self._unit_b[:, 2])
-        z = np.where(made.beyond == 0, self._z_plane, pz + made.beyond * self._radius * self._steep)
         self._z = np.where(made.drawn, np.where(made.missed, pz, z), 0.0)
         self._inverse = np.where(made.drawn, inverse_depth(self._z), 0.0)
         self._alpha = np.where(made.drawn, opacity, 0.0)
@@ -137,14 +135,18 @@ class Blend:
         by_alpha = np.where(made.drawn, self._by_opacity(by, facing), 0.0)
         by_log = np.where(made.clamped, 0.0, by_alpha * self._alpha)
 
-        on_plane = made.drawn & ~made.by_dot
+        met = made.drawn & ~made.missed
+        in_dot, on_plane = made.drawn & made.by_dot, made.drawn & ~made.by_dot
+        share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            by_u = np.where(on_plane, -by_log * self._u / self._su, 0.0)
-            by_v = np.where(on_plane, -by_log * self._v / self._sv, 0.0)
-            met = made.drawn & ~made.missed & (made.beyond == 0)
+            by_share = np.where(in_dot & met, by_z * (self._z_plane - self._p[:, 2]), 0.0)
+            by_plane = np.where(in_dot, -by_share * share / self._plane, -by_log)  # by rho / 2 on the plane
+            by_u = np.where(on_plane | met, by_plane * self._u / self._su, 0.0)
+            by_v = np.where(on_plane | met, by_plane * self._v / self._sv, 0.0)
+            by_dot = np.where(in_dot, by_log - np.where(met, by_share / self._plane, 0.0), 0.0)
             off = np.where((on_plane | met)[..., None], self._off, 0.0)
             by_off = by_u[..., None] * self._unit_a + by_v[..., None] * self._unit_b
-            by_plane_z = (by_off * self._rays).sum(2) + np.where(met, by_z, 0.0)
+            by_plane_z = (by_off * self._rays).sum(2) + by_z * share
             by_plane_z = np.where(on_plane | met, by_plane_z / self._slant, 0.0)
         by_normal = -(by_plane_z[..., None] * off).sum(0) + self._towards * (self._weight.T @ by.normal)
         by_a = np.einsum("kn,knc->nc", by_u, off) + np.cross(self._unit_b, by_normal)
@@ -152,9 +154,8 @@ class Blend:
         by_p = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
 
         # the dot, at the centre's image
-        dot = np.where(made.drawn & made.by_dot, 2 * by_log, 0.0)
-        by_x = (dot * np.where(made.by_dot, self._dot_x, 0.0)).sum(0)
-        by_y = (dot * np.where(made.by_dot, self._dot_y, 0.0)).sum(0)
+        by_x = 2 * (by_dot * np.where(made.by_dot, self._dot_x, 0.0)).sum(0)
+        by_y = 2 * (by_dot * np.where(made.by_dot, self._dot_y, 0.0)).sum(0)
         x, y, z = self._p.T
         by_p += np.stack(
             [
@@ -164,22 +165,15 @@ class Blend:
             ],
             1,
         )
-        # depths that are the centre's, or an end of the disk's range
-        by_p[:, 2] += np.where(made.missed | (made.beyond != 0), by_z, 0.0).sum(0)
-        by_reach = np.where(made.missed, 0, made.beyond * by_z).sum(0)
-        steep = np.where(self._steep > 0, self._steep, np.inf)
-        along_a = by_reach * self._radius * self._su * self._unit_a[:, 2] / steep
-        along_b = by_reach * self._radius * self._sv * self._unit_b[:, 2] / steep
-        by_a[:, 2] += along_a * self._su
-        by_b[:, 2] += along_b * self._sv
+        by_p[:, 2] += (by_z * (1 - share)).sum(0)
 
         out, order = Placed.zeros(len(self._placed.p)), made.order
         out.unit_a[order], out.unit_b[order], out.p[order] = by_a, by_b, by_p
         with np.errstate(invalid="ignore"):
-            by_su = -np.where(on_plane, by_u * self._u, 0.0).sum(0) + along_a * self._unit_a[:, 2]
-            by_sv = -np.where(on_plane, by_v * self._v, 0.0).sum(0) + along_b * self._unit_b[:, 2]
+            by_su = -np.where(on_plane | met, by_u * self._u, 0.0).sum(0)
+            by_sv = -np.where(on_plane | met, by_v * self._v, 0.0).sum(0)
         out.scales[order] = np.stack([by_su, by_sv], 1)
-        out.log_opacity[order] = by_log.sum(0) + by_reach * self._steep / self._radius
+        out.log_opacity[order] = by_log.sum(0)
         out.rgb[order] = self._weight.T @ by.rgb
         return out
 

@@ -73,7 +73,11 @@ class Setup:
                     1 if cloud.planes is None else np.where(cloud.planes[box] >= 0, _PLANE_RADIUS, 1)
                 )
                 reach = reach * further
-            self.key = self.key - reach.astype(np.float32)
+        z_low, z_high = depth - reach, depth + reach
+        behind = depth < view.near  # fragments lie beyond `near`
+        z_low, z_high = np.where(behind, view.near, z_low), np.where(behind, np.maximum(view.near, z_high), z_high)
+        if self.by_depth:
+            self.key = z_low.astype(np.float32)
         if "compose_planes" in features.slots:
             table = PlaneTable(cloud)
             planes = table.index
@@ -88,7 +92,9 @@ class Setup:
         self.inverse_m2 = shape.inverse_m2[order]
         """above 0 for 3D Gaussians that are drawn exactly"""
         a, b, p, area = a[order], b[order], p[order], area[order]
-        self.log_opacity, self.half_r2, self.reach = log_opacity[order], half_r2[order], reach[order]
+        self.log_opacity, self.half_r2 = log_opacity[order], half_r2[order]
+        self.z_low, self.z_high = z_low[order], z_high[order]
+        """between which the depths of fragments lie"""
         self.labels = cloud.labels[order]
         self.pz = depth[order]
         # the plane's height above the camera's centre decides its side, and whether it is edge-on
@@ -120,6 +126,7 @@ class Setup:
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]
+        self.printed = np.zeros(len(order), bool) if self.planes is None else self.planes >= 0
         self.nearest = nearest[order]
         """depth before which none of a printed plane lies; -inf for splats of none"""
 
@@ -148,9 +155,9 @@ _PLANE_RADIUS = 64.0
 be drawn, so that those that a cut-off leaves out move no layer; of boxes half sides, so that those that are a
 small part of a pixel move none"""
 _OF_SPLATS = (
-    *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator"),
+    *("order", "log_opacity", "half_r2", "z_low", "z_high", "labels", "pz", "z_numerator"),
     *("inverse_m2", "turned"),
-    *("box", "dot", "center_x", "center_y", "anchor_x", "anchor_y", "colors", "normal", "nearest"),
+    *("box", "dot", "center_x", "center_y", "anchor_x", "anchor_y", "colors", "normal", "nearest", "printed"),
 )
 """arrays (n, ...) of a Setup"""
 _OF_COORDINATES = ("forms", "anchors")

@@ -10,4 +10,4 @@
 //@ worth
     worth += FMA(loss->depth, g->z, loss->depth_weight);
 //@ fragment_backward
-    by_d += add_depth(sums, s, g, weight * loss->depth);
+    by_d += add_depth(sums, s, g, weight * loss->depth, screen, x, y, &by_nu, &by_nv);

@@ -18,4 +18,4 @@
 //@ fragment_backward
     vfloat inverse_z = 1.0f / VSELECT((vfloat)INFINITY, g->z, VMASK(g->z > SPREAD_NEAR));
     vfloat outward = FMA(loss->spread_weight, FMA((vfloat)INVERSE_DEPTH, inverse_z, -loss->spread_first), -loss->spread_sum);
-    by_d += add_depth(sums, s, g, -2.0f * INVERSE_DEPTH * weight * loss->distortion * outward * inverse_z * inverse_z);
+    by_d += add_depth(sums, s, g, -2.0f * INVERSE_DEPTH * weight * loss->distortion * outward * inverse_z * inverse_z, screen, x, y, &by_nu, &by_nv);

@@ -1,18 +1,31 @@
-// Depth along z of a fragment, for those that need it: the ray's meeting with the splat's plane, within the
-// depth range of the R-sigma disk; in the low-pass dot of a splat whose plane the ray misses, the centre's depth
-// (numerics B2, B4).
+// Depth along z of a fragment, for those that need it: where the ray meets the splat's plane, within the depth range of the part that can
+// be visible; the centre's where the ray meets no plane beyond `near` (numerics B2, B4). slot/lowpass_screen.cl has that of its dots.
+//@ crossing
+//@@ dot_crossing
+//@ mask
+//@@ dot_mask
 //@ project
-    record.z_numerator = (wide)z_numerator;
-    record.z_center = (wide)pz;
-    record.z_reach = (wide)reach;
+    real depth_center = pz, depth_reach = reach;
 //@@ depth_reach
+    if (pz < near) {                // fragments lie beyond `near`
+        real furthest = fmax(near, pz + depth_reach);
+        depth_center = REAL(0.5) * (furthest + near);
+        depth_reach = REAL(0.5) * (furthest - near);
+    }
+    record.z_numerator = (wide)z_numerator;
+    record.z_center = (wide)depth_center;
+    record.z_reach = (wide)depth_reach;
+//@@ depth_nearest
 //@ seen
     vfloat z;
 //@ see
+    vfloat depth_d = s->z_numerator;        // depth times D
+//@@ camera_see_depth
+    vfloat depth = depth_d * inverse_d;
+    vint met = VMASK(c.d > 0.0f);
+//@@ dot_see_depth
     seen.z = VSELECT((vfloat)s->z_center,
-                     VMIN(VMAX(s->z_numerator * inverse_d, (vfloat)s->z_center - (vfloat)s->z_reach),
-                          (vfloat)s->z_center + (vfloat)s->z_reach),
-                     VMASK(c.d > 0.0f));
-//@@ see_depth
+                     VMIN(VMAX(depth, (vfloat)s->z_center - (vfloat)s->z_reach), (vfloat)s->z_center + (vfloat)s->z_reach), met);
+//@@ plane_see_depth
 //@ gather
     layer->mean.z = FMA(share, seen->z - layer->mean.z, layer->mean.z);

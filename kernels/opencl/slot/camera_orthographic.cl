@@ -35,10 +35,10 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
 //@ cross
     c.z = FMA((vfloat)s.zy, (vfloat)y, FMA((vfloat)s.zx, x, (vfloat)s.z0));
     c.inside &= VMASK(c.z >= s.z_near * c.d);
-//@ see_depth
-    seen.z = VSELECT((vfloat)s->z_center,
-                     clamp(c.z * inverse_d, (vfloat)(s->z_center - s->z_reach), (vfloat)(s->z_center + s->z_reach)),
-                     VMASK(c.d > 0.0f));
+//@ camera_see_depth
+    depth_d = c.z;
+//@ camera_dot_depth
+        beyond_near = VMASK(c.z >= s->z_near * c.d);
 //@ camera_derivative
         gx.x = view->focal_x * a.x; gx.y = view->focal_x * b.x;
         gy.x = view->focal_y * a.y; gy.y = view->focal_y * b.y;

@@ -12,12 +12,12 @@
 #ifndef BOX_HERE
 #define BOX_HERE false
 #endif
-//@ project
-    real depth_reach = BOX_HERE ? reach : reach * (RANGE_RADIUS / radius);
-    record.nearest = (wide)convert_float_rtn((wide)pz - (wide)depth_reach);
-//@@ plane_nearest
 //@ depth_reach
-    record.z_reach = (wide)depth_reach;
+    depth_reach = BOX_HERE ? reach : reach * (RANGE_RADIUS / radius);
+//@@ plane_depth_reach
+//@ depth_nearest
+    record.nearest = (wide)convert_float_rtn(record.z_center - record.z_reach);
+//@@ plane_nearest
 //@ key
     key = (float)record.nearest;
 //@ state

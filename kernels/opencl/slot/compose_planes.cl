@@ -9,13 +9,12 @@
     record.plane = planes[i];
 //@ functions
 #define PLANE_RADIUS REAL(64.0)       // standard deviations; of boxes half sides
+//@ plane_depth_reach
+    // its fragments lie on the plane as far out as any cut-off and a low-pass let them be drawn: so those that a cut-off leaves
+    // out move no layer, nor do boxes that are a small part of a pixel
+    if (planes[i] >= 0) depth_reach = reach * (BOX_HERE ? PLANE_RADIUS : PLANE_RADIUS / radius);
 //@ plane_nearest
-    if (planes[i] >= 0) {
-        record.nearest = (wide)plane_keys[planes[i] * get_global_size(1) + number];
-        // its fragments lie on the plane as far out as any cut-off and a low-pass let them be drawn: so those that a cut-off leaves
-        // out move no layer, nor do boxes that are a small part of a pixel
-        depth_reach = reach * (BOX_HERE ? PLANE_RADIUS : PLANE_RADIUS / radius);
-    }
+    if (planes[i] >= 0) record.nearest = (wide)plane_keys[planes[i] * get_global_size(1) + number];
 //@ plane_blocks_nearest
         if (s->plane >= 0) least = s->nearest;      // a plane's stand together, in each block
 //@ plane_ahead
@@ -34,7 +33,9 @@
             if (before > 0 && !reads) count_early += length - before;
             if (before > 0) length = before;
         }
-//@ see_depth
+//@ plane_dot_depth
+        if (s->plane >= 0) on_plane = -1;           // in the dot too
+//@ plane_see_depth
     seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types
 #define LAYER 0x80000000u       // among indices of splats: none, but a layer

@@ -39,6 +39,23 @@
             vfloat dot_y = fmax(fabs(y - s->dot_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
             away &= VMASK(FMA(dot_x, dot_x, dot_y * dot_y) * filter > half_r2);
         }
+// In the dot a fragment's depth goes from that of the ray's meeting with the plane to the centre's, as rho of the dot goes to 0 beside that
+// of the plane: z = z_center + (z_plane - z_center) rho_dot / rho_plane, at most sqrt(rho_dot) standard deviations from the centre. So it is
+// continuous where the dot takes over, and where the ray passes the plane's horizon; no cut-off has a say (docs/order.md).
+//@ dot_crossing
+    vfloat screen;              // rho / 2 of the dot
+//@ dot_mask
+            c.screen = screen;
+//@ dot_see_depth
+    if (HAS_DOT(s)) {
+        vint on_plane = c.inside & VMASK((c.q * inverse_d) * inverse_d <= c.screen), beyond_near = VMASK(c.d <= s->d_near);
+//@@ camera_dot_depth
+//@@ plane_dot_depth
+        met &= beyond_near;
+        depth = VSELECT(FMA(c.screen * (depth_d - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center), depth, on_plane);
+    }
+//@ dot_blocks_nearest
+        if (HAS_DOT(s)) depth = fmin(depth, (vfloat)((1.0f - BLOCKS_SLACK) * s->z_center));
 //@ fragment_mask
 // Vectors of pixels pass over a dot that is far away; to single pixels the question costs what it saves.
 #if LANES > 1
