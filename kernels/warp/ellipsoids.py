@@ -14,7 +14,7 @@ EWA = ("ellipsoid_ewa", "ellipsoid_ewa_antialiased")
 
 @cache
 def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
-    """disk(tangent_u, tangent_v, sizes, p, view) that has the picture of a 3D Gaussian; rim, of the disk that
+    """disk(tangent_u, tangent_v, sizes, p, view) that has the picture of a 3D Gaussian; its surface's normal; rim, of the disk that
     bounds it; reach of the ellipsoid; clipped bounds where it crosses the camera's plane.
     """
     vec3 = wp.types.vector(3, real)
@@ -117,6 +117,19 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
         return a, b, third, inverse_m2, spanned, share
 
     @wp.func
+    def surface(tangent_u: vec3, tangent_v: vec3, sizes: vec3, p: vec3) -> vec3:
+        """Unit normal of the surface of the largest values along rays, at the centre, away from the camera:
+        the inverse covariance times the ray, in units of the least axis."""
+        towards = p
+        if wp.static(parallel):
+            towards = vec3(zero, zero, one)
+        least = wp.min(sizes[0], wp.min(sizes[1], sizes[2]))
+        u, v, w = least / sizes[0], least / sizes[1], least / sizes[2]
+        tangent_w = wp.cross(tangent_u, tangent_v)
+        across = tangent_u * (u * u * wp.dot(tangent_u, towards)) + tangent_v * (v * v * wp.dot(tangent_v, towards))
+        return wp.normalize(across + tangent_w * (w * w * wp.dot(tangent_w, towards)))
+
+    @wp.func
     def rim(radius: real, inverse_m2: real) -> real:
         """Radius of the disk that the cone around the ellipsoid touches; large from within, where all rays
         ahead may see it."""
@@ -155,4 +168,4 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
             wp.min(box.y + box.half_y, float(fy * (middle_y + reach_y) + cy)),
         )
 
-    return SimpleNamespace(disk=disk, rim=rim, reach=reach, clipped=clipped)
+    return SimpleNamespace(disk=disk, surface=surface, rim=rim, reach=reach, clipped=clipped)

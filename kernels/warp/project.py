@@ -52,6 +52,7 @@ def make_project(
     of_box, disk = make_boxes(real), make_disk(real)
     exact, drawn_ewa = EXACT in effects, any(name in effects for name in EWA)
     thick_too = exact or drawn_ewa
+    surfaced = drawn_ewa and len(projects) > 0
     ellipsoid = make_ellipsoids(effects, real)
     limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
     placing = make_placing(effects, real)
@@ -143,12 +144,15 @@ def make_project(
         if wp.static(boxes_too):
             itself = boxed
         third = vec3()  # half axis of an ellipsoid that is conjugate to a and b
+        outward = vec3()  # its normal, where it is drawn by a disk that has another
         inverse_m2 = zero
         thick = bool(False)
         if wp.static(thick_too):
             thick = thickness[i] > 0.0
             if thick:
                 sizes = vec3(su, sv, real(wp.max(thickness[i], SMALLEST_SCALE)))
+                if wp.static(surfaced):
+                    outward = ellipsoid.surface(tangent_u, tangent_v, sizes, p)
                 a, b, third, inverse_m2, spanned, share = ellipsoid.disk(tangent_u, tangent_v, sizes, p, view)
                 log_opacity += float(wp.log(share))
                 half_r2 = log_opacity - view.log_cut
@@ -292,6 +296,9 @@ def make_project(
                 if planes[i] >= 0:
                     key = plane_keys[number * plane_count + planes[i]]
             record[at_nearest] = key
+        if wp.static(surfaced):
+            if thick:
+                normal = outward
         for k in range(wp.static(len(projects))):
             record = wp.static(projects[k])(record, wp.static(places[k]), normal, height)
         for line in range(wp.static(lines_each)):

@@ -27,6 +27,8 @@ class Axes:
     b: np.ndarray
     normal: np.ndarray
     """unit"""
+    surface: np.ndarray
+    """unit normal (n, 3) of what is seen, which is that of the disk but for `ewa`"""
     area: np.ndarray
     """|a x b|"""
     third: np.ndarray
@@ -44,7 +46,7 @@ def disks(unit_a: np.ndarray, unit_b: np.ndarray, scale: np.ndarray) -> Axes:
     """Of disks with unit tangents (n, 3) and standard deviations (n, 2)."""
     n, area = len(scale), scale.prod(axis=1)
     a, b, normal = unit_a * scale[:, :1], unit_b * scale[:, 1:], np.cross(unit_a, unit_b)
-    return Axes(a, b, normal, area, np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros(n))
+    return Axes(a, b, normal, normal.copy(), area, np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros(n))
 
 
 def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Axes:
@@ -60,14 +62,21 @@ def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Ax
         e2 = np.where((length > 0)[:, None], e2 / length[:, None], np.roll(e3, 1, axis=1))
         e1 = np.cross(e2, e3)
         a, b = (np.einsum("nk,nkc->nc", e * scales, axes) for e in (e1, e2))
-        normal = np.einsum("nk,nkc->nc", white / scales * scales.min(axis=1)[:, None] ** 2, axes)
-        length = np.linalg.norm(normal, axis=1)
-        turned = _ROUND * np.linalg.norm(towards, axis=1) / length
-        normal /= length[:, None]
+        normal, turned = _surface_normals(axes, scales, towards)
         area = scales.prod(axis=1) * m / np.einsum("nc,nc->n", normal, towards)
         none = np.zeros(len(p))
         inverse_m2 = none if view.parallel else 1 / m**2
-        return Axes(a, b, normal, area, towards / m[:, None], inverse_m2, none, turned)
+        return Axes(a, b, normal, normal, area, towards / m[:, None], inverse_m2, none, turned)
+
+
+def _surface_normals(axes: np.ndarray, scales: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals (n, 3) of the surfaces of the largest values along rays, at the centres: along the inverse
+    covariance times the ray, as RaDe-GS and GOF have it. And by how much rounding may turn them."""
+    shares = (scales.min(axis=1)[:, None] / scales) ** 2
+    normal = np.einsum("nk,nkc->nc", np.einsum("nkc,nc->nk", axes, towards) * shares, axes)
+    length = np.linalg.norm(normal, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return normal / length[:, None], _ROUND * np.linalg.norm(towards, axis=1) / length
 
 
 def ewa(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View, antialiased: bool) -> Axes:
@@ -93,4 +102,6 @@ def ewa(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View, antiali
     normal = np.stack([none, none, one], 1)
     with np.errstate(divide="ignore"):
         faint = 0.5 * np.log(before / after) if antialiased else none
-    return Axes(a, b, normal, a[:, 0] * b[:, 1], np.zeros_like(a), none, faint, none)
+    towards = np.broadcast_to([0.0, 0.0, 1.0], p.shape) if view.parallel else p
+    surface, turned = _surface_normals(axes, scales, towards)
+    return Axes(a, b, normal, surface, a[:, 0] * b[:, 1], np.zeros_like(a), none, faint, turned)

@@ -122,7 +122,7 @@ class Setup:
         self.round = optics.ROUND if view.raster is None else optics.ROUND_OF_RAYS
         """of a form in float32, relative to its terms"""
         self.colors = _colors(cloud, order, outward[order])
-        self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
+        self.normal = shape.surface[order] * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]

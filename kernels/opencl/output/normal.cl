@@ -1,6 +1,7 @@
 // normal (h, w, 3): unit normal in the camera frame, towards the camera, of the mean of the splats' normals by weight; 0 where
 // less than 1/255 is covered.
 //@ project
+//@@ ellipsoid_normal
     // the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
     real towards = offset > 0 ? -1 : 1;
     record.nx = (wide)(facet.x * towards);

@@ -22,6 +22,24 @@
         su = a.x;
         sv = b.y;
     }
+//@ ellipsoid_normal
+    if (THICK_HERE) {
+        // The inverse covariance times the direction of the rays at the centre, as ellipsoid_exact.cl has it: the normal of the surface of
+        // the largest values along rays. In units of the least axis, so that nothing overflows.
+        real3_ first = rotate_to_camera(view, tangent_u), second = rotate_to_camera(view, tangent_v), towards = p;
+        bool parallel = false;
+//@@ camera_ellipsoid
+        real3_ axes[3] = {first, second, cross3(first, second)};
+        const real lengths[3] = {fmax(scale_uv.x, SMALLEST_SCALE), fmax(scale_uv.y, SMALLEST_SCALE), THICKNESS_HERE};
+        real least = fmin(fmin(lengths[0], lengths[1]), lengths[2]);
+        real3_ outward = {0, 0, 0};
+        for (int k = 0; k < 3; k++) {
+            real share = least / lengths[k], along = dot3(axes[k], towards) * share * share;
+            outward.x += along * axes[k].x; outward.y += along * axes[k].y; outward.z += along * axes[k].z;
+        }
+        real length = sqrt(dot3(outward, outward));
+        facet.x = outward.x / length; facet.y = outward.y / length; facet.z = outward.z / length;
+    }
 //@ camera_derivative
         if (THICK_HERE) filtered = false;   // it has a low-pass of its own
 //@ camera_steepest
