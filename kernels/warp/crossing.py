@@ -1,5 +1,6 @@
 """Where the ray of a sample meets a splat: how opaque the splat is there, and how far away."""
 
+import math
 from functools import cache
 from types import SimpleNamespace
 
@@ -12,6 +13,9 @@ from .fast import fast_exp
 from .rays import SLOPES
 from .records import BOXES, Layout
 from .splat import make_splat
+
+HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
+"""where a splat is 1/255 of its opacity"""
 
 
 @cache
@@ -141,8 +145,9 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
         lines: wp.array(dtype=wp.vec4), index: int, s: Splat, c: Crossing, inverse_d: float, printed: bool
     ) -> float:
         """Depth of ray and plane within the splat's own range; the centre's where the ray meets no plane
-        beyond `near` (numerics B2, B4). In the dot of the low-pass it goes from the plane's to the centre's,
-        as rho of the dot goes to 0 beside that of the plane, unless the splat is `printed` on a plane.
+        beyond `near` (numerics B2, B4). What lies outside of the circle with the dot's rho, at least
+        2 ln 255, is mirrored at that circle, unless the splat is `printed` on a plane: the way from the
+        centre's depth is multiplied by the ratio of their rho.
         """
         at = index * each
         center = line_of(lines, at + zc_line)[zc_lane]
@@ -158,11 +163,11 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
             beyond_near = c.d <= s.v[3]
         depth = depth_d * inverse_d
         if wp.static(screen):
-            if not (c.inside and c.q * inverse_d * inverse_d <= c.screen):
-                if not beyond_near:
-                    return center
-                if not printed:
-                    depth = fma(c.screen * (depth_d - center * c.d), c.d / c.q, center)
+            if not beyond_near:
+                return center
+            circle = wp.max(c.screen, HALF_RHO_OF_RANGE)
+            if not (printed or c.q * inverse_d * inverse_d <= circle):
+                depth = fma(circle * (depth_d - center * c.d), c.d / c.q, center)
         return wp.clamp(depth, center - reach, center + reach)
 
     return SimpleNamespace(

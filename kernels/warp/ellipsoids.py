@@ -14,8 +14,9 @@ EWA = ("ellipsoid_ewa", "ellipsoid_ewa_antialiased")
 
 @cache
 def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
-    """disk(tangent_u, tangent_v, sizes, p, view) that has the picture of a 3D Gaussian; its surface's normal; rim, of the disk that
-    bounds it; reach of the ellipsoid; clipped bounds where it crosses the camera's plane.
+    """disk(tangent_u, tangent_v, sizes, p, view) that has the picture of a 3D Gaussian; surface, its normal;
+    rim, of the disk that bounds it; reach of the ellipsoid; clipped bounds where it crosses the camera's
+    plane.
     """
     vec3 = wp.types.vector(3, real)
     zero, half, one = real(0.0), real(0.5), real(1.0)
@@ -126,7 +127,9 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
         least = wp.min(sizes[0], wp.min(sizes[1], sizes[2]))
         u, v, w = least / sizes[0], least / sizes[1], least / sizes[2]
         tangent_w = wp.cross(tangent_u, tangent_v)
-        across = tangent_u * (u * u * wp.dot(tangent_u, towards)) + tangent_v * (v * v * wp.dot(tangent_v, towards))
+        across = tangent_u * (u * u * wp.dot(tangent_u, towards)) + tangent_v * (
+            v * v * wp.dot(tangent_v, towards)
+        )
         return wp.normalize(across + tangent_w * (w * w * wp.dot(tangent_w, towards)))
 
     @wp.func

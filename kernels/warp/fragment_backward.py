@@ -13,7 +13,7 @@ import warp as wp
 
 from .buffers import make_samples, sample_fields
 from .common import View, fma, line_of, of_bits, struct_of
-from .crossing import make_crossing
+from .crossing import HALF_RHO_OF_RANGE, make_crossing
 from .output.distortion import INVERSE_DEPTH, SPREAD_NEAR
 from .records import Layout
 from .splat import make_splat
@@ -126,27 +126,28 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         s: Splat,
         c: Crossing,
         inverse_d: float,
-        on_plane: bool,
         low_pass: float,
     ):
         """Depth of a fragment, and its derivatives by z_numerator, z_center, D; by q and by the low-pass's
-        half rho `low_pass`, of which the depth z_center + low_pass (z_numerator - z_center D) D / q of a dot
-        is made. It leaves the splat's range by rounding alone, and then has the centre's derivatives."""
+        half rho `low_pass`, which may be the circle that z_center + circle (z_numerator - z_center D) D / q
+        is mirrored at. It leaves the splat's range by rounding alone, and then has the centre's."""
         place = index * each
         center = line_of(lines, place + zc_line)[zc_lane]
         reach = line_of(lines, place + zr_line)[zr_lane]
         numerator = line_of(lines, place + z_line)[z_lane]
         z, by_record, by_dot = center, wp.vec3(0.0, 1.0, 0.0), wp.vec2()
-        if on_plane:
+        ahead = c.d > 0.0 and c.d <= s.v[3]
+        circle = wp.max(low_pass, HALF_RHO_OF_RANGE)
+        if ahead and c.q * inverse_d * inverse_d <= circle:
             met = numerator * inverse_d
             z = wp.clamp(met, center - reach, center + reach)
             if met == z:
                 by_record = wp.vec3(inverse_d, 0.0, -z * inverse_d)
-        elif c.d > 0.0 and c.d <= s.v[3]:
-            beyond, taken = numerator - center * c.d, low_pass * c.d / c.q
+        elif ahead:
+            beyond, taken = numerator - center * c.d, circle * c.d / c.q
             z = wp.clamp(fma(taken, beyond, center), center - reach, center + reach)
-            by_record = wp.vec3(taken, 1.0 - taken * c.d, low_pass / c.q * (beyond - center * c.d))
-            by_dot = wp.vec2(-taken * beyond / c.q, beyond * c.d / c.q)
+            by_record = wp.vec3(taken, 1.0 - taken * c.d, circle / c.q * (beyond - center * c.d))
+            by_dot = wp.vec2(-taken * beyond / c.q, wp.where(circle == low_pass, beyond * c.d / c.q, 0.0))
         return z, by_record, by_dot
 
     @wp.func
@@ -185,7 +186,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         z, by_record, by_dot_depth = float(0.0), wp.vec3(), wp.vec2()
         by_z = float(0.0)
         if wp.static(has_depth):
-            z, by_record, by_dot_depth = depth_at(lines, index, s, c, inverse_d, on_plane, decides)
+            low_pass = float(wp.inf)
+            if wp.static(screen):
+                low_pass = c.screen
+            z, by_record, by_dot_depth = depth_at(lines, index, s, c, inverse_d, low_pass)
         if wp.static(depth):
             worth += fma(loss.depth, z, loss.depth_weight)
             by_z += weight * loss.depth

@@ -15,6 +15,7 @@ from .records import BOXES
 def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
     """pose, tangents, depth_range, and the struct Moving of what moves by itself."""
     moves, waits, layers = (name in effects for name in ("motion_groups", "compose_pixel", "compose_planes"))
+    screen = "lowpass_screen" in effects
     boxes_too = any(name in effects for name in BOXES)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     half, one, two = real(0.5), real(1.0), real(2.0)
@@ -49,6 +50,10 @@ def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
         """Middle and half of the range of a splat's depths as blending bounds them. reach: of what is drawn;
         plane: -1 for none."""
         middle, found = depth, reach
+        if wp.static(screen):
+            # what the dot shows, whatever the cut-off
+            if not boxed:
+                found = reach * wp.max(one, range_radius / radius)
         if wp.static(waits):
             # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same at
             # every cut-off

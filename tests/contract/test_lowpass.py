@@ -46,6 +46,60 @@ def test_the_screen_dot_of_splats_about_as_wide_as_it(renderer, place, samples):
     assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples))
 
 
+def edge_on(tilt, size=1.0):
+    """A splat 2 m away, long in depth and 1 mm wide, `tilt` radians from edge-on."""
+    half = (math.pi / 2 - tilt) / 2
+    quats = [[math.cos(half), 0.0, math.sin(half), 0.0]]
+    return fs.SplatCloud([(1e-7, 0, 2)], quats, [(size, 1e-3)], [0.9], colors=[(1, 0.5, 0.2)])
+
+
+@pytest.mark.parametrize("order", ["centre", "pixel"])
+def test_depths_of_splats_seen_edge_on_are_in_their_visible_part(renderer, order):
+    """The low-pass shows pixels where the ray meets the plane right before the camera, or behind it."""
+    camera = fs.Camera.pinhole(65, 49, 60.0, 60.0, 32.5, 24.5)
+    radius = math.sqrt(2 * math.log(255))  # of the part that is 1/255 of the opacity or more
+    for tilt in (0.0, 5e-9, -5e-9, 1e-5, -1e-3, 0.02, -0.2):
+        for size in (0.01, 1.0):
+            shown = renderer.render(edge_on(tilt, size), camera, ALL_OUTPUTS, fs.Quality(order=order))[
+                "depth"
+            ]
+            depths = shown[shown > 0]
+            assert len(depths) > 3
+            reach = radius * size * math.cos(tilt)
+            assert depths.min() >= max(camera.near, 2 - reach) * (1 - 1e-6)
+            assert depths.max() <= (2 + reach) * (1 + 1e-6)
+    # all rays meet the plane before `near` or nowhere
+    shown = renderer.render(edge_on(5e-9), camera, ALL_OUTPUTS, fs.Quality(order=order))["depth"]
+    assert np.allclose(shown[shown > 0], 2, rtol=1e-6)
+    assert_agrees(renderer, edge_on(1e-3, 0.3), camera, quality=fs.Quality(order=order))
+
+
+def test_depths_change_steadily_as_a_splat_turns_through_edge_on(renderer):
+    """A plane's horizon sweeps over the low-pass's dot; the depths there do not follow it from end to end."""
+    camera, size = fs.Camera.pinhole(65, 49, 60.0, 60.0, 32.5, 24.5), 0.05
+    tilts = np.linspace(-0.1, 0.1, 21)
+    shown = np.stack([renderer.render(edge_on(tilt, size), camera, ALL_OUTPUTS)["depth"] for tilt in tilts])
+    dot = (shown > 0).all(0)
+    assert dot.sum() > 3
+    ends = shown[:, dot].max() - shown[:, dot].min()
+    steps = np.abs(np.diff(shown[:, dot], axis=0))
+    assert ends > size
+    assert steps.max() < 0.5 * ends
+
+
+@pytest.mark.parametrize("order", ["centre", "pixel"])
+def test_fog_does_not_depend_on_the_cut_off(renderer, order):
+    """Of one splat the cut-off takes away at most itself, in fog as without."""
+    camera, cut_off = fs.Camera.pinhole(65, 49, 60.0, 60.0, 32.5, 24.5), 1e-4
+    for tilt in (5e-9, 1e-5, 1e-3, 0.02):
+        wide, narrow = (
+            renderer.render(edge_on(tilt), fs.Capture(camera, quality=quality, fog=fs.Fog(0.5)))["rgb"]
+            for quality in (fs.Quality(order=order, alpha_cutoff=cut) for cut in (1e-12, cut_off))
+        )
+        assert np.abs(wide - narrow).max() <= cut_off + 2e-5
+    assert wide.max() > 0.05
+
+
 @pytest.mark.parametrize("scale", [(1e-6, 1e-2), (1e-3, 2.0), (1e-3, 50.0)])
 def test_splats_of_every_size(renderer, scale):
     assert_agrees(renderer, random_splats(150, seed=7, scale=scale), CAMERA, quality=PIXEL)

@@ -125,7 +125,8 @@ def test_every_decision_occurs():
     assert made["ceiling"].clamped[made["ceiling"].drawn].any()
     assert (made["edge-on"].missed & made["edge-on"].drawn).any()
     # depths between the centre's and the plane's
-    assert (both.by_dot & ~both.missed & both.drawn).any()
+    assert {*both.mirrored[both.drawn & ~both.missed].tolist()} == {True, False}
+    assert {*made["edge-on"].wide[made["edge-on"].mirrored & made["edge-on"].drawn].tolist()} == {True, False}
     assert not made["opaque"].drawn.all()
 
 

@@ -69,7 +69,9 @@ def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Ax
         return Axes(a, b, normal, normal, area, towards / m[:, None], inverse_m2, none, turned)
 
 
-def _surface_normals(axes: np.ndarray, scales: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _surface_normals(
+    axes: np.ndarray, scales: np.ndarray, towards: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals (n, 3) of the surfaces of the largest values along rays, at the centres: along the inverse
     covariance times the ray, as RaDe-GS and GOF have it. And by how much rounding may turn them."""
     shares = (scales.min(axis=1)[:, None] / scales) ** 2

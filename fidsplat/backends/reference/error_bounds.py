@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fidsplat.backends.reference.fragments import Fragments, cover, shifted
+from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, Fragments, cover, shifted
 from fidsplat.backends.reference.optics import ROUND
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
@@ -103,12 +103,13 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         high = np.where(s.box, np.where(may, most, 0.0), high)
     z_low = np.where(d_low > 0, z_low, -np.inf)
     if s.screen:
-        # in the dot; where rounding decides whether that is the larger weight, both, which are the same there
-        in_dot = _of_dot_depth(s, f, (d_low, d_high), (q_low, q_high), (near_dz, far_dz), (dot_low, dot_high))
-        may_plane = s.printed | (plane[0] * (1 - weight) <= dot_high * (1 + weight))
-        may_dot = ~s.printed & (~must | (plane[1] * (1 + weight) >= dot_low * (1 - weight)))
-        z_low = np.minimum(np.where(may_plane, z_low, np.inf), np.where(may_dot, in_dot[0], np.inf))
-        z_high = np.maximum(np.where(may_plane, z_high, -np.inf), np.where(may_dot, in_dot[1], -np.inf))
+        # beyond the circle; where rounding decides what lies there, both, which are the same on the circle
+        circle = np.maximum(dot_low, HALF_RHO_OF_RANGE), np.maximum(dot_high, HALF_RHO_OF_RANGE)
+        beyond = _of_mirrored_depth(s, (d_low, d_high), (q_low, q_high), (near_dz, far_dz), circle)
+        may_plane = s.printed | (plane[0] * (1 - weight) <= circle[1] * (1 + weight))
+        may_beyond = ~s.printed & ((d_low <= 0) | (plane[1] * (1 + weight) >= circle[0] * (1 - weight)))
+        z_low = np.minimum(np.where(may_plane, z_low, np.inf), np.where(may_beyond, beyond[0], np.inf))
+        z_high = np.maximum(np.where(may_plane, z_high, -np.inf), np.where(may_beyond, beyond[1], -np.inf))
     z_low, z_high = np.clip(z_low, s.z_low, s.z_high), np.clip(z_high, s.z_low, s.z_high)
     # no ray to the plane beyond `near`: the centre's depth, of dots
     missed = ~must & s.dot
@@ -126,20 +127,17 @@ _Pair = tuple[np.ndarray, np.ndarray]
 """least and most, (k, n) or (n,)"""
 
 
-def _of_dot_depth(s: Setup, f: Fragments, d: _Pair, q: _Pair, dz: _Pair, dot: _Pair) -> _Pair:
-    """Between which depths (k, n) fragments in the dot of a low-pass may lie, pz + dot (dz - pz d) 2 d / q,
-    with each factor between its least and most."""
+def _of_mirrored_depth(s: Setup, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -> _Pair:
+    """Between which depths (k, n) fragments may lie that are mirrored at a circle of half a rho, as
+    pz + circle (dz - pz d) 2 d / q, with each factor between its least and most."""
     d = np.maximum(d[0], 0.0), np.maximum(d[1], 0.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         beyond = dz[0] - np.maximum(s.pz * d[0], s.pz * d[1]), dz[1] - np.minimum(s.pz * d[0], s.pz * d[1])
-        least, most = 2 * dot[0] * d[0] / q[1], 2 * dot[1] * d[1] / q[0]
+        least, most = 2 * circle[0] * d[0] / q[1], 2 * circle[1] * d[1] / q[0]
         low = s.pz + np.where(beyond[0] < 0, beyond[0] * most, beyond[0] * least)
         high = s.pz + np.where(beyond[1] > 0, beyond[1] * most, beyond[1] * least)
     off = 2 * _ROUND * np.abs(s.pz)  # of a difference that is multiplied by a share
-    return (
-        np.where(np.isfinite(f.offset) & ~np.isnan(low), low - off, -np.inf),
-        np.where(np.isfinite(f.offset) & ~np.isnan(high), high + off, np.inf),
-    )
+    return np.where(np.isnan(low), -np.inf, low - off), np.where(np.isnan(high), np.inf, high + off)
 
 
 def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:

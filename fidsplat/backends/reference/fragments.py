@@ -12,6 +12,8 @@ from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 
 _NO_EDGES = np.zeros((4, 0))
+HALF_RHO_OF_RANGE = math.log(255)
+"""where a splat is 1/255 of its opacity"""
 DARKEST = 24 * math.log(2)
 """optical depth at which float32 leaves no light"""
 
@@ -56,9 +58,10 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
         half_rho = np.where(inside, q / (2 * drawn_d * drawn_d), np.inf)
         z = dz / drawn_d
         if s.screen:
-            # in the dot, from the depth on the plane to the centre's
-            in_dot = s.pz + offset * (dz - s.pz * drawn_d) * (2 * drawn_d / q)
-            z = np.where((half_rho <= offset) | s.printed, z, in_dot)
+            # what lies beyond the circle with the dot's rho is mirrored at it
+            circle = np.maximum(offset, HALF_RHO_OF_RANGE)
+            mirrored = s.pz + circle * (dz - s.pz * drawn_d) * (2 * drawn_d / q)
+            z = np.where((q <= 2 * circle * drawn_d**2) | s.printed, z, mirrored)
     if s.screen:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)

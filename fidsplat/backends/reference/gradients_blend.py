@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.reference.blend import INVERSE_DEPTH, SPREAD_NEAR, inverse_depth, transmittance
-from fidsplat.backends.reference.fragments import fragments_of
+from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, fragments_of
 from fidsplat.backends.reference.gradients_scene import Placed
 from fidsplat.backends.reference.optics import rays_of
 from fidsplat.backends.reference.setup import Setup
@@ -33,6 +33,10 @@ class Decisions:
     """at the ceiling of opacities"""
     missed: np.ndarray
     """the ray does not meet the plane beyond `near`: the depth is the centre's"""
+    mirrored: np.ndarray
+    """the depth is mirrored at a circle"""
+    wide: np.ndarray
+    """that circle is the dot's, not the one where the splat is 1/255 of its opacity"""
     shown: np.ndarray
     """(k,): enough is covered for depths and normals"""
 
@@ -52,6 +56,8 @@ def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
         by_dot=dot < plane,
         clamped=s.log_opacity - np.minimum(plane, dot) > np.log(view.ceiling),
         missed=(f.d <= 0) | (f.d * view.near > f.dz),
+        mirrored=s.screen & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * f.d**2),
+        wide=f.offset > HALF_RHO_OF_RANGE,
         shown=1 - final >= LEAST_ALPHA,
     )
 
@@ -100,8 +106,9 @@ class Blend:
             self._dot_y = y[:, None] - (view.focal_y * self._p[:, 1] / pz + view.center_y)
             dot, plane = self._dot_x**2 + self._dot_y**2, (self._u**2 + self._v**2) / 2
             half_rho = np.where(made.by_dot, dot, plane)
-            # in the dot, of the way from the centre's depth to that on the plane
-            self._share = np.where(made.by_dot, dot / plane, 1.0)
+            # of the way from the centre's depth to that on the plane
+            circle = np.where(made.wide, dot, HALF_RHO_OF_RANGE)
+            self._share = np.where(made.mirrored, circle / plane, 1.0)
             self._plane = plane
             z = pz + self._share * (self._z_plane - pz)
             opacity = np.where(made.clamped, view.ceiling, np.exp(log_opacity - half_rho))
@@ -136,14 +143,16 @@ class Blend:
         by_log = np.where(made.clamped, 0.0, by_alpha * self._alpha)
 
         met = made.drawn & ~made.missed
-        in_dot, on_plane = made.drawn & made.by_dot, made.drawn & ~made.by_dot
+        on_plane, mirrored = made.drawn & ~made.by_dot, met & made.mirrored
         share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            by_share = np.where(in_dot & met, by_z * (self._z_plane - self._p[:, 2]), 0.0)
-            by_plane = np.where(in_dot, -by_share * share / self._plane, -by_log)  # by rho / 2 on the plane
+            by_share = np.where(mirrored, by_z * (self._z_plane - self._p[:, 2]), 0.0)
+            by_plane = np.where(mirrored, -by_share * share / self._plane, 0.0)  # by rho / 2 on the plane
+            by_plane -= np.where(on_plane, by_log, 0.0)
             by_u = np.where(on_plane | met, by_plane * self._u / self._su, 0.0)
             by_v = np.where(on_plane | met, by_plane * self._v / self._sv, 0.0)
-            by_dot = np.where(in_dot, by_log - np.where(met, by_share / self._plane, 0.0), 0.0)
+            by_dot = np.where(made.drawn & made.by_dot, by_log, 0.0)
+            by_dot -= np.where(mirrored & made.wide, by_share / self._plane, 0.0)
             off = np.where((on_plane | met)[..., None], self._off, 0.0)
             by_off = by_u[..., None] * self._unit_a + by_v[..., None] * self._unit_b
             by_plane_z = (by_off * self._rays).sum(2) + by_z * share
@@ -154,8 +163,8 @@ class Blend:
         by_p = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
 
         # the dot, at the centre's image
-        by_x = 2 * (by_dot * np.where(made.by_dot, self._dot_x, 0.0)).sum(0)
-        by_y = 2 * (by_dot * np.where(made.by_dot, self._dot_y, 0.0)).sum(0)
+        by_x = 2 * np.where(by_dot != 0, by_dot * self._dot_x, 0.0).sum(0)
+        by_y = 2 * np.where(by_dot != 0, by_dot * self._dot_y, 0.0).sum(0)
         x, y, z = self._p.T
         by_p += np.stack(
             [

@@ -57,7 +57,11 @@ class Setup:
         else:
             reach, box_reach = np.hypot(a[:, 2], b[:, 2]), np.abs(a[:, 2]) + np.abs(b[:, 2])
             reach = np.hypot(reach, shape.third[:, 2])
-        reach = np.where(box, box_reach, np.sqrt(np.maximum(2 * half_r2, 0)) * reach)
+        radius = np.sqrt(np.maximum(2 * half_r2, 0))
+        # what a low-pass's dot shows, whatever the cut-off
+        within = np.maximum(radius, _RANGE_RADIUS if "lowpass_screen" in features.slots else 0.0) * reach
+        within = np.where(box, box_reach, within)
+        reach = np.where(box, box_reach, radius * reach)
         drawn = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
         self.by_depth = "compose_ordered" not in features.slots
         """whether fragments are composited by their own depth"""
@@ -72,10 +76,13 @@ class Setup:
                 further[box] = (
                     1 if cloud.planes is None else np.where(cloud.planes[box] >= 0, _PLANE_RADIUS, 1)
                 )
-                reach = reach * further
-        z_low, z_high = depth - reach, depth + reach
+                within = reach * further
+        z_low, z_high = depth - within, depth + within
         behind = depth < view.near  # fragments lie beyond `near`
-        z_low, z_high = np.where(behind, view.near, z_low), np.where(behind, np.maximum(view.near, z_high), z_high)
+        z_low, z_high = (
+            np.where(behind, view.near, z_low),
+            np.where(behind, np.maximum(view.near, z_high), z_high),
+        )
         if self.by_depth:
             self.key = z_low.astype(np.float32)
         if "compose_planes" in features.slots:

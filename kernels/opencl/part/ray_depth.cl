@@ -5,7 +5,9 @@
 //@ mask
 //@@ dot_mask
 //@ project
+    // of all that is drawn, and of what the low-pass's dot shows whatever the cut-off
     real depth_center = pz, depth_reach = reach;
+//@@ dot_depth_reach
 //@@ depth_reach
     if (pz < near) {                // fragments lie beyond `near`
         real furthest = fmax(near, pz + depth_reach);

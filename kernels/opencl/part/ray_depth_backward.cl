@@ -7,8 +7,9 @@
 //@ geometry_make
     g.d = c.d;
     vfloat z_low = s->z_center - s->z_reach, z_high = s->z_center + s->z_reach, depth = s->z_numerator * g.inverse_d;
-    g.met = g.on_plane & VMASK(depth >= z_low) & VMASK(depth <= z_high);
+    vint flat = g.on_plane;                 // the depth is that on the plane, but for the range
 //@@ dot_geometry_make
+    g.met = flat & VMASK(depth >= z_low) & VMASK(depth <= z_high);
     g.z = clamp(depth, z_low, z_high);
 //@ sums
     vfloat z_numerator, z_center;

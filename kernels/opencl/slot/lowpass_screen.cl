@@ -39,23 +39,6 @@
             vfloat dot_y = fmax(fabs(y - s->dot_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
             away &= VMASK(FMA(dot_x, dot_x, dot_y * dot_y) * filter > half_r2);
         }
-// In the dot a fragment's depth goes from that of the ray's meeting with the plane to the centre's, as rho of the dot goes to 0 beside that
-// of the plane: z = z_center + (z_plane - z_center) rho_dot / rho_plane, at most sqrt(rho_dot) standard deviations from the centre. So it is
-// continuous where the dot takes over, and where the ray passes the plane's horizon; no cut-off has a say (docs/order.md).
-//@ dot_crossing
-    vfloat screen;              // rho / 2 of the dot
-//@ dot_mask
-            c.screen = screen;
-//@ dot_see_depth
-    if (HAS_DOT(s)) {
-        vint on_plane = c.inside & VMASK((c.q * inverse_d) * inverse_d <= c.screen), beyond_near = VMASK(c.d <= s->d_near);
-//@@ camera_dot_depth
-//@@ plane_dot_depth
-        met &= beyond_near;
-        depth = VSELECT(FMA(c.screen * (depth_d - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center), depth, on_plane);
-    }
-//@ dot_blocks_nearest
-        if (HAS_DOT(s)) depth = fmin(depth, (vfloat)((1.0f - BLOCKS_SLACK) * s->z_center));
 //@ fragment_mask
 // Vectors of pixels pass over a dot that is far away; to single pixels the question costs what it saves.
 #if LANES > 1
@@ -78,3 +61,26 @@ static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat invers
     vfloat half_rho = (c.q * inverse_d) * inverse_d;
     return HAS_DOT(s) ? VSELECT(screen, VMIN(half_rho, screen), c.inside) : half_rho;
 }
+//@ dot_crossing
+    vfloat screen;              // rho / 2 of the dot
+//@ dot_mask
+            c.screen = screen;
+//@ dot_see_depth
+    // In the dot the ray may meet the plane far outside of the splat. What lies beyond the circle of rho = 2 ln 255, within which a splat is
+    // 1/255 of its opacity or more, is mirrored at it: the way from the centre's depth is multiplied by 2 ln 255 / rho, and so goes to
+    // 0 at the plane's horizon. Where the dot's rho is larger it is the circle, so that nothing jumps where the dot takes over (docs/order.md).
+    if (HAS_DOT(s)) {
+        vfloat circle = VMAX(c.screen, (vfloat)WIDE(5.5412635451584261));
+        vint on_plane = VMASK((c.q * inverse_d) * inverse_d <= circle), beyond_near = VMASK(c.d <= s->d_near);
+//@@ camera_dot_depth
+//@@ plane_dot_depth
+        met &= beyond_near;
+        depth = VSELECT(FMA(circle * (depth_d - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center), depth, on_plane);
+    }
+//@ dot_blocks_nearest
+        if (HAS_DOT(s)) depth = fmin(depth, (vfloat)((1.0f - BLOCKS_SLACK) * s->z_center));
+//@ dot_depth_reach
+#ifndef BOX_HERE
+#define BOX_HERE false
+#endif
+    if (!BOX_HERE) depth_reach *= fmax(REAL(1.0), REAL(3.3290429691304455) / radius);

@@ -4,17 +4,21 @@ static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho
     return HAS_DOT(s) ? c.inside & VMASK(half_rho <= screen) : c.inside;
 }
 //@ dot_geometry
-    vint dot;               // the depth is that of a dot: z_center + screen (z_numerator - z_center D) D / q
+    vint dot;               // the depth is mirrored at `circle`: z_center + circle (z_numerator - z_center D) D / q
+    vfloat circle;
 //@ dot_geometry_make
-    g.dot = ~g.on_plane & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
-    vfloat dot_depth = FMA(screen * (s->z_numerator - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center);
-    depth = VSELECT(VSELECT((vfloat)s->z_center, dot_depth, g.dot), depth, g.on_plane);
+    g.circle = max(screen, (vfloat)WIDE(5.5412635451584261));
+    vint ahead = VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
+    flat = ahead & VMASK(g.half_rho <= g.circle);
+    g.dot = ahead & ~flat;
+    vfloat dot_depth = FMA(g.circle * (s->z_numerator - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center);
+    depth = VSELECT(VSELECT((vfloat)s->z_center, dot_depth, g.dot), depth, flat);
 //@ dot_add_depth
-    vfloat per_q = 1.0f / FMA(g->nu, g->nu, g->nv * g->nv), by_dot = VSELECT((vfloat)0.0f, by_z * per_q, g->dot), taken = screen * g->d;
-    vfloat beyond = s->z_numerator - s->z_center * g->d, by_screen = by_dot * beyond * g->d;
+    vfloat per_q = 1.0f / FMA(g->nu, g->nu, g->nv * g->nv), by_dot = VSELECT((vfloat)0.0f, by_z * per_q, g->dot), taken = g->circle * g->d;
+    vfloat beyond = s->z_numerator - s->z_center * g->d, by_screen = VSELECT((vfloat)0.0f, by_dot * beyond * g->d, VMASK(g->circle == screen));
     by_numerator = FMA(by_dot, taken, by_numerator);
     by_center = FMA(-by_dot * taken, g->d, by_center);
-    by_d = FMA(by_dot * screen, beyond - s->z_center * g->d, by_d);
+    by_d = FMA(by_dot * g->circle, beyond - s->z_center * g->d, by_d);
     by_dot = -2.0f * VSELECT((vfloat)0.0f, by_dot * taken * beyond * per_q, g->dot);        // by n_u over n_u, by n_v over n_v
     *by_nu = FMA(by_dot, g->nu, *by_nu);
     *by_nv = FMA(by_dot, g->nv, *by_nv);
