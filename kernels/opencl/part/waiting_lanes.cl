@@ -91,6 +91,7 @@ static inline int early_take(ulong *early, int count, const ulong *batch, int ta
 //@ blocks_nearest
         vfloat least = s->nearest;
 //@@ camera_blocks_nearest
+//@@ dot_blocks_nearest
 //@@ plane_blocks_nearest
         VSTORE((in_order(VAS_INT(least)) & -CHUNK) | which, keys + first);
 //@ walk

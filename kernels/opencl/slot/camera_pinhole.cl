@@ -8,7 +8,6 @@
         // depth is z_numerator / D, within the splat's range, and D at most `d` here; not where D may be 0, nor of what is no disk
         vint met = VMASK(d > 2.0f * around_d) & VMASK((vfloat)s->z_numerator > 0.0f) & VMASK((vfloat)conic_h == (vfloat)(float)half_r2);
         vfloat depth = fmin((1.0f - BLOCKS_SLACK) * s->z_numerator / d, (vfloat)(s->z_center + s->z_reach));
-//@@ dot_blocks_nearest
         least = VSELECT(least, fmax(depth, least), met);
 //@ camera_dot
         // The dot is never the larger weight of a splat that is wider than it wherever the dot reaches: there D is at least

@@ -78,7 +78,7 @@ static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat invers
         depth = VSELECT(FMA(circle * (depth_d - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center), depth, on_plane);
     }
 //@ dot_blocks_nearest
-        if (HAS_DOT(s)) depth = fmin(depth, (vfloat)((1.0f - BLOCKS_SLACK) * s->z_center));
+        if (HAS_DOT(s)) least = fmin(least, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->nearest));
 //@ dot_depth_reach
 #ifndef BOX_HERE
 #define BOX_HERE false

@@ -7,7 +7,7 @@ static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho
     vint dot;               // the depth is mirrored at `circle`: z_center + circle (z_numerator - z_center D) D / q
     vfloat circle;
 //@ dot_geometry_make
-    g.circle = max(screen, (vfloat)WIDE(5.5412635451584261));
+    g.circle = HAS_DOT(s) ? max(screen, (vfloat)WIDE(5.5412635451584261)) : (vfloat)1e30f;
     vint ahead = VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     flat = ahead & VMASK(g.half_rho <= g.circle);
     g.dot = ahead & ~flat;
