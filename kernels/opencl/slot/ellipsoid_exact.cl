@@ -1,4 +1,4 @@
-// 3D Gaussians by their largest value along each ray (docs/ellipsoids.md). Let W make a Gaussian's covariance the unit matrix, p
+// 3D Gaussians by their largest value along each ray (docs/primitives.md). Let W make a Gaussian's covariance the unit matrix, p
 // be its centre, m = |W p|, and t the angle between W p and W r for a ray r from the camera's centre. The least squared distance
 // on the ray is rho = (m sin t)^2, where the ray meets the disk through p that W makes perpendicular to W p at rho_disk =
 // (m tan t)^2. So a 3D Gaussian is that disk, whose tangents a, b and p / m are conjugate half axes of the ellipsoid, with
