@@ -8,7 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.opencl import device, pocl_target, vendors
+from fidsplat.backends.opencl import device, vendors
+from fidsplat.backends.opencl.pocl_workarounds import linker, target_patch
 from fidsplat.errors import UnknownDeviceError
 
 POCL = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-"
@@ -93,9 +94,9 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         return Record(*words)
 
     good = record(1, 2, ctypes.addressof(triplet), ctypes.addressof(generic), 5)
-    assert pocl_target.why_not(ctypes.addressof(good), POCL + "generic") == ""
-    name = pocl_target.correct_target(ctypes.addressof(good), POCL + "generic")
-    assert name in [level for level, _ in pocl_target._LEVELS]
+    assert target_patch.why_not(ctypes.addressof(good), POCL + "generic") == ""
+    name = target_patch.correct_target(ctypes.addressof(good), POCL + "generic")
+    assert name in [level for level, _ in target_patch._LEVELS]
     assert ctypes.string_at(good[3]) == name.encode()
     assert list(good[:3]) == [1, 2, ctypes.addressof(triplet)]
     assert good[4] == 5
@@ -106,8 +107,8 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         record(8, 1 << 63),
     ):
         before = list(bad)
-        assert "not that of PoCL 3.0" in pocl_target.why_not(ctypes.addressof(bad), POCL + "generic")
-        assert pocl_target.correct_target(ctypes.addressof(bad), POCL + "generic") == "generic"
+        assert "not that of PoCL 3.0" in target_patch.why_not(ctypes.addressof(bad), POCL + "generic")
+        assert target_patch.correct_target(ctypes.addressof(bad), POCL + "generic") == "generic"
         assert list(bad) == before
 
 
@@ -121,9 +122,9 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
     ],
 )
 def test_only_pocl_that_mistakes_the_processor_is_corrected(monkeypatch, processor, llvm, needed):
-    monkeypatch.setattr(pocl_target, "_processor_name", lambda: processor)
-    assert pocl_target.needs_correction(POCL + llvm) == needed
-    assert not pocl_target.needs_correction("OpenCL 3.0 CUDA")
+    monkeypatch.setattr(target_patch, "_processor_name", lambda: processor)
+    assert target_patch.needs_correction(POCL + llvm) == needed
+    assert not target_patch.needs_correction("OpenCL 3.0 CUDA")
 
 
 def pocl_that_mistakes(record):
@@ -140,7 +141,7 @@ def record(monkeypatch):
     words = [ctypes.create_string_buffer(text) for text in (b"x86_64-unknown-linux-gnu", b"generic")]
     made = (ctypes.c_uint64 * 512)(*map(ctypes.addressof, words))
     made.kept = words
-    monkeypatch.setattr(pocl_target, "_corrected", {})  # of records that had its address before
+    monkeypatch.setattr(target_patch, "_corrected", {})  # of records that had its address before
     return made
 
 
@@ -155,7 +156,7 @@ def test_what_needs_no_patch_is_preferred(monkeypatch, record):
     assert list(device._named_devices()) == ["opencl:pocl", "opencl:intel"]
 
 
-@pytest.mark.parametrize(("way", "named"), [("variable", pocl_target.FORBID), ("hidden", "/proc/self/mem")])
+@pytest.mark.parametrize(("way", "named"), [("variable", target_patch.FORBID), ("hidden", "/proc/self/mem")])
 def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_remedy_told(
     monkeypatch, record, way, named
 ):
@@ -163,13 +164,13 @@ def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_
     other.name, other.version = "a newer PoCL", "OpenCL 3.0 PoCL HSTR: cpu-x86_64-pc-linux-gnu-haswell"
     monkeypatch.setattr(device, "OpenCLBackend", lambda opened: opened.name)
     if way == "variable":
-        monkeypatch.setenv(pocl_target.FORBID, "1")
+        monkeypatch.setenv(target_patch.FORBID, "1")
     else:
 
         def refuse(path, flags):
             raise PermissionError(13, "Permission denied", path)
 
-        monkeypatch.setattr(pocl_target.os, "open", refuse)
+        monkeypatch.setattr(target_patch.os, "open", refuse)
     before = list(record)
     monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl]))
     with pytest.raises(fs.DeviceError, match=rf"a PoCL: .*{named}.*pocl-opencl-icd") as caught:
@@ -177,7 +178,7 @@ def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_
     assert "\n" not in str(caught.value)
     monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl, other]))
     assert device.open_device() == "a newer PoCL"
-    assert pocl_target.correct_target(pocl.int_ptr, pocl.version) == "generic"
+    assert target_patch.correct_target(pocl.int_ptr, pocl.version) == "generic"
     assert list(record) == before
 
 

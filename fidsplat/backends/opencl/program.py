@@ -13,7 +13,9 @@ import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
-from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
+from fidsplat.backends.opencl.pocl_workarounds import is_pocl
+from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_program
+from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import Workspace, token_of
 from fidsplat.errors import DeviceError
 
@@ -55,9 +57,15 @@ def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
         DeviceError: the compiler refuses; its log is in the message.
     """
 
+    all_options = (*build_options(workspace.device), *options)
+
+    def compiled() -> cl.Program:
+        return cl.Program(workspace.context, text).build(options=list(all_options))
+
     def built() -> cl.Program:
-        program = cl.Program(workspace.context, text)
-        return program.build(options=[*build_options(workspace.device), *options])
+        if is_pocl(workspace.device):
+            return shared_program(workspace.context, text, all_options, compiled)
+        return compiled()
 
     try:
         if getattr(in_background, "on", False):
