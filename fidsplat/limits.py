@@ -1,4 +1,4 @@
-"""Limits of the process (`ulimit`) under which libraries and drivers crash, checked before they are loaded."""
+"""Limits of the process (`ulimit`) under which libraries and drivers crash, checked before those load."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OPEN_FILES = 32
 
 
 def check_imports() -> None:
-    """Raise InputError where memory is limited to less than imports need: OpenBLAS crashes without a reason."""
+    """Raise InputError where memory is limited to less than imports need: OpenBLAS crashes there."""
     needed = _IMPORTS + _cores() * _PER_CORE
     if (space := _limit("RLIMIT_AS")) < needed:
         raise InputError(
@@ -44,8 +44,8 @@ def check_driver(family: str) -> None:
         )
     if (files := _limit("RLIMIT_NOFILE")) < _OPEN_FILES:
         raise DeviceError(
-            f"the limit on open files must be at least {_OPEN_FILES} for compiled kernels, got {files}; raise it "
-            f"with `ulimit -n {_OPEN_FILES}`, or use the device reference"
+            f"the limit on open files must be at least {_OPEN_FILES} for compiled kernels, got {files}; "
+            f"raise it with `ulimit -n {_OPEN_FILES}`, or use the device reference"
         )
     if (space := _limit("RLIMIT_AS")) == float("inf"):
         return
@@ -54,8 +54,8 @@ def check_driver(family: str) -> None:
     if space - used < needed:
         raise DeviceError(
             f"the limit on memory must leave at least {bytes_words(needed)} for the driver of {family}, got "
-            f"{bytes_words(max(0, space - used))}; raise it with `ulimit -v {(used + needed) // 2**10}`, or use "
-            "the device reference"
+            f"{bytes_words(max(0, space - used))}; raise it with `ulimit -v {(used + needed) // 2**10}`, or "
+            "use the device reference"
         )
 
 

@@ -53,7 +53,7 @@ class Renderer:
     Args:
         device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or a GPU's name, or
             cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), "reference" (NumPy, float64, slow), or "auto"
-            ("opencl", else "warp" with a warning). None: the environment variable FIDSPLAT_DEVICE, else "auto".
+            ("opencl", else "warp" with a warning). None: what FIDSPLAT_DEVICE says, else "auto".
         memory_budget: bytes of the device that a picture and its cloud may take; by default nine tenths of
             what the device says it has. What needs more is drawn in bands of the picture and, by OpenCL,
             chunks of the cloud, which takes longer and gives the same bits.

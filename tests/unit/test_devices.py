@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends import registry
 from fidsplat.backends.opencl import device, vendors
-from fidsplat.backends.opencl.pocl_workarounds import linker, target_patch
+from fidsplat.backends.opencl.pocl_workarounds import target_patch
 from fidsplat.errors import UnknownDeviceError
 
 POCL = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-"
@@ -77,6 +78,55 @@ def test_devices_of_one_name_are_numbered(monkeypatch):
     found[0], found[2] = card(pocl, "a"), card(pocl, "c", available=False)
     with pytest.raises(fs.DeviceError, match="broken"):
         device.open_device("pocl-2")
+
+
+def test_platforms_are_matched_before_devices_and_processors_never(monkeypatch):
+    """Every driver for a processor repeats the processor's name."""
+
+    def card(platform, name, kind, vendor=""):
+        return SimpleNamespace(
+            platform=SimpleNamespace(name=platform), name=name, vendor=vendor, type=kind, version=""
+        )
+
+    cpu, gpu = device.cl.device_type.CPU, device.cl.device_type.GPU
+    pocl = card("Portable Computing Language", "cpu-Intel(R) Xeon(R)", cpu, "GenuineIntel")
+    other = card("Clover", "Intel Arc by Clover", gpu)
+    intel = card("Intel(R) OpenCL", "Intel(R) Xeon(R)", cpu)
+    found = [pocl, other, intel]
+    monkeypatch.setattr(device, "_all_devices", lambda: iter(found))
+    monkeypatch.setattr(device, "_why_unusable", lambda one: "")
+    monkeypatch.setattr(device, "OpenCLBackend", lambda one: one)
+    assert device.open_device("intel") is intel
+    assert device.open_device("arc") is other
+    assert device.open_device("cpu") is pocl
+    found.pop()
+    assert device.open_device("Intel") is other
+    found.pop()
+    with pytest.raises(UnknownDeviceError, match="no OpenCL device matches 'intel'; there are: opencl:pocl"):
+        device.open_device("intel")
+
+
+@pytest.mark.parametrize("warp", [True, False])
+def test_without_opencl_the_default_is_warp_and_says_so(monkeypatch, warp):
+    def refuse(selector):
+        raise fs.DeviceError("no OpenCL platform found")
+
+    def open_warp(selector):
+        if not warp:
+            raise fs.DeviceError("Warp is not installed")
+        return SimpleNamespace(info=SimpleNamespace(name="warp:cpu"))
+
+    families = {"opencl": SimpleNamespace(open_device=refuse), "warp": SimpleNamespace(open_device=open_warp)}
+    monkeypatch.setattr(registry, "import_module", lambda name: families[name.split(".")[2]])
+    monkeypatch.delenv("FIDSPLAT_DEVICE", raising=False)
+    if warp:
+        with pytest.warns(UserWarning, match="no OpenCL platform found; warp:cpu is used instead"):
+            assert fs.Renderer().device.name == "warp:cpu"
+    else:
+        with pytest.raises(fs.DeviceError, match="no OpenCL platform found; Warp is not installed"):
+            fs.Renderer()
+    with pytest.raises(fs.DeviceError, match="no OpenCL platform found$"):
+        fs.Renderer("opencl")
 
 
 def test_no_platform_says_how_to_get_one(monkeypatch):

@@ -196,6 +196,7 @@ SHARED = (
     "stack",
     "blank",
     "caches",
+    "checked_cache",
     "view",
     "prepare",
     "registry",

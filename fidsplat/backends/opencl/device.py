@@ -9,6 +9,8 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
+from fidsplat.backends.caches import pocl_folder
+from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.chunks import WholeScene
 from fidsplat.backends.ends import TileEnds
 from fidsplat.backends.opencl.ahead import Ahead
@@ -28,8 +30,10 @@ from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.errors import DeviceError, UnknownDeviceError
+from fidsplat.files import user_cache
 from fidsplat.splats import SplatCloud
 
+_PYOPENCL_FILES = ("binary", "info", "source.cl")
 _NO_PATCH_NEEDED = (
     "a newer PoCL (Debian: pocl-opencl-icd; conda: pocl) or Intel's runtime for CPUs needs no patch "
     "(docs/backends.md)"
@@ -81,7 +85,9 @@ class OpenCLBackend(Workspace):
     def __init__(self, device: cl.Device) -> None:
         if is_pocl(device):
             linker.provide_linker()
-            kernel_cache.check_once()
+            check_once(pocl_folder(), kernel_cache.is_loaded, kernel_cache.is_whole)
+        else:  # pyopencl keeps programs for drivers that have no cache of their own
+            check_once(user_cache() / "pyopencl", _PYOPENCL_FILES.__contains__, lambda _: True)
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}

@@ -1,80 +1,52 @@
-"""Removes from PoCL's kernel cache what an interrupted process has left half written.
+"""Check of PoCL's kernel cache, from which PoCL loads files without a check.
 
-PoCL 3 loads what it finds there without a look: a bitcode file or a shared object that is cut off, empty or
-noise ends the process ("LLVM ERROR", SIGBUS, abort) or gives a program without kernels, on that run and on
-every later one. So files that are not whole are removed before PoCL is first asked for a program; it then
-compiles them again. PoCL gives a file its name when it is written; what another process is about to finish is
-called tempfile_*, and is left alone: without it that process would end ("Final linking of kernel ...
-failed").
+A bitcode file or a shared object that is cut off, empty or noise ends the process ("LLVM ERROR", SIGBUS,
+abort) or makes a program without kernels, in that run and in every later one. Such files are removed before
+PoCL is first asked for a program; PoCL then compiles them again. PoCL renames a file when it is complete;
+files that another process is writing are called tempfile_*, and are left alone: without them that process
+would end.
 """
 
 from __future__ import annotations
 
 import os
 import struct
-import time
-from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
-from fidsplat.backends.caches import pocl_folder
-
 _BITCODE, _ELF = b"BC\xc0\xde", b"\x7fELF\x02\x01"
-_ENTER_SUBBLOCK = 1
+_SECTION = struct.Struct("<4xI16xQQ24x")
+"""header of a section: its kind, offset and bytes"""
+_NO_BITS, _ENTER_SUBBLOCK = 8, 1
 _UNFINISHED = "tempfile_"
 
 
-@cache
-def check_once() -> None:
-    """Looks through PoCL's cache, once in a process."""
-    remove_broken(pocl_folder())
-
-
-def remove_broken(folder: Path) -> int:
-    """Removes the bitcode files and shared objects below a folder that are not whole; returns their number.
-
-    What was looked at once is not looked at again: the time of the last look is that of a file beside the
-    programs.
-    """
-    stamp, now = folder / "fidsplat-checked", time.time()
-    try:
-        last = stamp.stat().st_mtime
-    except OSError:
-        last = 0.0
-    if last > now:  # the clock was put back: what is new looks old
-        last = 0.0
-    removed = 0
-    for place, _, names in os.walk(folder):
-        for name in names:
-            path = Path(place, name)
-            with suppress(OSError):  # it is another's cache too: what is not there any more is no error
-                if not name.endswith((".so", ".bc")) or name.startswith(_UNFINISHED):
-                    continue
-                if path.stat().st_mtime >= last - 1 and not is_whole(path):
-                    path.unlink()
-                    removed += 1
-    with suppress(OSError):  # a folder that cannot be written is looked through every time
-        stamp.touch()
-        os.utime(stamp, (now, now))
-    return removed
+def is_loaded(name: str) -> bool:
+    """Whether PoCL loads or opens cached files of a name."""
+    return name.endswith((".so", ".bc", "last_accessed")) and not name.startswith(_UNFINISHED)
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a bitcode file or a shared object reaches as far as its own headers say."""
+    """Whether a bitcode file or a shared object is as long as its own headers say."""
+    if path.suffix not in (".so", ".bc"):
+        return True
     with path.open("rb") as stream:
         size = os.fstat(stream.fileno()).st_size
         return _is_whole_elf(stream, size) if path.suffix == ".so" else _is_whole_bitcode(stream, size)
 
 
 def _is_whole_elf(stream: BinaryIO, size: int) -> bool:
-    """The table of sections is the last thing that a linker writes."""
+    """Whether the table of sections and every section are in the file; GNU ld writes the table last."""
     head = stream.read(64)
     if len(head) < 64 or not head.startswith(_ELF):
         return False
-    (sections,) = struct.unpack_from("<Q", head, 0x28)
+    (table,) = struct.unpack_from("<Q", head, 0x28)
     each, count = struct.unpack_from("<HH", head, 0x3A)
-    return sections + each * count <= size
+    if each != _SECTION.size or table + each * count > size:
+        return False
+    stream.seek(table)
+    sections = _SECTION.iter_unpack(stream.read(each * count))
+    return all(kind == _NO_BITS or offset + length <= size for kind, offset, length in sections)
 
 
 def _is_whole_bitcode(stream: BinaryIO, size: int) -> bool:

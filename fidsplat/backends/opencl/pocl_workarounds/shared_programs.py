@@ -1,7 +1,8 @@
 """One context and one copy of each program per PoCL device and process.
 
-PoCL does not free a program that has run: 3 MB for each renderer that was opened, rendered and dropped. Programs
-and their context are therefore shared by all renderers of a process; kernels, queues and buffers are not.
+PoCL does not free a program that has run: 3 MB for each renderer that was opened, rendered and dropped.
+Programs and their context are therefore shared by all renderers of a process; kernels, queues and buffers
+are not.
 """
 
 from __future__ import annotations
