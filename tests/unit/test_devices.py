@@ -125,7 +125,7 @@ def test_without_opencl_the_default_is_warp_and_says_so(monkeypatch, warp):
     else:
         with pytest.raises(fs.DeviceError, match="no OpenCL platform found; Warp is not installed"):
             fs.Renderer()
-    with pytest.raises(fs.DeviceError, match="no OpenCL platform found$"):
+    with pytest.raises(fs.DeviceError, match=r"no OpenCL platform found$"):
         fs.Renderer("opencl")
 
 

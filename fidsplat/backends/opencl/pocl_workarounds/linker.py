@@ -29,9 +29,7 @@ def why_no_linker() -> str:
 
 def provide_linker() -> None:
     """Put bin/ld first on the PATH of this process and of those that it starts."""
-    path = os.environ.get("PATH", os.defpath)
-    if path.split(os.pathsep)[0] != str(_FOLDER):
-        os.environ["PATH"] = f"{_FOLDER}{os.pathsep}{path}"
+    os.environ["PATH"] = f"{_FOLDER}{os.pathsep}{_path()}"
     if tcc := _tcc():
         os.environ[_TCC] = str(tcc)
     else:
@@ -49,5 +47,10 @@ def _tcc() -> Path | None:
 
 
 def _system_linker() -> str | None:
+    return shutil.which("ld", path=_path())
+
+
+def _path() -> str:
+    """The PATH without our folder."""
     folders = os.environ.get("PATH", os.defpath).split(os.pathsep)
-    return shutil.which("ld", path=os.pathsep.join(each for each in folders if each != str(_FOLDER)))
+    return os.pathsep.join(folder for folder in folders if folder != str(_FOLDER))
