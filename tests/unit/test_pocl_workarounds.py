@@ -3,10 +3,11 @@
 import os
 import subprocess
 import sys
+import warnings
 
 import pytest
 
-from fidsplat.backends.opencl.pocl_workarounds import linker
+from fidsplat.backends.opencl.pocl_workarounds import linker, target_patch
 
 RENDER = """
 import sys
@@ -33,7 +34,7 @@ def render(path, cache, *words):
     done = subprocess.run(
         [sys.executable, "-c", RENDER, *words], env=os.environ | places, capture_output=True, text=True
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0, done.stderr
     return done.stdout
 
 
@@ -67,6 +68,14 @@ def test_other_programs_get_the_linker_of_the_system(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", f"{linker._FOLDER}:{tmp_path}:{os.environ['PATH']}")  # and again, not first
     for words in ("--version", "-shared -o a.so a.o -lc", "-shared -o x/tempfile_a.so x/tempfile_b.o"):
         assert subprocess.check_output(["ld", *words.split()], text=True).strip() == words
+
+
+def test_the_patch_is_announced_once(tmp_path):
+    with pytest.warns(UserWarning, match="patched"):
+        target_patch.announce_once(tmp_path, "patched")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        target_patch.announce_once(tmp_path, "patched")
 
 
 LEAK = """

@@ -85,6 +85,8 @@ class OpenCLBackend(Workspace):
     def __init__(self, device: cl.Device) -> None:
         if is_pocl(device):
             linker.provide_linker()
+            if _needs_patch(device):
+                target_patch.announce_once(pocl_folder(), _PATCHED)
             check_once(pocl_folder(), kernel_cache.is_loaded, kernel_cache.is_whole)
         else:  # pyopencl keeps programs for drivers that have no cache of their own
             check_once(user_cache() / "pyopencl", _PYOPENCL_FILES.__contains__, lambda _: True)
