@@ -48,16 +48,15 @@ def remove_damaged(folder: Path, is_loaded: Callable[[str], bool], is_whole: Cal
         is_whole: whether a file without a checksum is complete.
     """
     known, valid, removed = _read(folder), {}, 0
-    for path in _loaded(folder, is_loaded):
+    for file in _loaded(folder, is_loaded):
         with suppress(OSError):  # another process may remove files too
-            key, state = str(path.relative_to(folder)), path.lstat()
-            entry = None
-            if stat.S_ISREG(state.st_mode) and (key in known or is_whole(path)):
-                entry = _current(path, state, known.get(key))
+            key, state, entry = file.path[len(str(folder)) + 1 :], file.stat(follow_symlinks=False), None
+            if stat.S_ISREG(state.st_mode) and (key in known or is_whole(Path(file))):
+                entry = _current(file.path, state, known.get(key))
             if entry is not None:
                 valid[key] = entry
             else:
-                _remove(path, state)
+                _remove(file.path, state)
                 removed += 1
     if valid != known:
         _write(folder, valid)
@@ -67,36 +66,41 @@ def remove_damaged(folder: Path, is_loaded: Callable[[str], bool], is_whole: Cal
 def record_new(folder: Path, is_loaded: Callable[[str], bool]) -> None:
     """Record the checksums of files that have none yet."""
     known, new = _read(folder), {}
-    for path in _loaded(folder, is_loaded):
-        with suppress(OSError):
-            key, state = str(path.relative_to(folder)), path.lstat()
-            if key not in known and stat.S_ISREG(state.st_mode):
-                new[key] = _current(path, state, None)
+    for file in _loaded(folder, is_loaded):
+        key = file.path[len(str(folder)) + 1 :]
+        if key not in known and file.is_file(follow_symlinks=False):
+            with suppress(OSError):
+                new[key] = _current(file.path, file.stat(), None)
     if new:
         _write(folder, known | new)
 
 
-def _current(path: Path, state: os.stat_result, entry: Entry | None) -> Entry | None:
+def _current(path: str, state: os.stat_result, entry: Entry | None) -> Entry | None:
     """The entry of a file as it is; None if it differs from a known entry."""
     identity = [state.st_size, state.st_ctime_ns, state.st_ino]
     if entry is not None and entry[1:] == identity:
         return entry
-    checksum = zlib.crc32(path.read_bytes())
+    checksum = zlib.crc32(Path(path).read_bytes())
     return [checksum, *identity] if entry is None or entry[0] == checksum else None
 
 
-def _loaded(folder: Path, is_loaded: Callable[[str], bool]) -> Iterator[Path]:
-    for place, folders, names in os.walk(folder):
-        for name in (*folders, *names):
-            if is_loaded(name):
-                yield Path(place, name)
+def _loaded(folder: Path, is_loaded: Callable[[str], bool]) -> Iterator[os.DirEntry[str]]:
+    """What has the name of a loaded file, in a folder and those below it."""
+    waiting = [str(folder)]
+    while waiting:
+        with suppress(OSError), os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                if is_loaded(entry.name):
+                    yield entry
+                elif entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
 
 
-def _remove(path: Path, state: os.stat_result) -> None:
+def _remove(path: str | Path, state: os.stat_result) -> None:
     if stat.S_ISDIR(state.st_mode):
         shutil.rmtree(path)
     else:
-        path.unlink()
+        os.unlink(path)
 
 
 def _read(folder: Path) -> dict[str, Entry]:

@@ -42,7 +42,8 @@ def load() -> ModuleType:
         raise DeviceError(f"Warp cannot be imported: {error}") from error
     with quiet(), _without_stderr():
         warp.init()
-    check_once(Path(warp.config.kernel_cache_dir), lambda name: name.endswith(_LOADED), lambda _: True)
+    if folder := warp.config.kernel_cache_dir:
+        check_once(Path(folder), lambda name: name.endswith(_LOADED), lambda _: True)
     return warp
 
 
