@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 from fidsplat.interrupts import Terminated, raised_in_time
+from fidsplat.limits import check_imports
 
 ABOUT = """Fiducial markers made of 2D Gaussian splats: make them, set them in scenes, draw them, read them
 back.
@@ -50,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings(), raised_in_time():
             warnings.showwarning = _show_warning
+            check_imports()
             status = _parse(words).run()
         sys.stdout.flush()
         return status

@@ -19,7 +19,7 @@ from fidsplat.backends.base import (
     Pipeline,
 )
 from fidsplat.backends.prepare import prepare, prepare_batch
-from fidsplat.backends.registry import open_backend
+from fidsplat.backends.registry import FIRST, open_backend
 from fidsplat.backends.view import NO_CAMERA, View
 from fidsplat.batch import FrameBatch, ViewByView
 from fidsplat.cameras import Camera
@@ -40,8 +40,8 @@ _PLAIN = Capture()
 
 
 def default_device() -> str:
-    """The device that is used where none is named: FIDSPLAT_DEVICE, else opencl."""
-    return os.environ.get("FIDSPLAT_DEVICE", "").strip() or "opencl"
+    """The device that is used where none is named: FIDSPLAT_DEVICE, else auto."""
+    return os.environ.get("FIDSPLAT_DEVICE", "").strip() or FIRST
 
 
 class Renderer:
@@ -51,9 +51,9 @@ class Renderer:
     its own.
 
     Args:
-        device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or device's name, or
-            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), or "reference" (NumPy, float64, slow).
-            None: what the environment variable FIDSPLAT_DEVICE says, else "opencl".
+        device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or a GPU's name, or
+            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), "reference" (NumPy, float64, slow), or "auto"
+            ("opencl", else "warp" with a warning). None: what FIDSPLAT_DEVICE says, else "auto".
         memory_budget: bytes of the device that a picture and its cloud may take; by default nine tenths of
             what the device says it has. What needs more is drawn in bands of the picture and, by OpenCL,
             chunks of the cloud, which takes longer and gives the same bits.

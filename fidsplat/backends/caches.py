@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
 import warnings
 import weakref
@@ -31,8 +32,11 @@ def pocl_folder() -> Path:
 
 @cache
 def ensure_caches() -> None:
-    """Before a driver is first asked for something: for each cache that cannot be written, or has no room, a
-    folder for this process, named in the environment. Warns."""
+    """Provide a folder for this process, named in the environment, for each cache that cannot be written, has
+    no room, or that other users can write. Warns. Called before a driver is first used.
+    """
+    if "HOME" not in os.environ and "XDG_CACHE_HOME" not in os.environ:  # PoCL would use a folder in /tmp
+        os.environ.setdefault("POCL_CACHE_DIR", str(user_cache() / "pocl" / "kcache"))
     where = {"POCL_CACHE_DIR": pocl_folder(), "XDG_CACHE_HOME": user_cache()}
     lacking = {name: why for name, folder in where.items() if (why := _lack(folder))}
     if "XDG_CACHE_HOME" not in os.environ and os.path.expanduser("~") == "~":
@@ -44,18 +48,23 @@ def ensure_caches() -> None:
     os.environ.update({name: str(place / name.lower()) for name in lacking})
     warnings.warn(
         f"kernels are compiled again in this run: {'; '.join(lacking.values())}; "
-        f"set {' and '.join(lacking)} to a folder with room",
+        f"set {' and '.join(lacking)} to a folder of your own with room",
         stacklevel=2,
     )
 
 
 def _lack(folder: Path) -> str:
-    """Why nothing can be kept in a folder; empty if it can."""
+    """Why a folder cannot hold compiled kernels; empty if it can."""
     try:
         free = shutil.disk_usage(writable_folder(folder)).free
+        state = folder.stat()
     except (OSError, InputError) as error:
         return str(error).partition(";")[0]
-    return "" if free >= LEAST_FREE else f"{folder} has room for {free // 2**20} MB only"
+    if free < LEAST_FREE:
+        return f"{folder} has room for {free // 2**20} MB only"
+    if hasattr(os, "geteuid") and state.st_uid != os.geteuid():
+        return f"{folder} belongs to another user"
+    return f"{folder} can be written by every user" if state.st_mode & stat.S_IWOTH else ""
 
 
 def _remove(place: Path, process: int) -> None:

@@ -5,11 +5,13 @@ first use.
 from __future__ import annotations
 
 import os
+import warnings
 from importlib import import_module
 
 from fidsplat.backends.base import Backend, DeviceInfo
 from fidsplat.backends.caches import ensure_caches
 from fidsplat.errors import DeviceError, UnknownDeviceError, unknown
+from fidsplat.limits import check_driver
 
 FAMILIES = {
     "opencl": "fidsplat.backends.opencl.device",
@@ -18,43 +20,74 @@ FAMILIES = {
 }
 """family: its module; another family is one more entry; from outside, of one process"""
 
+FIRST = "auto"
+"""the device that stands for the first family of ORDER that has a usable device"""
+ORDER = ("opencl", "warp")
+
 _STARTED_BY: dict[str, int] = {}
 """family: the process that was the first here to ask its driver for something"""
 
 
 def open_backend(name: str) -> Backend:
-    """Open a device by name: a family (`opencl`, `warp`, `reference`) or `family:part of a platform's or
-    device's name`.
+    """Open a device by name: `auto`, a family (`opencl`, `warp`, `reference`) or `family:selector`.
 
     Raises:
         UnknownDeviceError: no such family, or nothing of the family answers to the selector.
         DeviceError: the device is there and cannot be used, or a fork has made it unusable here.
     """
     family, _, selector = str(name).strip().partition(":")
-    if family.lower() not in FAMILIES:
+    family = family.lower()
+    if (family, selector) == (FIRST, ""):
+        return _open_first()
+    if family not in FAMILIES:
         raise UnknownDeviceError(
             f"{unknown('device', family, FAMILIES)}, and their devices, which `fidsplat devices` lists"
         )
-    if (family.lower(), selector.lower()) != ("warp", "cpu"):  # which has no driver
-        _check_driver(family.lower())
-    if family.lower() != "reference":
-        ensure_caches()
-    return import_module(FAMILIES[family.lower()]).open_device(selector)
+    _prepare(family, selector)
+    return import_module(FAMILIES[family]).open_device(selector)
 
 
 def devices() -> list[DeviceInfo]:
-    """Every device that can be opened here, and why the others cannot. Raises DeviceError where a fork has
-    made a driver unusable."""
+    """Every device that can be opened here, and why the others cannot.
+
+    Raises:
+        DeviceError: a fork has made a driver unusable, or a limit of the process is too low for drivers.
+    """
     for family in FAMILIES:
-        _check_driver(family)
-    ensure_caches()
+        _prepare(family)
     return [info for module in FAMILIES.values() for info in import_module(module).devices()]
+
+
+def _open_first() -> Backend:
+    """The best device of the first family of ORDER that has a usable one. Warns of those that have none."""
+    reasons = []
+    for family in ORDER:
+        _prepare(family)
+        try:
+            backend = import_module(FAMILIES[family]).open_device("")
+        except DeviceError as error:
+            reasons.append(str(error))
+            continue
+        if reasons:
+            warnings.warn(f"{'; '.join(reasons)}; {backend.info.name} is used instead", stacklevel=4)
+        return backend
+    raise DeviceError("; ".join(reasons))
+
+
+def _prepare(family: str, selector: str = "") -> None:
+    """Check that a family's driver can be entered, and provide folders for its caches."""
+    if family == "reference":
+        return
+    if (family, selector.lower()) != ("warp", "cpu"):  # which has no driver
+        _check_driver(family)
+    check_driver(family)
+    ensure_caches()
 
 
 def _check_driver(family: str) -> None:
     """Raises DeviceError where the driver would wait for threads that a fork left behind."""
     started = _STARTED_BY.setdefault(family, os.getpid())
-    if family != "reference" and started != os.getpid():
+    if started != os.getpid():
         raise DeviceError(
             f"{family} was started by process {started}, of which this one is a fork, and its driver "
             "does not survive that; open the first Renderer in the workers, or start them by "

@@ -19,8 +19,11 @@ def load(key: str | None) -> dict[str, Any] | None:
     """What was kept under a key; None if nothing, or if the file is damaged."""
     if key is None:
         return None
+    path = folder() / f"{key}.json"
+    if not path.is_file():  # to open a FIFO would wait for a writer
+        return None
     try:
-        kept = from_json((folder() / f"{key}.json").read_text("utf-8"))
+        kept = from_json(path.read_text("utf-8"))
     except (OSError, ValueError):
         return None
     return kept if isinstance(kept, dict) else None

@@ -69,7 +69,7 @@ class Marker:
     ] = None
     iterations: Annotated[int | None, option("N", "pictures that refined looks at (default: 1000)")] = None
     device: Annotated[
-        str | None, option("D", "that refined draws on (default: FIDSPLAT_DEVICE, or opencl)")
+        str | None, option("D", "that refined draws on (default: FIDSPLAT_DEVICE, or auto)")
     ] = None
     quality: Annotated[
         str | None, option("Q", "as `fidsplat render` takes it; what it says of markers, as above, holds")

@@ -31,15 +31,15 @@ def option(metavar: str, text: str, short: str | None = None):
     return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint="")
 
 
-Device = Annotated[str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")]
+Device = Annotated[str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)")]
 
 Devices = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
-    option("D", "see `fidsplat devices`; once more for each (default: FIDSPLAT_DEVICE, or opencl)"),
+    option("D", "see `fidsplat devices`; once more for each (default: FIDSPLAT_DEVICE, or auto)"),
 ]
 
 SceneDevice = Annotated[
-    str | None, option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or opencl)")
+    str | None, option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or auto)")
 ]
 SceneOutputs = Annotated[
     str | None, option("A,B,...", "outputs, as for `fidsplat render` (default: the scene's, or rgb)")

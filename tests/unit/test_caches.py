@@ -46,7 +46,7 @@ def test_a_cache_that_cannot_be_written_is_replaced(ensure, name):
     assert said.startswith(
         "kernels are compiled again in this run: cannot write into the folder /dev/null/nowhere"
     )
-    assert said.endswith(f"; set {name} to a folder with room")
+    assert said.endswith(f"; set {name} to a folder of your own with room")
     assert Path(os.environ[name]).parent.name.startswith("fidsplat-cache-")
 
 
@@ -54,14 +54,33 @@ def test_a_disk_without_room(ensure, monkeypatch):
     monkeypatch.setattr(caches.shutil, "disk_usage", lambda _: namedtuple("Usage", "free")(2**20))
     said = ensure(POCL_CACHE_DIR="/tmp", XDG_CACHE_HOME="/tmp")
     assert "/tmp has room for 1 MB only" in said
-    assert said.endswith("set POCL_CACHE_DIR and XDG_CACHE_HOME to a folder with room")
+    assert said.endswith("set POCL_CACHE_DIR and XDG_CACHE_HOME to a folder of your own with room")
 
 
-def test_nobody_without_a_home(ensure, monkeypatch):
+def test_folders_of_others_hold_no_kernels(ensure, tmp_path, monkeypatch):
+    tmp_path.chmod(0o777)
+    said = ensure(POCL_CACHE_DIR=tmp_path)
+    assert f"{tmp_path} can be written by every user" in said
+    tmp_path.chmod(0o755)
+    monkeypatch.setattr(caches.os, "geteuid", lambda: os.getuid() + 1)
+    assert f"{tmp_path} belongs to another user" in ensure(POCL_CACHE_DIR=tmp_path)
+
+
+def test_without_home_pocl_does_not_use_the_folder_for_temporary_files(ensure, monkeypatch, tmp_path):
+    """HOME is not set, and the user has a home folder."""
+    for name in (*NAMES, "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(caches.os.path, "expanduser", lambda text: str(tmp_path))
+    caches.ensure_caches.__wrapped__()
+    assert os.environ["POCL_CACHE_DIR"] == str(tmp_path / ".cache" / "pocl" / "kcache")
+    monkeypatch.delenv("POCL_CACHE_DIR")
+
+
+def test_nobody_without_a_home(ensure, monkeypatch, tmp_path):
     monkeypatch.setattr(caches.os.path, "expanduser", lambda text: text)
     monkeypatch.setenv("XDG_CACHE_HOME", "")
     monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("POCL_CACHE_DIR", "/tmp")
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
     with pytest.warns(UserWarning, match="this user has no home folder; set XDG_CACHE_HOME"):
         caches.ensure_caches.__wrapped__()
     caches._remove(Path(os.environ["XDG_CACHE_HOME"]).parent, os.getpid())

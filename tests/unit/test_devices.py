@@ -8,7 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.opencl import device, pocl_target, vendors
+from fidsplat.backends import registry
+from fidsplat.backends.opencl import device, vendors
+from fidsplat.backends.opencl.pocl_workarounds import target_patch
 from fidsplat.errors import UnknownDeviceError
 
 POCL = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-"
@@ -78,6 +80,55 @@ def test_devices_of_one_name_are_numbered(monkeypatch):
         device.open_device("pocl-2")
 
 
+def test_platforms_are_matched_before_devices_and_processors_never(monkeypatch):
+    """Every driver for a processor repeats the processor's name."""
+
+    def card(platform, name, kind, vendor=""):
+        return SimpleNamespace(
+            platform=SimpleNamespace(name=platform), name=name, vendor=vendor, type=kind, version=""
+        )
+
+    cpu, gpu = device.cl.device_type.CPU, device.cl.device_type.GPU
+    pocl = card("Portable Computing Language", "cpu-Intel(R) Xeon(R)", cpu, "GenuineIntel")
+    other = card("Clover", "Intel Arc by Clover", gpu)
+    intel = card("Intel(R) OpenCL", "Intel(R) Xeon(R)", cpu)
+    found = [pocl, other, intel]
+    monkeypatch.setattr(device, "_all_devices", lambda: iter(found))
+    monkeypatch.setattr(device, "_why_unusable", lambda one: "")
+    monkeypatch.setattr(device, "OpenCLBackend", lambda one: one)
+    assert device.open_device("intel") is intel
+    assert device.open_device("arc") is other
+    assert device.open_device("cpu") is pocl
+    found.pop()
+    assert device.open_device("Intel") is other
+    found.pop()
+    with pytest.raises(UnknownDeviceError, match="no OpenCL device matches 'intel'; there are: opencl:pocl"):
+        device.open_device("intel")
+
+
+@pytest.mark.parametrize("warp", [True, False])
+def test_without_opencl_the_default_is_warp_and_says_so(monkeypatch, warp):
+    def refuse(selector):
+        raise fs.DeviceError("no OpenCL platform found")
+
+    def open_warp(selector):
+        if not warp:
+            raise fs.DeviceError("Warp is not installed")
+        return SimpleNamespace(info=SimpleNamespace(name="warp:cpu"))
+
+    families = {"opencl": SimpleNamespace(open_device=refuse), "warp": SimpleNamespace(open_device=open_warp)}
+    monkeypatch.setattr(registry, "import_module", lambda name: families[name.split(".")[2]])
+    monkeypatch.delenv("FIDSPLAT_DEVICE", raising=False)
+    if warp:
+        with pytest.warns(UserWarning, match="no OpenCL platform found; warp:cpu is used instead"):
+            assert fs.Renderer().device.name == "warp:cpu"
+    else:
+        with pytest.raises(fs.DeviceError, match="no OpenCL platform found; Warp is not installed"):
+            fs.Renderer()
+    with pytest.raises(fs.DeviceError, match=r"no OpenCL platform found$"):
+        fs.Renderer("opencl")
+
+
 def test_no_platform_says_how_to_get_one(monkeypatch):
     monkeypatch.setattr(device, "_all_devices", lambda: iter(()))
     with pytest.raises(fs.DeviceError, match=r"pip install 'pyopencl\[pocl\]'"):
@@ -93,9 +144,9 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         return Record(*words)
 
     good = record(1, 2, ctypes.addressof(triplet), ctypes.addressof(generic), 5)
-    assert pocl_target.why_not(ctypes.addressof(good), POCL + "generic") == ""
-    name = pocl_target.correct_target(ctypes.addressof(good), POCL + "generic")
-    assert name in [level for level, _ in pocl_target._LEVELS]
+    assert target_patch.why_not(ctypes.addressof(good), POCL + "generic") == ""
+    name = target_patch.correct_target(ctypes.addressof(good), POCL + "generic")
+    assert name in [level for level, _ in target_patch._LEVELS]
     assert ctypes.string_at(good[3]) == name.encode()
     assert list(good[:3]) == [1, 2, ctypes.addressof(triplet)]
     assert good[4] == 5
@@ -106,8 +157,8 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         record(8, 1 << 63),
     ):
         before = list(bad)
-        assert "not that of PoCL 3.0" in pocl_target.why_not(ctypes.addressof(bad), POCL + "generic")
-        assert pocl_target.correct_target(ctypes.addressof(bad), POCL + "generic") == "generic"
+        assert "not that of PoCL 3.0" in target_patch.why_not(ctypes.addressof(bad), POCL + "generic")
+        assert target_patch.correct_target(ctypes.addressof(bad), POCL + "generic") == "generic"
         assert list(bad) == before
 
 
@@ -121,9 +172,9 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
     ],
 )
 def test_only_pocl_that_mistakes_the_processor_is_corrected(monkeypatch, processor, llvm, needed):
-    monkeypatch.setattr(pocl_target, "_processor_name", lambda: processor)
-    assert pocl_target.needs_correction(POCL + llvm) == needed
-    assert not pocl_target.needs_correction("OpenCL 3.0 CUDA")
+    monkeypatch.setattr(target_patch, "_processor_name", lambda: processor)
+    assert target_patch.needs_correction(POCL + llvm) == needed
+    assert not target_patch.needs_correction("OpenCL 3.0 CUDA")
 
 
 def pocl_that_mistakes(record):
@@ -140,7 +191,7 @@ def record(monkeypatch):
     words = [ctypes.create_string_buffer(text) for text in (b"x86_64-unknown-linux-gnu", b"generic")]
     made = (ctypes.c_uint64 * 512)(*map(ctypes.addressof, words))
     made.kept = words
-    monkeypatch.setattr(pocl_target, "_corrected", {})  # of records that had its address before
+    monkeypatch.setattr(target_patch, "_corrected", {})  # of records that had its address before
     return made
 
 
@@ -155,7 +206,7 @@ def test_what_needs_no_patch_is_preferred(monkeypatch, record):
     assert list(device._named_devices()) == ["opencl:pocl", "opencl:intel"]
 
 
-@pytest.mark.parametrize(("way", "named"), [("variable", pocl_target.FORBID), ("hidden", "/proc/self/mem")])
+@pytest.mark.parametrize(("way", "named"), [("variable", target_patch.FORBID), ("hidden", "/proc/self/mem")])
 def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_remedy_told(
     monkeypatch, record, way, named
 ):
@@ -163,13 +214,13 @@ def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_
     other.name, other.version = "a newer PoCL", "OpenCL 3.0 PoCL HSTR: cpu-x86_64-pc-linux-gnu-haswell"
     monkeypatch.setattr(device, "OpenCLBackend", lambda opened: opened.name)
     if way == "variable":
-        monkeypatch.setenv(pocl_target.FORBID, "1")
+        monkeypatch.setenv(target_patch.FORBID, "1")
     else:
 
         def refuse(path, flags):
             raise PermissionError(13, "Permission denied", path)
 
-        monkeypatch.setattr(pocl_target.os, "open", refuse)
+        monkeypatch.setattr(target_patch.os, "open", refuse)
     before = list(record)
     monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl]))
     with pytest.raises(fs.DeviceError, match=rf"a PoCL: .*{named}.*pocl-opencl-icd") as caught:
@@ -177,7 +228,7 @@ def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_
     assert "\n" not in str(caught.value)
     monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl, other]))
     assert device.open_device() == "a newer PoCL"
-    assert pocl_target.correct_target(pocl.int_ptr, pocl.version) == "generic"
+    assert target_patch.correct_target(pocl.int_ptr, pocl.version) == "generic"
     assert list(record) == before
 
 

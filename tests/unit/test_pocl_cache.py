@@ -1,21 +1,21 @@
-"""What is half written in PoCL's kernel cache is found and removed before PoCL trips over it."""
+"""Damaged files in kernel caches are removed before the driver loads them."""
 
 import os
 import shutil
 import subprocess
 import sys
-import time
 
 import pytest
 
 from fidsplat.backends.caches import pocl_folder
-from fidsplat.backends.opencl.pocl_cache import is_whole, remove_broken
+from fidsplat.backends.checked_cache import record_new, remove_damaged
+from fidsplat.backends.opencl.pocl_workarounds.kernel_cache import is_loaded, is_whole
 
 DRAW = """
 import numpy as np, fidsplat as fs
 one = np.ones((1, 4), np.float32)
 cloud = fs.SplatCloud([[0, 0, 2]], one, one[:, :2] * 0.3, one[:, 0], colors=one[:, :3])
-print(fs.Renderer("opencl:pocl").render(cloud, fs.Camera.pinhole(8, 8, 8, 8, 4, 4))["rgb"].sum())
+print(fs.Renderer("DEVICE").render(cloud, fs.Camera.pinhole(8, 8, 8, 8, 4, 4))["rgb"].sum())
 """
 DAMAGES = {
     "cut off": lambda content: content[: len(content) // 2],
@@ -36,12 +36,13 @@ def full_cache(tmp_path_factory):
     return folder, done.stdout
 
 
-def draw(folder):
+def draw(folder, device="opencl:pocl"):
     return subprocess.run(
-        [sys.executable, "-c", DRAW],
+        [sys.executable, "-c", DRAW.replace("DEVICE", device)],
         env=os.environ | {"POCL_CACHE_DIR": str(folder), "XDG_CACHE_HOME": str(folder / "other")},
         capture_output=True,
         text=True,
+        timeout=120,
     )
 
 
@@ -99,32 +100,88 @@ def test_a_program_without_kernels_is_built_again(monkeypatch):
     assert list(dict.fromkeys(builds)) == [(), ("-DATTEMPT_1",)]
 
 
-def test_a_damaged_cache_of_pyopencl_is_done_without(full_cache, tmp_path):
+def flip_a_bit(path):
+    """In the middle, with the times of the file as they were."""
+    content, state = bytearray(path.read_bytes()), path.stat()
+    content[len(content) // 2] ^= 16
+    path.write_bytes(content)
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
+
+
+def put_a_folder(path):
+    path.unlink()
+    path.mkdir()
+
+
+def put_a_fifo(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("damage", [flip_a_bit, put_a_folder, put_a_fifo])
+def test_what_a_checksum_or_the_kind_of_file_shows_is_compiled_again(full_cache, tmp_path, damage):
+    """Structure does not show these. The copy has other times, so that checksums decide."""
     folder = tmp_path / "cache"
     shutil.copytree(full_cache[0], folder)
-    (database,) = (folder / "other").rglob("*.sqlite")
-    database.write_bytes(DAMAGES["noise"](database.read_bytes()))
+    files = compiled(folder)
+    names = [path.relative_to(folder) for path in files]
+    assert remove_damaged(folder, is_loaded, is_whole) == 0
+    for path in files:
+        damage(path)
+    if damage is not flip_a_bit:
+        damage(next(folder.rglob("last_accessed")))
     done = draw(folder)
     assert (done.returncode, done.stdout) == (0, full_cache[1]), done.stderr
+    assert [path.relative_to(folder) for path in compiled(folder) if path.is_file()] == names
+
+
+@pytest.mark.exhaustive
+def test_kernels_of_warp_are_checked_too(tmp_path):
+    pytest.importorskip("warp")
+    folder = tmp_path / "cache"
+    first = draw(folder, "warp:cpu")
+    objects = sorted(folder.rglob("*.o"))
+    assert objects
+    for path in objects:
+        flip_a_bit(path)
+    put_a_folder(next(folder.rglob("*.meta")))
+    done = draw(folder, "warp:cpu")
+    assert (done.returncode, done.stdout) == (0, first.stdout), done.stderr
+    assert all(path.is_file() for path in folder.rglob("*.meta"))
+
+
+def test_a_damaged_record_of_checksums_is_made_again(full_cache, tmp_path):
+    folder = tmp_path / "cache"
+    shutil.copytree(full_cache[0], folder)
+    record, files = folder / "fidsplat-checksums.json", compiled(folder)
+    for damage in (
+        put_a_fifo,
+        put_a_folder,
+        lambda path: path.write_text("[1"),
+        lambda path: path.write_text("{"),
+    ):
+        damage(record)
+        assert remove_damaged(folder, is_loaded, is_whole) == 0
+        assert record.is_file()
+    assert compiled(folder) == files
+
+
+def test_new_files_get_a_checksum_when_the_process_ends(tmp_path):
+    program = tmp_path / "program.bc"
+    program.write_bytes(b"new")
+    record_new(tmp_path, is_loaded)
+    flip_a_bit(program)
+    assert remove_damaged(tmp_path, is_loaded, lambda _: True) == 1
+    assert not program.exists()
 
 
 def test_what_is_whole_stays(full_cache, tmp_path):
     folder = tmp_path / "cache"
     shutil.copytree(full_cache[0], folder)
     before = compiled(folder)
-    assert remove_broken(folder) == 0
+    assert remove_damaged(folder, is_loaded, is_whole) == 0
     assert compiled(folder) == before
-    assert remove_broken(tmp_path / "nowhere") == 0
-
-
-def test_a_clock_that_was_put_back_hides_nothing(full_cache, tmp_path):
-    folder = tmp_path / "cache"
-    shutil.copytree(full_cache[0], folder)
-    remove_broken(folder)
-    later = time.time() + 3600
-    os.utime(folder / "fidsplat-checked", (later, later))
-    compiled(folder)[0].write_bytes(b"")
-    assert remove_broken(folder) == 1
+    assert remove_damaged(tmp_path / "nowhere", is_loaded, is_whole) == 0
 
 
 def test_the_cache_is_where_pocl_looks(monkeypatch, tmp_path):
@@ -139,6 +196,6 @@ def test_what_another_process_is_about_to_finish_is_left_alone(tmp_path):
     unfinished, broken = tmp_path / "tempfile_ab12cd.so", tmp_path / "blend.so"
     for file in (unfinished, broken):
         file.write_bytes(b"")
-    assert remove_broken(tmp_path) == 1
+    assert remove_damaged(tmp_path, is_loaded, is_whole) == 1
     assert unfinished.exists()
     assert not broken.exists()

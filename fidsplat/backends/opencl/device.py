@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
+from fidsplat.backends.caches import pocl_folder
+from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.chunks import WholeScene
 from fidsplat.backends.ends import TileEnds
-from fidsplat.backends.opencl import pocl_cache, pocl_target
 from fidsplat.backends.opencl.ahead import Ahead
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.chunks import OpenCLChunks
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+from fidsplat.backends.opencl.pocl_workarounds import is_pocl, kernel_cache, linker, target_patch
 from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
@@ -28,8 +30,10 @@ from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.errors import DeviceError, UnknownDeviceError
+from fidsplat.files import user_cache
 from fidsplat.splats import SplatCloud
 
+_PYOPENCL_FILES = ("binary", "info", "source.cl")
 _NO_PATCH_NEEDED = (
     "a newer PoCL (Debian: pocl-opencl-icd; conda: pocl) or Intel's runtime for CPUs needs no patch "
     "(docs/backends.md)"
@@ -47,9 +51,11 @@ def devices() -> list[DeviceInfo]:
 
 
 def open_device(selector: str = "") -> OpenCLBackend:
-    """The best usable device (GPU before CPU, and last what must be patched) of those whose platform, name or
-    vendor contains `selector`, or the one that `devices` lists as opencl:`selector` where that ends with a
-    number.
+    """The best usable device that the selector matches: GPU before CPU, PoCL with a patch last.
+
+    Args:
+        selector: `cpu` or `gpu`; part of a platform's name; part of a GPU's name or vendor if no platform has
+            it; or, with a number at its end, what follows `opencl:` in the list of `devices`.
 
     Raises:
         DeviceError: no OpenCL at all, or none of the devices can be used.
@@ -60,7 +66,7 @@ def open_device(selector: str = "") -> OpenCLBackend:
         raise DeviceError(_NO_PLATFORM)
     wanted = selector.strip().lower()
     numbered = found.get(f"opencl:{wanted}") if wanted[-1:].isdigit() else None
-    matching = [numbered] if numbered else [device for device in found.values() if _matches(device, wanted)]
+    matching = [numbered] if numbered else _matching(found.values(), wanted)
     if not matching:
         known = "; ".join(f"{name}: {device.name}" for name, device in found.items())
         raise UnknownDeviceError(f"no OpenCL device matches {selector!r}; there are: {known}")
@@ -77,8 +83,13 @@ class OpenCLBackend(Workspace):
     """An open OpenCL device, and what is compiled for it."""
 
     def __init__(self, device: cl.Device) -> None:
-        if "Portable Computing Language" in device.platform.name:
-            pocl_cache.check_once()
+        if is_pocl(device):
+            linker.provide_linker()
+            if _needs_patch(device):
+                target_patch.announce_once(pocl_folder(), _PATCHED)
+            check_once(pocl_folder(), kernel_cache.is_loaded, kernel_cache.is_whole)
+        else:  # pyopencl keeps programs for drivers that have no cache of their own
+            check_once(user_cache() / "pyopencl", _PYOPENCL_FILES.__contains__, lambda _: True)
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
@@ -206,9 +217,7 @@ def _named_devices() -> dict[str, cl.Device]:
     named: dict[str, cl.Device] = {}
     for device in _all_devices():
         platform = device.platform.name
-        short = (
-            "pocl" if "Portable Computing Language" in platform else platform.split()[0].split("(")[0].lower()
-        )
+        short = "pocl" if is_pocl(device) else platform.split()[0].split("(")[0].lower()
         name, number = f"opencl:{short}", 1
         while name in named:
             number += 1
@@ -221,12 +230,19 @@ def _name_of(device: cl.Device) -> str:
     return next(name for name, known in _named_devices().items() if known == device)
 
 
-def _matches(device: cl.Device, selector: str) -> bool:
-    aliases = {"pocl": "portable computing language"}
-    named = f"{device.platform.name} {device.name} {device.vendor}".lower()
+def _matching(devices: Iterable[cl.Device], selector: str) -> list[cl.Device]:
+    """Devices that a selector matches. The name of a processor is not compared: every driver for it repeats
+    that name, so `intel` would match PoCL."""
+    devices = list(devices)
     if selector in ("cpu", "gpu"):
-        return bool(device.type & getattr(cl.device_type, selector.upper()))
-    return selector in named or aliases.get(selector, "\0") in named
+        return [each for each in devices if each.type & getattr(cl.device_type, selector.upper())]
+    if selector == "pocl":
+        return [each for each in devices if is_pocl(each)]
+    return [each for each in devices if selector in each.platform.name.lower()] or [
+        each
+        for each in devices
+        if not each.type & cl.device_type.CPU and selector in f"{each.name} {each.vendor}".lower()
+    ]
 
 
 def _why_unusable(device: cl.Device) -> str:
@@ -236,13 +252,15 @@ def _why_unusable(device: cl.Device) -> str:
         return "it has no compiler for OpenCL C"
     if not device.endian_little:
         return "it is big-endian"
-    if _needs_patch(device) and (why := pocl_target.why_not(device.int_ptr, device.version)):
+    if is_pocl(device) and (why := linker.why_no_linker()):
+        return why
+    if _needs_patch(device) and (why := target_patch.why_not(device.int_ptr, device.version)):
         return f"this PoCL's compiler does not know the processor, and {why}; {_NO_PATCH_NEEDED}"
     return ""
 
 
 def _needs_patch(device: cl.Device) -> bool:
-    return pocl_target.needs_correction(device.version)
+    return target_patch.needs_correction(device.version)
 
 
 def _describe(device: cl.Device, name: str) -> DeviceInfo:

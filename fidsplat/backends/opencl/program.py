@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import importlib
-import sqlite3
 import threading
 import warnings
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
-from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
+from fidsplat.backends.opencl.pocl_workarounds import is_pocl
+from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_program
+from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import Workspace, token_of
 from fidsplat.errors import DeviceError
 
@@ -21,16 +23,23 @@ in_background = threading.local()
 """`on` in threads whose starter has filtered warnings for them: filters are the whole process's"""
 
 
-def load_invoker() -> None:
-    """Imports the part of pyopencl that sets arguments, which opens a database in the user's cache folder.
+class _InvokerCache(dict[Any, Any]):
+    """pyopencl's cache of the Python code that sets arguments, in memory.
 
-    Where that is damaged this process does without it, and makes again what it holds.
+    pyopencl's own is a database of code without checksums, which crashes when it is damaged.
+    Making the code takes less than a millisecond per kernel.
     """
-    try:
-        importlib.import_module("pyopencl.invoker")
-    except sqlite3.DatabaseError:
-        cl._PYOPENCL_NO_CACHE = True
-        importlib.import_module("pyopencl.invoker")
+
+    store_if_not_present = dict.setdefault
+
+
+@cache
+def load_invoker() -> None:
+    """Import the part of pyopencl that sets arguments, without its database."""
+    before, cl._PYOPENCL_NO_CACHE = cl._PYOPENCL_NO_CACHE, True
+    invoker = importlib.import_module("pyopencl.invoker")
+    cl._PYOPENCL_NO_CACHE = before
+    invoker.__dict__["invoker_cache"] = _InvokerCache()
 
 
 def build_options(device: cl.Device) -> list[str]:
@@ -55,9 +64,15 @@ def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
         DeviceError: the compiler refuses; its log is in the message.
     """
 
+    all_options = (*build_options(workspace.device), *options)
+
+    def compiled() -> cl.Program:
+        return cl.Program(workspace.context, text).build(options=list(all_options))
+
     def built() -> cl.Program:
-        program = cl.Program(workspace.context, text)
-        return program.build(options=[*build_options(workspace.device), *options])
+        if is_pocl(workspace.device):
+            return shared_program(workspace.context, text, all_options, compiled)
+        return compiled()
 
     try:
         if getattr(in_background, "on", False):

@@ -20,6 +20,8 @@ from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.opencl.host_memory import HostMemory
 from fidsplat.backends.opencl.memory_plan import PAIR
 from fidsplat.backends.opencl.pages import large_pages
+from fidsplat.backends.opencl.pocl_workarounds import is_pocl
+from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_context
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.errors import DeviceError, bytes_words
@@ -196,7 +198,7 @@ class Workspace:
 
     def __init__(self, device: cl.Device, info: DeviceInfo, shape: DeviceShape) -> None:
         self.device, self.info, self.shape = device, info, shape
-        self.context = cl.Context([device])
+        self.context = shared_context(device) if is_pocl(device) else cl.Context([device])
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.side_queue = cl.CommandQueue(self.context)
         """for what the host reads while the stages run"""

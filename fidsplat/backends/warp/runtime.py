@@ -9,13 +9,17 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 
+from fidsplat.backends.checked_cache import check_once
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
 MISSING = "Warp is not installed; install it with: pip install 'fidsplat[warp]' (or pip install warp-lang)"
 _PACKAGE = "fidsplat_warp_kernels"
+_LOADED = (".o", ".cubin", ".ptx", ".meta")
+"""ends of the names of compiled kernels in Warp's cache"""
 
 
 def installed() -> bool:
@@ -38,6 +42,8 @@ def load() -> ModuleType:
         raise DeviceError(f"Warp cannot be imported: {error}") from error
     with quiet(), _without_stderr():
         warp.init()
+    if folder := warp.config.kernel_cache_dir:
+        check_once(Path(folder), lambda name: name.endswith(_LOADED), lambda _: True)
     return warp
 
 

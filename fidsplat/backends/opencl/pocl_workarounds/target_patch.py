@@ -1,13 +1,15 @@
-"""Lets the PoCL that pip installs compile for processors that its LLVM does not know: the last resort, for
-which devices that need none are preferred (device.py), and which the variable FIDSPLAT_NO_POCL_PATCH forbids.
+"""Correction of PoCL 3.0's target processor in memory: the last resort.
 
-PoCL 3.0 from PyPI asks its LLVM 14 for the processor's name. For one that is newer than LLVM 14 (AMD Zen 5,
-say) the answer is "generic", which PoCL then hands to clang as -target-cpu, where it is an error: every build
+Devices that need no patch are preferred (device.py), and the variable FIDSPLAT_NO_POCL_PATCH forbids it.
+
+PoCL 3.0 from PyPI takes the processor's name from its LLVM 14. For one that is newer than LLVM 14 (AMD Zen
+5, say) that name is "generic", which PoCL passes to clang as -target-cpu, where it is an error: every build
 fails with "unknown target CPU 'generic'" (pocl issues #512, #1049). For one that LLVM 14 takes for an older
-one (Zen 4, with AVX-512, for Zen 3, without) builds crash or never end: PoCL picks its kernel library by the
-processor's feature flags, and that one is for AVX-512. PoCL 3.1 and later read POCL_LLVM_CPU_NAME; 3.0 has no
-such setting, so the name is corrected where PoCL keeps it, in the device's record: the field `llvm_cpu`,
-which follows `llvm_target_triplet`. The new name is the one for which PoCL built that kernel library.
+one (Zen 4, with AVX-512, for Zen 3, without) builds crash or never end: PoCL selects its kernel library by
+the processor's feature flags, and that library is for AVX-512. PoCL 3.1 and later read POCL_LLVM_CPU_NAME;
+3.0 has no such setting. So the name is replaced where PoCL stores it, in the field `llvm_cpu` of the
+device's record, after `llvm_target_triplet`. The new name is the one for which PoCL built the kernel
+library.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import os
 import platform
 import re
 import struct
+import warnings
 from pathlib import Path
 
 # The x86 levels of PoCL's "distro" kernel libraries, best last, with LLVM's name for each.
@@ -69,6 +72,17 @@ def correct_target(device_address: int, device_version: str) -> str:
         _corrected[device_address] = name
         ctypes.c_uint64.from_address(place).value = ctypes.addressof(name)
     return _corrected[device_address].value.decode()
+
+
+def announce_once(cache: Path, text: str) -> None:
+    """Warn that the device is patched, once for each folder of compiled kernels."""
+    try:
+        (cache / "fidsplat-patch-announced").touch(exist_ok=False)
+    except FileExistsError:
+        return
+    except OSError:  # a folder that cannot be written has its own warning
+        pass
+    warnings.warn(text, stacklevel=4)
 
 
 def _place(device_address: int, device_version: str) -> int | None:

@@ -1,0 +1,124 @@
+"""Checksums of compiled kernels, which drivers cache in files and load without a check.
+
+A damaged file crashes the driver, or changes what it computes. Before a driver first loads kernels, files
+that differ from their checksum are removed, and the driver compiles them again. When the process ends, the
+checksums of new files are recorded. A file without a checksum, of a process that was killed, is checked by
+its format alone.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import shutil
+import stat
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+
+_RECORD = "fidsplat-checksums.json"
+_watched: set[Path] = set()
+
+Entry = list[int]
+"""checksum, bytes, time of the last change in ns, inode; while the last three are unchanged the file is not
+read"""
+
+
+def check_once(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callable[[Path], bool]) -> None:
+    """Check a folder once per process, and record the checksums of its new files when the process ends."""
+    folder = folder.absolute()
+    if folder in _watched:
+        return
+    _watched.add(folder)
+    remove_damaged(folder, is_loaded, is_whole)
+    process = os.getpid()
+    atexit.register(lambda: os.getpid() == process and record_new(folder, is_loaded))
+
+
+def remove_damaged(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callable[[Path], bool]) -> int:
+    """Remove what differs from its checksum or is no regular file, and return the number of files removed.
+
+    Args:
+        is_loaded: whether the driver loads files of a name; others are left alone.
+        is_whole: whether a file without a checksum is complete.
+    """
+    known, valid, removed = _read(folder), {}, 0
+    for file in _loaded(folder, is_loaded):
+        with suppress(OSError):  # another process may remove files too
+            key, state, entry = file.path[len(str(folder)) + 1 :], file.stat(follow_symlinks=False), None
+            if stat.S_ISREG(state.st_mode) and (key in known or is_whole(Path(file))):
+                entry = _current(file.path, state, known.get(key))
+            if entry is not None:
+                valid[key] = entry
+            else:
+                _remove(file.path, state)
+                removed += 1
+    if valid != known:
+        _write(folder, valid)
+    return removed
+
+
+def record_new(folder: Path, is_loaded: Callable[[str], bool]) -> None:
+    """Record the checksums of files that have none yet."""
+    known, new = _read(folder), {}
+    for file in _loaded(folder, is_loaded):
+        key = file.path[len(str(folder)) + 1 :]
+        if key not in known and file.is_file(follow_symlinks=False):
+            with suppress(OSError):
+                new[key] = _current(file.path, file.stat(), None)
+    if new:
+        _write(folder, known | new)
+
+
+def _current(path: str, state: os.stat_result, entry: Entry | None) -> Entry | None:
+    """The entry of a file as it is; None if it differs from a known entry."""
+    identity = [state.st_size, state.st_ctime_ns, state.st_ino]
+    if entry is not None and entry[1:] == identity:
+        return entry
+    checksum = zlib.crc32(Path(path).read_bytes())
+    return [checksum, *identity] if entry is None or entry[0] == checksum else None
+
+
+def _loaded(folder: Path, is_loaded: Callable[[str], bool]) -> Iterator[os.DirEntry[str]]:
+    """What has the name of a loaded file, in a folder and those below it."""
+    waiting = [str(folder)]
+    while waiting:
+        with suppress(OSError), os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                if is_loaded(entry.name):
+                    yield entry
+                elif entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
+
+
+def _remove(path: str | Path, state: os.stat_result) -> None:
+    if stat.S_ISDIR(state.st_mode):
+        shutil.rmtree(path)
+    else:
+        os.unlink(path)
+
+
+def _read(folder: Path) -> dict[str, Entry]:
+    """The recorded entries; none where the record is missing or damaged."""
+    path = folder / _RECORD
+    with suppress(OSError):
+        state = path.lstat()
+        if not stat.S_ISREG(state.st_mode):
+            _remove(path, state)
+    try:
+        record = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(record, dict):
+        return {}
+    return {key: entry for key, entry in record.items() if isinstance(entry, list) and len(entry) == 4}
+
+
+def _write(folder: Path, entries: dict[str, Entry]) -> None:
+    with suppress(InputError), atomic_write(folder / _RECORD) as stream:  # a folder that is read-only
+        stream.write(json.dumps(entries).encode())

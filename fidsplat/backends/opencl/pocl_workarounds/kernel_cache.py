@@ -1,0 +1,65 @@
+"""Check of PoCL's kernel cache, from which PoCL loads files without a check.
+
+A bitcode file or a shared object that is cut off, empty or noise ends the process ("LLVM ERROR", SIGBUS,
+abort) or makes a program without kernels, in that run and in every later one. Such files are removed before
+PoCL is first asked for a program; PoCL then compiles them again. PoCL renames a file when it is complete;
+files that another process is writing are called tempfile_*, and are left alone: without them that process
+would end.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+_BITCODE, _ELF = b"BC\xc0\xde", b"\x7fELF\x02\x01"
+_SECTION = struct.Struct("<4xI16xQQ24x")
+"""header of a section: its kind, offset and bytes"""
+_NO_BITS, _ENTER_SUBBLOCK = 8, 1
+_UNFINISHED = "tempfile_"
+
+
+def is_loaded(name: str) -> bool:
+    """Whether PoCL loads or opens cached files of a name."""
+    return name.endswith((".so", ".bc", "last_accessed")) and not name.startswith(_UNFINISHED)
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a bitcode file or a shared object is as long as its own headers say."""
+    if path.suffix not in (".so", ".bc"):
+        return True
+    with path.open("rb") as stream:
+        size = os.fstat(stream.fileno()).st_size
+        return _is_whole_elf(stream, size) if path.suffix == ".so" else _is_whole_bitcode(stream, size)
+
+
+def _is_whole_elf(stream: BinaryIO, size: int) -> bool:
+    """Whether the table of sections and every section are in the file; GNU ld writes the table last."""
+    head = stream.read(64)
+    if len(head) < 64 or not head.startswith(_ELF):
+        return False
+    (table,) = struct.unpack_from("<Q", head, 0x28)
+    each, count = struct.unpack_from("<HH", head, 0x3A)
+    if each != _SECTION.size or table + each * count > size:
+        return False
+    stream.seek(table)
+    sections = _SECTION.iter_unpack(stream.read(each * count))
+    return all(kind == _NO_BITS or offset + length <= size for kind, offset, length in sections)
+
+
+def _is_whole_bitcode(stream: BinaryIO, size: int) -> bool:
+    """Walks over the top-level blocks of an LLVM bitstream, each of which says how many words it has."""
+    if stream.read(4) != _BITCODE or size % 4:
+        return False
+    at = 4
+    while at < size:
+        # an abbreviation id in 2 bits, the block's id and the width of ids in it: one word for all blocks
+        # that LLVM has at the top level; then the number of words
+        stream.seek(at)
+        head = stream.read(8)
+        if len(head) < 8 or head[0] & 3 != _ENTER_SUBBLOCK:
+            return False
+        at += 8 + 4 * struct.unpack_from("<I", head, 4)[0]
+    return at == size
