@@ -15,9 +15,12 @@ from fidsplat.quality import Quality
 from fidsplat.surroundings import Gradient, Panorama
 
 RGB = Output("rgb", 3, "float32")
+ERROR = Output("error", 1, "float32")
+"""made of two renderings (fidsplat/ideal.py): no backend has an effect of that name"""
 IMAGES: dict[str, Output] = {
     "rgb": RGB,
     **{effect.output.name: effect.output for effect in CATALOGUE.values() if effect.output},
+    "error": ERROR,
 }
 """all output images"""
 OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
@@ -132,7 +135,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             *(("shutter_rows",) if capture.exposed and in_spheres else ()),
             *(("blend_double",) if double else ()),
         ),
-        outputs=tuple(sorted({*capture.outputs} - {"rgb"})),
+        outputs=tuple(sorted({*capture.outputs} - {"rgb", "error"})),
         sh_degree=sh_degree,
         samples=quality.samples,
         setup_precision=quality.setup_precision,
