@@ -15,16 +15,15 @@ from fidsplat.quality import Quality
 from fidsplat.surroundings import Gradient, Panorama
 
 RGB = Output("rgb", 3, "float32")
-ERROR = Output("error", 1, "float32")
-"""made of two renderings (fidsplat/ideal.py): no backend has an effect of that name"""
 IMAGES: dict[str, Output] = {
     "rgb": RGB,
     **{effect.output.name: effect.output for effect in CATALOGUE.values() if effect.output},
-    "error": ERROR,
 }
 """all output images"""
 OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
-"""those that users ask for"""
+"""those that users ask for and backends render"""
+REQUESTED = (*OUTPUTS, "error")
+"""all that users ask for; `error` is made of two renderings (fidsplat/ideal.py)"""
 
 _KINDS = {Gradient: "gradient", Panorama: "panorama"}
 
@@ -95,8 +94,8 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
         InputError: an output that nobody declares, or two effects that do not go together.
     """
     for name in capture.outputs:
-        if name not in OUTPUTS:
-            raise InputError(unknown("output", name, OUTPUTS))
+        if name not in REQUESTED:
+            raise InputError(unknown("output", name, REQUESTED))
     quality, background = capture.quality, capture.backdrop
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
