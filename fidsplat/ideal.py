@@ -24,7 +24,7 @@ where the first term is measured, so that it holds whatever the quality leaves o
    `rounding` counts too. Resolving and colours (spherical harmonics) are `_resolving`.
 
 R and C are bounded by the colours of all splats and of the background. Where kernels have no such bound
-(`_BOUNDED`), Q is composited in float64, and its rounding is that of its float32 image. Not counted are the
+(`_BOUNDED`), or rgb itself is composited in float64, Q is composited in float64, and its rounding is that of its float32 image. Not counted are the
 rounding of the float64 set-up, and, with order="pixel", which of two fragments comes first where their depths
 agree to float64's rounding.
 """
@@ -157,7 +157,7 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         )
     features, view = prepare(data, replace(plain, quality=quality.with_(blend_precision="float32")))
     unbounded = sorted({*features.slots} - _BOUNDED)
-    if not unbounded:
+    if not unbounded and quality.blend_precision == "float32":
         return replace(features, outputs=("rounding",)), view
     try:
         if any(name.startswith("background_") for name in unbounded):
