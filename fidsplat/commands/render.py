@@ -50,7 +50,7 @@ class Render:
       distance distance_median distance_first            the same along the ray
       normal normal_world                 towards the camera, in its axes or the world's
       blended                             number of splats that made the pixel
-      error                               upper bound of what rgb is off from the ideal (docs/accuracy.md)
+      error                               upper bound of what rgb is off from the ideal (docs/quality.md)
 
     Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and
     change standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are
