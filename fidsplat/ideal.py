@@ -21,7 +21,7 @@ where the first term is measured, so that it holds whatever the quality leaves o
    the distance to the further end: the output `rounding` (kernels/opencl/output/rounding.cl).
 4. Each product of a transmittance is rounded, which moves what lies behind it, at most 2^-24 T C, and each sum
    of colours, at most 2^-24 (1 - T) C, C the largest absolute colour: 2^-24 C for each fragment, which
-   `rounding` counts too. Resolving and colours (spherical harmonics) are `_resolving`.
+   `rounding` counts too. Resolving, and the colours of spherical harmonics, add `resolving` units.
 
 R and C are bounded by the colours of all splats and of the background. Where kernels have no such bound
 (`_BOUNDED`), or rgb itself is composited in float64, Q is composited in float64, and its rounding is that of its float32 image. Not counted are the
@@ -166,9 +166,10 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         if why := backend.unsupported(double[0]):
             raise InputError(why)
     except InputError as error:
+        effects = ", ".join(unbounded) or "blend_precision='float64'"
         raise InputError(
-            f"the output 'error' must be of effects whose rounding is bounded, got {', '.join(unbounded)} on "
-            f"{info.name} ({error}); leave out one of the two, or use device='reference'"
+            f"the output 'error' must be of effects whose rounding {info.name} bounds, got {effects}; leave "
+            "out one of the two, or use device='reference'"
         ) from error
     return double
 

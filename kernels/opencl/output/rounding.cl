@@ -3,7 +3,7 @@
 // fidsplat/backends/reference/error_bounds.py: the opacity lies between `low` and `high`, and the colour moves by no more than the
 // transmittance in front times the distance from the opacity that is blended to the further of them. Fragments that rounding may take
 // away (near plane, horizon, rim) count too, so that all that are listed are asked, not only those that are blended. Each that is
-// blended rounds the transmittance and the sum of colours, together by UNIT.
+// blended rounds the transmittance and the sum of colours, together by UNIT, and this sum by half of that.
 //@ state
     vfloat rounding;
 //@ start
@@ -15,9 +15,10 @@
 
 static inline vfloat squared(vfloat x) { return x * x; }
 
-// What rounding changes in an opacity of half rho `h`, relative: ln(opacity), rho, their difference and two exponentials.
+// What rounding changes in an opacity of half rho `h`, relative: ln(opacity), rho (a root, a division and a square by OpenCL's
+// bounds), their difference, and the exponential.
 static inline vfloat opacity_rounding(const Splat *s, vfloat h) {
-    return UNIT * (16.0f + 2.0f * fabs((vfloat)s->log_opacity) + 16.0f * fmin(h, (vfloat)100.0f));
+    return UNIT * (16.0f + 2.0f * fabs((vfloat)s->log_opacity) + 32.0f * fmin(h, (vfloat)100.0f));
 }
 
 static inline void add_rounding(Pixel *pixel, const Splat *s, Crossing c, vfloat x, vfloat y, vint mask, vfloat screen,
@@ -32,7 +33,7 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Crossing c, vfloat
 #ifdef HAS_DOT
     if (HAS_DOT(s)) {
         vfloat away = sqrt(screen);
-        vfloat off_dot = OF_FORM * (sqrt(constants->filter) * (1.0f + 2.0f * (across + down)) + 1.5f * away);
+        vfloat off_dot = OF_FORM * (sqrt(constants->filter) * (1.0f + 2.0f * (across + down)) + 3.0f * away);
         nearest = fmin(nearest, squared(fmax(away - off_dot, (vfloat)0.0f)));
         furthest = fmin(furthest, squared(away + off_dot));
     }
@@ -41,7 +42,7 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Crossing c, vfloat
     vfloat low = fragment_opacity(s, furthest, 1.0f) * (1.0f - opacity_rounding(s, furthest));
     vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
-    pixel->rounding += pixel->t * fmax(high - opacity, opacity - low) + VSELECT((vfloat)0.0f, (vfloat)UNIT, mask);
+    pixel->rounding += pixel->t * fmax(high - opacity, opacity - low) + VSELECT((vfloat)0.0f, (vfloat)(1.5f * UNIT), mask);
 }
 //@ mask
 #if LANES == 1

@@ -21,8 +21,8 @@ def terms(form: wp.vec4, x: float, y: float) -> float:
 
 @wp.func
 def opacity_rounding(log_opacity: float, half_rho: float) -> float:
-    """What rounding changes in an opacity, relative: ln(opacity), rho, their difference, two exponentials."""
-    return UNIT * (16.0 + 2.0 * wp.abs(log_opacity) + 16.0 * wp.min(half_rho, 100.0))
+    """What rounding changes in an opacity, relative: ln(opacity), rho, their difference, the exponential."""
+    return UNIT * (16.0 + 2.0 * wp.abs(log_opacity) + 32.0 * wp.min(half_rho, 100.0))
 
 
 @wp.func
@@ -40,7 +40,7 @@ def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, dot: float, opacity
     if dot < wp.inf:
         away = wp.sqrt(dot)
         off_dot = OF_FORM * (
-            wp.sqrt(view.per_pixel) * (1.0 + 2.0 * (wp.abs(x) + wp.abs(y))) + 1.5 * away
+            wp.sqrt(view.per_pixel) * (1.0 + 2.0 * (wp.abs(x) + wp.abs(y))) + 3.0 * away
         )
         least, most = wp.max(away - off_dot, 0.0), away + off_dot
         nearest = wp.min(nearest, least * least)
@@ -50,7 +50,7 @@ def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, dot: float, opacity
     p = pixel
     p.rounding += p.t * wp.max(high - opacity, opacity - low)
     if c.drawn:
-        p.rounding += UNIT
+        p.rounding += 1.5 * UNIT
     return p
 
 
