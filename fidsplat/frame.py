@@ -36,7 +36,8 @@ class Frame(Mapping):
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
     metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
     unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
-    (h, w) int32; `blended` (h, w) int32; `error` (h, w), an upper bound of |rgb - ideal|. Where less than 1/255 is covered, or of first hits less than
+    (h, w) int32; `blended` (h, w) int32; `error` (h, w), an upper bound of |rgb - ideal|
+    (fidsplat/ideal.py). Where less than 1/255 is covered, or of first hits less than
     `Quality.first_hit`, labels and ids are -1, the others of these 0.
     """
 
@@ -74,7 +75,9 @@ class Frame(Mapping):
         check_process(self._process, "frame")
         refuse_numbered(name, self._ids)
         if name == "error":
-            raise InputError("the output 'error' must be read on the host, got device_array; take frame['error']")
+            raise InputError(
+                "the output 'error' must be read on the host, got device_array; take frame['error']"
+            )
         if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
@@ -113,8 +116,7 @@ class Frame(Mapping):
                 "to_torch makes tensors of torch, which is not installed; pip install torch"
             ) from None
         if self._stays(name):
-            check_process(self._process, "frame")
-            return torch.from_dlpack(self._images.device_array(name))
+            return torch.from_dlpack(self.device_array(name))
         return torch.from_numpy(self[name].copy())  # torch has no arrays that are read-only
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:

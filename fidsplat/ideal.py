@@ -19,14 +19,14 @@ where the first term is measured, so that it holds whatever the quality leaves o
 3. A fragment of Q has an opacity between those that interval arithmetic over the rounding of its forms gives,
    also where rounding decides whether it is drawn at all (near plane, horizon, rim). Kernels add up T_k times
    the distance to the further end: the output `rounding` (kernels/opencl/output/rounding.cl).
-4. Each product of a transmittance is rounded, which moves what lies behind it, at most 2^-24 T C, and each sum
-   of colours, at most 2^-24 (1 - T) C, C the largest absolute colour: 2^-24 C for each fragment, which
+4. Each product of a transmittance is rounded, which moves what lies behind it, at most 2^-24 T C, and each
+   sum of colours, at most 2^-24 (1 - T) C, C the largest absolute colour: 2^-24 C for each fragment, which
    `rounding` counts too. Resolving, and the colours of spherical harmonics, add `resolving` units.
 
 R and C are bounded by the colours of all splats and of the background. Where kernels have no such bound
-(`_BOUNDED`), or rgb itself is composited in float64, Q is composited in float64, and its rounding is that of its float32 image. Not counted are the
-rounding of the float64 set-up, and, with order="pixel", which of two fragments comes first where their depths
-agree to float64's rounding.
+(`_BOUNDED`), or rgb itself is composited in float64, Q is composited in float64, and its rounding is that of
+its float32 image. Not counted are the rounding of the float64 set-up, and, with order="pixel", which of two
+fragments comes first where their depths agree to float64's rounding.
 """
 
 from __future__ import annotations

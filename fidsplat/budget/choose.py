@@ -239,8 +239,8 @@ def check_bounds(error: float | None, ms: float | None) -> None:
 
 
 def _color_range(value: Any) -> float:
-    ok = isinstance(value, Real) and not isinstance(value, bool) and 0 < value < math.inf
-    if not ok:
+    ok = isinstance(value, Real) and not isinstance(value, bool)
+    if not (ok and 0 < float(value) < math.inf):
         raise InputError(f"colors must be a positive range, got {value!r}; give the largest colour, e.g. 1.0")
     return float(value)
 

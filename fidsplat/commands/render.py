@@ -84,7 +84,7 @@ class Render:
     ] = None
     max_error: Annotated[
         float | None,
-        option("E", "render with the cheapest quality whose largest error of rgb is at most E, and certify it"),
+        option("E", "render with the cheapest quality whose error of rgb is certified to be at most E"),
     ] = None
     max_ms: Annotated[
         float | None,

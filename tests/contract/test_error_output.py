@@ -57,7 +57,9 @@ def anything(seed):
     quats = edge_on if seed % 4 == 1 else g.normal(size=(n, 4))
     scales = np.exp(g.normal(np.log(g.choice([0.001, 0.05, 0.5])), g.choice([0.3, 2]), (n, 2)))
     opacities = g.choice([1e-6, 1e-4, 1e-2, 0.5, 0.99, 1.0], n)
-    colors = {"sh": g.normal(size=(n, 9, 3))} if seed % 3 == 0 else {"colors": g.choice([0, 1, -1, 100], (n, 3))}
+    colors = (
+        {"sh": g.normal(size=(n, 9, 3))} if seed % 3 == 0 else {"colors": g.choice([0, 1, -1, 100], (n, 3))}
+    )
     cloud = fs.SplatCloud(means, quats, scales, opacities, **colors)
     camera = fs.Camera.look_at(24, 17, float(g.choice([0.5, 1.5])), g.normal(size=3) * 0.2, (0, 0, 3))
     name, lowpass = g.choice(["standard", "fast", "gsplat"]), ("screen", "none")[seed % 2]
@@ -217,7 +219,7 @@ def test_batches_and_stores_are_refused(renderer, tmp_path):
     fs.save_ply(haze(3, 0.5), tmp_path / "few.ply")
     fs.build_store([tmp_path / "few.ply"], tmp_path / "few.fss")
     store = fs.Store(tmp_path / "few.fss")
-    with pytest.raises(InputError, match="'error' must .*got a store"):
+    with pytest.raises(InputError, match=r"'error' must .*got a store"):
         renderer.render(store, SMALL, OUTPUTS)
 
 

@@ -50,7 +50,8 @@ MAY_IMPORT = {
     "batch": BASE | {"backends", "effects", "frame"},
     "resident": PLAIN | {"store", "effects", "backends", "frame"},
     "ideal": PLAIN | {"effects", "backends"},
-    "render": PLAIN | {"ideal", "resident", "store", "scenes", "effects", "backends", "frame", "views", "batch"},
+    "render": PLAIN
+    | {"ideal", "resident", "store", "scenes", "effects", "backends", "frame", "views", "batch"},
     "several": PLAIN | {"render", "resident", "scenes", "store", "frame"},
     "viewer": PLAIN
     | {"store", "scenes", "effects", "backends", "render", "resident", "frame", "vision", "formats"},
