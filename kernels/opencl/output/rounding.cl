@@ -42,7 +42,8 @@ static inline void add_rounding(Pixel *pixel, const Splat *s, Crossing c, vfloat
     vfloat low = fragment_opacity(s, furthest, 1.0f) * (1.0f - opacity_rounding(s, furthest));
     vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
-    pixel->rounding += pixel->t * fmax(high - opacity, opacity - low) + VSELECT((vfloat)0.0f, (vfloat)(1.5f * UNIT), mask);
+    vint blended = mask & VMASK(pixel->t > 0.0f);
+    pixel->rounding += pixel->t * fmax(high - opacity, opacity - low) + VSELECT((vfloat)0.0f, (vfloat)(1.5f * UNIT), blended);
 }
 //@ mask
 #if LANES == 1
