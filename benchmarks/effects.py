@@ -105,6 +105,7 @@ def effects(base: fs.Camera) -> dict[str, dict]:
         **{f"boxes, {name}": {**lens, "cloud": "box"} for name, lens in lenses(base).items()},
         **{f"SH degree {degree}": {"cloud": degree} for degree in (1, 2, 3)},
         **{f"output {name}": {"outputs": ("rgb", name)} for name in OUTPUTS if name != "rgb"},
+        "output error": {"outputs": ("rgb", "error"), "quality": TIMED.with_(order="centre")},
         "fog": {"fog": fs.Fog(0.05)},
         "background gradient": {"background": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.3, 0.2))},
         "background panorama": {"background": fs.Panorama(sky)},

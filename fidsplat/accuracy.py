@@ -16,6 +16,7 @@ from fidsplat.backends.base import GivesFloat64
 from fidsplat.capture import Capture
 from fidsplat.effects import select
 from fidsplat.errors import DeviceError, InputError
+from fidsplat.ideal import nothing_left_out
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.resident import ResidentCloud
@@ -82,15 +83,7 @@ def full_precision(capture: Capture, renderer: Renderer) -> Capture:
     Low-pass, samples, order and first_hit stay. A device composites in float64 where it can
     (`draws_float64`); else the arithmetic is its own, with the set-up in float64 if it has that.
     """
-    best = capture.quality.with_(
-        alpha_cutoff=TRUTH_CUTOFF,
-        detail_error=0.0,
-        transmittance_stop=0.0,
-        opacity_ceiling=1.0,
-        stop_rule="inclusive",
-        setup_precision="float64",
-        arithmetic="precise",
-    )
+    best = nothing_left_out(capture.quality, TRUTH_CUTOFF).with_(arithmetic="precise")
     if not renderer.device.always_float64 and draws_float64(renderer, capture):
         best = best.with_(blend_precision="float64")
     return capture.with_(quality=best)

@@ -16,6 +16,19 @@ Ids = Callable[[], np.ndarray] | None
 """gives the indices (n,) int32 of the splats that were drawn in the whole scene; None: these themselves"""
 
 
+class MadeImage(Protocol):
+    """An image that is made from others when it is read."""
+
+    def read(self) -> np.ndarray:
+        """The image, an array of its own."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, of what only this image takes."""
+        ...
+
+
 class Frame(Mapping):
     """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
     device on first use.
@@ -23,12 +36,17 @@ class Frame(Mapping):
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
     metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
     unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
-    (h, w) int32; `blended` (h, w) int32. Where less than 1/255 is covered, or of first hits less than
+    (h, w) int32; `blended` (h, w) int32; `error` (h, w), an upper bound of |rgb - ideal|
+    (fidsplat/ideal.py). Where less than 1/255 is covered, or of first hits less than
     `Quality.first_hit`, labels and ids are -1, the others of these 0.
     """
 
-    def __init__(self, images: Images, outputs: tuple[str, ...], ids: Ids = None) -> None:
-        """ids: the indices that `splat_id` shows for those of the splats that were drawn."""
+    def __init__(
+        self, images: Images, outputs: tuple[str, ...], ids: Ids = None, error: MadeImage | None = None
+    ) -> None:
+        """ids: the indices that `splat_id` shows for those of the splats that were drawn. error: the output
+        `error`, if it was asked for."""
+        self._error = error
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
@@ -38,7 +56,9 @@ class Frame(Mapping):
         self._check(name)
         if name not in self._arrays:
             check_process(self._process, "frame")
-            self._arrays[name] = image = numbered(name, self._images.read(name), self._ids)
+            made = self._error if name == "error" else None
+            image = self._images.read(name) if made is None else made.read()
+            self._arrays[name] = image = numbered(name, image, self._ids)
             image.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
 
@@ -54,6 +74,10 @@ class Frame(Mapping):
         self._check(name)
         check_process(self._process, "frame")
         refuse_numbered(name, self._ids)
+        if name == "error":
+            raise InputError(
+                "the output 'error' must be read on the host, got device_array; take frame['error']"
+            )
         if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
@@ -91,9 +115,8 @@ class Frame(Mapping):
             raise InputError(
                 "to_torch makes tensors of torch, which is not installed; pip install torch"
             ) from None
-        if isinstance(self._images, GivesArrays) and (name != "splat_id" or self._ids is None):
-            check_process(self._process, "frame")
-            return torch.from_dlpack(self._images.device_array(name))
+        if self._stays(name):
+            return torch.from_dlpack(self.device_array(name))
         return torch.from_numpy(self[name].copy())  # torch has no arrays that are read-only
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
@@ -114,9 +137,14 @@ class Frame(Mapping):
 
     def _exchanged(self) -> Any:
         name = self._only()
-        if isinstance(self._images, GivesArrays):
+        if self._stays(name):
             return self.device_array(name)
         return self[name].copy()  # what is read-only cannot be given away
+
+    def _stays(self, name: str) -> bool:
+        """Whether the device has an array of this image to give."""
+        made = name == "error" or (name == "splat_id" and self._ids is not None)
+        return isinstance(self._images, GivesArrays) and not made
 
     def _only(self) -> str:
         """The name of the one output."""
@@ -170,7 +198,7 @@ class Frame(Mapping):
         """An array for an output, `into` or a new one, in which rows of pixels [first, end) are those of the
         picture: they alone are copied where the device can do that."""
         self._check(name)
-        if not isinstance(self._images, ReadsRows):
+        if not isinstance(self._images, ReadsRows) or name == "error":
             into = np.empty_like(self[name]) if into is None else into
             into[first:end] = self[name][first:end]
             return into
@@ -182,12 +210,15 @@ class Frame(Mapping):
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage: project, sort, bin, blend, resolve.
+        """Milliseconds on the device by stage: project, sort, bin, blend, resolve; error: all that the output
+        `error` takes.
 
         On a GPU a frame of a kind that was drawn before is drawn once more for that, since taking the time of
         each launch would slow all frames down. Empty if its cloud is not on the device any more.
         """
-        return self._images.timings
+        if self._error is None:
+            return self._images.timings
+        return {**self._images.timings, **self._error.timings}
 
     @property
     def stats(self) -> Mapping[str, int]:

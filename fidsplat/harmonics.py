@@ -54,6 +54,24 @@ def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
+def color_range(colors: np.ndarray | None, sh: np.ndarray | None) -> tuple[float, float]:
+    """Lower and upper bound of every channel of colours (n, 3), or of what harmonics (n, k, 3) show from any
+    direction; 0 is always within. What is not finite does not count.
+
+    The squares of a band's basis values add up to (2 l + 1) / (4 pi), so that the band is at most the root of
+    that times the length of its coefficients.
+    """
+    if sh is None:
+        values = np.zeros(0) if colors is None else colors[np.isfinite(colors)]
+        return float(values.min(initial=0.0)), float(values.max(initial=0.0))
+    most = np.full((len(sh), 3), 0.5)
+    for band in range(int(np.sqrt(sh.shape[1]))):
+        own = sh[:, band**2 : (band + 1) ** 2]
+        squares = np.einsum("nkc,nkc->nc", own, own, dtype=np.float64)
+        most += np.sqrt((2 * band + 1) / (4 * np.pi) * squares)
+    return 0.0, float(most[np.isfinite(most)].max(initial=0.0))
+
+
 def _sample_directions() -> np.ndarray:
     """32 evenly spread unit directions (Fibonacci lattice), on which every band is well conditioned."""
     i = np.arange(32)

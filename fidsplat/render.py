@@ -26,6 +26,7 @@ from fidsplat.cameras import Camera
 from fidsplat.capture import Capture, CaptureParts, output_names
 from fidsplat.errors import InputError, unknown
 from fidsplat.frame import Frame, check_process, stacked
+from fidsplat.ideal import ErrorImage, ideal_of
 from fidsplat.quality import Quality, whole_number
 from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
@@ -297,6 +298,10 @@ class Renderer:
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
         plain = [_asked(scene, one) for one in each]
+        if any("error" in one.outputs for one in plain):
+            raise InputError(
+                "the captures of a batch must not ask for the output 'error', got it; render each by itself"
+            )
         views = views_of(plain, poses, groups, mask)
         self._refuse_unknown_labels(resident, views)
         return self._draw_batch(resident, views)
@@ -341,18 +346,28 @@ class Renderer:
         band: tuple[int, int] | None = None,
     ) -> Frame:
         features, view = prepare(resident.whole, capture)
-        if band is not None:
-            view = replace(view, band=(band[0] * view.samples, band[1] * view.samples))
+        view = _banded(view, band)
+        plan = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
             pipeline, data = self.backend.pipeline(features), resident.data
             if not isinstance(data, Residency):
-                return Frame(draw(pipeline, data, view), capture.outputs)
+                error = None
+                images = draw(pipeline, data, view)
+                if plan is not None:
+                    ideal = draw(self.backend.pipeline(plan.features), data, _banded(plan.view, band))
+                    error = ErrorImage(images, ideal, plan)
+                return Frame(images, capture.outputs, error=error)
 
             def part(one: PartOfView) -> Frame:
                 images = one.images or draw(pipeline, one.data, one.view)
                 return Frame(images, capture.outputs, one.ids)
 
             return stacked(data.parts(view, features, capture.quality, pipeline), part)
+
+
+def _banded(view: View, band: tuple[int, int] | None) -> View:
+    """The view of which only these rows of pixels are wanted."""
+    return view if band is None else replace(view, band=(band[0] * view.samples, band[1] * view.samples))
 
 
 def _asked(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:

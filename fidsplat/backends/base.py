@@ -73,6 +73,20 @@ class ResidentData(Traits, Protocol):
         ...
 
 
+@runtime_checkable
+class HasColorRange(Protocol):
+    """A cloud whose colours are known, as the output `error` requires."""
+
+    @property
+    def count(self) -> int:
+        """Splats."""
+        ...
+
+    def color_range(self) -> tuple[float, float]:
+        """Lower and upper bound of every channel of every splat, from any direction."""
+        ...
+
+
 class Images(Protocol):
     """Finished output images of one picture, on the device until asked for."""
 

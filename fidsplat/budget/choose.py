@@ -9,14 +9,16 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
+from fidsplat.accuracy import draws_float64
 from fidsplat.budget import prices, store
-from fidsplat.budget.prices import Candidate
+from fidsplat.budget.prices import FREE, Candidate
 from fidsplat.budget.search import Calibration, Search
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError
+from fidsplat.ideal import cutoff_of, nothing_left_out
 from fidsplat.provenance import code_hash, digest_of
-from fidsplat.quality import Quality
+from fidsplat.quality import Quality, whole_number
 from fidsplat.render import Renderer, default_device
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
@@ -42,10 +44,14 @@ class Choice:
     """name of the device"""
     knobs: dict[str, Any]
     """where it differs from what a budget starts from (`prices.FREE`)"""
+    certified: float | None = None
+    """largest value of the output `error`, where it was rendered (`certify`)"""
+    remark: str = ""
+    """of a promise the class of scenes; else why there is no certificate"""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: all but the quality itself, and what it takes to make it again."""
-        keys = ("error", "ms", "ms_late", "source", "device", "knobs")
+        keys = ("error", "ms", "ms_late", "source", "device", "knobs", "certified", "remark")
         return {key: getattr(self, key) for key in keys}
 
     @property
@@ -56,8 +62,35 @@ class Choice:
             for name, value in ({"alpha_cutoff": self.quality.alpha_cutoff} | self.knobs).items()
         )
         how = "promised error" if self.source == "prices" else "measured error"
+        sure = "" if self.certified is None else f", certified at most {self.certified:.2g}"
         took = "" if self.ms is None else f", {self.ms:.3g} ms a frame"
-        return f"{knobs}: {how} {self.error:.2g}{took} on {self.device}"
+        remark = f" ({self.remark})" if self.remark else ""
+        return f"{knobs}: {how} {self.error:.2g}{sure}{took} on {self.device}{remark}"
+
+
+LAYERS = 100
+"""faint fragments of a pixel, at most, in scenes of which nothing is known"""
+
+
+@dataclass(frozen=True)
+class SceneClass:
+    """The scenes for which a quality is promised that nobody has measured there."""
+
+    layers: int
+    """opacity of a pixel's fragments below the cut-off, in all, over the cut-off; at most"""
+    colors: float
+    """range of the colours of splats and background, at most"""
+
+    def promised(self, candidate: Candidate, base: Quality) -> float:
+        """Error of a candidate's images at most: each fragment that the cut-off leaves out moves a colour by
+        its opacity times the colours' range, the stop by the transmittance that it leaves; and what float32
+        was measured to add."""
+        quality = candidate.of(base)
+        skipped = self.layers * quality.alpha_cutoff + quality.transmittance_stop
+        return self.colors * (skipped + candidate.promised)
+
+    def __str__(self) -> str:
+        return f"for colours of a range of {self.colors:g} and at most {self.layers} faint layers at a pixel"
 
 
 def quality_within(
@@ -67,6 +100,8 @@ def quality_within(
     scene: Scene | SplatCloud | Store | None = None,
     capture: Capture | Camera | None = None,
     device: str | Renderer | None = None,
+    layers: int = LAYERS,
+    colors: float = 1.0,
 ) -> Quality:
     """The cheapest quality that keeps an error, or the most accurate one that keeps a time.
 
@@ -74,9 +109,12 @@ def quality_within(
     from the same definition at full precision in float64 (`fidsplat.accuracy.truth`). The definition
     (low-pass, samples, order, marker) is that of the capture's quality.
 
-    With the error alone the answer comes from a list of errors over random scenes. With a scene and a camera
-    it is measured: on this device, in that scene, from there. What was measured is kept in the user's cache
-    folder. docs/budget.md says how often each promise was kept.
+    With the error alone the answer is a promise for a class of scenes: at no pixel do the fragments below the
+    cut-off add up to more opacity than `layers` times the cut-off, as in every scene of at most `layers`
+    splats, and colours and background range over no more than `colors`. What cut-off and stop leave out is
+    then bounded; float32's rounding is taken from a list of errors over random scenes. With a scene and a
+    camera the error is measured: on this device, in that scene, from there. What was measured is kept in the
+    user's cache folder. docs/budget.md says how often each promise was kept.
 
     Args:
         error: largest error allowed.
@@ -86,13 +124,14 @@ def quality_within(
             if what they cost was measured; with `ms` alone several such errors are tried.
         capture: how; or a camera alone. By default a Scene's own.
         device: a device's name or a Renderer; by default that of `Renderer()`.
+        layers, colors: the class of scenes, without a scene.
 
     Raises:
         InputError: no bound, one that is no finite number, or one that nothing keeps; the message says what
             the best possible is.
         DeviceError: the device cannot be used or fails.
     """
-    return choose(error, ms, scene, capture, device).quality
+    return choose(error, ms, scene, capture, device, layers=layers, colors=colors).quality
 
 
 def choose(
@@ -102,6 +141,8 @@ def choose(
     capture: Capture | Camera | None = None,
     device: str | Renderer | None = None,
     tell: Callable[[str], None] = lambda text: None,
+    layers: int = LAYERS,
+    colors: float = 1.0,
 ) -> Choice:
     """As `quality_within`, with what is known about the quality beside it. `tell`: called with what is done.
 
@@ -123,7 +164,8 @@ def choose(
     candidates = prices.load(renderer.device.kind)
     if scene is None:
         assert error is not None
-        return _from_list(error, candidates, asked.quality, renderer)
+        scenes = SceneClass(whole_number("layers", layers, 1, 2**31 - 1), _color_range(colors))
+        return _from_list(error, scenes, candidates, asked.quality, renderer)
     streamed = scene.streamed if isinstance(scene, Scene) else None
     bases = [asked.quality]
     if streamed is not None:  # of an error levels of detail have half
@@ -196,17 +238,87 @@ def check_bounds(error: float | None, ms: float | None) -> None:
             raise InputError(f"{name} is {value!r}; it must be a finite number, e.g. {name}={example}")
 
 
-def _from_list(error: float, candidates: tuple[Candidate, ...], base: Quality, renderer: Renderer) -> Choice:
+def _color_range(value: Any) -> float:
+    ok = isinstance(value, Real) and not isinstance(value, bool)
+    if not (ok and 0 < float(value) < math.inf):
+        raise InputError(f"colors must be a positive range, got {value!r}; give the largest colour, e.g. 1.0")
+    return float(value)
+
+
+def _from_list(
+    error: float, scenes: SceneClass, candidates: tuple[Candidate, ...], base: Quality, renderer: Renderer
+) -> Choice:
+    name = renderer.device.name
     for candidate in candidates:
-        drawn = _drawn(candidate, base, renderer) if candidate.promised <= error else None
+        drawn = _drawn(candidate, base, renderer) if scenes.promised(candidate, base) <= error else None
         if drawn is not None:
-            name = renderer.device.name
-            return Choice(drawn.of(base), drawn.promised, None, None, "prices", name, drawn.knobs)
-    finest = sorted(candidates, key=lambda candidate: candidate.promised)
-    best = next(candidate.promised for candidate in finest if _drawn(candidate, base, renderer))
+            most = scenes.promised(drawn, base)
+            return Choice(drawn.of(base), most, None, None, "prices", name, drawn.knobs, remark=str(scenes))
+    finest = sorted(candidates, key=lambda candidate: scenes.promised(candidate, base))
+    best = next(scenes.promised(candidate, base) for candidate in finest if _drawn(candidate, base, renderer))
     raise InputError(
-        f"no quality promises an error of {error:g} for any scene on {renderer.device.name}: the best is "
-        f"{best:.2g}; allow that, or give scene=... and capture=... to measure yours"
+        f"error must be at least {best:.2g} to be promised {scenes} on {name}, got {error:g}; allow that, "
+        "name fewer layers, or give scene=... and capture=... to measure yours"
+    )
+
+
+TIGHTER = 1 / 16
+"""cut-off and stop of the next quality that is tried, over those of one whose error is not certified"""
+
+
+def certify(
+    choice: Choice,
+    error: float,
+    ms: float | None,
+    scene: Scene,
+    capture: Capture,
+    renderer: Renderer,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Choice:
+    """The choice, or one of finer cut-off and stop, with an image whose output `error` is nowhere above
+    `error`. Where the output is refused, the choice as it was measured, with the reason as its remark.
+
+    Raises:
+        InputError: the finest quality is not certified either, or takes longer than `ms`; the message says
+            what is possible.
+    """
+    plain = replace(capture, outputs=("error",), sensor=Sensor())
+    resident, quality = renderer.upload(scene), choice.quality
+    cutoff, double = cutoff_of(len(resident)), draws_float64(renderer, plain)
+    while True:
+        tell(f"certifying a cut-off of {quality.alpha_cutoff:.2g} in {quality.blend_precision}")
+        try:
+            frame = renderer.render(resident, plain.with_(quality=quality))
+        except InputError as refused:
+            return replace(choice, remark=f"not certified: {refused}")
+        certified = float(frame["error"].max(initial=0.0))
+        if certified <= error:
+            break
+        if quality.alpha_cutoff > cutoff:
+            left = max(TIGHTER * quality.alpha_cutoff, cutoff)
+            stop = TIGHTER * quality.transmittance_stop if left > cutoff else 0.0
+            quality = nothing_left_out(quality, left).with_(transmittance_stop=stop)
+            continue
+        if double and quality.blend_precision == "float32":
+            quality = quality.with_(blend_precision="float64", arithmetic="precise")
+            continue
+        raise InputError(
+            f"error must be at least {certified:.2g} to be certified for this scene on {choice.device}, got "
+            f"{error:g}; allow that"
+        )
+    if quality == choice.quality:
+        return replace(choice, certified=certified)
+    timed = Calibration(renderer, scene, plain.with_(outputs=("rgb",)), tell)
+    (times,) = timed.times([quality])
+    if ms is not None and times.late > ms:
+        raise InputError(
+            f"an error that is certified to be at most {error:g} takes {times.late:.3g} ms a frame on "
+            f"{choice.device}, not {ms:g}; allow one of the two more"
+        )
+    knobs = {name: getattr(quality, name) for name, free in FREE.items() if getattr(quality, name) != free}
+    # a bound of the error stands in for one that was not measured
+    return Choice(
+        *(quality, certified, times.median, times.late, "measured", choice.device, knobs), certified=certified
     )
 
 

@@ -58,7 +58,8 @@ class Candidate:
 
     @property
     def promised(self) -> float:
-        """The error that is promised for a scene that nobody has measured."""
+        """The error that is expected in a scene like those of the list: no bound, as its fragments may be
+        fainter, more, brighter and thinner."""
         return MARGIN * self.most
 
 

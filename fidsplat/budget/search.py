@@ -74,7 +74,9 @@ class Calibration:
         self._tell("drawing the picture at full precision")
         reference = reference_for(self.renderer, self._capture)
         scene = self._resident if reference is self.renderer else self._cloud
-        return truth(reference, scene, self._capture), error_bound(reference, self._capture)
+        image = truth(reference, scene, self._capture)
+        # what floats of 32 bits are off grows with the values
+        return image, error_bound(reference, self._capture) * max(1.0, float(np.abs(image).max(initial=0.0)))
 
     def error(self, quality: Quality) -> float:
         """Largest absolute error of rgb against the truth. What the truth may be off itself is added."""
@@ -140,10 +142,12 @@ class Search:
                     missed = candidate, error / measured
             if len(hits) == ENOUGH:
                 break
+        best = sorted(self._candidates, key=lambda candidate: candidate.median)[:ENOUGH]
+        finest = [] if hits else list(self._measured(best))  # of which some may have been passed over
+        hits = hits or [(drawn, measured) for drawn, measured in finest if measured <= error]
         if hits:
             return min(self._timed(hits), key=lambda found: found.times.median)
-        best = sorted(self._candidates, key=lambda candidate: candidate.median)[:ENOUGH]
-        least = min(measured for _, measured in self._measured(best))
+        least = min(measured for _, measured in finest)
         raise InputError(
             f"no quality keeps an error of {error:g} for this scene on {self.device}: the least is "
             f"{least:.2g}; allow {least * 1.1:.2g} or more"

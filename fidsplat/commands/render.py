@@ -50,6 +50,7 @@ class Render:
       distance distance_median distance_first            the same along the ray
       normal normal_world                 towards the camera, in its axes or the world's
       blended                             number of splats that made the pixel
+      error                               upper bound of what rgb is off from the ideal (docs/quality.md)
 
     Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and
     change standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are
@@ -83,7 +84,7 @@ class Render:
     ] = None
     max_error: Annotated[
         float | None,
-        option("E", "draw with the cheapest quality whose largest error of rgb is at most E, e.g. 1e-3"),
+        option("E", "render with the cheapest quality whose error of rgb is certified to be at most E"),
     ] = None
     max_ms: Annotated[
         float | None,
@@ -144,11 +145,14 @@ class Render:
 
     def _measured(self, scene: "Scene", renderer: "Renderer") -> "Choice":
         """The quality that keeps to --max-error and --max-ms."""
-        from fidsplat.budget import choose
+        from fidsplat.budget import certify, choose
 
         capture = scene.capture.with_(quality=self.quality)
         with console(self.json).status("measuring") as status:
-            return choose(self.max_error, self.max_ms, scene, capture, renderer, tell=status.update)
+            choice = choose(self.max_error, self.max_ms, scene, capture, renderer, tell=status.update)
+            if self.max_error is None:
+                return choice
+            return certify(choice, self.max_error, self.max_ms, scene, capture, renderer, status.update)
 
     def _drawn(
         self,

@@ -65,6 +65,7 @@ _IMAGES = (
     _image("splat_id", dtype="int32"),
     _image("blended", dtype="int32"),
     _image("distortion", public=False),
+    _image("rounding", public=False),
 )
 
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (*map(Effect, _PLAIN), *_IMAGES)}

@@ -21,7 +21,9 @@ IMAGES: dict[str, Output] = {
 }
 """all output images"""
 OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
-"""those that users ask for"""
+"""those that users ask for and backends render"""
+OF_TWO = ("error",)
+"""those that are made of two renderings (fidsplat/ideal.py)"""
 
 _KINDS = {Gradient: "gradient", Panorama: "panorama"}
 
@@ -92,8 +94,8 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
         InputError: an output that nobody declares, or two effects that do not go together.
     """
     for name in capture.outputs:
-        if name not in OUTPUTS:
-            raise InputError(unknown("output", name, OUTPUTS))
+        if name not in (*OUTPUTS, *OF_TWO):
+            raise InputError(unknown("output", name, (*OUTPUTS, *OF_TWO)))
     quality, background = capture.quality, capture.backdrop
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
@@ -132,7 +134,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             *(("shutter_rows",) if capture.exposed and in_spheres else ()),
             *(("blend_double",) if double else ()),
         ),
-        outputs=tuple(sorted({*capture.outputs} - {"rgb"})),
+        outputs=tuple(sorted({*capture.outputs} - {"rgb", *OF_TWO})),
         sh_degree=sh_degree,
         samples=quality.samples,
         setup_precision=quality.setup_precision,

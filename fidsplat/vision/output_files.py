@@ -24,7 +24,7 @@ def suffixes_of(name: str) -> tuple[str, ...]:
     picture to look at."""
     if _is_depth(name):
         return (".npy", ".png", "-turbo.png")
-    return (".npy", ".png") if name in _WHOLE else (".png",)
+    return (".npy", ".png") if name in (*_WHOLE, "error") else (".png",)
 
 
 def save_output(
@@ -51,8 +51,10 @@ def picture_of(name: str, image: np.ndarray) -> np.ndarray:
     """An output image, (h, w) or (h, w, 3), as a picture that people look at."""
     if _is_depth(name):
         return depth_picture(image)
+    if name in ("blended", "error"):
+        return count_picture(image)
     if name in _WHOLE:
-        return count_picture(image) if name == "blended" else label_picture(image)
+        return label_picture(image)
     return normal_picture(image) if name in ("normal", "normal_world") else image
 
 

@@ -89,8 +89,8 @@ def label_picture(label: np.ndarray) -> np.ndarray:
 
 
 def count_picture(count: np.ndarray) -> np.ndarray:
-    """Counts (h, w) in the turbo colours from 0 (dark blue) to the greatest (red)."""
-    return _turbo(count / max(int(count.max(initial=0)), 1))
+    """Counts or errors (h, w) in the turbo colours from 0 (dark blue) to the greatest (red)."""
+    return _turbo(count / (count.max(initial=0) or 1))
 
 
 def count_key(most: int, height: int) -> np.ndarray:

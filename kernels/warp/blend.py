@@ -60,6 +60,9 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(sample_fields(outputs).items()))
     stores, words = output.functions(outputs, "store"), output.digest(outputs)
+    Crossing, opacity_of = crossing.Crossing, crossing.opacity_of
+    asking = bool(output.having(outputs, "fragment"))
+    fragments, screen = output.functions(outputs, "fragment"), "lowpass_screen" in effects
     bent, curved = "rays" in effects, cross_slopes is not None
 
     @wp.func
@@ -74,6 +77,18 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         p = start(x, y, rays, view)
         if x >= view.width or y >= view.height:
             p.t = 0.0
+        return p
+
+    @wp.func
+    def met(pixel: Pixel, s: Splat, c: Crossing, x: float, y: float, view: View):
+        """The sample after outputs have seen a splat of its list; nothing is composited yet."""
+        p, dot, opacity = pixel, float(wp.inf), float(0.0)
+        if wp.static(screen):
+            dot = c.screen
+        if c.drawn:
+            opacity = opacity_of(s, c, 1.0 / c.d, view)
+        for k in range(wp.static(len(fragments))):
+            p = wp.static(fragments[k])(p, s, c, x, y, dot, opacity, view)
         return p
 
     @wp.func
@@ -100,6 +115,8 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                 c = cross_ray(s, ray, x, y, view)
             else:
                 c = cross(s, row[0], row[1], row[2], x, y, view)
+            if wp.static(asking):
+                p = met(p, s, c, x, y, view)
             if c.drawn:
                 p = blend_one(p, s, c, place, lines, lists, planes, view)
         return p
@@ -255,6 +272,10 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                             c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
                         else:
                             c = cross(s, u, v, d, x, y, view)
+                        if wp.static(asking):
+                            at = state_first + (row - y0) * view.tile_w + column - x0
+                            if unfinished(state[at], view):
+                                state[at] = met(state[at], s, c, x, y, view)
                         if c.drawn:
                             at = state_first + (row - y0) * view.tile_w + column - x0
                             p = state[at]

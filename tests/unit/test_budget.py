@@ -7,12 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from brute_force import ideal
 from random_scenes import HELD_OUT, random_scene
 from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
-from fidsplat.budget import choose, prices, search, store
+from fidsplat.budget import Choice, certify, choose, prices, search, store
 from fidsplat.budget.choose import _key
 from fidsplat.errors import InputError
 from fidsplat.timing import Clock, Timer
@@ -20,6 +21,7 @@ from fidsplat.timing import Clock, Timer
 BACKEND = "opencl"
 BOUNDS = (1e-2, 1e-3, 1e-4)
 HELD_OUT_SCENES = 16
+AWAY = np.eye(4) + np.outer([0, 0, 1, 0], [0, 0, 0, 3.0])  # 3 m
 SMALL = fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)
 
 
@@ -68,6 +70,73 @@ def test_the_price_list_keeps_its_promise(renderer, held_out, error):
     quality = fs.quality_within(error=error, device=renderer)
     found = [error_of(renderer, scene, quality, want) for scene, want in held_out]
     assert max(found) <= error, found
+
+
+def layers(count, opacity, color=1.0):
+    """Splats that fill the image of SMALL, one behind the other."""
+    means = np.column_stack([np.zeros((count, 2)), np.linspace(1.0, 2.0, count)])
+    arrays = means, np.tile([1.0, 0, 0, 0], (count, 1)), np.full((count, 2), 1e3), np.full(count, opacity)
+    return fs.SplatCloud(*arrays, colors=np.full((count, 3), color))
+
+
+@pytest.mark.parametrize(
+    ("error", "count", "colors"),
+    [(0.1, 100, 1.0), (1e-2, 100, 1.0), (1e-3, 1000, 1.0), (1e-4, 100, 1.0), (1e-2, 100, 1000.0)],
+)
+def test_the_promise_names_its_class_of_scenes(renderer, error, count, colors):
+    """The worst of the class: as many layers as it has, each as opaque as what is left out may be."""
+    quality = fs.quality_within(error, device=renderer, layers=count, colors=colors)
+    haze = layers(count, 0.99 * quality.alpha_cutoff, colors)
+    light = fs.SplatCloud.concatenate([layers(30, 0.5, 0.0), layers(1, 1.0, colors).transformed(AWAY)])
+    for cloud in (haze, light):
+        frame = renderer.render(cloud, SMALL, quality=quality)
+        assert errors(frame["rgb"], ideal(cloud, SMALL, quality)).maximum <= error
+    choice = choose(error, device=renderer, layers=count, colors=colors)
+    assert f"range of {colors:g} and at most {count} faint layers" in choice.summary
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"layers": 10**9}, "at most 1000000000 faint layers"),
+        ({"colors": 1e9}, r"range of 1e\+09"),
+        ({"layers": 0}, "layers is 0"),
+        ({"colors": 0}, "got 0"),
+    ],
+)
+def test_a_class_that_nothing_keeps(renderer, words, message):
+    with pytest.raises(InputError, match=message):
+        fs.quality_within(1e-3, device=renderer, **words)
+
+
+def coarse(renderer):
+    """A choice that was never measured."""
+    return Choice(fs.Quality.named("fast"), 0.0, 1.0, 1.0, "measured", renderer.device.name, {})
+
+
+@in_turn()
+def test_a_choice_is_certified_or_made_finer_until_it_is(renderer):
+    haze = layers(300, 1e-3)
+    scene = fs.Scene([haze], camera=SMALL)
+    choice = certify(coarse(renderer), 1e-3, None, scene, scene.capture, renderer)
+    assert choice.certified <= 1e-3
+    assert choice.quality.alpha_cutoff > 1e-6
+    off = errors(renderer.render(scene, quality=choice.quality)["rgb"], ideal(haze, SMALL, choice.quality))
+    assert off.maximum <= choice.certified
+    again = certify(choice, 1e-3, None, scene, scene.capture, renderer)
+    assert again.quality == choice.quality
+    with pytest.raises(InputError, match=r"error must be at least .* to be certified"):
+        certify(choice, 1e-9, None, scene, scene.capture, renderer)
+    with pytest.raises(InputError, match=r"takes .* ms a frame"):
+        certify(coarse(renderer), 1e-3, 1e-6, scene, scene.capture, renderer)
+
+
+def test_a_choice_without_a_certificate_says_why(renderer):
+    scene = fs.Scene([layers(3, 0.5)], camera=SMALL, fog=fs.Fog(0.1))
+    choice = certify(coarse(renderer), 1e-3, None, scene, scene.capture, renderer)
+    assert choice.certified is None
+    assert "not certified: the output 'error' must" in choice.summary
+    assert "fog" in choice.summary
 
 
 def test_less_error_is_never_cheaper(renderer):
@@ -271,7 +340,7 @@ def test_frames_are_really_timed(renderer, scene):
 
 @pytest.mark.parametrize("error", [0, -1e-3, 1e-9])
 def test_an_error_that_nothing_keeps(renderer, scene, error):
-    with pytest.raises(InputError, match=r"the best is \d"):
+    with pytest.raises(InputError, match=r"error must be at least \d.* to be promised"):
         fs.quality_within(error=error, device=renderer)
     with pytest.raises(InputError, match=r"the least is \d.*allow \d"):
         within(renderer, scene, error)

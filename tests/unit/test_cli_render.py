@@ -56,6 +56,8 @@ def test_a_budget_is_measured_and_told(scene, tmp_path, capsys, monkeypatch):
     assert 0 < chosen["error"] <= 1e-3
     assert 0 < chosen["ms"] <= chosen["ms_late"] <= 60000
     assert chosen["source"] == "measured"
+    assert 0 < chosen["certified"] <= 1e-3
+    assert chosen["remark"] == ""
     assert fs.Quality().with_(**chosen["knobs"])
     assert main(words) == 0
     printed = capsys.readouterr().out

@@ -50,7 +50,9 @@ MAY_IMPORT = {
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "resident": PLAIN | {"store", "effects", "backends", "frame"},
-    "render": PLAIN | {"resident", "store", "scenes", "effects", "backends", "frame", "views", "batch"},
+    "ideal": PLAIN | {"effects", "backends"},
+    "render": PLAIN
+    | {"ideal", "resident", "store", "scenes", "effects", "backends", "frame", "views", "batch"},
     "several": PLAIN | {"render", "resident", "scenes", "store", "frame"},
     "viewer": PLAIN
     | {"store", "scenes", "effects", "backends", "render", "resident", "frame", "vision", "formats"},
@@ -58,10 +60,10 @@ MAY_IMPORT = {
     "remote": BASE | {"provenance", "flights", "render", "vision", "experiments", "store"},
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "logs": BASE | {"cameras", "vision"},
-    "accuracy": PLAIN | {"scenes", "effects", "render", "resident", "backends"},
+    "accuracy": PLAIN | {"scenes", "effects", "ideal", "render", "resident", "backends"},
     "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects", "provenance"},
     "detail": PLAIN | {"store", "render", "backends", "accuracy"},
-    "budget": PLAIN | {"store", "scenes", "render", "accuracy", "provenance", "timing"},
+    "budget": PLAIN | {"store", "scenes", "ideal", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 

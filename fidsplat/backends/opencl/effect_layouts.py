@@ -253,6 +253,7 @@ LAYOUTS: dict[str, Layout] = {
         samples=(Samples("float", "splat_id_raw"), Samples("int", "splat_id_index_raw")),
     ),
     "overdraw": Layout("output/overdraw.cl", samples=(Samples("int", "overdraw_raw"),)),
+    "rounding": Layout("output/rounding.cl", samples=(Samples("float", "rounding_raw"),)),
     "blended": Layout("output/blended.cl", samples=(Samples("int", "blended_raw"),)),
     # what changes rgb on its way out
     "fog": Layout(

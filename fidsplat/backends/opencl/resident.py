@@ -14,6 +14,7 @@ import pyopencl as cl
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.errors import DeviceError
+from fidsplat.harmonics import color_range
 from fidsplat.splats import SplatCloud
 
 _VECTOR = 16
@@ -98,6 +99,10 @@ class Resident:
     def memory_bytes(self) -> int:
         """Bytes that the cloud holds on the device; a CPU's are the host's."""
         return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
+
+    def color_range(self) -> tuple[float, float]:
+        """As `HasColorRange`."""
+        return color_range(self._arrays.get("colors"), self._arrays.get("sh"))
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         """The array of splats [first, end)."""

@@ -20,6 +20,7 @@ from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES, FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.errors import InputError, UnknownDeviceError
+from fidsplat.harmonics import color_range
 from fidsplat.splats import SplatCloud
 
 _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once: half a megabyte each, which caches hold
@@ -103,6 +104,10 @@ class ReferenceCloud:
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
         self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
+
+    def color_range(self) -> tuple[float, float]:
+        """As `HasColorRange`."""
+        return color_range(self.cloud.plain_colors, self.cloud.sh)
 
 
 @dataclass

@@ -11,7 +11,7 @@ from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, nbytes
 from fidsplat.errors import DeviceError, InputError, bytes_words
-from fidsplat.harmonics import MAX_DEGREE
+from fidsplat.harmonics import MAX_DEGREE, color_range
 from fidsplat.splats import SplatCloud
 
 
@@ -33,6 +33,13 @@ class Resident:
         self.footprint, self.ellipsoids = footprint, ellipsoids
         self.adopted = False
         """whether somebody else may change the arrays"""
+
+    def color_range(self) -> tuple[float, float]:
+        """As `HasColorRange`, of what the arrays hold now."""
+        colors = self.arrays["colors"].numpy()[: self.count * max(self.sh_degree + 1, 1) ** 2]
+        if self.sh_degree > 0:
+            return color_range(None, colors.reshape(self.count, -1, 3))
+        return color_range(colors, None)
 
     @property
     def memory_bytes(self) -> int:

@@ -53,6 +53,10 @@ class Output:
     """what a sample keeps while its list is composited; 0 before the first fragment"""
     start: Any = None
     """(pixel, length, view): other first values; length: of the sample's ray, 1 unless `length`"""
+    fragment: Any = None
+    """(pixel, s, c, x, y, dot, opacity, view): a splat that the sample's tile lists, whether its fragment is
+    drawn or not (c.drawn), before it is composited; x, y: from the anchor; dot: squared distance from the
+    projected centre in pixels, infinite without a low-pass; opacity: 0 of one that is not drawn"""
     attenuate: Any = None
     """(pixel, seen, shown): how much of a fragment's weight shows as its colour, of `shown`"""
     composite: Any = None
