@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from fidsplat.backends.base import GivesArrays, GivesUint8, Images, ReadsRows, Waits
+from fidsplat.capture import Capture
 from fidsplat.errors import InputError, MissingOutputError
 
 Ids = Callable[[], np.ndarray] | None
@@ -27,11 +28,13 @@ class Frame(Mapping):
     `Quality.first_hit`, labels and ids are -1, the others of these 0.
     """
 
-    def __init__(self, images: Images, outputs: tuple[str, ...], ids: Ids = None) -> None:
+    def __init__(self, images: Images, capture: Capture, ids: Ids = None) -> None:
         """ids: the indices that `splat_id` shows for those of the splats that were drawn."""
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}
-        self.outputs = outputs
+        self.capture = capture
+        """The capture that made it. `read_back` and `truth_of` use its camera, shutter and motion."""
+        self.outputs = capture.outputs
         """Names of the images, in the order in which they were asked for."""
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -154,7 +157,7 @@ class Frame(Mapping):
 
     def __reduce__(self):
         """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
-        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
+        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats), self.capture.picklable())
 
     def wait(self) -> Frame:
         """This frame, once the device has drawn it; nothing is copied.
@@ -207,8 +210,10 @@ class _KeptImages:
         return self.arrays[name]
 
 
-def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
-    return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+def _kept_frame(
+    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], capture: Capture
+) -> Frame:
+    return Frame(_KeptImages(arrays, timings, stats), capture)
 
 
 class OfRows(Protocol):
@@ -254,7 +259,7 @@ def stacked(parts: Iterable[P], draw: Callable[[P], Frame]) -> Frame:
         return last[0]
     finish(last[0])
     take(*last)
-    return _kept_frame(arrays, timings, stats)
+    return _kept_frame(arrays, timings, stats, last[0].capture)
 
 
 def numbered(name: str, image: np.ndarray, ids: Ids) -> np.ndarray:

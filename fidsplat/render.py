@@ -320,7 +320,7 @@ class Renderer:
             else:
                 each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
                 images = ViewByView(each, batch.total, batch.size, len(resident))
-        return FrameBatch(images, views.captures[0].outputs, ids)
+        return FrameBatch(images, views, ids)
 
     def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
@@ -346,11 +346,11 @@ class Renderer:
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
             pipeline, data = self.backend.pipeline(features), resident.data
             if not isinstance(data, Residency):
-                return Frame(draw(pipeline, data, view), capture.outputs)
+                return Frame(draw(pipeline, data, view), capture)
 
             def part(one: PartOfView) -> Frame:
                 images = one.images or draw(pipeline, one.data, one.view)
-                return Frame(images, capture.outputs, one.ids)
+                return Frame(images, capture, one.ids)
 
             return stacked(data.parts(view, features, capture.quality, pipeline), part)
 

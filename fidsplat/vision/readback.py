@@ -68,13 +68,14 @@ def read_back(
 ) -> ReadBack:
     """Read every marker of a scene in its picture: id, corners, pose, and how far these are from the truth.
 
-    Of a scene that moves, the truth is where things are at its shutter's time. Boards (charuco, gridboard,
-    aprilgrid) give one pose each, from all that is seen of them. Drawings and images are not looked for.
+    Boards (charuco, gridboard, aprilgrid) give one pose each, from all that is seen of them. Drawings and
+    images are not looked for.
 
     Args:
         picture: a `Frame` with `rgb`, and with `label` if `Reading.visible` is to know what hides markers; or
-            (h, w, 3) uint8, or float in [0, 1].
-        camera: that took it; default the scene's.
+            images by name; or (h, w, 3) uint8, or float in [0, 1].
+        scene, camera: as of `truth_of`: the truth is where the Frame's own capture has the camera and the
+            markers, or the scene's capture for other images.
         families: tag families to look for, see `detect`; default the scene's.
 
     Raises:
@@ -82,7 +83,7 @@ def read_back(
     """
     image = to_uint8(picture["rgb"] if isinstance(picture, Mapping) else np.asarray(picture))
     label = picture["label"] if isinstance(picture, Mapping) and "label" in picture else None
-    camera, markers = standing(scene, camera, image.shape)
+    camera, markers = standing(picture, scene, camera, image.shape)
     found = detect(image, families_of(placed.marker for placed in markers) if families is None else families)
     codes, left = match(found, markers, camera)
     for number, placed in enumerate(markers):
