@@ -259,8 +259,8 @@ class SplatCloud(PickledByFields, Summarised):
         return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
 
     def reach(self, sigmas: float) -> np.ndarray:
-        """Half extents (n, 3) float64 [m] of splats along the world's axes: of Gaussians to that many standard
-        deviations, of boxes to their corners."""
+        """Half extents (n, 3) float64 [m] of splats along the world's axes: of Gaussians to that many
+        standard deviations, of boxes to their corners."""
         turns = quaternion_to_matrix(self.quats)
         axes = turns[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]
         squares = (axes * axes).sum(axis=2)

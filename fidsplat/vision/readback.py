@@ -139,12 +139,15 @@ def families_of(markers: Iterable[Marker]) -> tuple[str, ...]:
 
 
 def means(readings: Sequence[Reading]) -> dict[str, Any]:
-    """How many markers were found of how many, and the means of their errors, as `Reading.as_dict` has them;
-    None where none was found."""
-    facts = [reading.as_dict() for reading in readings if reading.detection is not None]
+    """How many markers were found of how many that could be, and the means of their errors, as
+    `Reading.as_dict` has them; None where none was found. Markers that are not visible (seen from behind, out
+    of the image, occluded) are counted apart, in `not_visible`."""
+    could_be = [reading for reading in readings if reading.visible > 0 or reading.detection is not None]
+    facts = [reading.as_dict() for reading in could_be if reading.detection is not None]
     keys = ("position_error_mm", "angle_error_deg", "corner_error_px")
     mean = {key: float(np.mean([fact[key] for fact in facts])) if facts else None for key in keys}
-    return {"markers": len(readings), "found": len(facts), **mean}
+    counts = {"markers": len(could_be), "found": len(facts), "not_visible": len(readings) - len(could_be)}
+    return counts | mean
 
 
 def _same(found: Detection, made: Marker) -> bool:

@@ -9,11 +9,13 @@ import shapely
 from sampling import in_turn
 
 import fidsplat as fs
+from fidsplat.cli import main
 from fidsplat.experiments.demo_scene import demo_scene, demo_views
 from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
 from fidsplat.vision import read_back
 from fidsplat.vision.detect import Detection
+from fidsplat.vision.images import write_png
 from fidsplat.vision.readback import corner_error, families_of, match, means
 from fidsplat.vision.visible import visible, visible_part
 
@@ -198,6 +200,27 @@ def test_the_error_of_corners_is_the_root_mean_square_of_their_distances():
     corners = np.array([[0, 0], [9, 0], [9, 9], [0, 9]], float)
     code = Detection("apriltag", "36h11", 5, None, corners + np.array([3, 4]))
     assert corner_error(code, corners) == pytest.approx(5)
+
+
+def test_markers_that_face_away_or_lie_outside_are_not_missed(tmp_path, monkeypatch, capsys):
+    """One in front of the camera, one turned over, one beside the image; a blank image misses the first."""
+    tag = fs.marker("aruco:4x4_50:7", size=0.2)
+    places = [
+        rigid_matrix((0.05, 0, 0.1)),
+        rigid_matrix((-0.1, 0.05, 0), (0, 1, 0, 0.1)),
+        rigid_matrix((3, 0, 0), (1, 0.1, 0, 0)),
+    ]
+    scene = fs.Scene(markers=[PlacedMarker(tag, pose) for pose in places], camera=outlined()[1])
+    blank = np.full((240, 320, 3), 128, np.uint8)
+    found = means(read_back(blank, scene).readings)
+    assert (found["markers"], found["found"], found["not_visible"]) == (1, 0, 2)
+    monkeypatch.chdir(tmp_path)
+    scene.save("scene.toml")
+    write_png("blank.png", blank)
+    assert main(["detect", "blank.png", "--scene", "scene.toml"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "4x4_50" in line or "mean" in line]
+    for row, words in zip(rows, ("no ", "faces away", "not in view", "0 of 1"), strict=True):
+        assert words in row
 
 
 def test_pictures_that_cannot_be_read_back():
