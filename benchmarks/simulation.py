@@ -51,7 +51,7 @@ def readings(renderer: fs.Renderer, count: int) -> list[Reading]:
     found = []
     for pose in tag_poses(count):
         pictures = rig.render({"tag": pose[None]})
-        found += read_back(pictures.of("camera").frame(0), pictures.scene("camera")).readings
+        found += read_back(pictures.of("camera").frame(0), scene).readings
     return found
 
 

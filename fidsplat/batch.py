@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from fidsplat.backends.blank import blank
 from fidsplat.effects import OUTPUTS
 from fidsplat.errors import InputError, MissingOutputError
 from fidsplat.frame import Frame, Ids, check_process, numbered, refuse_numbered
+from fidsplat.views import Views
 
 
 class FrameBatch(Mapping):
@@ -23,11 +25,12 @@ class FrameBatch(Mapping):
     and 0 in all else. View i has the bits that `Renderer.render` gives it alone.
     """
 
-    def __init__(self, images: BatchImages, outputs: tuple[str, ...], ids: Ids = None) -> None:
+    def __init__(self, images: BatchImages, views: Views, ids: Ids = None) -> None:
         """ids: as those of a Frame."""
         self._images, self._process, self._ids = images, os.getpid(), ids
+        self._views = views
         self._arrays: dict[str, np.ndarray] = {}
-        self.outputs = outputs
+        self.outputs = views.captures[0].outputs
         """Names of the images, in the order in which they were asked for."""
 
     @property
@@ -74,7 +77,7 @@ class FrameBatch(Mapping):
             or not 0 <= number < self.views
         ):
             raise InputError(f"there is no view {number!r}; this batch has views 0 to {self.views - 1}")
-        return Frame(_OneOf(self._images, int(number)), self.outputs, self._ids)
+        return Frame(_OneOf(self._images, int(number)), self._views.capture(int(number)), self._ids)
 
     def wait(self) -> FrameBatch:
         """This batch, once the device has drawn it; nothing is copied."""
@@ -96,7 +99,8 @@ class FrameBatch(Mapping):
 
     def __reduce__(self):
         """Pickled and copied as NumPy arrays."""
-        return _kept_batch, (dict(self), dict(self.timings), dict(self.stats))
+        views = replace(self._views, captures=tuple(one.picklable() for one in self._views.captures))
+        return _kept_batch, (dict(self), dict(self.timings), dict(self.stats), views)
 
     @property
     def timings(self) -> Mapping[str, float]:
@@ -174,9 +178,9 @@ class _OneOf:
 
 
 def _kept_batch(
-    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]
+    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], views: Views
 ) -> FrameBatch:
-    return FrameBatch(_KeptBatch(arrays, timings, stats), tuple(arrays))
+    return FrameBatch(_KeptBatch(arrays, timings, stats), views)
 
 
 def _added(counts) -> dict[str, Any]:

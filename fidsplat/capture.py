@@ -73,6 +73,15 @@ class Capture(PickledByFields):
         rows = self.shutter.rows_per_band + 1 if self.camera is None else self.camera.height
         return len(self.shutter.bands(rows)) > 1 or len(self.shutter.times(0.0)) > 1
 
+    def picklable(self) -> Capture:
+        """The same capture, with poses at the times of its shutter in place of the motion's functions."""
+        if self.motion.is_still or self.camera is None:
+            return self
+        shutter = self.shutter
+        middles = [middle for _, _, middle in shutter.bands(self.camera.height)]
+        times = [shutter.time, *(time for middle in middles for time in shutter.times(middle))]
+        return replace(self, motion=self.motion.sampled(times))
+
     def with_(self, **changes: Any) -> Capture:
         """A copy with some parts changed; those that are None stay as they are.
 

@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from fidsplat.backends.base import GivesArrays, GivesUint8, Images, ReadsRows, Waits
+from fidsplat.capture import Capture
 from fidsplat.errors import InputError, MissingOutputError
 
 Ids = Callable[[], np.ndarray] | None
@@ -42,14 +43,16 @@ class Frame(Mapping):
     """
 
     def __init__(
-        self, images: Images, outputs: tuple[str, ...], ids: Ids = None, error: MadeImage | None = None
+        self, images: Images, capture: Capture, ids: Ids = None, error: MadeImage | None = None
     ) -> None:
-        """ids: the indices that `splat_id` shows for those of the splats that were drawn. error: the output
-        `error`, if it was asked for."""
+        """ids: the indices that `splat_id` shows for the rendered splats. error: the output `error`, if it is
+        requested."""
         self._error = error
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}
-        self.outputs = outputs
+        self.capture = capture
+        """The capture that made it. `read_back` and `truth_of` use its camera, shutter and motion."""
+        self.outputs = capture.outputs
         """Names of the images, in the order in which they were asked for."""
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -182,7 +185,7 @@ class Frame(Mapping):
 
     def __reduce__(self):
         """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
-        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
+        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats), self.capture.picklable())
 
     def wait(self) -> Frame:
         """This frame, once the device has drawn it; nothing is copied.
@@ -238,8 +241,10 @@ class _KeptImages:
         return self.arrays[name]
 
 
-def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
-    return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+def _kept_frame(
+    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], capture: Capture
+) -> Frame:
+    return Frame(_KeptImages(arrays, timings, stats), capture)
 
 
 class OfRows(Protocol):
@@ -285,7 +290,7 @@ def stacked(parts: Iterable[P], draw: Callable[[P], Frame]) -> Frame:
         return last[0]
     finish(last[0])
     take(*last)
-    return _kept_frame(arrays, timings, stats)
+    return _kept_frame(arrays, timings, stats, last[0].capture)
 
 
 def numbered(name: str, image: np.ndarray, ids: Ids) -> np.ndarray:

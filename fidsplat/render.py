@@ -325,7 +325,7 @@ class Renderer:
             else:
                 each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
                 images = ViewByView(each, batch.total, batch.size, len(resident))
-        return FrameBatch(images, views.captures[0].outputs, ids)
+        return FrameBatch(images, views, ids)
 
     def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
@@ -356,11 +356,11 @@ class Renderer:
                 if plan is not None:
                     ideal = draw(self.backend.pipeline(plan.features), data, _banded(plan.view, band))
                     error = ErrorImage(images, ideal, plan)
-                return Frame(images, capture.outputs, error=error)
+                return Frame(images, capture, error=error)
 
             def part(one: PartOfView) -> Frame:
                 images = one.images or draw(pipeline, one.data, one.view)
-                return Frame(images, capture.outputs, one.ids)
+                return Frame(images, capture, one.ids)
 
             return stacked(data.parts(view, features, capture.quality, pipeline), part)
 

@@ -95,7 +95,7 @@ class SeveralDevices:
         made = list(self._pool.map(draw, range(len(bands))))
         self._cut_anew([end - first for first, end in bands], [seconds for _, seconds in made])
         frames = [frame for frame, _ in made]
-        return Frame(_Banded(frames, bands, self._pool), frames[0].outputs)
+        return Frame(_Banded(frames, bands, self._pool), frames[0].capture)
 
     def render_views(
         self,

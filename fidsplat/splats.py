@@ -248,8 +248,8 @@ class SplatCloud(PickledByFields, Summarised):
         return self.means + self.origin
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest axis-aligned box (min (3,), max (3,)) float64, world, around all splats' 3 sigma ellipses
-        or ellipsoids.
+        """Smallest axis-aligned box (min (3,), max (3,)) float64, world, around all splats: the 3 sigma
+        ellipses or ellipsoids of Gaussians, the rectangles of boxes.
 
         Raises InputError for an empty cloud.
         """
@@ -259,14 +259,17 @@ class SplatCloud(PickledByFields, Summarised):
         return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
 
     def reach(self, sigmas: float) -> np.ndarray:
-        """How far (n, 3) float64 [m] splats reach along the world's axes, to that many standard
-        deviations."""
+        """Half extents (n, 3) float64 [m] of splats along the world's axes: of Gaussians to that many
+        standard deviations, of boxes to their corners."""
         turns = quaternion_to_matrix(self.quats)
         axes = turns[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]
         squares = (axes * axes).sum(axis=2)
         if self.thickness is not None:
             squares += (turns[:, :, 2] * (sigmas * self.thickness.astype(np.float64))[:, None]) ** 2
-        return np.sqrt(squares)
+        if self.boxes is None:
+            return np.sqrt(squares)
+        corners = np.abs(turns[:, :, :2] * self.scales.astype(np.float64)[:, None, :]).sum(axis=2)
+        return np.where(self.boxes[:, None], corners, np.sqrt(squares))
 
     def flattened(self) -> "SplatCloud":
         """The cloud with disks in place of its 3D Gaussians: of each, the thinnest axis becomes the normal.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
@@ -109,6 +109,13 @@ class Motion:
         """world_to_camera (4, 4) then; None if it does not move."""
         return None if self.camera is None else _checked(self.camera(time), "the camera", time)
 
+    def sampled(self, times: Iterable[float]) -> Motion:
+        """A motion that has the poses at these times alone, and pickles even if made of functions."""
+        moments = [float(time) for time in times]
+        groups = {label: _PoseTable({t: pose(t) for t in moments}) for label, pose in self.groups.items()}
+        camera = self.camera and _PoseTable({t: self.camera(t) for t in moments})
+        return Motion(camera, groups)
+
     def moved(self, camera: Camera, time: float) -> Camera:
         """The camera as it stands then."""
         pose = self.camera_at(time)
@@ -121,6 +128,19 @@ class Motion:
             (label, _checked(pose(time), f"the splats of label {label}", time))
             for label, pose in sorted(self.groups.items())
         ]
+
+
+@dataclass(frozen=True, eq=False)
+class _PoseTable:
+    """Poses at some times, callable as a function of the time."""
+
+    poses: dict[float, np.ndarray]
+
+    def __call__(self, time: float) -> np.ndarray:
+        if time not in self.poses:
+            given = ", ".join(f"{one:g}" for one in self.poses)
+            raise InputError(f"time must be one that this motion was sampled at ({given} s), got {time:g} s")
+        return self.poses[time]
 
 
 def _checked(matrix, who: str, time: float) -> np.ndarray:

@@ -1,5 +1,6 @@
 """`fidsplat detect`."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -194,7 +195,10 @@ def reading_row(reading: "Reading") -> tuple[str, ...]:
     """One row of a table of readings."""
     facts = reading.as_dict()
     found, share = "yes" if facts["found"] else "no", facts["visible"]
-    found += "" if share > 0.995 else f", {100 * share:.0f} % in view"
+    if share == 0 and not facts["found"]:
+        found = "faces away" if reading.tilt > math.pi / 2 else "not in view"
+    elif share <= 0.995:
+        found += f", {100 * share:.0f} % in view"
     return (facts["marker"], found, f"{facts['distance_m']:.3f}", *_errors(facts))
 
 

@@ -32,7 +32,7 @@ def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:
         return -np.ones(3), np.ones(3)
     if isinstance(cloud, Store):  # its chunks are small against it
         return cloud.bounds(REACH)
-    reach = REACH * cloud.reach(1.0)
+    reach = cloud.reach(REACH)
     share = 0.5 if len(cloud) >= MANY else 0.0
     low = np.percentile(cloud.means - reach, share, axis=0)
     high = np.percentile(cloud.means + reach, 100 - share, axis=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -134,7 +134,7 @@ class SceneParts(PickledByFields):
     def motion(self) -> Motion:
         """What moves: the camera, markers by their labels (and whatever else has these), and clouds."""
         groups = {
-            marker.label: partial(_moved_from, marker.pose, marker.motion)
+            marker.label: _MarkerMotion(marker.pose, marker.motion)
             for marker in self.markers
             if marker.motion is not None
         }
@@ -184,11 +184,18 @@ class SceneParts(PickledByFields):
         return dict(zip(sorted(self.cloud_motions), free, strict=False))
 
 
-def _moved_from(start: np.ndarray, motion: Pose, time: float) -> np.ndarray:
-    """The motion of the world that takes a marker from its pose to where it is then."""
-    pose = motion(time)
-    check_similarity(pose, f"a marker's pose at {time:g} s", rigid=True)
-    return np.asarray(pose, np.float64) @ np.linalg.inv(start)
+@dataclass(frozen=True, eq=False)
+class _MarkerMotion:
+    """The motion of the world that takes a marker from its pose to where it is at a time. It is plain data if
+    the marker's own motion is, so that `digest_of` accepts it."""
+
+    start: np.ndarray
+    motion: Pose
+
+    def __call__(self, time: float) -> np.ndarray:
+        pose = self.motion(time)
+        check_similarity(pose, f"a marker's pose at {time:g} s", rigid=True)
+        return np.asarray(pose, np.float64) @ np.linalg.inv(self.start)
 
 
 def _all_of(values: Iterable, kind: type, name: str) -> tuple:

@@ -282,14 +282,13 @@ class Pictures(Mapping):
 
     def camera(self, name: str, environment: int = 0) -> Camera:
         """A camera with the pose that it had."""
-        self.of(name)
-        pose = matrix_of(inverse(self.cameras[name][environment]))
-        return replace(self.rig.cameras[name].camera, world_to_camera=pose, position=None)
+        camera = self.of(name).frame(environment).capture.camera
+        assert camera is not None  # what took a picture
+        return camera
 
-    def scene(self, name: str, environment: int = 0) -> Scene:
-        """The rig's markers where they were, before that camera: for `read_back` and `truth_of`."""
-        poses = {body: pose[environment] for body, pose in self.bodies.items()}
-        return Scene(markers=tuple(self.rig.placed(poses)), camera=self.camera(name, environment))
+    def placed(self, environment: int = 0) -> list[PlacedMarker]:
+        """The scene's markers where they were."""
+        return self.rig.placed({body: pose[environment] for body, pose in self.bodies.items()})
 
 
 def _cameras_of(cameras: Any) -> dict[str, RigCamera]:

@@ -9,7 +9,6 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -226,9 +225,7 @@ class Viewer:
             said.content = "Wait until the picture is still, then ask again."
             return
         try:
-            camera = view.viewpoint.camera(view.drawn.scene, view.drawn.settings.lens)
-            scene = replace(view.drawn.scene, shutter=None)
-            readings, others = read_back(view.frame, scene, camera)
+            readings, others = read_back(view.frame, view.drawn.scene)
         except FidsplatError as error:
             said.content = str(error)
             return

@@ -68,13 +68,14 @@ def read_back(
 ) -> ReadBack:
     """Read every marker of a scene in its picture: id, corners, pose, and how far these are from the truth.
 
-    Of a scene that moves, the truth is where things are at its shutter's time. Boards (charuco, gridboard,
-    aprilgrid) give one pose each, from all that is seen of them. Drawings and images are not looked for.
+    Boards (charuco, gridboard, aprilgrid) give one pose each, from all that is seen of them. Drawings and
+    images are not looked for.
 
     Args:
         picture: a `Frame` with `rgb`, and with `label` if `Reading.visible` is to know what hides markers; or
-            (h, w, 3) uint8, or float in [0, 1].
-        camera: that took it; default the scene's.
+            images by name; or (h, w, 3) uint8, or float in [0, 1].
+        scene, camera: as of `truth_of`: the truth is where the Frame's own capture has the camera and the
+            markers, or the scene's capture for other images.
         families: tag families to look for, see `detect`; default the scene's.
 
     Raises:
@@ -82,7 +83,7 @@ def read_back(
     """
     image = to_uint8(picture["rgb"] if isinstance(picture, Mapping) else np.asarray(picture))
     label = picture["label"] if isinstance(picture, Mapping) and "label" in picture else None
-    camera, markers = standing(scene, camera, image.shape)
+    camera, markers = standing(picture, scene, camera, image.shape)
     found = detect(image, families_of(placed.marker for placed in markers) if families is None else families)
     codes, left = match(found, markers, camera)
     for number, placed in enumerate(markers):
@@ -138,12 +139,15 @@ def families_of(markers: Iterable[Marker]) -> tuple[str, ...]:
 
 
 def means(readings: Sequence[Reading]) -> dict[str, Any]:
-    """How many markers were found of how many, and the means of their errors, as `Reading.as_dict` has them;
-    None where none was found."""
-    facts = [reading.as_dict() for reading in readings if reading.detection is not None]
+    """How many markers were found of how many that could be, and the means of their errors, as
+    `Reading.as_dict` has them; None where none was found. Markers that are not visible (seen from behind, out
+    of the image, occluded) are counted apart, in `not_visible`."""
+    could_be = [reading for reading in readings if reading.visible > 0 or reading.detection is not None]
+    facts = [reading.as_dict() for reading in could_be if reading.detection is not None]
     keys = ("position_error_mm", "angle_error_deg", "corner_error_px")
     mean = {key: float(np.mean([fact[key] for fact in facts])) if facts else None for key in keys}
-    return {"markers": len(readings), "found": len(facts), **mean}
+    counts = {"markers": len(could_be), "found": len(facts), "not_visible": len(readings) - len(could_be)}
+    return counts | mean
 
 
 def _same(found: Detection, made: Marker) -> bool:

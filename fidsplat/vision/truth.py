@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -72,17 +73,19 @@ class Truth:
 
 
 def truth_of(picture: Mapping[str, np.ndarray], scene: Scene, camera: Camera | None = None) -> Truth:
-    """What a picture of a scene shows; of a scene that moves, at its shutter's time.
+    """Ground truth of an image of a scene.
 
     Args:
-        picture: a Frame, or images by name. Its `label` tells what hides markers, and gives masks.
-        camera: that took it; default the scene's.
+        picture: a Frame, whose own capture says where the camera and the markers were; or images by name,
+            taken by the scene's capture. `label` says what is occluded, and gives masks.
+        scene: the one that was rendered. What moves is where it was at the shutter's time.
+        camera: takes the place of the capture's, with its pose.
 
     Raises:
-        InputError: no camera, or one of another size than the picture.
+        InputError: no camera, or one of another size than the image.
     """
     first = next(iter(picture))
-    camera, markers = standing(scene, camera, picture[first].shape)
+    camera, markers = standing(picture, scene, camera, picture[first].shape)
     label = picture.get("label")
     return Truth(
         camera,
@@ -91,13 +94,15 @@ def truth_of(picture: Mapping[str, np.ndarray], scene: Scene, camera: Camera | N
     )
 
 
-def standing(scene: Scene, camera: Camera | None, shape: Sequence[int]) -> tuple[Camera, list[PlacedMarker]]:
-    """The camera and the markers where they are at the scene's shutter's time.
-
-    Raises InputError as `truth_of`, for a picture of that shape.
-    """
-    time = 0.0 if scene.shutter is None else scene.shutter.time
-    camera = scene.camera if camera is None else camera
+def standing(
+    picture: Any, scene: Scene, camera: Camera | None, shape: Sequence[int]
+) -> tuple[Camera, list[PlacedMarker]]:
+    """The camera and the markers at the shutter's time of the capture that made an image of that shape: a
+    Frame's own capture, for other images the scene's. Arguments and errors: as `truth_of`."""
+    capture = getattr(picture, "capture", None) or scene.capture
+    time = capture.shutter.time
+    if camera is None:
+        camera = capture.camera and capture.motion.moved(capture.camera, time)
     if camera is None:
         raise InputError("the scene has no camera, so the pose of its markers is unknown; give one")
     if (camera.height, camera.width) != tuple(shape[:2]):
@@ -105,9 +110,9 @@ def standing(scene: Scene, camera: Camera | None, shape: Sequence[int]) -> tuple
             f"the picture has {shape[1]} x {shape[0]} pixels and the camera {camera.width} x "
             f"{camera.height}; give the picture that this scene was rendered to"
         )
-    if camera is scene.camera:
-        camera = scene.motion.moved(camera, time)
-    return camera, [m if m.motion is None else replace(m, pose=m.motion(time)) for m in scene.markers]
+    groups = dict(capture.motion.groups_at(time))
+    markers = [replace(m, pose=groups[m.label] @ m.pose) if m.label in groups else m for m in scene.markers]
+    return camera, markers
 
 
 def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> MarkerTruth:

@@ -53,7 +53,7 @@ def test_a_frame_becomes_a_tensor(monkeypatch):
     assert array.flags.writeable
     np.testing.assert_array_equal(array, drawn["label"])
     images = SimpleNamespace(read=None, timings={}, stats={}, device_array=lambda name: f"{name} there")
-    assert fs.Frame(images, ("rgb",)).to_torch() == ("dlpack", "rgb there")
+    assert fs.Frame(images, fs.Capture(outputs="rgb")).to_torch() == ("dlpack", "rgb there")
     with pytest.raises(fs.InputError, match="no 'depth'"):
         drawn.to_torch("depth")
     monkeypatch.setitem(sys.modules, "torch", None)
@@ -75,7 +75,7 @@ def test_a_frame_of_one_output_goes_through_dlpack():
     assert not np.shares_memory(there, one["label"])
     given = np.arange(6.0).reshape(2, 3)
     images = SimpleNamespace(read=None, timings={}, stats={}, device_array=lambda name: given)
-    assert np.shares_memory(np.from_dlpack(fs.Frame(images, ("depth",))), given)  # no copy
+    assert np.shares_memory(np.from_dlpack(fs.Frame(images, fs.Capture(outputs="depth"))), given)  # no copy
     with pytest.raises(fs.InputError, match="this frame has 2 images"):
         np.from_dlpack(frame("rgb", "depth"))
 

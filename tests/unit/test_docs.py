@@ -1,10 +1,13 @@
 """What the README and the pages of docs/ print works as printed: their Python runs, their scene files load,
-their command lines parse, their links lead somewhere."""
+their commands run, or parse where they take minutes, their links lead somewhere."""
 
 import re
 import runpy
 import shlex
+import shutil
 import sys
+from glob import glob
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,7 @@ from sybil.example import Example
 from sybil.parsers.markdown import CodeBlockParser, PythonCodeBlockParser, SkipParser
 
 import fidsplat as fs
-from fidsplat.cli import _parse
+from fidsplat.cli import _parse, main
 from fidsplat.vision.images import read_image
 
 TREE = Path(__file__).resolve().parents[2]
@@ -38,8 +41,40 @@ def load_scene(example: Example) -> None:
     fs.Scene.load(path)
 
 
-def check_commands(text: str) -> None:
-    """Every `fidsplat` parses, and every script that Python is to run is there."""
+PARSED_ONLY = {
+    "bench": "times the machine",
+    "check": "minutes; tests/hard_cases",
+    "demo": "tests/unit/test_demo.py runs it",
+    "experiment": "minutes; tests/experiments",
+    "store measure": "minutes; tests/unit/test_store_detail.py",
+    "tradeoff": "minutes; tests/experiments",
+    "train": "minutes; tests/unit/test_train_command.py",
+    "view": "ends when it is stopped; tests/unit/test_viewer_*.py",
+}
+"""commands that are not run here, and why; all others are"""
+PARSED_WORDS = {
+    "--device": "a machine's own",
+    "--max-error": "tests/unit/test_budget.py",
+    "--max-ms": "times the machine",
+    "--plants-from": "made by an experiment",
+    "--ray": "a cluster",
+    "city/city.toml": "a hundred frames of 1280 x 720; tests/unit/test_flights.py",
+}
+SMALLER = {"store demo": ["--splats", "20000", "--houses", "1", "--views", "0", "--markers", "2"]}
+"""what is added to a command so that it takes a second"""
+EXTRAS = {
+    "experiments": ("pandas", "matplotlib", "pupil_apriltags", "flip_evaluator", "jinja2"),
+    "logs": ("mcap", "rosbags"),
+    "sim": ("mujoco", "gymnasium"),
+    "usd": ("pxr",),
+    "video": ("imageio_ffmpeg",),
+    "viewer": ("viser",),
+}
+"""modules of extras; those of an extra that a line and its page do not mention are hidden while it runs"""
+
+
+def check_commands(text: str, run=lambda words, line: None) -> None:
+    """Every `fidsplat` parses, and goes to `run` with its line; every script for Python is there."""
     for line in text.replace("\\\n", " ").splitlines():
         words = shlex.shlex(line, posix=True, punctuation_chars=";&|>")
         words.whitespace_split = True
@@ -47,6 +82,8 @@ def check_commands(text: str) -> None:
         for word in [*words, ";"]:
             if set(word) <= set(";&|>"):
                 check_command(command)
+                if command[:1] == ["fidsplat"]:
+                    run(command[1:], line)
                 command = []
             elif word != "do" and not re.fullmatch(r"[A-Z_]+=\S*", word):
                 command.append(word)
@@ -59,12 +96,87 @@ def check_command(words: list[str]) -> None:
         assert (TREE / words[1]).exists(), f"{words[1]} is not there"
 
 
+def run_command(words: list[str], line: str, page: str) -> None:
+    """Run a command in the folder of the test, with the files that it names and without the extras that are
+    not mentioned."""
+    verb = " ".join(words[:2]) if words[0] == "store" else words[0]
+    if verb in PARSED_ONLY or set(PARSED_WORDS) & set(words):
+        return
+    with pytest.MonkeyPatch.context() as hidden:
+        for extra, modules in EXTRAS.items():
+            if f"(extra: {extra})" in line or re.search(rf"pip install '\S*\[[\w,]*\b{extra}\b", page):
+                if any(find_spec(module) is None for module in modules):
+                    return
+            else:
+                for module in modules:
+                    hidden.setitem(sys.modules, module, None)
+        for word in words:
+            if word in READERS_FILES and not glob(word):
+                READERS_FILES[word]()
+        given = [name for word in words for name in (sorted(glob(word)) if "*" in word else [word])]
+        assert main([*given, *SMALLER.get(verb, [])]) == 0, line
+
+
+def save_city(name: str):
+    """A row of splats before the camera, as a PLY file or a store."""
+    places = np.stack([np.linspace(-1, 1, 20), np.zeros(20), np.full(20, 3.0)], 1)
+    row = fs.SplatCloud(places, np.tile([1.0, 0, 0, 0], (20, 1)), np.full((20, 2), 0.1), np.full(20, 0.9),
+                        colors=np.full((20, 3), 0.5))  # fmt: skip
+    if name.endswith(".ply"):
+        fs.save_ply(row, name)
+    else:
+        save_city("house.ply")
+        assert main(["store", "build", "house.ply", "-o", name]) == 0
+
+
+def copy_examples() -> None:
+    """The scenes of `examples/`, an eighth of their size."""
+    shutil.copytree(EXAMPLES, "examples")
+    for file in Path("examples").glob("*.toml"):
+        lines = re.sub(
+            r"^(width|height) = (\d+)",
+            lambda m: f"{m[1]} = {int(m[2]) // 8}",
+            file.read_text("utf-8"),
+            flags=re.M,
+        )
+        file.write_text(lines, "utf-8")
+
+
+SCENE = """[camera]
+width = 120
+height = 90
+fov_x_deg = 60.0
+position = [0.0, 0.0, -0.5]
+look_at = [0.0, 0.0, 0.0]
+[[markers]]
+spec = "apriltag:36h11:5"
+size = 0.2
+[render]
+background = [0.5, 0.5, 0.5]
+"""
+POSES = "0 0 0 -0.5 0 0 0 1\n0.1 0.01 0 -0.5 0 0 0 1\n"
+READERS_FILES = {
+    "scene.toml": lambda: Path("scene.toml").write_text(SCENE),
+    "flight.tum": lambda: Path("flight.tum").write_text(POSES),
+    "yard.ply": lambda: save_city("yard.ply"),
+    "block-*.ply": lambda: save_city("block-1.ply"),
+    "house.fss": lambda: save_city("house.fss"),
+    "examples/*.toml": copy_examples,
+}
+"""files that readers have, by their names on the pages; made before the first command that names them"""
+
+
+def run_commands(example: Example) -> None:
+    page = example.document.text
+    check_commands(example.parsed, lambda words, line: run_command(words, line, page))
+
+
 BLOCKS = Sybil(
     [
         PythonCodeBlockParser(),
         SkipParser(),
         CodeBlockParser("toml", load_scene),
-        CodeBlockParser("bash", lambda example: check_commands(example.parsed)),
+        CodeBlockParser("bash", run_commands),
     ]
 )
 

@@ -10,6 +10,8 @@ from full_disk import small_files
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.flights import Flight, FlightFolder
+from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes import PlacedMarker
 from fidsplat.vision.images import read_image
 from fidsplat.vision.video import write_video
 
@@ -181,6 +183,20 @@ def test_what_a_flight_is_of(here):
     (here / "scene.toml").write_text(SCENE.replace("0.4", "0.41"))
     others.append(small_flight().key("a"))
     assert len({key, *others}) == 6
+
+
+def test_a_flight_past_a_marker_that_moves_has_a_key(here):
+    """Another one for another motion; the gallery has such keys too."""
+
+    def key(far: float) -> str:
+        flight = small_flight()
+        path = fs.Trajectory([0.0, 1.0], np.stack([np.eye(4), rigid_matrix((far, 0, 0))]))
+        scene = fs.Scene(markers=[PlacedMarker(fs.marker("aruco:4x4_50:7", size=0.4), motion=path)])
+        capture = flight.capture.with_(motion=scene.motion)
+        return Flight(scene, flight.trajectory, flight.times, capture).key("a")
+
+    assert key(0.1) == key(0.1)
+    assert key(0.1) != key(0.2)
 
 
 def test_a_large_cloud_is_hashed_too(here):

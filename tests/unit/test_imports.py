@@ -46,9 +46,9 @@ MAY_IMPORT = {
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
     | {"scenes", "effects", "backends", "render", "frame", "vision", "provenance", "random_clouds"},
-    "frame": BASE | {"backends", "vision"},
+    "frame": BASE | {"backends", "vision", "capture"},
     "views": PLAIN,
-    "batch": BASE | {"backends", "effects", "frame"},
+    "batch": BASE | {"backends", "effects", "frame", "views"},
     "resident": PLAIN | {"store", "effects", "backends", "frame"},
     "ideal": PLAIN | {"effects", "backends"},
     "render": PLAIN

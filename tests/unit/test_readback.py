@@ -1,15 +1,21 @@
 """Reading back: what is visible, which detection is whose, poses of boards."""
 
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import shapely
 from sampling import in_turn
 
 import fidsplat as fs
+from fidsplat.cli import main
 from fidsplat.experiments.demo_scene import demo_scene, demo_views
+from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
 from fidsplat.vision import read_back
 from fidsplat.vision.detect import Detection
+from fidsplat.vision.images import write_png
 from fidsplat.vision.readback import corner_error, families_of, match, means
 from fidsplat.vision.visible import visible, visible_part
 
@@ -140,10 +146,81 @@ def test_a_board_gives_one_pose(renderer, spec):
     assert means([reading])["position_error_mm"] is None
 
 
+def test_the_truth_is_where_the_frames_own_capture_had_camera_and_markers(renderer):
+    """Not where the scene has them: after a camera, a shutter and a motion given to `render`, in a batch, and
+    after pickling, which functions do not survive."""
+    placed, own = outlined()
+    aside = fs.Camera.look_at(320, 240, 1.0, (0.3, 0.1, -0.7), (0.05, 0, 0))
+
+    def slide(time):
+        return rigid_matrix((0.1 * time, 0, 0), (1, 0, 0, 0.1 * time))
+
+    scene = fs.Scene(markers=[placed], camera=own, shutter=fs.Shutter(time=0.5))
+    moving = fs.Scene(markers=[replace(placed, motion=slide)], camera=own, shutter=fs.Shutter(time=0.5))
+    later, rolling = fs.Shutter(time=1.0), fs.Shutter(time=1.0, exposure_time=1e-4, sub_poses=2, readout=1e-4)
+    pose = [0.15, 0.1, -0.7, 1.0, 0, 0, 0]
+    frames = [
+        (scene, renderer.render(scene, aside), 0.0),
+        (moving, renderer.render(moving, aside), 0.5),
+        (moving, renderer.render(moving, aside, shutter=later), 1.0),
+        (moving, pickle.loads(pickle.dumps(renderer.render(moving, shutter=rolling))), 1.0),
+        (moving, renderer.render(moving, fs.Capture(aside)), 0.0),  # which does not move
+        (scene, renderer.render(scene, motion=fs.Motion(lambda t: aside.world_to_camera, {1: slide})), 0.5),
+        (moving, renderer.render(scene, motion=fs.Motion(None, {1: slide}), shutter=later), 1.0),
+    ]
+    batch = renderer.render_batch(
+        scene, own, poses=[pose, pose], groups={1: [[0, 0, 0, 1, 0, 0, 0], [0.1, 0, 0, 1, 0, 0, 0]]}
+    )
+    for made in (batch, pickle.loads(pickle.dumps(batch))):
+        frames += [(scene, made.frame(i), None) for i in range(2)]
+    for case, (made_of, frame, time) in enumerate(frames):
+        (reading,), others = read_back(frame, made_of)
+        assert others == []
+        assert reading.position_error < 2e-3, case
+        assert reading.angle_error < np.radians(1), case
+        if time is not None:
+            np.testing.assert_allclose(reading.placed.pose, slide(time), atol=1e-12)
+    (reading,), _ = read_back(frames[1][1], moving, own)  # a camera that is given takes the place of both
+    assert reading.position_error > 0.1
+
+
+def test_a_pickled_frame_is_made_again_by_its_capture(renderer):
+    """Of a rolling shutter too, all of whose poses come along; of other times it says that it has none."""
+    placed, camera = outlined()
+    scene = fs.Scene(markers=[placed], camera=camera)
+    moved = fs.Motion(lambda time: rigid_matrix((-time, 0, 1)))
+    frame = renderer.render(scene, motion=moved, shutter=fs.Shutter(0.1, exposure_time=0.1, readout=0.2))
+    again = pickle.loads(pickle.dumps(frame))
+    assert np.array_equal(renderer.render(scene, again.capture)["rgb"], frame["rgb"])
+    with pytest.raises(fs.InputError, match="time must be one that this motion was sampled at"):
+        again.capture.motion.camera_at(7.0)
+
+
 def test_the_error_of_corners_is_the_root_mean_square_of_their_distances():
     corners = np.array([[0, 0], [9, 0], [9, 9], [0, 9]], float)
     code = Detection("apriltag", "36h11", 5, None, corners + np.array([3, 4]))
     assert corner_error(code, corners) == pytest.approx(5)
+
+
+def test_markers_that_face_away_or_lie_outside_are_not_missed(tmp_path, monkeypatch, capsys):
+    """One in front of the camera, one turned over, one beside the image; a blank image misses the first."""
+    tag = fs.marker("aruco:4x4_50:7", size=0.2)
+    places = [
+        rigid_matrix((0.05, 0, 0.1)),
+        rigid_matrix((-0.1, 0.05, 0), (0, 1, 0, 0.1)),
+        rigid_matrix((3, 0, 0), (1, 0.1, 0, 0)),
+    ]
+    scene = fs.Scene(markers=[PlacedMarker(tag, pose) for pose in places], camera=outlined()[1])
+    blank = np.full((240, 320, 3), 128, np.uint8)
+    found = means(read_back(blank, scene).readings)
+    assert (found["markers"], found["found"], found["not_visible"]) == (1, 0, 2)
+    monkeypatch.chdir(tmp_path)
+    scene.save("scene.toml")
+    write_png("blank.png", blank)
+    assert main(["detect", "blank.png", "--scene", "scene.toml"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "4x4_50" in line or "mean" in line]
+    for row, words in zip(rows, ("no ", "faces away", "not in view", "0 of 1"), strict=True):
+        assert words in row
 
 
 def test_pictures_that_cannot_be_read_back():

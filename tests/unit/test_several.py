@@ -31,6 +31,7 @@ def test_bands_of_devices_have_the_bits_of_one(store, two):
             two._shares = np.array([0.0, share, 1.0])
             ours = two.render(given, look(turn=TURNED), outputs)
             whole = alone.render(cloud, look(turn=TURNED), outputs)
+            assert np.array_equal(ours.capture.camera.world_to_camera, look(turn=TURNED).world_to_camera)
             for output in outputs:
                 assert np.array_equal(ours[output], whole[output]), (output, share)
     assert ours.stats["visible"] >= whole.stats["visible"]

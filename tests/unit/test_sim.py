@@ -82,9 +82,9 @@ def test_a_marker_is_read_where_its_body_is_by_a_fixed_camera_and_by_one_that_mo
     for camera in ("fixed", "mounted"):
         for i in range(2):
             there = matrix_of(poses["box"][i]) @ rigid_matrix((0.05, 0, 0))
-            scene = pictures.scene(camera, i)
-            np.testing.assert_allclose(scene.markers[0].pose, there, atol=1e-12)
-            (reading,) = read_back(pictures.of(camera).frame(i), scene).readings
+            np.testing.assert_allclose(pictures.placed(i)[0].pose, there, atol=1e-12)
+            (reading,) = read_back(pictures.of(camera).frame(i), rig.scene).readings
+            np.testing.assert_allclose(reading.placed.pose, there, atol=1e-12)
             assert reading.position_error < 0.01, (camera, i)
             assert reading.corner_error < 0.1
     robot = matrix_of(poses["robot"][1]) @ np.linalg.inv(rigid_matrix((0.1, 0, 0.2)))
@@ -117,9 +117,7 @@ def test_bodies_at_rest_where_the_scene_has_their_splats(scene, renderer):
     pose = {"box": compose(np.array([0, 0, 1.5, 1, 0, 0, 0.0]), a_pose())[None]}
     one, other = at_rest.render(pose), in_frame.render(pose)
     assert (one["label"] != other["label"]).mean() < 1e-3  # float32 of another place
-    np.testing.assert_allclose(
-        one.scene("fixed").markers[0].pose, other.scene("fixed").markers[0].pose, atol=1e-12
-    )
+    np.testing.assert_allclose(one.placed()[0].pose, other.placed()[0].pose, atol=1e-12)
 
 
 def test_layers_of_another_renderer_are_each_environments_own(scene):

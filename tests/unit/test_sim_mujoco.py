@@ -84,7 +84,7 @@ def test_a_tag_is_read_where_mujoco_says_it_is(model, rig):
             eye[:3, :3] = data.camera(camera).xmat.reshape(3, 3) @ np.diag([1.0, -1.0, -1.0])
             eye[:3, 3] = data.camera(camera).xpos
             truth = np.linalg.inv(eye) @ box @ FACE
-            (reading,) = read_back(pictures.of(camera).frame(i), pictures.scene(camera, i)).readings
+            (reading,) = read_back(pictures.of(camera).frame(i), rig.scene).readings
             np.testing.assert_allclose(reading.truth, truth, atol=1e-9)
             assert np.linalg.norm(reading.pose[:3, 3] - truth[:3, 3]) < 0.01, (camera, i)
 
@@ -252,7 +252,7 @@ def test_the_ten_lines_of_the_pages_draw_a_tag_that_is_read():
     assert readme == page
     exec(readme, names)
     pictures = names["pictures"]
-    (reading,) = read_back(pictures.of("eye").frame(0), pictures.scene("eye")).readings
+    (reading,) = read_back(pictures.of("eye").frame(0), names["rig"].scene).readings
     assert reading.position_error < 0.003  # 0.2 % of 1.4 m
 
 

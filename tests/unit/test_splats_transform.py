@@ -183,6 +183,25 @@ def test_bounds_hold_every_3_sigma_ellipse_tightly():
     np.testing.assert_allclose(points.max(axis=(0, 1)), high, atol=1e-4)
 
 
+def test_bounds_of_boxes_are_those_of_their_corners():
+    """Next to Gaussians too, and of a marker that is made of them: its sheet, quiet zone included."""
+    mixed = np.arange(len(cloud_of())) % 2 == 0
+    cloud = cloud_of().with_boxes(mixed)
+    axes = quaternion_to_matrix(cloud.quats)[:, :, :2] * cloud.scales[:, None, :]
+    corners = np.einsum("nij,jt->nti", axes, [[-1, 1, 1, -1], [-1, -1, 1, 1]]) + cloud.means[:, None]
+    apart = fs.SplatCloud.concatenate([cloud]).reach(3.0)
+    np.testing.assert_allclose((corners.max(1) - cloud.means)[mixed], apart[mixed], atol=1e-6)
+    np.testing.assert_array_equal(apart[~mixed], cloud_of().reach(3.0)[~mixed])
+    made = fs.marker("qr:hello", size=0.21, mixture="exact")
+    pose = rigid_matrix((1, 2, 3), (1, 0.3, -0.5, 0.2))
+    rows, columns = made.grid.shape
+    half = np.array([columns, rows]) * made.module / 2
+    sheet = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
+    sheet = sheet @ pose[:3, :3].T + pose[:3, 3]
+    low, high = made.cloud.transformed(pose).bounds()
+    np.testing.assert_allclose([low, high], [sheet.min(0), sheet.max(0)], atol=1e-6)
+
+
 def test_bounds_are_in_the_world():
     one = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[1, 2]], [1], colors=[[1, 1, 1]], origin=[1e6, 0, 5])
     low, high = one.bounds()

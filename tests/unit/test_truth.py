@@ -125,7 +125,7 @@ def test_truth_of_a_picture_of_another_size(scene, frame):
     with pytest.raises(fs.InputError, match="160 x 120 pixels and the camera 80 x 60"):
         truth_of(frame, scene, fs.Camera.pinhole(80, 60, 50, 50, 40, 30))
     with pytest.raises(fs.InputError, match="the scene has no camera"):
-        truth_of(frame, fs.Scene())
+        truth_of(dict(frame), fs.Scene())
 
 
 @pytest.mark.parametrize("seed", range(4))

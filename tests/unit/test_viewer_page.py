@@ -1,6 +1,7 @@
 """The viewer's page, with a client that is no browser."""
 
 import socket
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,8 @@ from viewing import HERE, Client, scene, until
 import fidsplat as fs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.viewer.edits import Body
+from fidsplat.viewer.session import View
+from fidsplat.viewer.settings import Settings
 from fidsplat.viewer.stream import Stream
 
 
@@ -52,6 +55,21 @@ def test_what_a_browser_gets_and_asks(viewer):
     viewer._leave(client)
     viewer._leave(client)
     viewer.read(client)
+
+
+def test_a_marker_that_moves_is_read_where_it_is_at_the_time_of_the_image(viewer):
+    def slide(time):
+        return rigid_matrix((0.1 * time, 0, 0))
+
+    (still,) = scene().markers
+    moving = fs.Scene(markers=[replace(still, motion=slide)], background=(0.2, 0.3, 0.4))
+    drawn = replace(viewer.session.drawn, scene=moving, settings=replace(Settings.of(moving), time=1.0))
+    capture = drawn.settings.capture(moving, replace(HERE, width=320, height=240).camera(moving, "scene"))
+    client = Client()
+    viewer._said[1] = client.said
+    viewer._views[1] = View(drawn.renderer.render(moving, capture), drawn, HERE)
+    viewer.read(client)
+    assert "| aruco:4x4_50:7 | 0." in client.said.content  # millimetres, not 100 of them
 
 
 def test_what_a_button_cannot_do_is_said(viewer, monkeypatch):
