@@ -21,6 +21,8 @@ from fidsplat.splats import SplatCloud
 NORM, COSINE = 1e-4, 1e-6
 """what a device may be off at most, as `Difference` has it; or by twice what `last_place` changes"""
 _BEHIND = (0.3, 0.6, 0.1)
+_ORIGIN = np.array([40.0, -25.0, 7.0])
+"""of the clouds, metres: a derivative by a world position instead of one relative to it shows"""
 
 
 class Difference(NamedTuple):
@@ -42,11 +44,30 @@ def random_picture(
     quality: Any = None,
     **splats: Any,
 ) -> tuple[SplatCloud, Capture]:
-    """Random splats before a camera that looks at their middle; others are `random_splats`' own."""
+    """Random splats far from the world's origin, and a camera whose pixels are not square and whose principal
+    point is not the centre. splats: arguments of `random_splats`."""
     cloud = random_splats(count, seed, sh_degree=degree, **splats)
-    eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3)
-    camera = Camera.look_at(*size, 1.1, eye, (0.0, 0.1, 3.0))
+    cloud = SplatCloud(*arrays_of(cloud), origin=_ORIGIN, **colors_of(cloud))
+    eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3) + _ORIGIN
+    camera = stretched(Camera.look_at(*size, 1.1, eye, _ORIGIN + (0.0, 0.1, 3.0)))
     return cloud, Capture(camera, outputs=outputs, quality=quality, background=_BEHIND)
+
+
+def stretched(camera: Camera) -> Camera:
+    """The pinhole camera with fy = 1.3 fx and a principal point off the centre."""
+    fx, (cx, cy) = camera.fx, (camera.cx + 1.5, camera.cy - 0.75)
+    matrix, position = camera.world_to_camera, camera.position
+    return Camera.pinhole(camera.width, camera.height, fx, 1.3 * fx, cx, cy, matrix, position=position)
+
+
+def arrays_of(cloud: SplatCloud) -> tuple[np.ndarray, ...]:
+    """Means, quats, scales and opacities."""
+    return cloud.means, cloud.quats, cloud.scales, cloud.opacities
+
+
+def colors_of(cloud: SplatCloud) -> dict[str, Any]:
+    """Colours or harmonics, as arguments of a cloud."""
+    return {"colors": cloud.colors} if cloud.sh is None else {"sh": cloud.sh}
 
 
 def random_loss(features: FeatureSet, view: View, seed: int = 0) -> dict[str, np.ndarray]:
@@ -95,9 +116,10 @@ def last_place(cloud: SplatCloud) -> SplatCloud:
         towards = np.where(rng.random(array.shape) < 0.5, -np.inf, np.inf).astype(np.float32)
         return np.nextafter(array, towards)
 
-    color = {"colors": cloud.colors} if cloud.sh is None else {"sh": cloud.sh}
     means, quats = moved(cloud.means), moved(cloud.quats)
-    return SplatCloud(means, quats, cloud.scales, cloud.opacities, origin=cloud.origin, **color)
+    return SplatCloud(
+        means, quats, cloud.scales, cloud.opacities, origin=cloud.origin, **colors_of(cloud)
+    )
 
 
 def differences(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> Iterator[Difference]:

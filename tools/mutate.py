@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import hashlib
 import json
 import os
 import random
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -62,6 +64,9 @@ TESTS = {  # package or file: test files and folders, and an expression for -k; 
 }  # fmt: skip
 MOST_FILES = 12
 """of tests for one mutation, the most fitting of the map"""
+TEST_SECONDS = 30
+"""of CPU time, after which a test hangs"""
+LIMIT = -signal.SIGXCPU
 INVALID = re.compile(r"BUILD_PROGRAM_FAILURE|clBuildProgram|Warp\w*Codegen\w*Error|Error while parsing function")
 
 _LITERALS = r"""'''.*?'''|\"\"\".*?\"\"\"|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'"""
@@ -276,55 +281,54 @@ class Tree:
         """`result` (caught, survived, invalid) with the test and how it ended. first: a test to run before."""
         file = self._folder / mutation.path
         text = file.read_text("utf-8")
-        file.write_text(text[: mutation.start] + mutation.text + text[mutation.end :], "utf-8")
+        mutated = text[: mutation.start] + mutation.text + text[mutation.end :]
+        file.write_text(mutated, "utf-8")
         try:
             while True:
                 broken = [word for test, passes in self._passes.items() if not passes for word in ("--deselect", test)]
-                how, test, output = self._pytest([*tests_for(mutation), *broken], self._limit)
+                status, test, output = self._pytest([*tests_for(mutation), *broken])
                 if INVALID.search(output):
                     return {"result": "invalid", "test": test, "how": "does not compile"}
-                if how == 0 or not test:
-                    return {"result": "survived", "test": "", "how": "" if how == 0 else f"{how}"}
+                if status in (0, LIMIT) or not test:
+                    return {"result": "survived", "test": "", "how": {0: "", LIMIT: "limit"}.get(status, f"status {status}")}
                 file.write_text(text, "utf-8")
-                passes = self._passes.setdefault(test, self._alone(test))
-                file.write_text(text[: mutation.start] + mutation.text + text[mutation.end :], "utf-8")
-                if passes:
-                    return {"result": "caught", "test": test, "how": {1: "fails", 2: "fails"}.get(how, str(how))}
-                if how == "limit":
-                    return {"result": "survived", "test": "", "how": "limit"}
+                if self._passes.setdefault(test, self._alone(test)):
+                    how = {-signal.SIGPROF: "hangs"}.get(status, "fails" if status > 0 else f"signal {-status}")
+                    return {"result": "caught", "test": test, "how": how}
+                file.write_text(mutated, "utf-8")
         finally:
             file.write_text(text, "utf-8")
 
     def _alone(self, test: str) -> bool:
-        """Whether it passes without the mutation in a third of the limit."""
-        options = [] if "::" in test else ["--collect-only"]
-        return self._pytest([test, "-m", "", *options], self._limit / 3)[0] == 0
+        """Whether a test, or the import of a test file, passes without the mutation."""
+        return self._pytest([test, "-m", "", *([] if "::" in test else ["--collect-only"])])[0] == 0
 
-    def _pytest(self, arguments: list[str], limit: float) -> tuple[int | str, str, str]:
-        """Exit status or `limit`, the first test that failed or that ran for the last third, and the output."""
-        environment = os.environ | {"PYTHONPATH": str(self._folder), "PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "999"}
-        command = [sys.executable, "-m", "pytest", "-n", "0", "-x", "-v", "-p", "no:cacheprovider", *arguments]
+    def _pytest(self, arguments: list[str]) -> tuple[int, str, str]:
+        """Exit status, negative for a signal; the test that failed or was running; the output."""
+        path = os.pathsep.join(str(self._folder / name) for name in (".", "tools"))
+        environment = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "999"}
+        command = [sys.executable, "-m", "pytest", "-n", "0", "-x", "-v", "-p", "mutate", "-p", "no:cacheprovider", *arguments]
+        limited = lambda: resource.setrlimit(resource.RLIMIT_CPU, (int(self._limit), int(self._limit) + 5))  # noqa: E731
         with tempfile.TemporaryFile() as stream:
-            child = subprocess.Popen(command, cwd=self._folder, env=environment, stdout=stream, stderr=stream, start_new_session=True)
-            begun = since = time.monotonic()
-            size, how = 0, None
-            while how is None:
-                try:
-                    how = child.wait(0.2)
-                except subprocess.TimeoutExpired:
-                    now, grown = time.monotonic(), os.fstat(stream.fileno()).st_size
-                    size, since = grown, now if grown > size else since
-                    how = "limit" if now > begun + limit else None
-            if child.poll() is None:
-                os.killpg(child.pid, signal.SIGKILL)
+            child = subprocess.Popen(command, cwd=self._folder, env=environment, stdout=stream, stderr=stream, start_new_session=True, preexec_fn=limited)
+            try:
+                status = child.wait(10 * self._limit)
+            except subprocess.TimeoutExpired:
+                status = LIMIT
+            finally:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(child.pid, signal.SIGKILL)
                 child.wait()
             stream.seek(0)
             output = stream.read().decode("utf-8", "replace")
         failed = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", output, re.MULTILINE)
-        running = re.findall(r"^(\S+\.py::.*?)(?: (?:PASSED|SKIPPED|FAILED|ERROR|Fatal)\b.*)?$", output, re.MULTILINE)
-        if failed or (how == "limit" and time.monotonic() - since < limit / 3) or not running:
-            return how, failed[1] if failed else "", output
-        return how, running[-1].strip() if how else "", output
+        begun = re.findall(r"^(\S+\.py::.*?)(?: (?:PASSED|SKIPPED|FAILED|ERROR|Fatal)\b.*)?$", output, re.MULTILINE)
+        return status, failed[1] if failed else begun[-1].strip() if begun and status else "", output
+
+
+def pytest_runtest_logstart() -> None:
+    """End pytest by a signal when one test takes too long. This module is a plugin of the runs it starts."""
+    signal.setitimer(signal.ITIMER_PROF, TEST_SECONDS)
 
 
 def report(rows: dict[str, dict]) -> str:
@@ -350,7 +354,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=80, help="mutations of the sample")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--package", default="", help="only packages with this in their path")
-    parser.add_argument("--limit", type=float, default=90, help="seconds for the tests of one mutation")
+    parser.add_argument("--limit", type=float, default=60, help="seconds of CPU time for the tests of one mutation")
     parser.add_argument("--results", type=Path, default=Path("mutations.jsonl"))
     parser.add_argument("--survivors", action="store_true", help="run the recorded survivors again")
     parser.add_argument("--equivalent", nargs=2, metavar=("KEY", "REASON"))

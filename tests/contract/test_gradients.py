@@ -44,6 +44,8 @@ def assert_same(backend, cloud, capture, by_images=None, **build):
 
 CASES = {
     "random": {},
+    "degree 2": {"degree": 2},
+    "degree 3": {"degree": 3},
     "plain colours, surfel": {"degree": None, "quality": "surfel", "outputs": ("rgb",)},
     "far below a pixel": {"scale": (1e-5, 1e-3), "depth": (1.0, 5.0), "across": 1.0},
     "huge": {"scale": (1.0, 50.0), "depth": (0.5, 4.0), "count": 30},
@@ -97,7 +99,7 @@ def test_distortions_and_their_derivatives_are_the_references(backend):
 def test_opaque_splats_have_derivatives(backend):
     """Nothing shines through them, and their own opacity counts."""
     cloud, capture = random_picture(3, scale=(0.3, 1.0), depth=(1.5, 4.0))
-    opaque = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh)
+    opaque = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh, origin=cloud.origin)
     found = assert_same(backend, opaque, capture)
     assert np.abs(found["opacities"]).max() > 0
     assert all(np.isfinite(array).all() for array in found.values())
@@ -108,7 +110,10 @@ def long_lists():
     cloud, capture = random_picture(
         4, count=400, scale=(0.2, 1.5), depth=(2.0, 5.0), across=1.0, size=(150, 40)
     )
-    faint = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, 0.004 + 0.01 * cloud.opacities, sh=cloud.sh)
+    opacities = 0.004 + 0.01 * cloud.opacities
+    faint = fs.SplatCloud(
+        cloud.means, cloud.quats, cloud.scales, opacities, sh=cloud.sh, origin=cloud.origin
+    )
     return faint, capture
 
 

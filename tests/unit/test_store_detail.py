@@ -148,6 +148,31 @@ def measured(level, sizes, errors):
     return Detail("pixel", level, sizes, errors, 3, "here", "today")
 
 
+def test_the_view_that_needs_most_decides_the_levels_of_a_batch(store, renderer):
+    sizes, errors = (0.05, 0.5, 4.0), (1e-4, 1e-3, 1e-2)
+    save_details(store.path, store.identity, [measured(level, sizes, errors) for level in range(1, 9)])
+    resident, quality = renderer.upload(fs.Store(store.path)), QUALITY.with_(detail_error=0.05)
+
+    def batch_of(*away, quality=quality):
+        return renderer.render_batch(
+            resident, [fs.Capture(seen_from(each, (160, 120)), quality=quality) for each in away]
+        )
+
+    def alone(away, quality=quality):
+        return renderer.render(resident, seen_from(away, (160, 120)), quality=quality)
+
+    far, near, exact = alone(700.0), alone(200.0), alone(700.0, QUALITY)
+    assert far.stats["splats"] < near.stats["splats"] < exact.stats["splats"]
+    same = batch_of(700.0, 700.0)
+    assert same.stats["splats"] == far.stats["splats"]
+    assert all(np.array_equal(image, far["rgb"]) for image in same["rgb"])
+    assert not np.array_equal(far["rgb"], exact["rgb"])
+    mixed = batch_of(700.0, 200.0)
+    assert mixed.stats["splats"] >= near.stats["splats"]
+    off = [np.abs(image - exact["rgb"]).max() for image in (mixed["rgb"][0], far["rgb"])]
+    assert off[0] < off[1]
+
+
 def test_sizes_that_no_view_met_are_not_promised():
     one = measured(1, (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1))
     assert pixels([one], 1, 0.001) == 0.0
