@@ -21,7 +21,7 @@ from fidsplat.splats import SplatCloud
 NORM, COSINE = 1e-4, 1e-6
 """what a device may be off at most, as `Difference` has it; or by twice what `last_place` changes"""
 _BEHIND = (0.3, 0.6, 0.1)
-_ORIGIN = np.array([40.0, -25.0, 7.0])
+_ORIGIN = (40.0, -25.0, 7.0)
 """of the clouds, metres: a derivative by a world position instead of one relative to it shows"""
 
 
@@ -42,14 +42,15 @@ def random_picture(
     degree: int | None = 1,
     outputs: tuple[str, ...] = ("rgb", "alpha", "depth", "normal"),
     quality: Any = None,
+    origin: tuple[float, float, float] = _ORIGIN,
     **splats: Any,
 ) -> tuple[SplatCloud, Capture]:
-    """Random splats far from the world's origin, and a camera whose pixels are not square and whose principal
+    """Random splats, by default far from the world's origin, and a camera whose pixels are not square and whose principal
     point is not the centre. splats: arguments of `random_splats`."""
     cloud = random_splats(count, seed, sh_degree=degree, **splats)
-    cloud = SplatCloud(*arrays_of(cloud), origin=_ORIGIN, **colors_of(cloud))
-    eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3) + _ORIGIN
-    camera = stretched(Camera.look_at(*size, 1.1, eye, _ORIGIN + (0.0, 0.1, 3.0)))
+    cloud = SplatCloud(*arrays_of(cloud), origin=np.array(origin), **colors_of(cloud))
+    eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3) + origin
+    camera = stretched(Camera.look_at(*size, 1.1, eye, np.add(origin, (0.0, 0.1, 3.0))))
     return cloud, Capture(camera, outputs=outputs, quality=quality, background=_BEHIND)
 
 

@@ -206,7 +206,15 @@ def test_derivatives_are_timed_and_another_picture_in_between_is_an_error(backen
         pipeline.backward(images, {})
 
 
-def test_a_cloud_of_no_splat_has_the_backgrounds_derivative(backend):
-    _, capture = random_picture(7)
+def test_a_frame_without_a_visible_splat_has_the_backgrounds_derivative(backend):
+    """No splat at all, or all of them behind the camera."""
+    cloud, capture = random_picture(7)
+    behind = fs.SplatCloud(
+        cloud.means - (0.0, 0.0, 40.0), cloud.quats, 0.1 * cloud.scales, cloud.opacities, sh=cloud.sh,
+        origin=cloud.origin,
+    )  # fmt: skip
+    found = assert_same(backend, behind, capture)
+    assert found["background"].any()
+    assert not found["means"].any()
     empty = fs.SplatCloud(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 2)), [], sh=np.zeros((0, 4, 3)))
     assert_same(backend, empty, capture)
