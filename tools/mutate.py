@@ -27,8 +27,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -67,27 +67,43 @@ MOST_FILES = 12
 TEST_SECONDS = 30
 """of CPU time, after which a test hangs"""
 LIMIT = -signal.SIGXCPU
-INVALID = re.compile(r"BUILD_PROGRAM_FAILURE|clBuildProgram|Warp\w*Codegen\w*Error|Error while parsing function")
+INVALID = re.compile(
+    r"BUILD_PROGRAM_FAILURE|clBuildProgram|Warp\w*Codegen\w*Error|Error while parsing function"
+)
 
 _LITERALS = r"""'''.*?'''|\"\"\".*?\"\"\"|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'"""
 _SKIPPED = {
     ".py": rf"{_LITERALS}|\#[^\n]*|^\s*(?:@|from\s|import\s)[^\n]*",
     ".cl": rf"{_LITERALS}|//[^\n]*|/\*.*?\*/|^[ \t]*\#[ \t]*(?:if|elif|include|pragma|undef)[^\n]*",
 }
+_NUMBER = r"0[xX][\da-fA-F]+\w*|(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?[fuUlL]*"
+_OPERATOR = r"->|\*\*|<<=?|>>=?|//|&&|\|\||[-+*/<>=!&|^%]=|."
 _TOKENS = {
     ending: re.compile(
-        rf"(?P<skip>{skipped}|\s+|\\\n)|(?P<number>0[xX][\da-fA-F]+\w*|(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][+-]?\d+)?[fuUlL]*)"
-        r"|(?P<name>[A-Za-z_]\w*)|(?P<op>->|\*\*|<<=?|>>=?|//|&&|\|\||[-+*/<>=!&|^%]=|.)",
+        rf"(?P<skip>{skipped}|\s+|\\\n)|(?P<number>{_NUMBER})|(?P<name>[A-Za-z_]\w*)|(?P<op>{_OPERATOR})",
         re.DOTALL | re.MULTILINE,
     )
     for ending, skipped in _SKIPPED.items()
 }
-_KEYWORDS = {"return", "and", "or", "not", "in", "is", "if", "else", "elif", "while", "yield", "lambda", "assert"}
-_COMPARED = {"<": ("<=", ">"), "<=": ("<", ">="), ">": (">=", "<"), ">=": (">", "<="), "==": ("!=",), "!=": ("==",)}
-_PAIRS = "min max|fmin fmax|minimum maximum|argmin argmax|floor ceil|any all|sin cos|fminf fmaxf|amin amax"
-_EXTREMES = {a: b for pair in _PAIRS.split("|") for a, b in (pair.split(), pair.split()[::-1])}
-_WORDS = {"width": "height", "height": "width", "rows": "columns", "columns": "rows", "row": "column", "column": "row"}
-_LOOSE, _TIGHT = {"+", "-"}, {"*", "/", "%", "//"}
+_PAIRS = {
+    "axis": "width height, rows columns, row column, s0 s1, xy yx",
+    "min/max": "min max, fmin fmax, minimum maximum, argmin argmax, amin amax, floor ceil, any all, sin cos",
+    "logic": "and or, && ||",
+    "sign": "+= -=, *= /=",
+    "comparison": "< <=, > >=, < >, <= >=, == !=",
+}
+_KEYWORDS = {"return", "and", "or", "not", "in", "is", "if", "else", "elif", "while", "yield", "lambda"}
+_SUMS, _PRODUCTS, _LOGIC = {"+", "-"}, {"*", "/", "%", "//", "**"}, {"and", "or", "&&", "||"}
+_INSIDE = _SUMS | _PRODUCTS | {"<", ">", "<=", ">=", "==", "!=", "is", "in", "not"}
+
+
+def _swaps() -> dict[str, list[tuple[str, str]]]:
+    found: dict[str, list[tuple[str, str]]] = {}
+    for operator, text in _PAIRS.items():
+        for one, other in (pair.split(" ") for pair in text.split(", ")):
+            found.setdefault(one, []).append((operator, other))
+            found.setdefault(other, []).append((operator, one))
+    return found
 
 
 @dataclass(frozen=True)
@@ -110,194 +126,165 @@ class Mutation:
     def key(self) -> str:
         return hashlib.blake2b(repr((self.path, self.was, self.becomes)).encode(), digest_size=5).hexdigest()
 
+    def applied(self, source: str) -> str:
+        return source[: self.start] + self.text + source[self.end :]
+
 
 def edits(text: str, ending: str) -> Iterator[tuple[str, int, int, str]]:
     """All mutations of a source text: operator, start, end, replacement."""
     found = [m for m in _TOKENS[ending].finditer(text) if m.lastgroup != "skip"]
-    words = [m.group() for m in found]
+    words = ["", *(m.group() for m in found), "", ""]
     names = set(words)
-    for i, m in enumerate(found):
-        word, before, after = m.group(), words[i - 1] if i else "", words[i + 1] if i + 1 < len(words) else ""
-        binary = i > 0 and _ends_operand(found[i - 1])
+    for i, m in enumerate(found, 1):
+        before, word, after = words[i - 1 : i + 2]
+        # whether an operand ends before this token
+        binary = before in (")", "]", "}") or (re.match(r"[\w.]", before) and before not in _KEYWORDS)
         if m.lastgroup == "number":
-            inside = before == "[" and after == "]" and i > 1 and _ends_operand(found[i - 2])
-            for value in _other_numbers(word):
-                yield ("index" if inside else "constant"), *m.span(), value
-        elif m.lastgroup == "name":
-            swapped = _other_axis(word)
-            if swapped and (swapped in names or before == "."):
-                yield "axis", *m.span(), swapped
-            if word in _EXTREMES and after == "(":
-                yield "min/max", *m.span(), _EXTREMES[word]
-            if word in ("and", "or"):
-                yield "logic", *m.span(), "or" if word == "and" else "and"
-            if word == "not" and before != "is" and after != "in":
-                yield "logic", *m.span(), ""
-        elif word in _COMPARED:
-            yield from (("comparison", *m.span(), other) for other in _COMPARED[word])
-        elif word in ("+=", "-=", "*=", "/="):
-            yield "sign", *m.span(), {"+=": "-=", "-=": "+=", "*=": "/=", "/=": "*="}[word]
-        elif word in _LOOSE:
-            yield "sign", *m.span(), {"+": "-", "-": "+"}[word] if binary else " "
-        elif word in ("&&", "||"):
-            yield "logic", *m.span(), "||" if word == "&&" else "&&"
-        elif word == "!" and ending == ".cl":
+            operator = "index" if before == "[" and after == "]" else "constant"
+            yield from ((operator, *m.span(), other) for other in _other_numbers(word))
+        swaps = SWAPS.get(word, [])
+        if re.fullmatch(r"(?:\w+_)?[a-z]?[xy]", word):
+            swaps = [("axis", word[:-1] + ("y" if word[-1] == "x" else "x"))]
+        for operator, other in swaps:
+            exists = operator != "axis" or other in names or before == "."
+            if exists and (operator != "min/max" or after == "("):
+                yield operator, *m.span(), other
+        if word in _SUMS:
+            yield "sign", *m.span(), ("-" if word == "+" else "+") if binary else " "
+        if (word == "not" and before != "is" and after != "in") or (word == "!" and ending == ".cl"):
             yield "logic", *m.span(), ""
-        if binary and (word in _LOOSE | _TIGHT or word in ("&&", "||", "and", "or")):
-            if end := _end_of_term(words, i + 1, word):
-                yield "dropped term", m.start(), found[end - 1].end(), ""
+        if binary and word in _SUMS | _PRODUCTS | _LOGIC - {"**"}:
+            last = _end_of_term(words, i + 1, word)
+            yield "dropped term", m.start(), found[min(last, len(found)) - 1].end(), ""
 
 
-def _ends_operand(token: re.Match[str]) -> bool:
-    return token.group() in (")", "]", "}") or (token.lastgroup != "op" and token.group() not in _KEYWORDS)
-
-
-def _end_of_term(words: list[str], at: int, operator: str) -> int | None:
-    """Index after the operand that begins at `at`, with its factors after a plus or minus."""
-    binding = {*_TIGHT, "**"} if operator in _LOOSE else {"**"} if operator in _TIGHT else None
-    if binding is None:
-        binding = {*_LOOSE, *_TIGHT, "**", "<", ">", "<=", ">=", "==", "!=", "is", "in", "not"}
-    while True:
-        while at < len(words) and words[at] in ("-", "+", "!", "~", "not"):
+def _end_of_term(words: list[str], at: int, operator: str) -> int:
+    """Number of the last word of the operand that begins at `at`, with the operators that bind it tighter."""
+    tighter = _INSIDE if operator in _LOGIC else _PRODUCTS if operator in _SUMS else {"**"}
+    while at < len(words) - 2:
+        while words[at] in ("-", "+", "!", "~", "not"):
             at += 1
-        if at >= len(words):
-            return None
-        at = _end_of_group(words, at) if words[at] in "([{" else at + 1
-        while at < len(words) and words[at] in ("(", "[", "."):
+        at = _end_of_group(words, at) if words[at] in ("(", "[", "{") else at + 1
+        while words[at] in ("(", "[", "."):
             at = at + 2 if words[at] == "." else _end_of_group(words, at)
-        if at >= len(words) or words[at] not in binding:
-            return at
+        if words[at] not in tighter:
+            break
         at += 1
+    return at - 1
 
 
 def _end_of_group(words: list[str], at: int) -> int:
     depth = 0
-    while at < len(words):
-        depth += (words[at] in "([{") - (words[at] in ")]}")
-        at += 1
+    for at in range(at, len(words) - 1):  # noqa: B020
+        depth += (words[at] in ("(", "[", "{")) - (words[at] in (")", "]", "}"))
         if depth == 0:
             break
-    return at
-
-
-def _other_axis(word: str) -> str | None:
-    if word in _WORDS:
-        return _WORDS[word]
-    if word in ("s0", "s1"):
-        return "s1" if word == "s0" else "s0"
-    if re.fullmatch(r"xy|yx|(?:\w+_)?[a-z]?[xy]", word):
-        return word[:-2] + word[:-3:-1] if word in ("xy", "yx") else word[:-1] + ("y" if word[-1] == "x" else "x")
-    return None
+    return at + 1
 
 
 def _other_numbers(word: str) -> list[str]:
-    digits = word.rstrip("fuUlL") if not word.lower().startswith("0x") else ""
-    if not digits:
-        return []
+    digits = word.rstrip("fuUlL")
     suffix = word[len(digits) :]
-    if re.fullmatch(r"[\d_]+", digits) and "f" not in suffix:
-        value = int(digits)
-        return [f"{other}{suffix}" for other in (value + 1, value - 1) if other >= 0]
-    value = float(digits)
-    return [f"{1.25 * value if value else 0.5!r}{suffix}"]
+    if word.lower().startswith("0x"):
+        return []
+    if digits.isdecimal() and "f" not in suffix:
+        return [f"{other}{suffix}" for other in (int(digits) + 1, int(digits) - 1) if other >= 0]
+    return [f"{1.25 * float(digits) or 0.5!r}{suffix}"]
 
 
-def sources() -> dict[str, list[Path]]:
-    """Package -> files. A package of fidsplat is its folder, or `fidsplat` for a module directly in it."""
-    found: dict[str, list[Path]] = {}
-    for folder, endings in ((ROOT / "fidsplat", {".py"}), (ROOT / "kernels", {".py", ".cl"})):
-        for file in sorted(folder.rglob("*")):
-            if file.suffix in endings and file.name != "__init__.py":
-                path = file.relative_to(ROOT).as_posix()
-                prefix = max((name for name in TESTS if path.startswith(f"{name}/")), key=len)
-                found.setdefault(prefix, []).append(file)
-    return found
+SWAPS = _swaps()
+
+
+def package_of(path: str) -> str:
+    """Longest prefix in `TESTS`."""
+    return max((name for name in TESTS if path.startswith(f"{name}/")), key=len, default="")
+
+
+def mutations_of(file: Path) -> Iterator[Mutation]:
+    """All mutations of a file, those that Python refuses included."""
+    path, text = file.relative_to(ROOT).as_posix(), file.read_text("utf-8")
+    for operator, start, end, other in edits(text, file.suffix):
+        first, last = text.rfind("\n", 0, start) + 1, text.find("\n", end)
+        was, becomes = text[first:last].strip(), (text[first:start] + other + text[end:last]).strip()
+        line = text.count("\n", 0, start) + 1
+        yield Mutation(package_of(path), path, line, operator, start, end, other, was, becomes)
 
 
 def sample(count: int, seed: int, package: str) -> list[Mutation]:
     """Seeded mutations; a package's number grows with the square root of its source's size, and each operator
     of a package is as likely. The first `n` of a larger sample are the sample of `n`."""
-    random_ = random.Random(seed)
-    packages = {name: files for name, files in sources().items() if package in name}
-    weights = {name: sum(file.stat().st_size for file in files) ** 0.5 for name, files in packages.items()}
-    sites: dict[str, dict[str, list[tuple[Path, int, int, str]]]] = {}
-    for name, files in packages.items():
-        for file in files:
-            for operator, *edit in edits(file.read_text("utf-8"), file.suffix):
-                sites.setdefault(name, {}).setdefault(operator, []).append((file, *edit))
+    chance, weights, sites = random.Random(seed), Counter[str](), {}
+    for file in sorted([*ROOT.glob("fidsplat/**/*.py"), *ROOT.glob("kernels/**/*.*")]):
+        name = package_of(file.relative_to(ROOT).as_posix())
+        if file.suffix in _TOKENS and file.name != "__init__.py" and package in name:
+            weights[name] += file.stat().st_size
+            for mutation in mutations_of(file):
+                sites.setdefault(name, {}).setdefault(mutation.operator, []).append(mutation)
     drawn, chosen = dict.fromkeys(sites, 0), {}
-    while len(chosen) < count:
-        name = min(drawn, key=lambda name: (drawn[name] + 1) / weights[name])
-        operator = random_.choice(sorted(sites[name]))
-        mutation = _mutation(name, operator, *random_.choice(sites[name][operator]))
-        if mutation and mutation.key not in chosen:
+    while sites and len(chosen) < count:
+        name = min(drawn, key=lambda name: (drawn[name] + 1) / weights[name] ** 0.5)
+        mutation = chance.choice(sites[name][chance.choice(sorted(sites[name]))])
+        if mutation.key not in chosen and _is_python(mutation):
             chosen[mutation.key] = mutation
             drawn[name] += 1
     return list(chosen.values())
 
 
-def _mutation(package: str, operator: str, file: Path, start: int, end: int, text: str) -> Mutation | None:
-    """None where Python does not accept the result."""
-    source = file.read_text("utf-8")
-    mutated = source[:start] + text + source[end:]
-    if file.suffix == ".py":
-        try:
-            ast.parse(mutated)
-        except SyntaxError:
-            return None
-    line = source.count("\n", 0, start)
-    was, becomes = (each.split("\n")[line].strip() for each in (source, mutated))
-    path = file.relative_to(ROOT).as_posix()
-    return Mutation(package, path, line + 1, operator, start, end, text, was, becomes)
+def _is_python(mutation: Mutation) -> bool:
+    """Whether Python accepts the result; True for other languages."""
+    file = ROOT / mutation.path
+    with contextlib.suppress(SyntaxError):
+        return file.suffix != ".py" or bool(ast.parse(mutation.applied(file.read_text("utf-8"))))
+    return False
 
 
 def tests_for(mutation: Mutation) -> list[str]:
-    """Arguments of pytest: the files of the map, first those that mention the words of the file's name most."""
+    """Arguments of pytest: the files of the map that mention the words of the file's name most often."""
     patterns, expression = TESTS[mutation.package]
-    files: dict[Path, int] = {}
     words = [word for word in re.split(r"[_/.]", mutation.path)[2:-1] if len(word) > 2]
-    for pattern in patterns.split():
-        for place in sorted(ROOT.glob(pattern)):
-            for file in sorted(place.rglob("test_*.py")) if place.is_dir() else [place]:
-                text = file.read_text("utf-8")
-                files.setdefault(file, sum(min(text.count(word), 8) + 9 * (word in file.name) for word in words))
-    order = sorted(files, key=lambda file: -files[file])
-    return [*(file.relative_to(ROOT).as_posix() for file in order[:MOST_FILES]), *(["-k", expression] if expression else [])]
+    places = [place for pattern in patterns.split() for place in sorted(ROOT.glob(pattern))]
+    files = [
+        file for place in places for file in sorted([place] if place.is_file() else place.rglob("test_*.py"))
+    ]
+    texts = {file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in files}
+
+    def mentions(name: str) -> int:
+        return sum(min(texts[name].count(word), 8) + 9 * (word in name) for word in words)
+
+    order = sorted(texts, key=mentions, reverse=True)
+    return [*order[:MOST_FILES], *(["-k", expression] if expression else [])]
 
 
 class Tree:
     """A copy of the working tree in which one mutation at a time is applied."""
 
-    def __init__(self, folder: Path, limit: float) -> None:
+    def __init__(self, folder: Path, limit: int) -> None:
         self._folder, self._limit = folder, limit
         self._passes: dict[str, bool] = {}
-        listed = subprocess.run(["git", "ls-files", "-coz", "--exclude-standard"], cwd=ROOT, capture_output=True, check=True)
-        for name in filter(None, listed.stdout.decode().split("\0")):
-            if (ROOT / name).is_file():
+        command = ["git", "ls-files", "-coz", "--exclude-standard"]
+        for name in subprocess.check_output(command, cwd=ROOT, text=True).split("\0"):
+            if name and (ROOT / name).is_file():
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, folder / name)
 
-    def run(self, mutation: Mutation) -> dict[str, str]:
-        """`result` (caught, survived, invalid) with the test and how it ended. first: a test to run before."""
-        file = self._folder / mutation.path
+    def run(self, mutation: Mutation) -> tuple[str, str, str]:
+        """`caught`, `survived` or `invalid` (it does not compile), the test that caught it, how it ended."""
+        file, broken = self._folder / mutation.path, []
         text = file.read_text("utf-8")
-        mutated = text[: mutation.start] + mutation.text + text[mutation.end :]
-        file.write_text(mutated, "utf-8")
-        try:
-            while True:
-                broken = [word for test, passes in self._passes.items() if not passes for word in ("--deselect", test)]
+        while True:
+            file.write_text(mutation.applied(text), "utf-8")
+            try:
                 status, test, output = self._pytest([*tests_for(mutation), *broken])
-                if INVALID.search(output):
-                    return {"result": "invalid", "test": test, "how": "does not compile"}
-                if status in (0, LIMIT) or not test:
-                    return {"result": "survived", "test": "", "how": {0: "", LIMIT: "limit"}.get(status, f"status {status}")}
+            finally:
                 file.write_text(text, "utf-8")
-                if self._passes.setdefault(test, self._alone(test)):
-                    how = {-signal.SIGPROF: "hangs"}.get(status, "fails" if status > 0 else f"signal {-status}")
-                    return {"result": "caught", "test": test, "how": how}
-                file.write_text(mutated, "utf-8")
-        finally:
-            file.write_text(text, "utf-8")
+            if INVALID.search(output):
+                return "invalid", test, ""
+            if status in (0, LIMIT) or not test:
+                return "survived", "", {0: "", LIMIT: "limit"}.get(status, f"pytest ended with {status}")
+            if self._passes.setdefault(test, self._alone(test)):
+                how = "fails" if status > 0 else "hangs" if status == -signal.SIGPROF else f"signal {-status}"
+                return "caught", test, how
+            broken += ["--deselect", test]  # it fails without the mutation, too
 
     def _alone(self, test: str) -> bool:
         """Whether a test, or the import of a test file, passes without the mutation."""
@@ -307,10 +294,14 @@ class Tree:
         """Exit status, negative for a signal; the test that failed or was running; the output."""
         path = os.pathsep.join(str(self._folder / name) for name in (".", "tools"))
         environment = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "999"}
-        command = [sys.executable, "-m", "pytest", "-n", "0", "-x", "-v", "-p", "mutate", "-p", "no:cacheprovider", *arguments]
-        limited = lambda: resource.setrlimit(resource.RLIMIT_CPU, (int(self._limit), int(self._limit) + 5))  # noqa: E731
-        with tempfile.TemporaryFile() as stream:
-            child = subprocess.Popen(command, cwd=self._folder, env=environment, stdout=stream, stderr=stream, start_new_session=True, preexec_fn=limited)
+        options = ["-n", "0", "-x", "-v", "-p", "mutate", "-p", "no:cacheprovider"]
+        limits = resource.RLIMIT_CPU, (self._limit, self._limit + 5)
+        with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as stream:
+            child = subprocess.Popen(
+                [sys.executable, "-m", "pytest", *options, *arguments],
+                cwd=self._folder, env=environment, stdout=stream, stderr=stream, start_new_session=True,
+                preexec_fn=lambda: resource.setrlimit(*limits),
+            )  # fmt: skip
             try:
                 status = child.wait(10 * self._limit)
             except subprocess.TimeoutExpired:
@@ -320,9 +311,10 @@ class Tree:
                     os.killpg(child.pid, signal.SIGKILL)
                 child.wait()
             stream.seek(0)
-            output = stream.read().decode("utf-8", "replace")
+            output = stream.read()
         failed = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", output, re.MULTILINE)
-        begun = re.findall(r"^(\S+\.py::.*?)(?: (?:PASSED|SKIPPED|FAILED|ERROR|Fatal)\b.*)?$", output, re.MULTILINE)
+        outcome = r"(?: (?:PASSED|SKIPPED|FAILED|ERROR|Fatal)\b.*)?"
+        begun = re.findall(rf"^(\S+\.py::.*?){outcome}$", output, re.MULTILINE)
         return status, failed[1] if failed else begun[-1].strip() if begun and status else "", output
 
 
@@ -333,28 +325,29 @@ def pytest_runtest_logstart() -> None:
 
 def report(rows: dict[str, dict]) -> str:
     """Markdown: the score per package, then survivors and equivalent mutations."""
-    lines = ["| package | mutations | caught | survived | equivalent | share |", "|---|---|---|---|---|---|"]
-    for package in (*sorted({row["package"] for row in rows.values()}), ""):
-        results = [row["result"] for row in rows.values() if package in ("", row["package"])]
+    lines = ["| package | caught | survived | equivalent | share |", "|---|---|---|---|---|"]
+    for package in (*sorted({row["package"] for row in rows.values()}), "all"):
+        results = [row["result"] for row in rows.values() if package in ("all", row["package"])]
         caught, survived, equivalent = (results.count(each) for each in ("caught", "survived", "equivalent"))
         share = f"{100 * caught / (caught + survived):.0f} %" if caught + survived else "-"
-        total = caught + survived + equivalent
-        lines.append(f"| {package or 'all'} | {total} | {caught} | {survived} | {equivalent} | {share} |")
+        lines.append(f"| {package} | {caught} | {survived} | {equivalent} | {share} |")
     for result in ("survived", "equivalent"):
-        lines += ["", f"{result}:", ""] + [
-            f"- `{row['key']}` {row['path']}:{row['line']} ({row['operator']}): `{row['was']}` -> `{row['becomes']}` {row['how']}"
-            for row in rows.values()
-            if row["result"] == result
-        ]
+        lines += ["", f"{result}:", *(_words(row) for row in rows.values() if row["result"] == result)]
     return "\n".join(lines)
 
 
+def _words(row: dict) -> str:
+    where = f"{row['path']}:{row['line']} ({row['operator']})"
+    return f"- `{row['key']}` {where}: `{row['was']}` -> `{row['becomes']}` {row['test']} {row['how']}"
+
+
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    formatter = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
     parser.add_argument("--count", type=int, default=80, help="mutations of the sample")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--package", default="", help="only packages with this in their path")
-    parser.add_argument("--limit", type=float, default=60, help="seconds of CPU time for the tests of one mutation")
+    parser.add_argument("--limit", type=int, default=60, help="seconds of CPU time for a mutation's tests")
     parser.add_argument("--results", type=Path, default=Path("mutations.jsonl"))
     parser.add_argument("--survivors", action="store_true", help="run the recorded survivors again")
     parser.add_argument("--equivalent", nargs=2, metavar=("KEY", "REASON"))
@@ -372,24 +365,33 @@ def main() -> int:
     if options.equivalent:
         key, reason = options.equivalent
         record(rows[key] | {"result": "equivalent", "how": reason})
-    if options.equivalent or options.report:
-        print(report(rows))
-        return 0
-    chosen = sample(options.count, options.seed, options.package)
-    if options.list:
-        print("\n".join(f"{each.key} {each.path}:{each.line} {each.operator}: {each.was} -> {each.becomes}" for each in chosen))
-        return 0
-    with tempfile.TemporaryDirectory(prefix="mutate-") as folder:
-        tree = Tree(Path(folder), options.limit)
-        for mutation in chosen:
-            known = rows.get(mutation.key, {}).get("result")
-            if known is None or (known == "survived" and options.survivors):
-                begun = time.monotonic()
-                found = tree.run(mutation)
-                record({"key": mutation.key, **asdict(mutation), **found, "seconds": round(time.monotonic() - begun, 1)})
-                print(f"{found['result']:9} {rows[mutation.key]['seconds']:6.1f} s  {mutation.path}:{mutation.line}  {mutation.was} -> {mutation.becomes}  [{found['test']}] {found['how']}", flush=True)
-    print(report({each.key: rows[each.key] for each in chosen}))
+    elif options.survivors:
+        paths = {row["path"]: row["key"] for row in rows.values() if row["result"] == "survived"}
+        left = {key for key, row in rows.items() if row["result"] == "survived"}
+        chosen = [one for path in paths for one in mutations_of(ROOT / path) if one.key in left]
+        run({one.key: one for one in chosen}.values(), options.limit, record)
+    elif not options.report:
+        chosen = sample(options.count, options.seed, options.package)
+        if options.list:
+            print("\n".join(_words(_row(one, "", "")) for one in chosen))
+            return 0
+        run([one for one in chosen if one.key not in rows], options.limit, record)
+    print(report(rows))
     return 0
+
+
+def run(chosen: Iterable[Mutation], limit: int, record: Callable[[dict], None]) -> None:
+    """Run mutations one after the other and record each result."""
+    with tempfile.TemporaryDirectory(prefix="mutate-") as folder:
+        tree = Tree(Path(folder), limit)
+        for mutation in chosen:
+            row = _row(mutation, *tree.run(mutation))
+            record(row)
+            print(row["result"], _words(row), flush=True)
+
+
+def _row(mutation: Mutation, result: str, test: str, how: str = "") -> dict:
+    return {"key": mutation.key, **asdict(mutation), "result": result, "test": test, "how": how}
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def assert_same(backend, cloud, capture, by_images=None, **build):
 
 CASES = {
     "random": {},
-    "degree 2": {"degree": 2},
+    "degree 2, portrait": {"degree": 2, "size": (29, 53)},
     "degree 3": {"degree": 3},
     "plain colours, surfel": {"degree": None, "quality": "surfel", "outputs": ("rgb",)},
     "far below a pixel": {"scale": (1e-5, 1e-3), "depth": (1.0, 5.0), "across": 1.0},

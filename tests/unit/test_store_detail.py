@@ -96,6 +96,19 @@ def test_cells_above_a_panorama_are_as_wide_as_it_shows_them(store):
     assert around == math.inf
 
 
+def test_cells_through_a_distorting_lens_have_the_sizes_of_a_pinhole(store):
+    """0.05 m on the axis 5 m ahead, and a box that begins beside the camera's plane."""
+    corners = np.array([[-0.1, -0.1, 5.0], [3.0, -0.1, 4.0]])
+    high = corners + np.array([[0.2, 0.2, 1.0], [1.0, 0.2, 1.0]])
+    found = []
+    for own in (None, fs.BrownConrady(k1=-0.1)):
+        camera = fs.Camera.pinhole(80, 60, 50.0, 50.0, 40.0, 30.0, lens=own)
+        _, view = prepare(store, fs.Capture(camera))
+        found.append(sizes(view, lambda sigmas: (corners, high), np.full(2, 0.05)))
+    assert 0.5 <= found[0][0] < 0.5001
+    assert np.array_equal(*found)
+
+
 def test_less_is_drawn_of_what_is_further_away(store):
     counts = [sum(store.counts(np.array(chosen(store, seen_from(away), 0.5)[0]))) for away in (60, 600, 6000)]
     assert len(store) >= counts[0] > counts[1] > counts[2]
