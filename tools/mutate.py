@@ -64,7 +64,7 @@ TESTS = {  # package or file: test files and folders, and an expression for -k; 
 }  # fmt: skip
 MOST_FILES = 12
 """of tests for one mutation, the most fitting of the map"""
-TEST_SECONDS = 30
+TEST_SECONDS = 20
 """of CPU time, after which a test hangs"""
 LIMIT = -signal.SIGXCPU
 INVALID = re.compile(
@@ -241,7 +241,8 @@ def _is_python(mutation: Mutation) -> bool:
 def tests_for(mutation: Mutation) -> list[str]:
     """Arguments of pytest: the files of the map that mention the words of the file's name most often."""
     patterns, expression = TESTS[mutation.package]
-    words = [word for word in re.split(r"[_/.]", mutation.path)[2:-1] if len(word) > 2]
+    first = 2 if mutation.path.startswith("kernels/") else 1
+    words = [word for word in re.split(r"[_/.]", mutation.path)[first:-1] if len(word) > 2]
     places = [place for pattern in patterns.split() for place in sorted(ROOT.glob(pattern))]
     files = [
         file for place in places for file in sorted([place] if place.is_file() else place.rglob("test_*.py"))

@@ -60,6 +60,28 @@ def by_mcap(path):
         ]
 
 
+@pytest.mark.parametrize(
+    ("lens", "model", "numbers"),
+    [
+        (fs.BrownConrady(k1=1, k2=2, p1=3, p2=4, k3=5), "plumb_bob", 5),
+        (fs.BrownConrady(k1=1, k2=2, p1=3, p2=4, k3=5, k4=6, k5=7, k6=8), "rational_polynomial", 8),
+        (
+            fs.BrownConrady(k1=1, k2=2, p1=3, p2=4, k3=5, k4=6, k5=7, k6=8, s1=9, s2=10, s3=11, s4=12),
+            "rational_polynomial",
+            12,
+        ),
+        (fs.Fisheye(k1=1, k2=2, k3=3, k4=4), "equidistant", 4),
+    ],
+)
+def test_lenses_have_the_numbers_of_opencv_in_their_order(tmp_path, lens, model, numbers):
+    from fidsplat.logs import RobotLog
+
+    with RobotLog(tmp_path / "run.mcap") as log:
+        log.camera_info(1.0, "front", fs.Camera.pinhole(32, 24, 30, 31, 16, 12, lens=lens))
+    ((_, _, info),) = by_mcap(tmp_path / "run.mcap")
+    assert (info.distortion_model, list(info.d)) == (model, [float(k + 1) for k in range(numbers)])
+
+
 @pytest.mark.parametrize(("name", "read"), [("run.mcap", by_mcap), ("bag", by_rosbags)])
 def test_their_own_readers_read_what_we_write(tmp_path, name, read):
     found = {}
