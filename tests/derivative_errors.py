@@ -45,8 +45,10 @@ def random_picture(
     origin: tuple[float, float, float] = _ORIGIN,
     **splats: Any,
 ) -> tuple[SplatCloud, Capture]:
-    """Random splats, by default far from the world's origin, and a camera whose pixels are not square and whose principal
-    point is not the centre. splats: arguments of `random_splats`."""
+    """Random splats and a camera whose pixels are not square and whose principal point is not the centre.
+
+    origin: of the cloud, by default far from the world's. splats: arguments of `random_splats`.
+    """
     cloud = random_splats(count, seed, sh_degree=degree, **splats)
     cloud = SplatCloud(*arrays_of(cloud), origin=np.array(origin), **colors_of(cloud))
     eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3) + origin
@@ -118,9 +120,7 @@ def last_place(cloud: SplatCloud) -> SplatCloud:
         return np.nextafter(array, towards)
 
     means, quats = moved(cloud.means), moved(cloud.quats)
-    return SplatCloud(
-        means, quats, cloud.scales, cloud.opacities, origin=cloud.origin, **colors_of(cloud)
-    )
+    return SplatCloud(means, quats, cloud.scales, cloud.opacities, origin=cloud.origin, **colors_of(cloud))
 
 
 def differences(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> Iterator[Difference]:

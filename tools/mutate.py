@@ -58,7 +58,7 @@ TESTS = {  # package or file: test files and folders, and an expression for -k; 
     "fidsplat/scenes": (f"{UNIT}/test_[sci]*.py", ""),
     "fidsplat/sim": (f"{UNIT} {EXPERIMENTS}/test_plants.py", ""),
     "fidsplat/store": (f"{UNIT}/test_s*.py {UNIT}/test_l*.py tests/contract/test_denser_splats.py", ""),
-    "fidsplat/train": (f"{UNIT}/test_train*.py tests/contract/test_train*.py tests/contract/test_refine.py", ""),
+    "fidsplat/train": (f"{UNIT}/test_train*.py tests/contract/test_[tr]*.py", ""),
     "fidsplat/viewer": (f"{UNIT}/test_viewer*.py", ""),
     "fidsplat/vision": (f"{UNIT} {EXPERIMENTS}", ""),
 }  # fmt: skip

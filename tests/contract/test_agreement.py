@@ -96,7 +96,9 @@ def test_spherical_harmonics(renderer, degree):
 
 @in_turn()
 @pytest.mark.parametrize("tilt", [0, 20, 45, 60, 75])
-@pytest.mark.parametrize("spec", ["charuco:4x5:4x4_50", "qr-v5-L:" + "fidsplat " * 10], ids=["charuco", "qr5"])
+@pytest.mark.parametrize(
+    "spec", ["charuco:4x5:4x4_50", "qr-v5-L:" + "fidsplat " * 10], ids=["charuco", "qr5"]
+)
 def test_markers_at_five_tilts(renderer, spec, tilt):
     """at 400 pixels around the marker, oblong or square, against all of its splats, by a rolled camera."""
     cloud = fs.marker(spec, size=1.0, mixture="fitted").cloud

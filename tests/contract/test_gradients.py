@@ -99,7 +99,9 @@ def test_distortions_and_their_derivatives_are_the_references(backend):
 def test_opaque_splats_have_derivatives(backend):
     """Nothing shines through them, and their own opacity counts."""
     cloud, capture = random_picture(3, scale=(0.3, 1.0), depth=(1.5, 4.0))
-    opaque = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh, origin=cloud.origin)
+    opaque = fs.SplatCloud(
+        cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh, origin=cloud.origin
+    )
     found = assert_same(backend, opaque, capture)
     assert np.abs(found["opacities"]).max() > 0
     assert all(np.isfinite(array).all() for array in found.values())
@@ -111,9 +113,7 @@ def long_lists():
         4, count=400, scale=(0.2, 1.5), depth=(2.0, 5.0), across=1.0, size=(150, 40)
     )
     opacities = 0.004 + 0.01 * cloud.opacities
-    faint = fs.SplatCloud(
-        cloud.means, cloud.quats, cloud.scales, opacities, sh=cloud.sh, origin=cloud.origin
-    )
+    faint = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, opacities, sh=cloud.sh, origin=cloud.origin)
     return faint, capture
 
 

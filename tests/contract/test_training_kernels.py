@@ -165,9 +165,10 @@ def test_loss_of_normals(renderer, views, works):
     ],
 )
 def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lanes):
-    """By the derivatives that the same picture has in arrays, which are the reference's. At degree 0, which has plain colours, then at
-    degrees 2 and 3; a third of the splats are behind the camera but in the last step. Of a solid wall the
-    picture depends by its colour alone; in the second step, by depths, by its place; then, black, no more."""
+    """By the derivatives that the same picture has in arrays, which are the reference's. At degree 0, which
+    has plain colours, then at degrees 2 and 3; a third of the splats are behind the camera but in the last
+    step. Of a solid wall the picture depends by its colour alone; in the second step, by depths, by its
+    place; then, black, no more."""
     device, host = works(lanes, strategy=strategy, sh_degree=3, sparse_adam=sparse)
     near = stretched(views[2].camera)
     view = replace(views[2], camera=moved_by_origin(near))
