@@ -21,6 +21,8 @@ from fidsplat.splats import SplatCloud
 NORM, COSINE = 1e-4, 1e-6
 """what a device may be off at most, as `Difference` has it; or by twice what `last_place` changes"""
 _BEHIND = (0.3, 0.6, 0.1)
+_ORIGIN = (40.0, -25.0, 7.0)
+"""of the clouds, metres: a derivative by a world position instead of one relative to it shows"""
 
 
 class Difference(NamedTuple):
@@ -40,13 +42,35 @@ def random_picture(
     degree: int | None = 1,
     outputs: tuple[str, ...] = ("rgb", "alpha", "depth", "normal"),
     quality: Any = None,
+    origin: tuple[float, float, float] = _ORIGIN,
     **splats: Any,
 ) -> tuple[SplatCloud, Capture]:
-    """Random splats before a camera that looks at their middle; others are `random_splats`' own."""
+    """Random splats and a camera whose pixels are not square and whose principal point is not the centre.
+
+    origin: of the cloud, by default far from the world's. splats: arguments of `random_splats`.
+    """
     cloud = random_splats(count, seed, sh_degree=degree, **splats)
-    eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3)
-    camera = Camera.look_at(*size, 1.1, eye, (0.0, 0.1, 3.0))
+    cloud = SplatCloud(*arrays_of(cloud), origin=np.array(origin), **colors_of(cloud))
+    eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3) + origin
+    camera = stretched(Camera.look_at(*size, 1.1, eye, np.add(origin, (0.0, 0.1, 3.0))))
     return cloud, Capture(camera, outputs=outputs, quality=quality, background=_BEHIND)
+
+
+def stretched(camera: Camera) -> Camera:
+    """The pinhole camera with fy = 1.3 fx and a principal point off the centre."""
+    fx, (cx, cy) = camera.fx, (camera.cx + 1.5, camera.cy - 0.75)
+    matrix, position = camera.world_to_camera, camera.position
+    return Camera.pinhole(camera.width, camera.height, fx, 1.3 * fx, cx, cy, matrix, position=position)
+
+
+def arrays_of(cloud: SplatCloud) -> tuple[np.ndarray, ...]:
+    """Means, quats, scales and opacities."""
+    return cloud.means, cloud.quats, cloud.scales, cloud.opacities
+
+
+def colors_of(cloud: SplatCloud) -> dict[str, Any]:
+    """Colours or harmonics, as arguments of a cloud."""
+    return {"colors": cloud.colors} if cloud.sh is None else {"sh": cloud.sh}
 
 
 def random_loss(features: FeatureSet, view: View, seed: int = 0) -> dict[str, np.ndarray]:
@@ -95,9 +119,8 @@ def last_place(cloud: SplatCloud) -> SplatCloud:
         towards = np.where(rng.random(array.shape) < 0.5, -np.inf, np.inf).astype(np.float32)
         return np.nextafter(array, towards)
 
-    color = {"colors": cloud.colors} if cloud.sh is None else {"sh": cloud.sh}
     means, quats = moved(cloud.means), moved(cloud.quats)
-    return SplatCloud(means, quats, cloud.scales, cloud.opacities, origin=cloud.origin, **color)
+    return SplatCloud(means, quats, cloud.scales, cloud.opacities, origin=cloud.origin, **colors_of(cloud))
 
 
 def differences(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> Iterator[Difference]:

@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, random_splats
+from derivative_errors import stretched
 
 import fidsplat as fs
 from fidsplat.rotations import rigid_matrix
@@ -138,6 +139,43 @@ def test_effects_are_those_of_the_views_alone(renderer, cloud, lens):
         alone = views_of([capture], POSES[[number]], {1: POSES[[number]]}).capture(0)
         frame = renderer.render(cloud, alone)
         assert all(np.array_equal(batch[name][number], frame[name]) for name in batch), number
+
+
+TURNED = 0.5 * np.array([[0, 0, 0, 2, 0, 0, 0], [0, 0, 0, 2, 0.5, -0.4, 0.2], [0.2, 0, 0, 2, 0, 1.5, 0]])
+BACKGROUNDS = {
+    "gradient": fs.Gradient((0.9, 0.2, 0.1), (0.1, 0.3, 0.8), up=(0.3, -1.0, 0.2)),
+    "panorama": fs.Panorama(np.random.default_rng(3).uniform(0, 1, (8, 16, 3)).astype(np.float32)),
+}
+
+
+@pytest.mark.parametrize("name", BACKGROUNDS)
+def test_each_view_sees_the_background_in_its_own_direction(renderer, cloud, name):
+    """With fog and a sensor, whose noise is that of single frames too."""
+    capture = fs.Capture(
+        stretched(CAMERA), ("rgb",), background=BACKGROUNDS[name],
+        sensor=fs.Sensor(full_well=1000.0, vignetting=(-0.3, 0.0, 0.0)),
+    )  # fmt: skip
+    batch = renderer.render_batch(cloud, capture, poses=TURNED)
+    frames = [
+        renderer.render(cloud, views_of([capture], TURNED[[number]], None).capture(0)) for number in range(3)
+    ]
+    assert_same(batch, frames)
+    corners = batch["rgb"][:, 0, 0]
+    assert all(np.abs(corners[a] - corners[b]).max() > 0.02 for a, b in ((0, 1), (0, 2), (1, 2)))
+
+
+def test_exposures_of_a_batch_are_those_of_single_frames(renderer, cloud):
+    """Views with a pose each and a group that moves while the shutter is open."""
+    going = fs.Motion(groups={1: lambda time: rigid_matrix((3 * time, 0, 0), (1, 0, 0, time))})
+    shutter = fs.Shutter(exposure_time=0.1, sub_poses=2)
+    captures = [
+        fs.Capture(camera, ("rgb", "depth"), motion=going, shutter=shutter, background=(0.2, 0.4, 0.6))
+        for camera in CAMERAS
+    ]
+    batch = renderer.render_batch(cloud, captures)
+    assert_same(batch, [renderer.render(cloud, capture) for capture in captures])
+    still = renderer.render(cloud, CAMERAS[0], background=(0.2, 0.4, 0.6))
+    assert not np.array_equal(batch["rgb"][0], still["rgb"])
 
 
 def test_what_moves_already_may_go_on_beside_poses(renderer, cloud):

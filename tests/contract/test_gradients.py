@@ -44,6 +44,8 @@ def assert_same(backend, cloud, capture, by_images=None, **build):
 
 CASES = {
     "random": {},
+    "degree 2, portrait": {"degree": 2, "size": (29, 53)},
+    "degree 3": {"degree": 3},
     "plain colours, surfel": {"degree": None, "quality": "surfel", "outputs": ("rgb",)},
     "far below a pixel": {"scale": (1e-5, 1e-3), "depth": (1.0, 5.0), "across": 1.0},
     "huge": {"scale": (1.0, 50.0), "depth": (0.5, 4.0), "count": 30},
@@ -97,7 +99,9 @@ def test_distortions_and_their_derivatives_are_the_references(backend):
 def test_opaque_splats_have_derivatives(backend):
     """Nothing shines through them, and their own opacity counts."""
     cloud, capture = random_picture(3, scale=(0.3, 1.0), depth=(1.5, 4.0))
-    opaque = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh)
+    opaque = fs.SplatCloud(
+        cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh, origin=cloud.origin
+    )
     found = assert_same(backend, opaque, capture)
     assert np.abs(found["opacities"]).max() > 0
     assert all(np.isfinite(array).all() for array in found.values())
@@ -108,7 +112,8 @@ def long_lists():
     cloud, capture = random_picture(
         4, count=400, scale=(0.2, 1.5), depth=(2.0, 5.0), across=1.0, size=(150, 40)
     )
-    faint = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, 0.004 + 0.01 * cloud.opacities, sh=cloud.sh)
+    opacities = 0.004 + 0.01 * cloud.opacities
+    faint = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, opacities, sh=cloud.sh, origin=cloud.origin)
     return faint, capture
 
 
@@ -201,7 +206,15 @@ def test_derivatives_are_timed_and_another_picture_in_between_is_an_error(backen
         pipeline.backward(images, {})
 
 
-def test_a_cloud_of_no_splat_has_the_backgrounds_derivative(backend):
-    _, capture = random_picture(7)
+def test_a_frame_without_a_visible_splat_has_the_backgrounds_derivative(backend):
+    """No splat at all, or all of them behind the camera."""
+    cloud, capture = random_picture(7)
+    behind = fs.SplatCloud(
+        cloud.means - (0.0, 0.0, 40.0), cloud.quats, 0.1 * cloud.scales, cloud.opacities, sh=cloud.sh,
+        origin=cloud.origin,
+    )  # fmt: skip
+    found = assert_same(backend, behind, capture)
+    assert found["background"].any()
+    assert not found["means"].any()
     empty = fs.SplatCloud(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 2)), [], sh=np.zeros((0, 4, 3)))
     assert_same(backend, empty, capture)

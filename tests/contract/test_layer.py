@@ -172,6 +172,7 @@ def test_a_scene_without_a_layer_has_none_of_its_text(shape):
         (lambda: fs.Layer(np.zeros((4, 5, 3)), np.full((4, 5), -1.0)), "depths below 0"),
         (lambda: fs.Layer(np.full((4, 5, 3), np.nan), np.ones((4, 5))), "not finite"),
         (lambda: fs.Layer(np.zeros((4, 5, 3)), np.ones((4, 5)), 0.5), "must be whole numbers"),
+        (lambda: fs.Layer(np.zeros((4, 5, 3)), np.ones((4, 5)), [1, 2]), "must be whole numbers"),
         (lambda: fs.Layer("red", np.ones((4, 5))), "the rgb of a layer must be an array"),
         (lambda: fs.Capture(CAMERA, layer=3), "layer is 3; it must be a Layer"),
     ],

@@ -113,6 +113,13 @@ def test_the_middle_of_a_panorama_lies_ahead(renderer):
     assert rgb[60:, :, 2].max() == 0
 
 
+@pytest.mark.parametrize("up", [-1.0, 1.0], ids=["above", "below"])
+def test_a_panorama_reaches_to_its_poles(renderer, up):
+    """Straight up and down, where the top or the bottom row is all that a narrow view shows."""
+    camera = fs.Camera.look_at(21, 15, 0.3, (0.0, 0.0, 0.0), (0.02, up, 0.01), up=(0.2, 0.0, 1.0))
+    agree(renderer, Picture(CLOUD, camera, outputs=("rgb",), background=panorama(16, 8)))
+
+
 def test_noise_has_the_variance_of_its_electrons(renderer):
     """Light v: variance v / full well + (read noise / full well)^2, to the standard error of 3 x 200 x 200
     samples."""

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyopencl.array
 import pytest
-from derivative_errors import random_loss
+from derivative_errors import COSINE, NORM, derivatives, differences, random_loss, stretched
 from training_scene import scene
 
 import fidsplat as fs
@@ -14,6 +14,7 @@ from fidsplat.backends.derivatives import Trains
 from fidsplat.backends.gradients import on_host
 from fidsplat.backends.opencl import training
 from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.errors import InputError
 from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.train import TrainSettings
@@ -25,6 +26,7 @@ from fidsplat.train.parameters import NAMES, Splats
 
 BACKEND = "opencl"
 COUNT = 70
+ORIGIN = np.array([30.0, -20.0, 12.0])
 
 
 @pytest.fixture(scope="module")
@@ -159,22 +161,32 @@ def test_loss_of_normals(renderer, views, works):
         ("mcmc", False, 0),
         ("default", False, 1),
         ("default", True, 1),
+        ("mcmc", False, 1),
     ],
 )
 def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lanes):
-    """By the derivatives that the same picture has in arrays. At degree 0, which has plain colours, then at
-    degrees 2 and 3; a third of the splats are behind the camera but in the last step. Of a solid wall the
-    picture depends by its colour alone; in the second step, by depths, by its place; then, black, no more."""
+    """By the derivatives that the same picture has in arrays, which are the reference's. At degree 0, which
+    has plain colours, then at degrees 2 and 3; a third of the splats are behind the camera but in the last
+    step. Of a solid wall the picture depends by its colour alone; in the second step, by depths, by its
+    place; then, black, no more."""
     device, host = works(lanes, strategy=strategy, sh_degree=3, sparse_adam=sparse)
-    view, origin = views[2], np.zeros(3)
+    near = stretched(views[2].camera)
+    view = replace(views[2], camera=moved_by_origin(near))
     rate, counted = rates(TrainSettings(), 100, 1.5), view.camera if strategy == "default" else None
     for step, degree in ((1, 0), (2, 0), (3, 2), (4, 3)):
         for work in (device, host):
-            work.load(before_a_wall(view.camera, 0.5 if step == 1 else -9.0, step < 4))
-        shown = drawn_alike(renderer, device, host, degree, f"before step {step}")
+            work.load(before_a_wall(near, 0.5 if step == 1 else -9.0, step < 4))
+        shown = drawn_alike(renderer, device, host, degree, f"before step {step}", ORIGIN)
         by = ("depth",) if step == 2 else ("rgb",)
         taken = taken_back(renderer, device, view, shown, lanes, by)
         gradients = {name: on_host(array) for name, array in taken.gradients().items()}
+        capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
+        features, seen = prepare(shown, capture)
+        loss = random_loss(features, seen)
+        cloud = host.store().cloud(degree, ORIGIN)
+        expected = derivatives(ReferenceBackend(), cloud, capture, {name: loss[name] for name in by}, False)
+        off = [one for one in differences(gradients, expected) if one.norm > NORM or one.turned > COSINE]
+        assert not off, (step, off)
         idle = ~moved_by(gradients)
         assert step == 4 or (idle[::3].all() and idle.mean() < 0.6)
         assert idle[1] == (step > 2)
@@ -182,18 +194,26 @@ def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lane
             by = {name: bool(gradients[name][1].any()) for name in ("opacities", "colors", "means")}
             assert by == {"opacities": False, "colors": step == 1, "means": step == 2}
         before = host.store().chosen(np.flatnonzero(idle))
-        device.step(taken, rate, step, counted, origin)
-        host.step(gradients, rate, step, counted, origin)
+        device.step(taken, rate, step, counted, ORIGIN)
+        host.step(gradients, rate, step, counted, ORIGIN)
         agree(device, host)
-        drawn_alike(renderer, device, host, degree, f"after step {step}")
+        drawn_alike(renderer, device, host, degree, f"after step {step}", ORIGIN)
         rested = device.store().chosen(np.flatnonzero(idle))
         same = [np.array_equal(rested.first[name], before.first[name]) for name in NAMES]
         assert all(same) == (sparse or not idle.any())
 
 
-def drawn_alike(renderer, device, host, degree, when):
+def moved_by_origin(camera):
+    """The camera where clouds with that origin are, as splats relative to it are before this one."""
+    matrix = camera.world_to_camera.copy()
+    matrix[:3, 3] -= matrix[:3, :3] @ ORIGIN
+    lens = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+    return fs.Camera.pinhole(*lens, matrix, position=camera.position + ORIGIN)
+
+
+def drawn_alike(renderer, device, host, degree, when, origin):
     """What the device draws, which is what its twin does."""
-    shown = [work.resident(degree, np.zeros(3)) for work in (device, host)]
+    shown = [work.resident(degree, origin) for work in (device, host)]
     for name in ("means", "quats", "scales", "opacities", "sh" if degree else "colors"):
         a, b = (read(renderer, one, name).reshape(COUNT, -1) for one in shown)
         np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-6, err_msg=f"{name} {when}")

@@ -88,7 +88,10 @@ def test_novel_views_are_seeded_random_and_see_the_whole_plane():
     assert all(
         np.array_equal(a.world_to_camera, b.world_to_camera) for a, b in zip(cameras, again, strict=True)
     )
-    assert not np.allclose(cameras[0].position, other[0].position)
+    another_seed = novel_cameras(CATEGORIES["large"], 2, seed=1)
+    another_category = novel_cameras(CATEGORIES["huge"], 2)
+    for cameras_of_another in (other, another_seed, another_category):
+        assert not np.allclose(cameras[0].position, cameras_of_another[0].position)
     tilts = [tilt_of(camera) for camera in cameras]
     assert max(tilts) <= MAX_TEST_TILT
     assert max(tilts) - min(tilts) > 25

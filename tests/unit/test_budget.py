@@ -322,6 +322,22 @@ def test_a_time_is_kept_by_nine_frames_of_ten():
         measured(known, 1e-3, 5.0)
 
 
+def test_late_frames_are_the_90th_percentile_without_the_first(renderer, scene, monkeypatch):
+    """Frames of 1 to 9 ms after one of a second, which warms up."""
+    calibration = search.Calibration.__new__(search.Calibration)
+    taken = iter([1.0, *(ms / 1e3 for ms in (5, 3, 9, 1, 7, 2, 8, 4, 6))])
+    clock = Clock()
+
+    def frame():
+        clock.seconds += next(taken)
+
+    monkeypatch.setattr(calibration, "_tell", lambda words: None, raising=False)
+    monkeypatch.setattr(calibration, "timer", lambda quality: Timer(frame, clock), raising=False)
+    assert calibration.times([fs.Quality()], repeats=9) == [
+        search.Times(pytest.approx(5.0), pytest.approx(8.2))
+    ]
+
+
 @pytest.mark.parametrize("ms", [0, -3, 1e-6])
 def test_a_time_that_nothing_keeps(renderer, scene, clock, ms):
     with pytest.raises(InputError, match=r"the fastest takes [\d.]+ ms, with an error of"):

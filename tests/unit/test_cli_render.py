@@ -267,6 +267,20 @@ def test_the_frame_leaves_strays_out_only_when_there_are_many():
     assert ((inside > 0) & (inside < (1280, 720))).all()
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_frame_holds_a_cloud_that_is_long_along_one_axis(axis):
+    half = np.full(3, 0.2)
+    half[axis] = 3.0
+    ends = np.stack(np.meshgrid(*([-1, 1],) * 3), -1).reshape(-1, 3) * half + (5.0, -2.0, 7.0)
+    turns, sizes = np.tile([1.0, 0, 0, 0], (8, 1)), np.full((8, 2), 1e-3)
+    cloud = fs.SplatCloud(ends, turns, sizes, np.ones(8), colors=np.ones((8, 3)))
+    camera = framing_camera(cloud)
+    inside = camera.project(ends)
+    assert ((inside > 0) & (inside < (camera.width, camera.height))).all()
+    spread = np.ptp(inside, axis=0) / (camera.width, camera.height)
+    assert spread.max() > 0.75  # and not from much further away than that takes
+
+
 def test_every_eighth_pixel_of_the_reference(scene, tmp_path, capsys):
     assert main(["render", scene, "--device", "reference", "--every", "8", "-o", "some.png", "--json"]) == 0
     facts = said(capsys)

@@ -60,6 +60,29 @@ def by_mcap(path):
         ]
 
 
+ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+"""of OpenCV's coefficients"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "order", "model"),
+    [
+        (fs.BrownConrady, ORDER[:5], "plumb_bob"),
+        (fs.BrownConrady, ORDER[:8], "rational_polynomial"),
+        (fs.BrownConrady, ORDER, "rational_polynomial"),
+        (fs.Fisheye, ("k1", "k2", "k3", "k4"), "equidistant"),
+    ],
+)
+def test_lenses_have_the_coefficients_of_opencv_in_their_order(tmp_path, kind, order, model):
+    from fidsplat.logs import RobotLog
+
+    values = {name: 1e-4 * (k + 1) for k, name in enumerate(order)}
+    with RobotLog(tmp_path / "run.mcap") as log:
+        log.camera_info(1.0, "front", fs.Camera.pinhole(32, 24, 30, 31, 16, 12, lens=kind(**values)))
+    ((_, _, info),) = by_mcap(tmp_path / "run.mcap")
+    assert (info.distortion_model, list(info.d)) == (model, list(values.values()))
+
+
 @pytest.mark.parametrize(("name", "read"), [("run.mcap", by_mcap), ("bag", by_rosbags)])
 def test_their_own_readers_read_what_we_write(tmp_path, name, read):
     found = {}

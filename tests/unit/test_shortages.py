@@ -5,7 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pyopencl as cl
 import pytest
+
+import fidsplat as fs
 
 ROOT = Path(__file__).parents[2]
 FIDSPLAT = f"{sys.executable} -m fidsplat"
@@ -22,6 +26,17 @@ def shell(text, folder, **environment):
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
     )
     return done.returncode, done.stdout, done.stderr.strip()
+
+
+def test_a_zeroed_buffer_that_grows_is_large_enough_and_zeroed():
+    backend = fs.Renderer("opencl").backend
+    workspace, queue = backend.pool, backend.queue
+    for size in (16, 4096, 64):
+        buffer = workspace.zeroed("a test's", size, queue)
+        held = np.ones(buffer.size // 4, np.uint32)
+        cl.enqueue_copy(queue, held, buffer)
+        assert buffer.size >= size
+        assert not held.any()
 
 
 @pytest.mark.parametrize(

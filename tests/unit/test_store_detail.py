@@ -96,6 +96,19 @@ def test_cells_above_a_panorama_are_as_wide_as_it_shows_them(store):
     assert around == math.inf
 
 
+def test_cells_through_a_distorting_lens_have_the_sizes_of_a_pinhole(store):
+    """0.05 m on the axis 5 m ahead, and a box that begins beside the camera's plane."""
+    corners = np.array([[-0.1, -0.1, 5.0], [3.0, -0.1, 4.0]])
+    high = corners + np.array([[0.2, 0.2, 1.0], [1.0, 0.2, 1.0]])
+    found = []
+    for own in (None, fs.BrownConrady(k1=-0.1)):
+        camera = fs.Camera.pinhole(80, 60, 50.0, 50.0, 40.0, 30.0, lens=own)
+        _, view = prepare(store, fs.Capture(camera))
+        found.append(sizes(view, lambda sigmas: (corners, high), np.full(2, 0.05)))
+    assert 0.5 <= found[0][0] < 0.5001
+    assert np.array_equal(*found)
+
+
 def test_less_is_drawn_of_what_is_further_away(store):
     counts = [sum(store.counts(np.array(chosen(store, seen_from(away), 0.5)[0]))) for away in (60, 600, 6000)]
     assert len(store) >= counts[0] > counts[1] > counts[2]
@@ -146,6 +159,31 @@ def test_a_picture_at_no_allowed_error_is_exact(store, renderer):
 
 def measured(level, sizes, errors):
     return Detail("pixel", level, sizes, errors, 3, "here", "today")
+
+
+def test_the_view_that_needs_most_decides_the_levels_of_a_batch(store, renderer):
+    sizes, errors = (0.05, 0.5, 4.0), (1e-4, 1e-3, 1e-2)
+    save_details(store.path, store.identity, [measured(level, sizes, errors) for level in range(1, 9)])
+    resident, quality = renderer.upload(fs.Store(store.path)), QUALITY.with_(detail_error=0.05)
+
+    def batch_of(*away, quality=quality):
+        return renderer.render_batch(
+            resident, [fs.Capture(seen_from(each, (160, 120)), quality=quality) for each in away]
+        )
+
+    def alone(away, quality=quality):
+        return renderer.render(resident, seen_from(away, (160, 120)), quality=quality)
+
+    far, near, exact = alone(700.0), alone(200.0), alone(700.0, QUALITY)
+    assert far.stats["splats"] < near.stats["splats"] < exact.stats["splats"]
+    same = batch_of(700.0, 700.0)
+    assert same.stats["splats"] == far.stats["splats"]
+    assert all(np.array_equal(image, far["rgb"]) for image in same["rgb"])
+    assert not np.array_equal(far["rgb"], exact["rgb"])
+    mixed = batch_of(700.0, 200.0)
+    assert mixed.stats["splats"] >= near.stats["splats"]
+    off = [np.abs(image - exact["rgb"]).max() for image in (mixed["rgb"][0], far["rgb"])]
+    assert off[0] < off[1]
 
 
 def test_sizes_that_no_view_met_are_not_promised():

@@ -9,6 +9,7 @@ import pytest
 from training_scene import BACKGROUND, scene, write
 
 import fidsplat as fs
+from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import load_colmap
 from fidsplat.train import Dataset, TrainingView, load_dataset
 from fidsplat.train.dataset import looked_at
@@ -208,6 +209,17 @@ def test_cameras_of_a_model_that_cannot_be_used_are_named(folder):
 def test_views_that_are_held_out(made, folder):
     assert [len(load_dataset(folder, n).views) for n in (0, 2)] == [4, 2]
     assert [view.name for view in load_dataset(folder, 2).held_out] == ["1.png", "3.png", "0.png"]
+    for count, held_out in ((15, 0), (16, 2), (17, 3)):
+        names = [f"{number:02}.png" for number in range(count)]
+        cameras = [made.views[k % 2].camera for k in range(count)]
+        place = folder / f"{count}"
+        (place / "images").mkdir(parents=True)
+        for name in names:
+            write_png(place / "images" / name, made.views[0].picture)
+        save_colmap(place / "sparse" / "0", names, cameras, made.points, made.colors)
+        found = load_dataset(place)
+        assert [view.name for view in found.held_out] == names[::8][:held_out]
+        assert len(found.views) == count - held_out
     many = Dataset("many", made.views * 4, (), made.points, made.colors)
     assert many.digest != made.digest
 

@@ -265,7 +265,9 @@ def test_densification_keeps_the_order_and_puts_new_splats_behind():
         assert not made.second[name][5:].any()
     np.testing.assert_array_equal(made.values["means"][5], old.values["means"][1])  # a clone
     np.testing.assert_allclose(made.scales[6:], 0.03 / 1.6, rtol=1e-5)
+    np.testing.assert_array_equal(made.values["quats"][6:], old.values["quats"][[2, 5, 2, 5]])
     away = made.values["means"][6:] - old.values["means"][[2, 5, 2, 5]]
+    assert (np.abs(away[:2] - away[2:]).max(axis=1) > 1e-4).all()  # the parts of a splat are apart
     assert (np.abs(away).max(axis=1) > 0).all()
     turns = fs.rotations.quaternion_to_matrix(old.values["quats"][[2, 5, 2, 5]])
     assert np.abs(np.einsum("ni,ni->n", away, turns[:, :, 2])).max() < 1e-6  # within their disks
@@ -290,7 +292,7 @@ def test_no_more_splats_are_made_than_allowed():
 
 def test_large_splats_go_after_the_first_reset():
     settings = TrainSettings()
-    for iteration, left in ((600, 8), (3100, 7)):
+    for iteration, left in ((600, 8), (3000, 8), (3001, 7)):
         splats = ready()
         splats.values["log_scales"][4] = np.log(0.3)
         assert len(densify.plan(splats, settings, iteration, 2.0).rows) == left
@@ -313,9 +315,35 @@ def test_mcmc_moves_the_dead_and_grows_up_to_its_limit():
         together = 1 - (1 - made.opacities[source]) ** copies
         assert together == pytest.approx(0.5, rel=1e-4)
     assert not made.first["means"][sources[:2]].any()
+    for place, source in zip((3, 9, 40), sources, strict=True):
+        assert_looks_like(made, [source, place], ids(made).count(source))
     splats.values["logits"][:] = logit(0.004)
     with pytest.raises(TrainingError, match=r"all splats are fainter"):
         mcmc.moved(splats, settings, 600)
+
+
+def assert_looks_like(splats, rows, copies):
+    """Equal splats at one place block as much light along a line through it as the splat of `ready`."""
+    x = np.linspace(-0.1, 0.1, 4001)
+    for row in rows:
+        for scale in splats.scales[row]:
+            each = splats.opacities[row] * np.exp(-0.5 * (x / scale) ** 2)
+            one = 0.5 * np.exp(-0.5 * (x / 0.01) ** 2)
+            assert (1 - (1 - each) ** copies).sum() == pytest.approx(one.sum(), rel=1e-4)
+
+
+def test_mcmc_moves_a_splat_of_exactly_the_dead_opacity():
+    splats = ready(12)
+    splats.values["logits"][4] = -3
+    exactly = TrainSettings(strategy="mcmc", growth=1.0, dead_opacity=float(splats.opacities[4]))
+    assert ids(mcmc.moved(splats, exactly, 600))[4] != 4
+
+
+def test_densification_takes_a_gradient_of_exactly_the_threshold():
+    splats = ready()
+    splats.gradients[2] = 1.0
+    exactly = TrainSettings(gradient_threshold=0.25)
+    assert ids(densify.plan(splats, exactly, 600, 2.0).made(splats)) == [*range(8), 2]
 
 
 def test_mcmc_shakes_faint_splats_within_their_disks():

@@ -36,7 +36,7 @@ def draw():
 
 def picture():
     """As tests/contract/test_gradients.py draws, whose kernels it shares."""
-    return random_picture(1, degree=None, quality="surfel", outputs=("rgb",))
+    return random_picture(1, degree=None, quality="surfel", outputs=("rgb",), origin=(0.0, 0.0, 0.0))
 
 
 def on_device(cloud, gradients=tuple(TYPES)):

@@ -93,8 +93,11 @@ class _Backward:
         self._launcher.stage("blend backward")
         self._blend()
         self._launcher.stage("project backward")
-        if self._count:
+        if self._pairs:
             self._launcher.launch(self._made.project, self._count, self._given)
+        else:  # no splat is visible: there are no moments
+            for array in (*found.values(), self._given["by_poses"]):
+                array.zero_()
         view = self._picture.view
         pixels = view.width * view.height
         parts = self._take("background parts", 3 * _SHARES, self._wp.float64)
