@@ -1,4 +1,4 @@
-"""Turns measured figures into the Markdown tables of docs/performance.md, devlog/roofline.md and devlog/growth.md.
+"""Turns measured figures into the Markdown tables of docs/performance.md and of devlog/.
 
     python benchmarks/performance_tables.py benchmarks/results/*.json*
     python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/*.md devlog/*.md

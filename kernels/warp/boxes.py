@@ -1,4 +1,4 @@
-"""Boxes: rectangles |u| <= 1, |v| <= 1 of a splat's plane, whose edges the sample filters (docs/primitives.md).
+"""Boxes: rectangles |u| <= 1, |v| <= 1 of a splat plane with filtered edges (docs/primitives.md).
 
 D + n_u, D - n_u, D + n_v, D - n_v over their gradients are the sample's distances from the four edges,
 inwards, in samples. Where they are affine in the sample, gradients are the splat's own; where a lens gives
