@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, user_cache
+from fidsplat.files import atomic_write, from_json, read_text, user_cache
 
 
 def folder() -> Path:
@@ -20,7 +20,7 @@ def load(key: str | None) -> dict[str, Any] | None:
     if key is None:
         return None
     try:
-        kept = from_json((folder() / f"{key}.json").read_text("utf-8"))
+        kept = from_json(read_text(folder() / f"{key}.json"))
     except (OSError, ValueError):
         return None
     return kept if isinstance(kept, dict) else None

@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from fidsplat import __version__
-from fidsplat.files import atomic_write, writable_folder
+from fidsplat.files import atomic_write, read_text, writable_folder
 from fidsplat.frame import Frame
 from fidsplat.provenance import digest_of
 from fidsplat.render import Renderer
@@ -43,7 +43,7 @@ class Piece:
 
 def piece_of(source: Path, scene: Scene) -> Piece:
     """A scene that was read from a file; its title is the first line's comment."""
-    text = source.read_text("utf-8", "replace") if source.suffix.lower() == ".toml" else ""
+    text = read_text(source, "replace") if source.suffix.lower() == ".toml" else ""
     first = text.partition("\n")[0]
     title = first.lstrip("# ").partition(". fidsplat")[0] if first.startswith("#") else source.stem
     return Piece(source.stem, title.rstrip("."), scene, text)

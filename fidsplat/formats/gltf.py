@@ -19,10 +19,9 @@ from urllib.parse import unquote
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json
+from fidsplat.files import atomic_write, from_json, read_input
 from fidsplat.formats.plain import (
     HALF_TURN,
-    beginning,
     cloud_of,
     coefficients,
     content,
@@ -46,7 +45,7 @@ def load_gltf(path: Path) -> SplatCloud:
         InputError: it is damaged, holds no splats, refers to a file outside of its folder, or its nodes
             scale unevenly or mirror.
     """
-    data = content(path, "a glTF file", (b"glTF", b"{", codecs.BOM_UTF8))
+    data = content(path, (b"glTF", b"{", codecs.BOM_UTF8))
     document, binary = _parts(path, data)
     try:
         reader = _Reader(path, document, binary)
@@ -260,7 +259,7 @@ class _Reader:
             raise InputError(f"{self._path} refers to {uri!r}, outside of its folder; it is not read")
         views = [view for view in self._document["bufferViews"] if view["buffer"] == number]
         size = max(int(view.get("byteOffset", 0)) + int(view["byteLength"]) for view in views)
-        return beginning(file, "the data of a glTF file", max(size, 0))  # whatever else the file holds
+        return read_input(file, first=max(size, 0))  # whatever else the file holds
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

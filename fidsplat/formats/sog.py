@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import from_json
-from fidsplat.formats.plain import check_file, cloud_of
+from fidsplat.files import from_json, open_input
+from fidsplat.formats.plain import cloud_of
 from fidsplat.splats import SplatCloud
 
 MAX_PART, MAX_META = 2**30, 2**24
@@ -32,15 +32,14 @@ _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 
 def load_sog(path: Path) -> SplatCloud:
     """Read a .sog file. Raises InputError where it is damaged, lacks a part, or has another version."""
-    check_file(path, "a SOG file")
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_input(path) as stream, zipfile.ZipFile(stream) as archive:
             return _cloud(path, archive)
+    except InputError:
+        raise
     except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError) as error:
         raise InputError(f"{path} is not a SOG file: its zip is damaged ({error})") from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path}: the SOG file is damaged ({type(error).__name__}: {error})") from None
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
-from fidsplat.formats.plain import check_file, cloud_of, plain_colors, refuse_boxes, three_scales, world_means
+from fidsplat.files import atomic_write, regular_file
+from fidsplat.formats.plain import cloud_of, plain_colors, refuse_boxes, three_scales, world_means
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 
@@ -23,8 +23,7 @@ _SEEN = 4096
 
 def load_splat(path: Path) -> SplatCloud:
     """Read a .splat file. Raises InputError where it is not one."""
-    check_file(path, "a .splat file")
-    size = path.stat().st_size
+    size = regular_file(path).stat().st_size
     if not size or size % _ROW.itemsize:
         raise InputError(
             f"{path}: {size} bytes are not rows of {_ROW.itemsize}; cut short, or not a .splat file"

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_path
+from fidsplat.files import atomic_path, regular_file
 from fidsplat.formats.plain import (
     HALF_TURN,
-    check_file,
     cloud_of,
     coefficients,
     refuse_boxes,
@@ -37,7 +36,7 @@ def load_usd(path: Path) -> SplatCloud:
             missing.
     """
     pxr = _pxr()
-    check_file(path, "a USD file")
+    regular_file(path)
     try:
         stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)
     except pxr.Tf.ErrorException:

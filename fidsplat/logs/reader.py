@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.files import open_input, path_of, regular_file
 from fidsplat.logs.files import typestore
 from fidsplat.rotations import rigid_matrix
 from fidsplat.vision.images import decoded
@@ -102,11 +102,13 @@ def _damage_told(file: Path) -> Iterator[None]:
 def _messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
     """Topic, type, time in nanoseconds, CDR."""
     if file.is_dir():
+        for part in file.iterdir():
+            regular_file(part)
         with BagReader(file) as bag:
             for connection, time, data in bag.messages():
                 yield connection.topic, connection.msgtype, time, data
         return
-    with file.open("rb") as stream:
+    with open_input(file) as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             if schema is not None and channel.message_encoding == "cdr":
                 yield channel.topic, schema.name, message.log_time, message.data

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of
+from fidsplat.files import atomic_write, path_of, read_input
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
@@ -246,10 +246,7 @@ def rgba_pixels(data: bytes, name: str) -> np.ndarray:
 
 
 def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
-    try:
-        data = np.fromfile(path_of(path), np.uint8)
-    except OSError as error:
-        raise InputError(f"cannot read the image {path}: {error.strerror or error}") from error
+    data = np.frombuffer(read_input(path), np.uint8)
     image = None
     # OpenCV raises when there are more pixels than its limit
     with _silent_opencv(), contextlib.suppress(cv2.error):
