@@ -107,6 +107,25 @@ def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
     return read_input(path).decode("utf-8", errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
+@contextmanager
+def utf8_path(path: Path) -> Iterator[Path]:
+    """A name of a file for libraries that crash on names other than UTF-8: a symbolic link to such a file."""
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory() as folder:
+            link = Path(folder, "link" + path.suffix.encode("ascii", "ignore").decode())
+            link.symlink_to(path.absolute())
+            yield link
+    else:
+        yield path
+
+
+def printable(text: str) -> str:
+    """Text in which escapes stand for bytes of file names that are not UTF-8, for pages and charts."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def from_json(text: str | bytes, finite: bool = False) -> Any:
     """What JSON says. Raises ValueError for all that is none, tables in a thousand tables among it; finite:
     and for numbers that are not."""
@@ -124,15 +143,26 @@ def _finite(text: str) -> float:
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def atomic_write(path: str | os.PathLike[str], durable: bool = False) -> Iterator[BinaryIO]:
     """Open a temporary file beside ``path`` for binary writing and move it onto ``path`` when all went well.
 
     A reader never sees half a file, and a run that is stopped leaves the old one as it was.
+
+    durable: wait until the disk has the file, so that a power cut leaves the new file or the old one too.
 
     Raises InputError when the folder is missing or cannot be written.
     """
     with atomic_path(path) as part, part.open("wb") as stream:
         yield stream
+        if durable:
+            stream.flush()
+            os.fsync(stream.fileno())
+    if durable:
+        folder = os.open(path_of(path).parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # the name of the file
+        finally:
+            os.close(folder)
 
 
 @contextmanager
@@ -150,7 +180,8 @@ def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path
         raise InputError(f"cannot write {target}: {error.strerror or error}") from error
     try:
         os.close(descriptor)
-        yield Path(name)
+        with utf8_path(Path(name)) as part:
+            yield part
         os.chmod(name, 0o666 & ~_umask())
         os.replace(name, target)
     except BaseException as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from fidsplat import __version__
-from fidsplat.files import atomic_write, read_text, writable_folder
+from fidsplat.files import atomic_write, printable, read_text, writable_folder
 from fidsplat.frame import Frame
 from fidsplat.provenance import digest_of
 from fidsplat.render import Renderer
@@ -77,7 +77,7 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
         parts.append(_figure(piece, files, renderer.device.title))
         yield files[0]
     with atomic_write(folder / PAGE) as stream:
-        stream.write(_page(parts).encode())
+        stream.write(printable(_page(parts)).encode())
     yield folder / PAGE
 
 

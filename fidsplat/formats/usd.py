@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_path, regular_file
+from fidsplat.files import atomic_path, regular_file, utf8_path
 from fidsplat.formats.plain import (
     HALF_TURN,
     cloud_of,
@@ -38,9 +38,16 @@ def load_usd(path: Path) -> SplatCloud:
     pxr = _pxr()
     regular_file(path)
     try:
-        stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)
-    except pxr.Tf.ErrorException:
+        with utf8_path(path) as name:
+            return _load(pxr, path, name)
+    except (pxr.Tf.ErrorException, RuntimeError) as error:  # arrays are read late, when they are requested
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path} is not a USD file that can be read") from None
+
+
+def _load(pxr: Any, path: Path, name: Path) -> SplatCloud:
+    stage = pxr.Usd.Stage.Open(str(name), pxr.Usd.Stage.LoadAll)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in _KINDS]
     if not prims:
         raise InputError(f"{path} holds no ParticleField")

@@ -64,7 +64,7 @@ def save_checkpoint(
     }
     arrays = {f"{group}.{name}": getattr(made.splats, group)[name] for group in _GROUPS for name in NAMES}
     arrays |= {"gradients": made.splats.gradients, "seen": made.splats.seen, **made.history}
-    with atomic_write(file) as stream:
+    with atomic_write(file, durable=True) as stream:
         np.savez(stream, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
 
 

@@ -87,7 +87,7 @@ def _views(file: Path, table: dict, tell: Callable[[str, float], None], words: s
                 matrix = np.vstack([matrix, (0, 0, 0, 1)])
             if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
                 raise ValueError
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             raise InputError(
                 f"{file}: frame {number} needs a file_path and a transform_matrix of 4 x 4 finite numbers"
             ) from None

@@ -10,10 +10,18 @@ import cv2
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of, read_input
+from fidsplat.files import atomic_write, path_of, read_input, utf8_path
+from fidsplat.stderr import without_stderr
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
+
+_CONTAINERS = (
+    *((4, kind) for kind in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")),
+    (0, b"\x1aE\xdf\xa3"),
+    (8, b"AVI "),
+)
+"""how MP4 and QuickTime, Matroska and WebM, and AVI files begin: place and bytes"""
 
 MAX_BITS = 2**26
 """values of a marker image that are looked at: four for each of 4096 x 4096 modules, which are most"""
@@ -80,20 +88,31 @@ def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
         for name in names:
             yield str(name), read_image(name)
     elif is_video(file):
-        with _silent_opencv():
-            video = cv2.VideoCapture(str(file))
-            done, frame = video.read()
-        if not done:
-            raise InputError(
-                f"{file} is not a video that OpenCV can read; convert it to MP4 (H.264), or to pictures"
-            )
-        number = 0
-        while done:
-            yield f"{file}:{number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
-            number += 1
-            done, frame = video.read()
+        yield from _frames(file)
     else:
         yield str(path), read_image(file)
+
+
+def _frames(file: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and pictures of a video."""
+    head = read_input(file, first=12)
+    video = cv2.VideoCapture()
+    # FFmpeg goes by the content: playlists and scripts, whatever their name, open other files and addresses
+    if any(word == head[at : at + len(word)] for at, word in _CONTAINERS):
+        with _silent_opencv(), utf8_path(file.absolute()) as name:
+            video.open(str(name), cv2.CAP_FFMPEG)
+    number = 0
+    while True:
+        with _silent_opencv():
+            done, frame = video.read()
+        if not done:
+            break
+        yield f"{file}:{number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+        number += 1
+    if not number:
+        raise InputError(
+            f"{file} is not a video that OpenCV can read; convert it to MP4 (H.264), or to pictures"
+        )
 
 
 def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
@@ -258,7 +277,7 @@ def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
 
 @contextlib.contextmanager
 def _silent_opencv() -> Iterator[None]:
-    """A damaged file is our error in one line, without OpenCV's warnings on stderr beside it."""
+    """Discard what OpenCV, libpng and FFmpeg write to stderr: a damaged file is one line, our error."""
     if hasattr(cv2, "setLogLevel"):  # OpenCV 4
         read, write = cv2.getLogLevel, cv2.setLogLevel  # type: ignore[attr-defined]
     else:
@@ -266,6 +285,7 @@ def _silent_opencv() -> Iterator[None]:
     before = read()
     write(0)
     try:
-        yield
+        with without_stderr():
+            yield
     finally:
         write(before)
