@@ -27,10 +27,11 @@ def input_limit(size: int) -> int:
     return int(text)
 
 
-def check_expansion(path: Path, need: float, what: str, size: int | None = None) -> None:
+def check_expansion(path: Path | str, need: float, what: str, size: int | None = None) -> None:
     """Check what a file declares against `input_limit`.
 
     Args:
+        path: the file, or for a part of one that has a size, what to call it.
         need: bytes of memory that reading takes.
         what: what the file declares, for the error: "100,000,000 splats".
         size: bytes of the file or of its compressed part; default what it takes on the disk, without
@@ -39,7 +40,7 @@ def check_expansion(path: Path, need: float, what: str, size: int | None = None)
     Raises InputError above the limit.
     """
     if size is None:
-        status = path.stat()
+        status = Path(path).stat()
         size = min(status.st_size, 512 * status.st_blocks)
     if need > (limit := input_limit(size)):
         raise InputError(

@@ -14,6 +14,7 @@ from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, regular_file
 from fidsplat.formats.plain import cloud_of, plain_colors, refuse_boxes, three_scales, world_means
 from fidsplat.harmonics import C0
+from fidsplat.input_limit import check_expansion
 from fidsplat.splats import SplatCloud
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -28,6 +29,7 @@ def load_splat(path: Path) -> SplatCloud:
         raise InputError(
             f"{path}: {size} bytes are not rows of {_ROW.itemsize}; cut short, or not a .splat file"
         )
+    check_expansion(path, 4 * size, f"{size // _ROW.itemsize:,} splats")
     rows = np.memmap(path, _ROW, "r").view(np.ndarray)
     means, scales = rows["means"][:_SEEN], rows["scales"][:_SEEN]
     if not (np.isfinite(means).all(1) & np.isfinite(scales).all(1) & (scales > 0).any(1)).any():

@@ -11,6 +11,7 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, path_of, read_input, utf8_path
+from fidsplat.input_limit import check_expansion
 from fidsplat.stderr import without_stderr
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -23,6 +24,8 @@ _CONTAINERS = (
 )
 """how MP4 and QuickTime, Matroska and WebM, and AVI files begin: place and bytes"""
 
+_PIXEL = 8
+"""bytes of memory that a pixel takes while it is read"""
 MAX_BITS = 2**26
 """values of a marker image that are looked at: four for each of 4096 x 4096 modules, which are most"""
 
@@ -240,8 +243,59 @@ def encoded(image: np.ndarray, kind: str, quality: int = 95) -> bytes:
     return data.tobytes()
 
 
+def declared_pixels(data: bytes | np.ndarray) -> int:
+    """Pixels of a PNG, WebP (RFC 9649), JPEG, BMP or TIFF image by its header; 0 for another file."""
+    head = bytes(data[:32])
+    body = head[20:30]
+    if head[:8] == b"\x89PNG\r\n\x1a\n":
+        return int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big")
+    if head[:2] == b"BM":
+        width, height = (int.from_bytes(head[at : at + 4], "little", signed=True) for at in (18, 22))
+        return abs(width * height)
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        if head[12:16] == b"VP8L":  # 14 bits each, less 1, after a byte
+            bits = int.from_bytes(body[1:5], "little")
+            return ((bits & 0x3FFF) + 1) * ((bits >> 14 & 0x3FFF) + 1)
+        if head[12:16] == b"VP8X":  # 24 bits each, less 1, after 4 bytes
+            return (int.from_bytes(body[4:7], "little") + 1) * (int.from_bytes(body[7:10], "little") + 1)
+        width, height = (int.from_bytes(body[k : k + 2], "little") & 0x3FFF for k in (6, 8))
+        return width * height
+    if head[:2] == b"\xff\xd8":
+        return _jpeg_pixels(data)
+    return _tiff_pixels(data) if head[:4] in (b"II*\0", b"MM\0*") else 0
+
+
+def _jpeg_pixels(data: bytes | np.ndarray) -> int:
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        kind, size = int(data[at + 1]), int.from_bytes(bytes(data[at + 2 : at + 4]), "big")
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):  # a frame's header
+            height, width = (int.from_bytes(bytes(data[at + k : at + k + 2]), "big") for k in (5, 7))
+            return height * width
+        at += 1 if kind == 0xFF else 2 + size
+    return 0
+
+
+def _tiff_pixels(data: bytes | np.ndarray) -> int:
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(bytes(data[at : at + size]), "little" if data[0] == 0x49 else "big")
+
+    first = number(4, 4)
+    sides = {}
+    for at in range(first + 2, first + 2 + 12 * number(first, 2), 12):
+        sides[number(at, 2)] = number(at + 8, 2 if number(at + 2, 2) == 3 else 4)  # a short, or a long
+    return sides.get(256, 0) * sides.get(257, 0)
+
+
+def _admit(data: bytes | np.ndarray, name: str | os.PathLike[str]) -> None:
+    pixels = declared_pixels(data)
+    check_expansion(os.fspath(name), _PIXEL * pixels, f"{pixels:,} pixels", len(data))
+
+
 def decoded(content: bytes) -> np.ndarray:
-    """The picture (h, w, 3) uint8 RGB of a file's content. Raises InputError for what is no picture."""
+    """The picture (h, w, 3) uint8 RGB of a file's content. Raises InputError for what is no picture, and
+    beyond `input_limit`."""
+    _admit(content, "a compressed picture")
     image = None
     with _silent_opencv(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
@@ -253,8 +307,10 @@ def decoded(content: bytes) -> np.ndarray:
 def rgba_pixels(data: bytes, name: str) -> np.ndarray:
     """(h, w, 4) uint8 of a picture file's content, alpha 255 where it has none.
 
-    name: of the file, for errors. Raises InputError for anything but a picture of 8 bits.
+    name: of the file, for errors. Raises InputError for anything but a picture of 8 bits, and beyond
+    `input_limit`.
     """
+    _admit(data, name)
     image = None
     with _silent_opencv(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
@@ -266,6 +322,7 @@ def rgba_pixels(data: bytes, name: str) -> np.ndarray:
 
 def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
     data = np.frombuffer(read_input(path), np.uint8)
+    _admit(data, path)
     image = None
     # OpenCV raises when there are more pixels than its limit
     with _silent_opencv(), contextlib.suppress(cv2.error):
