@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -88,7 +89,7 @@ def _draw(frame: Frame, files: Sequence[Path]) -> None:
 
 def _figure(piece: Piece, files: Sequence[Path], device: str) -> str:
     said = html.escape
-    first, *more = [quote(file.name) for file in files]
+    first, *more = [quote(os.fsencode(file.name)) for file in files]
     markers = ", ".join(placed.marker.spec for placed in piece.scene.markers)
     facts = f"{len(piece.scene.splats):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
     images = "".join(f'<a href="{name}"><img src="{name}" loading="lazy" alt=""></a> ' for name in more)

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import open_input, path_of, regular_file
+from fidsplat.files import open_input, path_of, regular_file, utf8_path
 from fidsplat.input_limit import check_expansion
 from fidsplat.logs.files import typestore
 from fidsplat.rotations import rigid_matrix
@@ -110,7 +110,7 @@ def _messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
     if file.is_dir():
         for part in file.iterdir():
             regular_file(part)
-        with BagReader(file) as bag:
+        with utf8_path(file) as name, BagReader(name) as bag:
             for connection, time, data in bag.messages():
                 yield connection.topic, connection.msgtype, time, data
         return
