@@ -4,11 +4,15 @@ import json
 import os
 import threading
 
+import cv2
 import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.cli import main
 from fidsplat.errors import InputError
+from fidsplat.experiments.charts import bars, chart
+from fidsplat.experiments.gallery import Piece, write_gallery
 from fidsplat.experiments.summary import read_summary
 from fidsplat.experiments.sweep import read_records
 from fidsplat.files import atomic_write, writable_folder
@@ -221,3 +225,135 @@ def pipe(tmp_path):
 def test_a_pipe_in_place_of_an_input_is_refused_and_not_waited_for(name, tmp_path, pipe):
     with pytest.raises(InputError, match="must be a regular file, got a pipe"):
         INPUTS[name](tmp_path, pipe)
+
+
+ODD = "a\udcff$x$"  # a byte that is not UTF-8, and what matplotlib takes for mathematics
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz", ".glb", ".gltf", ".usda", ".usdc", ".fss"])
+def test_splat_files_with_names_that_are_not_utf8(tmp_path, suffix):
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr.UsdVol", reason="pip install 'fidsplat[usd]'")
+    folder = tmp_path / ODD
+    folder.mkdir()
+    file = folder / f"{ODD}{suffix}"
+    if suffix == ".fss":
+        fs.save_ply(CLOUD, folder / f"{ODD}.ply")
+        build_store([folder / f"{ODD}.ply"], file)
+        assert Store(file).header.splats == 1
+        return
+    save_splats(CLOUD, file)
+    assert not file.is_symlink()
+    assert len(load_splats(file)) == 1
+
+
+def test_a_video_with_a_name_that_is_not_utf8_is_read(tmp_path):
+    file = tmp_path / f"{ODD}.avi"
+    write_avi(tmp_path / "a.avi").rename(file)
+    assert [image.shape for _, image in pictures(file)] == [(48, 64, 3)] * 3
+
+
+def write_avi(file):
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for k in range(3):
+        video.write(np.full((48, 64, 3), 80 * k, np.uint8))
+    video.release()
+    return file
+
+
+def test_a_bag_with_a_name_that_is_not_utf8(tmp_path):
+    from fidsplat.logs import RobotLog, log_pictures
+
+    with RobotLog(tmp_path / ODD) as log:
+        log.image(0.5, "front", np.zeros((4, 5, 3)))
+    assert [one.image.shape for one in log_pictures(tmp_path / ODD)] == [(4, 5, 3)]
+
+
+def test_pages_and_charts_of_names_that_are_not_utf8(tmp_path):
+    with chart(tmp_path / f"{ODD}.svg") as (_, (axes,)):
+        bars(axes, [ODD, "a$\\frac$"], {ODD: [1, 2], "b": [2, 3]})
+    assert "$x$" in (tmp_path / f"{ODD}.svg").read_text()
+    camera = fs.Camera.look_at(8, 6, 1.0, (0, 0, -1), (0, 0, 0))
+    piece = Piece(ODD, ODD, fs.Scene([CLOUD], camera=camera), "")
+    *_, page = write_gallery(tmp_path / ODD, [piece], "reference")
+    assert "a%FF%24x%24-rgb" in page.read_text()
+
+
+def test_a_script_of_ffmpeg_is_no_video_and_opens_no_other_file(tmp_path):
+    """FFmpeg knows them by their content, whatever they are called."""
+    write_avi(tmp_path / "secret.avi")
+    for text in ("ffconcat version 1.0\nfile secret.avi\n", "#EXTM3U\n#EXTINF:1,\nsecret.avi\n"):
+        (tmp_path / "a.mp4").write_text(text)
+        with pytest.raises(InputError, match="not a video"):
+            next(pictures(tmp_path / "a.mp4"))
+
+
+def test_damaged_images_and_videos_are_one_line(tmp_path, capfd):
+    """libpng and FFmpeg write to stderr by themselves."""
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    write_png(tmp_path / "a.png", noise)
+    write_avi(tmp_path / "a.avi")
+    for name, size in (("a.png", 4000), ("a.avi", 300)):
+        os.truncate(tmp_path / name, size)
+        assert main(["detect", str(tmp_path / name)]) == 2
+    (tmp_path / "a.mp4").write_bytes(b"\0\0\0\x18ftypisom" + bytes(90))
+    assert main(["detect", str(tmp_path / "a.mp4")]) == 2
+    out, err = capfd.readouterr()
+    assert [line[:9] for line in (out + err).splitlines()] == ["fidsplat:"] * 3
+
+
+def test_a_durable_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
+    done, sync, replace = [], os.fsync, os.replace
+
+    def synced(descriptor):
+        done.append("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "file")
+        sync(descriptor)
+
+    def replaced(*names):
+        done.append("replace")
+        replace(*names)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    with atomic_write(tmp_path / "a", durable=True) as stream:
+        stream.write(b"x")
+    assert done == ["file", "replace", "folder"]
+
+
+@pytest.mark.parametrize("value", ["1" + "0" * 400, "1e999"])
+def test_a_pose_beyond_all_numbers_is_an_input_error(tmp_path, value):
+    matrix = [[1, 0, 0, 7], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    text = json.dumps({"frames": [{"file_path": "a.png", "transform_matrix": matrix}]})
+    (tmp_path / "transforms.json").write_text(text.replace("7", value))
+    with pytest.raises(InputError, match=r"frame 0 needs .* 4 x 4 finite numbers"):
+        load_dataset(tmp_path)
+
+
+def test_an_array_of_usd_that_is_damaged_is_an_input_error(tmp_path):
+    """USD reads arrays late, when they are requested."""
+    pytest.importorskip("pxr.UsdVol", reason="pip install 'fidsplat[usd]'")
+    means = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    ones = np.ones((50, 4))
+    cloud = fs.SplatCloud(means, ones, ones[:, :2], ones[:, 0], colors=ones[:, :3])
+    save_splats(cloud, tmp_path / "a.usdc")
+    data = bytearray((tmp_path / "a.usdc").read_bytes())
+    count = data.index(cloud.means.tobytes()) - 8
+    assert int.from_bytes(data[count : count + 8], "little") == 50
+    data[count : count + 8] = (2**60).to_bytes(8, "little")
+    (tmp_path / "a.usdc").write_bytes(data)
+    with pytest.raises(InputError, match="not a USD file that can be read"):
+        load_splats(tmp_path / "a.usdc")
+
+
+def test_a_bag_that_names_a_file_outside_of_it(tmp_path):
+    """The file of that name within the bag is meant, or none."""
+    from fidsplat.logs import RobotLog, log_pictures
+
+    for name in ("bag", "other"):
+        with RobotLog(tmp_path / name) as log:
+            log.image(0.5, "front", np.zeros((4, 5, 3)))
+    (tmp_path / "other" / "other.db3").rename(tmp_path / "other.db3")
+    note = tmp_path / "bag" / "metadata.yaml"
+    note.write_text(note.read_text().replace("bag.db3", "../other.db3"))
+    with pytest.raises(InputError, match=r"files are missing: .*bag/other\.db3"):
+        next(log_pictures(tmp_path / "bag"))
