@@ -46,7 +46,7 @@ def load_usd(path: Path) -> SplatCloud:
     except InputError:
         raise
     # also of arrays, which are read late, when they are requested
-    except (pxr.Tf.ErrorException, RuntimeError, OSError, OverflowError):
+    except (pxr.Tf.ErrorException, RuntimeError, OSError, OverflowError, ValueError):
         raise InputError(f"{path} is not a USD file that can be read") from None
 
 
