@@ -17,7 +17,7 @@ from fidsplat import __version__
 from fidsplat.cameras import Motion, Shutter, Trajectory
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, path_of, writable_folder
+from fidsplat.files import atomic_write, from_json, path_of, read_text, writable_folder
 from fidsplat.formats import load_trajectory, save_trajectory
 from fidsplat.provenance import digest_of
 from fidsplat.render import Renderer
@@ -184,11 +184,12 @@ class FlightFolder:
                     file.unlink()
 
     def _recorded(self) -> dict[str, Any] | None:
-        try:
-            found = from_json((self.folder / RECORD).read_text("utf-8"))
-        except FileNotFoundError:
+        file = self.folder / RECORD
+        if not file.exists():
             return None
-        except (OSError, ValueError):
+        try:
+            found = from_json(read_text(file))
+        except ValueError:
             found = {}
         return found if isinstance(found, dict) else {}
 

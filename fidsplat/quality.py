@@ -162,8 +162,8 @@ class Quality:
     arithmetic: str = "fast"
     """Exponentials and logarithms of blending. `fast`: our own polynomials, bit-identical wherever devices
     fuse multiply-adds (images are not: compilers decide on the rest); exponentials within 2.3 units of the
-    last place, logarithms within 1.1. `precise`: the library's, of which OpenCL promises 3. Colours differ by less than 1e-6, and by the stop at most
-    where a pixel reaches it a splat earlier."""
+    last place, logarithms within 1.1. `precise`: the library's, of which OpenCL promises 3. Colours differ by
+    less than 1e-6, and by the stop at most where a pixel reaches it a splat earlier."""
 
     blend_precision: str = "float32"
     """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many

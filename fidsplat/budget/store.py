@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, user_cache
+from fidsplat.files import atomic_write, from_json, read_text, user_cache
 
 
 def folder() -> Path:
@@ -19,11 +19,8 @@ def load(key: str | None) -> dict[str, Any] | None:
     """What was kept under a key; None if nothing, or if the file is damaged."""
     if key is None:
         return None
-    path = folder() / f"{key}.json"
-    if not path.is_file():  # to open a FIFO would wait for a writer
-        return None
     try:
-        kept = from_json(path.read_text("utf-8"))
+        kept = from_json(read_text(folder() / f"{key}.json"))
     except (OSError, ValueError):
         return None
     return kept if isinstance(kept, dict) else None

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
+from fidsplat.files import open_input
 from fidsplat.flights import FlightFolder
 from fidsplat.vision.coco import CocoAnnotations
 from fidsplat.vision.images import read_image
@@ -59,7 +59,8 @@ def _images(folder: FlightFolder, k: int) -> dict[str, np.ndarray]:
     found = {}
     for name in folder.flight.capture.outputs:
         if ".npy" in suffixes_of(name):
-            found[name] = np.load(Path(folder.file(k, name, ".npy")))
+            with open_input(folder.file(k, name, ".npy")) as stream:
+                found[name] = np.load(stream)
         elif name == "rgb":
             found[name] = read_image(folder.file(k, name, ".png"))
     return found

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fidsplat.errors import InputError
-from fidsplat.files import from_json
+from fidsplat.files import from_json, read_text
 
 if TYPE_CHECKING:
     from fidsplat.scenes import Scene
@@ -41,7 +41,7 @@ def flown(folder: Path) -> tuple[str, str]:
 
     poses = folder / POSES
     try:
-        source = from_json((folder / RECORD).read_text("utf-8"))["source"]
+        source = from_json(read_text(folder / RECORD))["source"]
         file = folder / source
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(

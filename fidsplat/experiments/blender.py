@@ -23,7 +23,7 @@ from fidsplat.experiments.setup import (
     novel_cameras,
     training_cameras,
 )
-from fidsplat.files import atomic_write, from_json, user_cache, writable_folder
+from fidsplat.files import atomic_write, from_json, read_text, user_cache, writable_folder
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
@@ -49,7 +49,7 @@ def check_pictures(folder: Path, view: str, seed: int, samples: int | None = Non
     Raises InputError when that is another seed or number of samples (None: any).
     """
     try:
-        about = from_json(_note(folder, view).read_text("utf-8"))
+        about = from_json(read_text(_note(folder, view)))
     except (FileNotFoundError, NotADirectoryError):
         return {}
     except (OSError, ValueError) as error:

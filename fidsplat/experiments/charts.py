@@ -17,7 +17,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, printable
 
 Values = Sequence[float]
 _STYLE: dict[Any, Any] = {
@@ -59,8 +59,8 @@ def bars(axes: Axes, groups: Sequence[str], series: Mapping[str, Values], logari
     width = 0.84 / max(1, len(series))
     for number, (name, values) in enumerate(series.items()):
         places = np.arange(len(groups)) - 0.42 + width * (number + 0.5)
-        axes.bar(places, values, 0.92 * width, label=name, color=COLOURS[number % len(COLOURS)])
-    axes.set_xticks(range(len(groups)), groups)
+        axes.bar(places, values, 0.92 * width, label=literal(name), color=COLOURS[number % len(COLOURS)])
+    axes.set_xticks(range(len(groups)), list(map(literal, groups)))
     axes.grid(axis="x", visible=False)
     if logarithmic:
         axes.set_yscale("log")
@@ -74,6 +74,11 @@ def legend_above(figure: Figure, axes: Axes) -> None:
         if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
             break
         legend.remove()
+
+
+def literal(text: str) -> str:
+    """A name for charts: matplotlib takes what stands between two $ for mathematics."""
+    return printable(text).replace("$", r"\$")
 
 
 def plain_ticks(axis) -> None:

@@ -30,7 +30,7 @@ from fidsplat.experiments.setup import (
     training_cameras,
 )
 from fidsplat.experiments.views import exact_view
-from fidsplat.files import atomic_write, from_json, writable_folder
+from fidsplat.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.vision.images import read_image, write_png
 
@@ -97,8 +97,8 @@ def write_scene(wanted: dict, folder: Path, seed: int, truth: str, blender: Path
 
 def _whole(note: Path, about: dict) -> bool:
     try:
-        return from_json(note.read_text("utf-8")) == about
-    except (FileNotFoundError, ValueError):
+        return from_json(read_text(note)) == about
+    except ValueError:  # InputError too: it is not there
         return False
 
 

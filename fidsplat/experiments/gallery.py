@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import html
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
 
 from fidsplat import __version__
-from fidsplat.files import atomic_write, writable_folder
+from fidsplat.files import atomic_write, printable, read_text, writable_folder
 from fidsplat.frame import Frame
 from fidsplat.provenance import digest_of
 from fidsplat.render import Renderer
@@ -43,7 +44,7 @@ class Piece:
 
 def piece_of(source: Path, scene: Scene) -> Piece:
     """A scene that was read from a file; its title is the first line's comment."""
-    text = source.read_text("utf-8", "replace") if source.suffix.lower() == ".toml" else ""
+    text = read_text(source, "replace") if source.suffix.lower() == ".toml" else ""
     first = text.partition("\n")[0]
     title = first.lstrip("# ").partition(". fidsplat")[0] if first.startswith("#") else source.stem
     return Piece(source.stem, title.rstrip("."), scene, text)
@@ -77,7 +78,7 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
         parts.append(_figure(piece, files, renderer.device.title))
         yield files[0]
     with atomic_write(folder / PAGE) as stream:
-        stream.write(_page(parts).encode())
+        stream.write(printable(_page(parts)).encode())
     yield folder / PAGE
 
 
@@ -88,7 +89,7 @@ def _draw(frame: Frame, files: Sequence[Path]) -> None:
 
 def _figure(piece: Piece, files: Sequence[Path], device: str) -> str:
     said = html.escape
-    first, *more = [quote(file.name) for file in files]
+    first, *more = [quote(os.fsencode(file.name)) for file in files]
     markers = ", ".join(placed.marker.spec for placed in piece.scene.markers)
     facts = f"{len(piece.scene.splats):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
     images = "".join(f'<a href="{name}"><img src="{name}" loading="lazy" alt=""></a> ' for name in more)

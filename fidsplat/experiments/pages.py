@@ -10,7 +10,7 @@ import jinja2
 import pandas as pd
 
 from fidsplat.experiments.summary import Frame
-from fidsplat.files import atomic_write, writable_folder
+from fidsplat.files import atomic_write, printable, writable_folder
 
 NOTHING = "-"
 
@@ -41,7 +41,7 @@ def write_page(page: Path, folder: Path, template: str, context: Mapping[str, An
     beside = "" if folder == page.parent else f"{folder.name}/"
     text = environment.get_template(template).render(**context, folder=beside)
     with atomic_write(page) as stream:
-        stream.write(text.encode())
+        stream.write(printable(text).encode())
 
 
 def markdown_table(frame: Frame) -> str:

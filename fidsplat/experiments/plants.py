@@ -15,7 +15,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.blender import camera_facts, drawn, ready
-from fidsplat.files import atomic_write, from_json, writable_folder
+from fidsplat.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.formats import save_ply
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.provenance import code_hash
@@ -142,10 +142,8 @@ def _note(wanted: Plants, folder: Path) -> None:
     own = {name: value for name, value in asdict(wanted).items() if name not in ("kinds", "each")}
     own["sources"] = code_hash()
     try:
-        before = from_json(file.read_text("utf-8"))
-    except FileNotFoundError:
-        before = own
-    except (OSError, ValueError) as error:
+        before = from_json(read_text(file)) if file.exists() else own
+    except ValueError as error:
         raise InputError(f"cannot read {file}: {error}") from error
     if before != own:
         raise InputError(f"{folder} holds plants of {before}, not {own}; give another folder")

@@ -19,7 +19,7 @@ from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
 from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.targets import targets
 from fidsplat.experiments.views import LINEAR, TRUTHS
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, open_input
 
 _FURTHEST = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
 """the detectors of each kind by how far they read on the ideal texture: the first that is there is shown"""
@@ -66,7 +66,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     sheets = next((found for place in (*folders, folder) if (found := sheet_files(place))), [])
     for sheet in sheets:
         if sheet.parent.resolve() != folder.resolve():
-            with atomic_write(folder / sheet.name) as stream, open(sheet, "rb") as source:
+            with atomic_write(folder / sheet.name) as stream, open_input(sheet) as source:
                 shutil.copyfileobj(source, stream)
     context |= {
         "targets": len(reached),

@@ -21,7 +21,7 @@ import pandas as pd
 
 from fidsplat.errors import InputError
 from fidsplat.experiments.sweep import Record, read_records
-from fidsplat.files import atomic_write, from_json
+from fidsplat.files import atomic_write, from_json, read_text
 
 _MARK = "# "
 Frame: TypeAlias = Any
@@ -82,7 +82,7 @@ def summarise(
 def read_summary(file: Path) -> Summary:
     """Read what `Summary.write` wrote. Raises InputError for another file."""
     try:
-        text = file.read_text("utf-8")
+        text = read_text(file)
         lines = text.splitlines()
         heads = [from_json(line.removeprefix(_MARK)) for line in lines if line.startswith(_MARK)]
         if not all(isinstance(head, dict) for head in heads):

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, ordinary_file, writable_folder
+from fidsplat.files import atomic_write, from_json, ordinary_file, read_text, writable_folder
 
 Key = dict[str, Any]
 """a point of a sweep: plain data that names what is measured"""
@@ -147,11 +147,11 @@ def read_records(file: Path) -> list[Record]:
 
     Raises InputError when another line is none of ours.
     """
-    try:
-        text = file.read_text("utf-8")
-    except FileNotFoundError:
+    if not file.exists():
         return []
-    except (OSError, UnicodeDecodeError) as error:
+    try:
+        text = read_text(file)
+    except UnicodeDecodeError as error:
         raise InputError(f"cannot read {file}: {error}") from error
     found: list[Record] = []
     run: dict[str, Any] | None = None

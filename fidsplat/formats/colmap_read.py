@@ -11,6 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens
 from fidsplat.errors import InputError
+from fidsplat.files import read_input, read_text
 from fidsplat.rotations import quaternion_to_matrix
 
 _MODELS = {
@@ -109,11 +110,11 @@ def _read(folder: Path, name: str, binary, text, needed: bool = True) -> list:
 def _read_file(file: Path, binary, text) -> list:
     try:
         if file.suffix.lower() == ".bin":
-            return list(binary(_Bytes(file.read_bytes())))
-        lines = file.read_text("utf-8").splitlines()
+            return list(binary(_Bytes(read_input(file))))
+        lines = read_text(file).splitlines()
         return list(text([line.strip() for line in lines if not line.lstrip().startswith("#")]))
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+    except InputError:
+        raise
     except (ValueError, IndexError, KeyError, struct.error) as error:
         raise InputError(f"{file} is damaged, or not COLMAP's: {error}; export the model again") from error
 

@@ -19,10 +19,9 @@ from urllib.parse import unquote
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json
+from fidsplat.files import atomic_write, from_json, read_input
 from fidsplat.formats.plain import (
     HALF_TURN,
-    beginning,
     cloud_of,
     coefficients,
     content,
@@ -30,12 +29,15 @@ from fidsplat.formats.plain import (
     three_scales,
     world_means,
 )
+from fidsplat.input_limit import check_expansion
 from fidsplat.rotations import rigid_matrix
 from fidsplat.splats import SplatCloud
 
 EXTENSION = "KHR_gaussian_splatting"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_COPIES = 3
+"""of each value while it is read: as it stands in the file, as a cloud, and moved to its place"""
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
@@ -46,7 +48,7 @@ def load_gltf(path: Path) -> SplatCloud:
         InputError: it is damaged, holds no splats, refers to a file outside of its folder, or its nodes
             scale unevenly or mirror.
     """
-    data = content(path, "a glTF file", (b"glTF", b"{", codecs.BOM_UTF8))
+    data = content(path, (b"glTF", b"{", codecs.BOM_UTF8))
     document, binary = _parts(path, data)
     try:
         reader = _Reader(path, document, binary)
@@ -173,9 +175,21 @@ class _Reader:
             if scenes
             else range(len(self._document.get("nodes", [])))
         )
-        return [cloud for root in roots for cloud in self._below(root, HALF_TURN)]
+        placed = [pair for root in roots for pair in self._below(root, HALF_TURN)]
+        self._admit([primitive for primitive, _ in placed])
+        made: dict[int, SplatCloud] = {}  # by the primitive's id: nodes may share a mesh
+        for primitive, _ in placed:
+            if id(primitive) not in made:
+                made[id(primitive)] = self._cloud(primitive)
+        return [
+            made[id(primitive)]
+            if np.abs(matrix - np.eye(4)).max() < 1e-12
+            else made[id(primitive)].transformed(matrix)
+            for primitive, matrix in placed
+        ]
 
-    def _below(self, number: int, above: np.ndarray) -> list[SplatCloud]:
+    def _below(self, number: int, above: np.ndarray) -> list[tuple[dict[str, Any], np.ndarray]]:
+        """Primitives of splats of a node and of those below it, with their poses (4, 4)."""
         if number in self._seen:
             raise InputError(f"{self._path}: node {number} stands below two others, or below itself")
         self._seen.add(number)
@@ -185,10 +199,8 @@ class _Reader:
         if "mesh" in node:
             for primitive in self._document["meshes"][node["mesh"]]["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):
-                    cloud = self._cloud(primitive)
-                    same = np.abs(matrix - np.eye(4)).max() < 1e-12
-                    found.append(cloud if same else cloud.transformed(matrix))
-        return found + [cloud for child in node.get("children", []) for cloud in self._below(child, matrix)]
+                    found.append((primitive, matrix))
+        return found + [pair for child in node.get("children", []) for pair in self._below(child, matrix)]
 
     def _cloud(self, primitive: dict[str, Any]) -> SplatCloud:
         kernel = primitive["extensions"][EXTENSION].get("kernel", "ellipse")
@@ -207,6 +219,15 @@ class _Reader:
         return cloud_of(
             self._path, arrays["POSITION"], quats, scales, opacities, sh, labels=labels, planes=planes
         )
+
+    def _admit(self, primitives: list[dict[str, Any]]) -> None:
+        """Check what all primitives take: nodes may share a mesh, and attributes an accessor."""
+        accessors = [
+            self._document["accessors"][number] for one in primitives for number in one["attributes"].values()
+        ]
+        need = sum(_COPIES * 4 * _WIDTHS[each["type"]] * int(each["count"]) for each in accessors)
+        size = sum(len(self._buffer(number)) for number in range(len(self._document["buffers"])))
+        check_expansion(self._path, need, "its nodes with all their attributes", size)
 
     def _whole(self, arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
         """(n,) int32 of an attribute of ours that holds whole numbers as floats, if it is there."""
@@ -260,7 +281,7 @@ class _Reader:
             raise InputError(f"{self._path} refers to {uri!r}, outside of its folder; it is not read")
         views = [view for view in self._document["bufferViews"] if view["buffer"] == number]
         size = max(int(view.get("byteOffset", 0)) + int(view["byteLength"]) for view in views)
-        return beginning(file, "the data of a glTF file", max(size, 0))  # whatever else the file holds
+        return read_input(file, first=max(size, 0))  # whatever else the file holds
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

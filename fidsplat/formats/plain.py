@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import stat
 from pathlib import Path
 
 import numpy as np
 
 from fidsplat.cloud_arrays import find_defects
 from fidsplat.errors import InputError
+from fidsplat.files import open_input, read_input
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 
@@ -79,39 +79,11 @@ def cloud_of(
         raise InputError(f"{path}: {error}") from error
 
 
-def content(path: Path, what: str, begins: tuple[bytes, ...] = (b"",)) -> bytes:
+def content(path: Path, begins: tuple[bytes, ...]) -> bytes:
     """A file's bytes; where they begin with none of these, behind spaces, its first ones alone, from which
-    its reader sees that it is another's. Raises InputError where it cannot be read."""
-    check_file(path, what)
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(64)
-            while head.isspace():
-                head = stream.read(1 << 16)
-            if not head.lstrip().startswith(begins):
-                return head
-            stream.seek(0)
-            return stream.read()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-
-
-def beginning(path: Path, what: str, size: int) -> bytes:
-    """As many of a file's first bytes, or all there are. Raises InputError where it cannot be read."""
-    check_file(path, what)
-    try:
-        with path.open("rb") as stream:
-            return stream.read(size)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-
-
-def check_file(path: Path, what: str) -> None:
-    """Raises InputError where there is no file that can be opened."""
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its writer
-            raise InputError(f"{path} is not an ordinary file, so not {what}")
-        with path.open("rb"):
-            pass
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    its reader sees that it is another's. Raises InputError as `read_input`."""
+    with open_input(path) as stream:
+        head = stream.read(64)
+        while head.isspace():
+            head = stream.read(1 << 16)
+    return read_input(path) if head.lstrip().startswith(begins) else head

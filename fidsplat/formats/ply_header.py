@@ -3,7 +3,6 @@ mapped."""
 
 import os
 import re
-import stat
 import warnings
 from dataclasses import dataclass
 from itertools import islice, takewhile
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.files import open_input, path_of
 
 MAX_HEADER = 65536
 """bytes; a splat file's header has some 2,000"""
@@ -79,7 +78,7 @@ class Header:
         for other in takewhile(lambda other: other is not element, self.elements.values()):
             before += other.count
         try:
-            with self.path.open("rb") as stream:
+            with open_input(self.path) as stream:
                 stream.seek(element.offset)
                 lines = islice(stream, before, before + element.count)
                 rows = np.loadtxt(lines, element.dtype, comments=None, ndmin=1)
@@ -146,18 +145,8 @@ def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
 
 
 def _beginning(file: Path) -> tuple[bytes, int]:
-    try:
-        status = file.stat()
-        # asked before opening: to open a pipe would wait for its writer
-        if not stat.S_ISREG(status.st_mode):
-            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
-            raise InputError(f"{file} is {kind}, not a PLY file")
-        with file.open("rb") as stream:
-            return stream.read(MAX_HEADER), status.st_size
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"cannot read {file}: {getattr(error, 'strerror', None) or error}") from error
+    with open_input(file) as stream:
+        return stream.read(MAX_HEADER), os.fstat(stream.fileno()).st_size
 
 
 def _lines(file: Path, head: bytes) -> tuple[list[str], int]:

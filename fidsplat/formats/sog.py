@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import from_json
-from fidsplat.formats.plain import check_file, cloud_of
+from fidsplat.files import from_json, open_input
+from fidsplat.formats.plain import cloud_of
+from fidsplat.input_limit import check_expansion
 from fidsplat.splats import SplatCloud
 
 MAX_PART, MAX_META = 2**30, 2**24
@@ -27,20 +28,21 @@ SPARE = 2**16
 _ROW = 64  # palette entries in a row of the picture of centroids
 MOST_ENTRIES = 2**16
 """of the palette: labels have 16 bits"""
+_SPLAT, _BAND = 160, 28
+"""bytes of memory that a splat takes while it is read, and each of its SH coefficients above degree 0"""
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 
 
 def load_sog(path: Path) -> SplatCloud:
     """Read a .sog file. Raises InputError where it is damaged, lacks a part, or has another version."""
-    check_file(path, "a SOG file")
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_input(path) as stream, zipfile.ZipFile(stream) as archive:
             return _cloud(path, archive)
+    except InputError:
+        raise
     except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError) as error:
         raise InputError(f"{path} is not a SOG file: its zip is damaged ({error})") from None
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path}: the SOG file is damaged ({type(error).__name__}: {error})") from None
 
 
@@ -48,7 +50,8 @@ def _cloud(path: Path, archive: zipfile.ZipFile) -> SplatCloud:
     meta = from_json(_part(path, archive, "meta.json", MAX_META))
     if meta.get("version") != 2:
         raise InputError(f"{path}: SOG of version {meta.get('version')!r}; version 2 is read")
-    count = int(meta["count"])
+    count, bands = int(meta["count"]), _COEFFICIENTS[meta["shN"]["bands"]] if "shN" in meta else 0
+    check_expansion(path, count * (_SPLAT + _BAND * bands), f"{count:,} splats")
 
     def pixels(part: str, number: int = 0) -> np.ndarray:
         """(count, 4) uint8 of a picture with a pixel for each splat."""
@@ -86,29 +89,13 @@ def _part(path: Path, archive: zipfile.ZipFile, name: str, most: int = MAX_PART)
 
 def _picture(path: Path, archive: zipfile.ZipFile, name: str, count: int) -> np.ndarray:
     """(h, w, 4) uint8 RGBA of so many pixels that are meant: a small file can hold a huge picture."""
-    from fidsplat.vision.images import rgba_pixels  # late: it brings OpenCV
+    from fidsplat.vision.images import declared_pixels, rgba_pixels  # late: it brings OpenCV
 
     data = _part(path, archive, name)
-    pixels = _pixels(data)
+    pixels = declared_pixels(data)
     if pixels > 2 * max(count, 0) + SPARE:
         raise InputError(f"{path}: {name} has {pixels} pixels for {count}; it is not read")
-    return rgba_pixels(data if pixels else b"", f"{path}: {name}")
-
-
-def _pixels(data: bytes) -> int:
-    """The pixels of a WebP (RFC 9649) or PNG picture, by its header; 0 for another file."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
-        return int.from_bytes(data[16:20], "big") * int.from_bytes(data[20:24], "big")
-    kind, body = data[12:16], data[20:30]
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP":
-        return 0
-    if kind == b"VP8L":  # 14 bits each, less 1, after a byte
-        bits = int.from_bytes(body[1:5], "little")
-        return ((bits & 0x3FFF) + 1) * ((bits >> 14 & 0x3FFF) + 1)
-    if kind == b"VP8X":  # 24 bits each, less 1, after 4 bytes
-        return (int.from_bytes(body[4:7], "little") + 1) * (int.from_bytes(body[7:10], "little") + 1)
-    width, height = (int.from_bytes(body[k : k + 2], "little") & 0x3FFF for k in (6, 8))
-    return width * height
+    return rgba_pixels(data if pixels and data[:4] in (b"\x89PNG", b"RIFF") else b"", f"{path}: {name}")
 
 
 def _book(part: dict[str, Any]) -> np.ndarray:

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
-from fidsplat.formats.plain import check_file, cloud_of, plain_colors, refuse_boxes, three_scales, world_means
+from fidsplat.files import atomic_write, regular_file
+from fidsplat.formats.plain import cloud_of, plain_colors, refuse_boxes, three_scales, world_means
 from fidsplat.harmonics import C0
+from fidsplat.input_limit import check_expansion
 from fidsplat.splats import SplatCloud
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -23,12 +24,12 @@ _SEEN = 4096
 
 def load_splat(path: Path) -> SplatCloud:
     """Read a .splat file. Raises InputError where it is not one."""
-    check_file(path, "a .splat file")
-    size = path.stat().st_size
+    size = regular_file(path).stat().st_size
     if not size or size % _ROW.itemsize:
         raise InputError(
             f"{path}: {size} bytes are not rows of {_ROW.itemsize}; cut short, or not a .splat file"
         )
+    check_expansion(path, 4 * size, f"{size // _ROW.itemsize:,} splats")
     rows = np.memmap(path, _ROW, "r").view(np.ndarray)
     means, scales = rows["means"][:_SEEN], rows["scales"][:_SEEN]
     if not (np.isfinite(means).all(1) & np.isfinite(scales).all(1) & (scales > 0).any(1)).any():

@@ -34,7 +34,7 @@ _FEW = 2**20
 
 def load_spz(path: Path) -> SplatCloud:
     """Read an SPZ file. Raises InputError where it is none, is cut short, or has another version."""
-    data = content(path, "an SPZ file", (b"\x1f\x8b", b"NGSP"))
+    data = content(path, (b"\x1f\x8b", b"NGSP"))
     if data[:4] == _MAGIC.to_bytes(4, "little"):  # without gzip around it
         raise InputError(
             f"{path}: SPZ of version {int.from_bytes(data[4:8], 'little')}; versions 2 and 3 are read"

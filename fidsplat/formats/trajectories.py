@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Trajectory
 from fidsplat.cameras.trajectory import check_rate
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, path_of
+from fidsplat.files import atomic_write, from_json, path_of, read_input
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import image_poses
 from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
@@ -53,7 +52,7 @@ def load_trajectory(path: str | os.PathLike[str], rate: float = RATE, smooth: bo
     check_rate(rate)
     if file.is_dir():
         file = _of_folder(file)
-    content = _content(file)
+    content = read_input(file, MAX_BYTES)
     if file.suffix.lower() == ".bin" or file.name == "images.txt":
         times, poses = None, _colmap(file)
     else:
@@ -153,18 +152,6 @@ def _of_folder(folder: Path) -> Path:
         if (folder / name).is_file():
             return folder / name
     raise InputError(f"{folder} is a folder without images.bin, images.txt or transforms.json")
-
-
-def _content(file: Path) -> bytes:
-    try:
-        status = file.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise InputError(f"{file} is not an ordinary file, so not a trajectory")
-        if status.st_size > MAX_BYTES:
-            raise InputError(f"{file} has {status.st_size} bytes; a trajectory has at most {MAX_BYTES}")
-        return file.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
 
 
 def _lines(file: Path, text: str) -> tuple[list[float] | None, list[np.ndarray]]:

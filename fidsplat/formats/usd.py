@@ -13,19 +13,21 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_path
+from fidsplat.files import atomic_path, open_input, utf8_path
 from fidsplat.formats.plain import (
     HALF_TURN,
-    check_file,
     cloud_of,
     coefficients,
     refuse_boxes,
     three_scales,
     world_means,
 )
+from fidsplat.input_limit import check_expansion
 from fidsplat.splats import SplatCloud
 
 _SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
+_ENTRY = 32
+"""bytes of memory that an entry of a section takes"""
 _KINDS = ("ParticleField", "ParticleField3DGaussianSplat")
 
 
@@ -37,11 +39,37 @@ def load_usd(path: Path) -> SplatCloud:
             missing.
     """
     pxr = _pxr()
-    check_file(path, "a USD file")
     try:
-        stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)
-    except pxr.Tf.ErrorException:
+        _check_sections(path)
+        with utf8_path(path) as name:
+            return _load(pxr, path, name)
+    except InputError:
+        raise
+    # also of arrays, which are read late, when they are requested
+    except (pxr.Tf.ErrorException, RuntimeError, OSError, OverflowError, ValueError):
         raise InputError(f"{path} is not a USD file that can be read") from None
+
+
+def _check_sections(path: Path) -> None:
+    """Check the counts of a crate file's sections, by which USD takes memory before it reads what they count
+    (pxr/usd/sdf/crateFile.cpp). Raises InputError beyond the limit."""
+    with open_input(path) as stream:
+        head = stream.read(24)
+        if head[:8] != b"PXR-USDC" or len(head) < 24:
+            return
+        stream.seek(int.from_bytes(head[16:24], "little"))
+        count = int.from_bytes(stream.read(8), "little")
+        sections = [stream.read(32) for _ in range(min(count, 64))]
+        for section in sections:
+            stream.seek(int.from_bytes(section[16:24], "little"))
+            name, numbers = section[:16].rstrip(b"\0").decode("ascii", "replace"), stream.read(16)
+            counts = [int.from_bytes(numbers[at : at + 8], "little") for at in (0, 8)]
+            need = max(_ENTRY * counts[0], counts[1] if name == "TOKENS" else 0)  # tokens also have a length
+            check_expansion(path, need, f"{counts[0]:,} entries in its section {name}")
+
+
+def _load(pxr: Any, path: Path, name: Path) -> SplatCloud:
+    stage = pxr.Usd.Stage.Open(str(name), pxr.Usd.Stage.LoadAll)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in _KINDS]
     if not prims:
         raise InputError(f"{path} holds no ParticleField")

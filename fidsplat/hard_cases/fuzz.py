@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.files import atomic_write, from_json
+from fidsplat.files import atomic_write, from_json, read_text
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, RARE, RISKY, Picture, compare, draw, truth_of
 from fidsplat.hard_cases.clouds import quaternion
 from fidsplat.provenance import code_hash
@@ -220,7 +220,7 @@ def _key(renderer: Renderer) -> str:
 
 def _load(file: Path | None, key: str) -> FuzzState:
     try:
-        values = from_json(file.read_text("utf-8")) if file is not None else {}
+        values = from_json(read_text(file)) if file is not None else {}
         if values.get("key") != key:
             return FuzzState(key)
         for name in ("uncertified", "largest"):

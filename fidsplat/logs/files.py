@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of, writable_folder
+from fidsplat.files import atomic_write, path_of, printable, writable_folder
 
 try:
     from mcap.writer import Writer as McapWriter
@@ -116,7 +116,8 @@ class _Bag:
     def __init__(self, target: Path, store: Any) -> None:
         self._target, self._store = target, store
         self._folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
-        self._writer = BagWriter(self._folder / target.name, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        self._made = self._folder / printable(target.name)
+        self._writer = BagWriter(self._made, version=9, storage_plugin=StoragePlugin.SQLITE3)
         self._writer.open()
         self._connections: dict[str, Any] = {}
 
@@ -133,7 +134,7 @@ class _Bag:
                     self._writer.close()
                 if self._target.exists():
                     self._target.rename(self._folder / "before")
-                (self._folder / self._target.name).rename(self._target)
+                self._made.rename(self._target)
             else:
                 with suppress(Exception):  # what went wrong is known already
                     self._writer.close()

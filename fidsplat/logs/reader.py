@@ -7,18 +7,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.files import open_input, path_of, regular_file, utf8_path
+from fidsplat.input_limit import check_expansion
 from fidsplat.logs.files import typestore
 from fidsplat.rotations import rigid_matrix
 from fidsplat.vision.images import decoded
 
 try:
+    import lz4.frame
+    import zstandard
+    from mcap.data_stream import ReadDataStream
     from mcap.reader import make_reader
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
     from rosbags.rosbag2 import Reader as BagReader
 except ImportError as error:
     raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
@@ -102,14 +108,45 @@ def _damage_told(file: Path) -> Iterator[None]:
 def _messages(file: Path) -> Iterator[tuple[str, str, int, bytes]]:
     """Topic, type, time in nanoseconds, CDR."""
     if file.is_dir():
-        with BagReader(file) as bag:
+        for part in file.iterdir():
+            regular_file(part)
+        with utf8_path(file) as name, BagReader(name) as bag:
             for connection, time, data in bag.messages():
                 yield connection.topic, connection.msgtype, time, data
         return
-    with file.open("rb") as stream:
+    with open_input(file) as stream:
+        _check_chunks(file, stream)
         for schema, channel, message in make_reader(stream).iter_messages():
             if schema is not None and channel.message_encoding == "cdr":
                 yield channel.topic, schema.name, message.log_time, message.data
+
+
+def _check_chunks(file: Path, stream: BinaryIO) -> None:
+    """Check what the chunks of an MCAP file expand to: one by one, or without an index, which says in which
+    order to read them, all together. Raises InputError above the limit."""
+    summary, need = make_reader(stream).get_summary(), 0
+    if summary is not None and summary.chunk_indexes:
+        for index in summary.chunk_indexes:
+            stream.seek(index.chunk_start_offset + 9)  # behind its opcode and length
+            chunk = Chunk.read(ReadDataStream(stream))
+            check_expansion(file, _expanded(chunk), "a chunk", len(chunk.data))
+    else:
+        stream.seek(0)
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                need += _expanded(record)
+                check_expansion(file, need, "chunks without an index")
+    stream.seek(0)
+
+
+def _expanded(chunk: Chunk) -> int:
+    """Bytes that a chunk expands to, by itself or by its compressed data, whichever says more."""
+    said = 0
+    if chunk.compression == "zstd":
+        said = zstandard.frame_content_size(chunk.data)
+    elif chunk.compression == "lz4":
+        said = lz4.frame.get_frame_info(chunk.data)["content_size"]
+    return max(chunk.uncompressed_size, said)
 
 
 def _stamp(header: Any) -> int:

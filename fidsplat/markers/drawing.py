@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.files import read_input
 from fidsplat.markers.paths import (
     FARTHEST,
     Rings,
@@ -119,11 +120,7 @@ def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
 
 def _root(path: Path) -> ElementTree.Element:
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path} is larger than {MOST_BYTES // 1_000_000} MB: simplify the drawing")
-        root = ElementTree.fromstring(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"cannot read the drawing {path}: {error.strerror or error}") from error
+        root = ElementTree.fromstring(read_input(path, MOST_BYTES))
     except ElementTree.ParseError as error:
         raise InputError(f"{path} is no SVG file: {error}") from None
     if _tag(root) != "svg":

@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.files import path_of, read_input
 from fidsplat.formats import Progress, load_splats
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
@@ -101,13 +101,7 @@ def read_scene(
 
 
 def _parse(file: Path) -> dict:
-    try:
-        with file.open("rb") as stream:
-            content = stream.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {file}: {getattr(error, 'strerror', None) or error}") from error
-    if len(content) > MAX_BYTES:
-        raise InputError(f"{file} is longer than {MAX_BYTES} bytes, which no scene file is")
+    content = read_input(file, MAX_BYTES)
     try:
         text = content.decode("utf-8-sig")  # editors of Windows mark a file as UTF-8
         if any(match["long"] for match in _LONG_KEY.finditer(text)):

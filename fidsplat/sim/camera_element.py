@@ -12,7 +12,7 @@ import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, fisheye_focal_length, focal_length
 from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.files import open_input, path_of
 from fidsplat.rotations import quaternion_multiply
 from fidsplat.sensor import Sensor
 from fidsplat.sim.poses import IDENTITY, check_poses, compose, inverse, matrix_of
@@ -56,9 +56,10 @@ def parse(path: str | os.PathLike[str]) -> tuple[ElementTree.Element, Place]:
     """A file's root. Raises InputError for a file that cannot be read, or is no XML."""
     file = path_of(path)
     try:
-        root = ElementTree.parse(file).getroot()
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+        with open_input(file) as stream:
+            root = ElementTree.parse(stream).getroot()
+    except InputError:
+        raise
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # or an encoding that nobody knows
         raise InputError(f"{file} is no XML: {error}") from None
     for element in root.iter():

@@ -29,7 +29,7 @@ from fidsplat.sim.poses import IDENTITY, compose, inverse, matrix_of
 from fidsplat.sim.rig import RigCamera
 
 DEEPEST = 32
-"""includes within includes"""
+"""includes within includes, and models within models"""
 
 
 @dataclass
@@ -55,7 +55,9 @@ class Description:
 
 
 def read_description(
-    path: str | os.PathLike[str], models: Iterable[str | os.PathLike[str]] = ()
+    path: str | os.PathLike[str],
+    models: Iterable[str | os.PathLike[str]] = (),
+    most_models: int = 10_000,
 ) -> Description:
     """The cameras and links of an SDF or URDF file.
 
@@ -67,10 +69,12 @@ def read_description(
         path: the file, or a model's folder with model.sdf in it.
         models: folders in which `model://NAME` is looked for, before those of the environment variables
             GZ_SIM_RESOURCE_PATH and SDF_PATH and the file's own.
+        most_models: models that an SDF file may have with all includes, of which a few lines make millions.
 
     Raises:
-        InputError: a file that cannot be read, an include that is not found or that includes itself, a value
-            that makes no camera, two cameras of one name; it names the file and the element.
+        InputError: a file that cannot be read, more models or deeper ones than may be, an include that is not
+            found or that includes itself, a value that makes no camera, two cameras of one name; it names the
+            file and the element.
     """
     file = path_of(path)
     if file.is_dir():
@@ -83,7 +87,7 @@ def read_description(
         folders = [Path(folder) for folder in models]
         for variable in ("GZ_SIM_RESOURCE_PATH", "SDF_PATH"):
             folders += [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
-        reader = _Sdf(found, folders)
+        reader = _Sdf(found, folders, most_models)
         reader.group(root, "", IDENTITY, place, ())
         for world in root.findall("world"):
             reader.group(world, "", IDENTITY, place.within("world"), ())
@@ -96,6 +100,10 @@ def read_description(
 class _Sdf:
     found: Description
     folders: list[Path]
+    most_models: int
+    models: int = 0
+    parsed: dict[Path, tuple[ElementTree.Element, Place]] = field(default_factory=dict)
+    """included files"""
 
     def group(
         self, parent: ElementTree.Element, prefix: str, at: np.ndarray, place: Place, files: tuple[Path, ...]
@@ -114,7 +122,9 @@ class _Sdf:
         file = self._file_of(uri, place)
         if file in files or len(files) >= DEEPEST:
             raise place.wrong("it includes itself")
-        root, inner = parse(file)
+        if file not in self.parsed:
+            self.parsed[file] = parse(file)
+        root, inner = self.parsed[file]
         model = root.find("model")
         if model is None:
             raise inner.wrong("it has no <model> to include")
@@ -145,6 +155,14 @@ class _Sdf:
         """One model, whose parent stands at `at`. An include may give it another name and pose."""
         own = name or name_of(model, place)
         place = place.within(own)
+        self.models += 1
+        if self.models > self.most_models:
+            raise place.wrong(
+                f"the file must have at most {self.most_models:,} models with its includes, got more; "
+                "read_description(..., most_models=N) allows N"
+            )
+        if prefix.count("::") >= DEEPEST:
+            raise place.wrong(f"models must be nested at most {DEEPEST} deep, got more; flatten them")
         here = compose(at, pose_element(model, place) if pose is None else pose)
         frames = _Frames(model, place)
         for link in model.findall("link"):

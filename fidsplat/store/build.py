@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError, bytes_words
-from fidsplat.files import atomic_write, from_json
+from fidsplat.files import atomic_write, from_json, read_input
 from fidsplat.formats.collect import Progress
 from fidsplat.store.columns import Columns, nodes_of
 from fidsplat.store.folders import emptied, filled, refuse_existing, store_folder
@@ -104,7 +104,7 @@ class _Build:
     def _begun(self) -> dict[str, Any]:
         """What is done; nothing, if it was begun from other inputs or not at all."""
         try:
-            state = from_json((self.folder / "state.json").read_bytes())
+            state = from_json(read_input(self.folder / "state.json"))
             if state["plan"] == self.plan.digest and self._there(state):
                 return state
         except (OSError, ValueError, KeyError, TypeError):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json
+from fidsplat.files import atomic_write, from_json, read_input
 from fidsplat.store.layout import header_crc
 
 FILE = "detail.json"
@@ -71,8 +71,11 @@ def load_details(folder: Path, identity: str) -> list[Detail]:
     """What was measured with a store; nothing, if it was another one then. Raises InputError for a file that
     is damaged."""
     file = folder / FILE
+    if not file.exists():
+        return []
+    content = read_input(file)
     try:
-        said = from_json(file.read_bytes())
+        said = from_json(content)
         if said["crc"] != header_crc(said):
             raise ValueError
         if said["identity"] != identity:
@@ -83,10 +86,6 @@ def load_details(folder: Path, identity: str) -> list[Detail]:
             if len(one.sizes) != len(one.errors) or list(one.sizes) != sorted(map(float, one.sizes)):
                 raise ValueError
             _ = [float(error) for error in one.errors if error is not None]
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{file} is damaged; remove it, and run `fidsplat store measure` again") from None
     return made

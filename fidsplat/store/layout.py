@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json
+from fidsplat.files import atomic_write, from_json, open_input, read_input
 
 FORMAT, VERSION = "fidsplat store", 1
 SUFFIX = ".fss"
@@ -107,11 +107,11 @@ def read_header(folder: Path) -> Header:
     """Raises InputError for what is no store, or one of a newer version."""
     file = folder / HEADER
     try:
-        said = from_json(file.read_bytes())
-    except FileNotFoundError:
-        raise InputError(f"{folder} is not a store: it has no {HEADER}") from None
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+        said = from_json(read_input(file))
+    except InputError as error:
+        if not file.exists():
+            raise InputError(f"{folder} is not a store: it has no {HEADER}") from None
+        raise error
     except ValueError:
         raise InputError(f"{file} is damaged: it is not JSON; build the store again") from None
     if not isinstance(said, dict) or said.get("format") != FORMAT:
@@ -170,7 +170,8 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
 def load_array(file: Path) -> np.ndarray:
     """The array of an .npy file. Raises OSError, EOFError or ValueError, whatever is damaged."""
     try:
-        return np.load(file, allow_pickle=False)
+        with open_input(file) as stream:
+            return np.load(stream, allow_pickle=False)
     except TokenError as error:  # of the header's Python
         raise ValueError(f"its header is damaged: {error}") from None
 
@@ -208,10 +209,10 @@ def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], start
     file, wanted = column_file(folder, name), npy_header(kind, shape)
     size = NPY_HEADER + row_bytes(kind, shape[1:]) * shape[0]
     try:
-        with file.open("rb") as stream:
+        with open_input(file) as stream:
             begins, found = stream.read(NPY_HEADER), os.fstat(stream.fileno()).st_size
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}; the store is not whole") from error
+    except InputError as error:
+        raise InputError(f"{error}; the store is not whole") from error
     if found < size:
         lost = max(found - NPY_HEADER, 0) // max(row_bytes(kind, shape[1:]), 1)
         chunk = max(int(np.searchsorted(starts, lost, "right")) - 1, 0)
@@ -238,8 +239,8 @@ def read_nodes(folder: Path, crc: int) -> np.ndarray:
     file = folder / NODES
     try:
         nodes = load_array(file)
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}; the store is not whole") from error
+    except InputError as error:
+        raise InputError(f"{error}; the store is not whole") from error
     except (ValueError, EOFError):
         nodes = np.empty(0)
     if nodes.dtype != NODE or nodes.ndim != 1 or zlib.crc32(nodes.tobytes()) != crc:

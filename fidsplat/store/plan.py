@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.files import printable
 from fidsplat.formats.collect import WINDOW
 from fidsplat.store.layout import CHUNK, MOST_SPLATS, NODE, row_bytes, shapes_of
 from fidsplat.store.merge import REDUCTION
@@ -91,7 +92,7 @@ class Plan:
         """Hexadecimal digits of all that decides what is built."""
         sha = hashlib.sha256()
         for source in self.sources:
-            sha.update(f"{source.stamp} {source.rows.count} {source.first_plane}\n".encode())
+            sha.update(printable(f"{source.stamp} {source.rows.count} {source.first_plane}\n").encode())
         own = (self.chunk, self.memory, self.levels, self.sh_degree, self.columns, self.grid)
         sha.update(repr(own).encode() + self.origin.tobytes() + self.splitters.tobytes())
         return sha.hexdigest()

@@ -12,7 +12,7 @@ import numpy as np
 
 from fidsplat import __version__
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json
+from fidsplat.files import atomic_write, from_json, open_input
 from fidsplat.provenance import code_hash
 from fidsplat.splats import SplatCloud
 from fidsplat.train.dataset import Dataset
@@ -64,7 +64,7 @@ def save_checkpoint(
     }
     arrays = {f"{group}.{name}": getattr(made.splats, group)[name] for group in _GROUPS for name in NAMES}
     arrays |= {"gradients": made.splats.gradients, "seen": made.splats.seen, **made.history}
-    with atomic_write(file) as stream:
+    with atomic_write(file, durable=True) as stream:
         np.savez(stream, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
 
 
@@ -74,11 +74,13 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
     Raises InputError for a file that is damaged or of another version.
     """
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with open_input(file) as stream, np.load(stream, allow_pickle=False) as arrays:
             facts = from_json(bytes(arrays["facts"]))
             red, green, blue = map(float, facts["background"])
             splats = Splats.of({name: arrays[f"values.{name}"] for name in NAMES})
         cloud = splats.cloud(int(facts["settings"]["sh_degree"]), np.array(facts["origin"], np.float64))
+    except InputError:
+        raise
     except _DAMAGED as error:
         raise InputError(f"{file} is no checkpoint of `fidsplat train` that can be read: {error}") from error
     return cloud, (red, green, blue)
@@ -100,7 +102,7 @@ def load_checkpoint(
     Raises InputError for a file that is damaged or of another run, which it names the difference of.
     """
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with open_input(file) as stream, np.load(stream, allow_pickle=False) as arrays:
             facts = from_json(bytes(arrays["facts"]))
             if facts.get("format") != _FORMAT:
                 raise ValueError("it is of another version of fidsplat")
@@ -108,6 +110,8 @@ def load_checkpoint(
             splats = Splats(values, first, second, arrays["gradients"], arrays["seen"])
             history = {name: arrays[name] for name in _HISTORY}
             before = [str(facts["by"][name]) for name in _made_by(device)]
+    except InputError:
+        raise
     except _DAMAGED as error:
         raise InputError(
             f"{file} is no checkpoint that can be read: {error}; remove it, or give --overwrite to begin "

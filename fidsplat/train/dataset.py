@@ -12,6 +12,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
+from fidsplat.files import printable
 from fidsplat.train.random_numbers import Purpose, uniform
 
 FAR = 1e4
@@ -114,7 +115,7 @@ class Dataset:
         for view in self.views:
             camera = view.camera
             lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-            found.update(f"{view.name} {lens}".encode() + camera.world_to_camera.tobytes())
+            found.update(printable(f"{view.name} {lens}").encode() + camera.world_to_camera.tobytes())
             found.update(np.ascontiguousarray(view.picture).tobytes())
             if view.mask is not None:
                 found.update(np.ascontiguousarray(view.mask).tobytes())

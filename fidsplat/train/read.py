@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import from_json, path_of
+from fidsplat.files import from_json, path_of, read_text
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
 from fidsplat.quality import whole_number
 from fidsplat.train.dataset import Dataset, TrainingView
@@ -120,9 +120,10 @@ def _mask(mask: Path) -> np.ndarray | None:
 def _background(folder: Path) -> Background:
     for name in NOTES:
         file = folder / name
-        if file.is_file():
+        if file.exists():
+            text = read_text(file, "replace")
             try:
-                value = from_json(file.read_text("utf-8")).get("background", 0.0)
+                value = from_json(text).get("background", 0.0)
                 red, green, blue = np.broadcast_to(np.asarray(value, float), 3).tolist()
             except (ValueError, AttributeError, TypeError):
                 raise InputError(f"{file} is damaged; background must be a number or three") from None

@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, focal_length
 from fidsplat.errors import InputError
-from fidsplat.files import from_json
+from fidsplat.files import from_json, read_text
 from fidsplat.formats.ply_header import read_header
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.flat import flat_view
@@ -67,11 +67,11 @@ def load_transforms(path: Path, tell: Callable[[str, float], None]) -> Found:
 
 def _table(file: Path) -> dict[str, Any]:
     try:
-        table = from_json(file.read_text("utf-8"))
+        table = from_json(read_text(file))
         if not isinstance(table, dict) or not isinstance(table.get("frames"), list):
             raise ValueError("it has no list of frames")
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{file} is no transforms.json: {error}") from None
     return table
@@ -87,7 +87,7 @@ def _views(file: Path, table: dict, tell: Callable[[str, float], None], words: s
                 matrix = np.vstack([matrix, (0, 0, 0, 1)])
             if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
                 raise ValueError
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             raise InputError(
                 f"{file}: frame {number} needs a file_path and a transform_matrix of 4 x 4 finite numbers"
             ) from None

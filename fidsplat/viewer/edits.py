@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, read_input
 from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.store.layout import SUFFIX as STORE
 
@@ -78,10 +78,7 @@ class SceneFile:
         self.text = self._seen = text
 
     def _read(self) -> str:
-        try:
-            return self.path.read_bytes().decode("utf-8", "replace")
-        except OSError as error:
-            raise InputError(f"cannot read {self.path}: {error.strerror or error}") from error
+        return read_input(self.path).decode("utf-8", "replace")
 
 
 def placed(text: str, number: int, pose: np.ndarray, name: str, kind: str = "markers") -> str:

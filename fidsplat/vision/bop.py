@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, writable_folder
+from fidsplat.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.vision.images import write_png
 from fidsplat.vision.truth import Box, MarkerTruth, Truth
 from fidsplat.vision.visible import outline
@@ -149,8 +149,8 @@ def _model(marker: MarkerTruth) -> dict[str, Any]:
 def _known(path: Path) -> dict[str, dict[str, Any]]:
     """The models that other scenes have written."""
     try:
-        return from_json(path.read_text("utf-8")) if path.exists() else {}
-    except (OSError, ValueError) as error:
+        return from_json(read_text(path)) if path.exists() else {}
+    except ValueError as error:
         raise InputError(f"cannot read {path}: {error}; give another folder") from None
 
 

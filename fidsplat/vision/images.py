@@ -10,11 +10,22 @@ import cv2
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of
+from fidsplat.files import atomic_write, path_of, read_input, utf8_path
+from fidsplat.input_limit import check_expansion
+from fidsplat.stderr import without_stderr
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
 
+_CONTAINERS = (
+    *((4, kind) for kind in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")),
+    (0, b"\x1aE\xdf\xa3"),
+    (8, b"AVI "),
+)
+"""how MP4 and QuickTime, Matroska and WebM, and AVI files begin: place and bytes"""
+
+_PIXEL = 8
+"""bytes of memory that a pixel takes while it is read"""
 MAX_BITS = 2**26
 """values of a marker image that are looked at: four for each of 4096 x 4096 modules, which are most"""
 
@@ -80,20 +91,31 @@ def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
         for name in names:
             yield str(name), read_image(name)
     elif is_video(file):
-        with _silent_opencv():
-            video = cv2.VideoCapture(str(file))
-            done, frame = video.read()
-        if not done:
-            raise InputError(
-                f"{file} is not a video that OpenCV can read; convert it to MP4 (H.264), or to pictures"
-            )
-        number = 0
-        while done:
-            yield f"{file}:{number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
-            number += 1
-            done, frame = video.read()
+        yield from _frames(file)
     else:
         yield str(path), read_image(file)
+
+
+def _frames(file: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and pictures of a video."""
+    head = read_input(file, first=12)
+    video = cv2.VideoCapture()
+    # FFmpeg goes by the content: playlists and scripts, whatever their name, open other files and addresses
+    if any(word == head[at : at + len(word)] for at, word in _CONTAINERS):
+        with _silent_opencv(), utf8_path(file.absolute()) as name:
+            video.open(str(name), cv2.CAP_FFMPEG)
+    number = 0
+    while True:
+        with _silent_opencv():
+            done, frame = video.read()
+        if not done:
+            break
+        yield f"{file}:{number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+        number += 1
+    if not number:
+        raise InputError(
+            f"{file} is not a video that OpenCV can read; convert it to MP4 (H.264), or to pictures"
+        )
 
 
 def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
@@ -221,8 +243,59 @@ def encoded(image: np.ndarray, kind: str, quality: int = 95) -> bytes:
     return data.tobytes()
 
 
+def declared_pixels(data: bytes | np.ndarray) -> int:
+    """Pixels of a PNG, WebP (RFC 9649), JPEG, BMP or TIFF image by its header; 0 for another file."""
+    head = bytes(data[:32])
+    body = head[20:30]
+    if head[:8] == b"\x89PNG\r\n\x1a\n":
+        return int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big")
+    if head[:2] == b"BM":
+        width, height = (int.from_bytes(head[at : at + 4], "little", signed=True) for at in (18, 22))
+        return abs(width * height)
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        if head[12:16] == b"VP8L":  # 14 bits each, less 1, after a byte
+            bits = int.from_bytes(body[1:5], "little")
+            return ((bits & 0x3FFF) + 1) * ((bits >> 14 & 0x3FFF) + 1)
+        if head[12:16] == b"VP8X":  # 24 bits each, less 1, after 4 bytes
+            return (int.from_bytes(body[4:7], "little") + 1) * (int.from_bytes(body[7:10], "little") + 1)
+        width, height = (int.from_bytes(body[k : k + 2], "little") & 0x3FFF for k in (6, 8))
+        return width * height
+    if head[:2] == b"\xff\xd8":
+        return _jpeg_pixels(data)
+    return _tiff_pixels(data) if head[:4] in (b"II*\0", b"MM\0*") else 0
+
+
+def _jpeg_pixels(data: bytes | np.ndarray) -> int:
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        kind, size = int(data[at + 1]), int.from_bytes(bytes(data[at + 2 : at + 4]), "big")
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):  # a frame's header
+            height, width = (int.from_bytes(bytes(data[at + k : at + k + 2]), "big") for k in (5, 7))
+            return height * width
+        at += 1 if kind == 0xFF else 2 + size
+    return 0
+
+
+def _tiff_pixels(data: bytes | np.ndarray) -> int:
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(bytes(data[at : at + size]), "little" if data[0] == 0x49 else "big")
+
+    first = number(4, 4)
+    sides = {}
+    for at in range(first + 2, first + 2 + 12 * number(first, 2), 12):
+        sides[number(at, 2)] = number(at + 8, 2 if number(at + 2, 2) == 3 else 4)  # a short, or a long
+    return sides.get(256, 0) * sides.get(257, 0)
+
+
+def _admit(data: bytes | np.ndarray, name: str | os.PathLike[str]) -> None:
+    pixels = declared_pixels(data)
+    check_expansion(os.fspath(name), _PIXEL * pixels, f"{pixels:,} pixels", len(data))
+
+
 def decoded(content: bytes) -> np.ndarray:
-    """The picture (h, w, 3) uint8 RGB of a file's content. Raises InputError for what is no picture."""
+    """The picture (h, w, 3) uint8 RGB of a file's content. Raises InputError for what is no picture, and
+    beyond `input_limit`."""
+    _admit(content, "a compressed picture")
     image = None
     with _silent_opencv(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
@@ -234,8 +307,10 @@ def decoded(content: bytes) -> np.ndarray:
 def rgba_pixels(data: bytes, name: str) -> np.ndarray:
     """(h, w, 4) uint8 of a picture file's content, alpha 255 where it has none.
 
-    name: of the file, for errors. Raises InputError for anything but a picture of 8 bits.
+    name: of the file, for errors. Raises InputError for anything but a picture of 8 bits, and beyond
+    `input_limit`.
     """
+    _admit(data, name)
     image = None
     with _silent_opencv(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
@@ -246,10 +321,8 @@ def rgba_pixels(data: bytes, name: str) -> np.ndarray:
 
 
 def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
-    try:
-        data = np.fromfile(path_of(path), np.uint8)
-    except OSError as error:
-        raise InputError(f"cannot read the image {path}: {error.strerror or error}") from error
+    data = np.frombuffer(read_input(path), np.uint8)
+    _admit(data, path)
     image = None
     # OpenCV raises when there are more pixels than its limit
     with _silent_opencv(), contextlib.suppress(cv2.error):
@@ -261,7 +334,7 @@ def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
 
 @contextlib.contextmanager
 def _silent_opencv() -> Iterator[None]:
-    """A damaged file is our error in one line, without OpenCV's warnings on stderr beside it."""
+    """Discard what OpenCV, libpng and FFmpeg write to stderr: a damaged file is one line, our error."""
     if hasattr(cv2, "setLogLevel"):  # OpenCV 4
         read, write = cv2.getLogLevel, cv2.setLogLevel  # type: ignore[attr-defined]
     else:
@@ -269,6 +342,7 @@ def _silent_opencv() -> Iterator[None]:
     before = read()
     write(0)
     try:
-        yield
+        with without_stderr():
+            yield
     finally:
         write(before)

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.files import open_input, read_input
 
 _SIGMA, _RADIUS = 1.5, 5  # pixels: Wang et al. 2004, as in the 3DGS and 2DGS papers
 _C1, _C2 = 0.01**2, 0.03**2
@@ -87,10 +88,7 @@ _EPSILON = 1e-10
 def weights_name(file: Path) -> str:
     """What tells weights apart in results: the start of the file's hash. Raises InputError when it cannot be
     read."""
-    try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
-    except OSError as error:
-        raise InputError(f"cannot read the LPIPS weights {file}: {error.strerror or error}") from error
+    return hashlib.sha256(read_input(file)).hexdigest()[:12]
 
 
 def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
@@ -99,8 +97,10 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
     Raises InputError when the file cannot be read or lacks an array or one has another shape.
     """
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with open_input(file) as stream, np.load(stream, allow_pickle=False) as arrays:
             weights = {name: np.asarray(arrays[name], np.float64) for name in arrays.files}
+    except InputError:
+        raise
     except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise InputError(f"{file} is no .npz file with LPIPS weights: {error}") from error
     for k, (out, into, size) in enumerate(_CHANNELS):

@@ -1,14 +1,31 @@
 """Files appear whole or not at all."""
 
+import json
 import os
+import threading
 
+import cv2
 import numpy as np
 import pytest
 
+import fidsplat as fs
+from fidsplat.cli import main
 from fidsplat.errors import InputError
+from fidsplat.experiments.charts import bars, chart
+from fidsplat.experiments.gallery import Piece, write_gallery
+from fidsplat.experiments.summary import read_summary
+from fidsplat.experiments.sweep import read_records
 from fidsplat.files import atomic_write, writable_folder
+from fidsplat.formats import load_splats, save_splats
+from fidsplat.formats.colmap import save_colmap
+from fidsplat.sim import read_description
+from fidsplat.store.build import build_store
 from fidsplat.store.layout import load_array
+from fidsplat.store.store import Store
+from fidsplat.train import splats_of
 from fidsplat.train.read import load_dataset
+from fidsplat.vision.images import pictures, read_image, write_png
+from fidsplat.vision.metrics import load_lpips
 
 
 def test_a_file_takes_the_place_of_the_old_one_only_when_it_is_whole(tmp_path):
@@ -81,3 +98,262 @@ def test_a_damaged_header_is_a_damaged_array(tmp_path):
     (tmp_path / "a.npy").write_bytes(whole.replace(b"(3,)", b"(3, "))
     with pytest.raises(ValueError, match="header"):
         load_array(tmp_path / "a.npy")
+
+
+def put_scene(folder, pipe, name):
+    (folder / "scene.toml").write_text(
+        f'[background]\nimage = "{pipe}"\n' if name == "panorama" else f'[[splats]]\nfile = "{pipe}"\n'
+    )
+    return fs.Scene.load(folder / "scene.toml")
+
+
+def put_gltf(folder, pipe):
+    save_splats(CLOUD, folder / "a.gltf")
+    document = json.loads((folder / "a.gltf").read_text())
+    document["buffers"][0]["uri"] = pipe.name
+    (folder / "a.gltf").write_text(json.dumps(document))
+    return load_splats(folder / "a.gltf")
+
+
+def put_transforms(folder, pipe, **facts):
+    matrix = np.eye(4).tolist()
+    write_png(folder / "a.png", np.zeros((4, 4)))
+    frame = {"file_path": "a.png", "transform_matrix": matrix, "fl_x": 4.0} | facts.pop("frame", {})
+    (folder / "transforms.json").write_text(json.dumps({"frames": [frame]} | facts))
+    return load_dataset(folder)
+
+
+def put_bag(folder, pipe, name):
+    from fidsplat.logs import log_pictures
+
+    (folder / "bag").mkdir()
+    pipe.rename(folder / "bag" / name)
+    return next(log_pictures(folder / "bag"))
+
+
+def put_colmap(folder, pipe, name):
+    model = folder / "sparse" / "0"
+    camera = fs.Camera.pinhole(4, 4, 4, 4, 2, 2)
+    save_colmap(model, ["a.png"], [camera], np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    place = folder / name
+    place.parent.mkdir(exist_ok=True)
+    place.unlink(missing_ok=True)
+    pipe.rename(place)
+    return load_dataset(folder)
+
+
+def put_store(folder, pipe, name):
+    fs.save_ply(CLOUD, folder / "a.ply")
+    build_store([folder / "a.ply"], folder / "a.fss")
+    (folder / "a.fss" / name).unlink()
+    pipe.rename(folder / "a.fss" / name)
+    return Store(folder / "a.fss")
+
+
+def in_logs(folder, pipe):
+    from fidsplat.logs import log_pictures
+
+    return next(log_pictures(pipe))
+
+
+def renamed(suffix, read):
+    return lambda folder, pipe: read(pipe.rename(folder / f"pipe{suffix}"))
+
+
+CLOUD = fs.SplatCloud([[0, 0, 1.0]], [[1.0, 0, 0, 0]], [[0.1, 0.1]], [0.5], colors=[[1.0, 0, 0]])
+INPUTS = {
+    **{
+        suffix: renamed(suffix, load_splats) for suffix in (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf")
+    },
+    "buffer of glTF": put_gltf,
+    "scene": lambda folder, pipe: fs.Scene.load(pipe),
+    "splats of a scene": lambda folder, pipe: put_scene(folder, pipe.rename(folder / "pipe.ply"), "splats"),
+    "panorama": lambda folder, pipe: put_scene(folder, pipe, "panorama"),
+    "picture": lambda folder, pipe: read_image(pipe),
+    "picture of a folder": lambda folder, pipe: next(pictures(pipe.rename(folder / "pipe.png").parent)),
+    "video": renamed(".mp4", lambda pipe: next(pictures(pipe))),
+    "marker image": lambda folder, pipe: fs.marker(f"image:{pipe}", size=0.1),
+    "drawing": lambda folder, pipe: fs.marker(f"svg:{pipe}", size=0.1),
+    **{f"trajectory {suffix}": renamed(suffix, fs.load_trajectory) for suffix in (".tum", ".json")},
+    "COLMAP trajectory": renamed(".bin", fs.load_trajectory),
+    "points of transforms.json": lambda folder, pipe: put_transforms(folder, pipe, ply_file_path="pipe"),
+    "mask": lambda folder, pipe: put_transforms(folder, pipe, frame={"mask_path": "pipe"}),
+    "picture of a data set": lambda folder, pipe: put_transforms(folder, pipe, frame={"file_path": "pipe"}),
+    **{
+        f"COLMAP {name}": lambda folder, pipe, name=name: put_colmap(folder, pipe, name)
+        for name in ("sparse/0/images.bin", "sparse/0/points3D.bin", "images/a.png", "dataset.json")
+    },
+    "checkpoint": lambda folder, pipe: splats_of(pipe),
+    "MCAP": in_logs,
+    **{
+        f"bag {name}": lambda folder, pipe, n=name: put_bag(folder, pipe, n)
+        for name in ("metadata.yaml", "a.db3")
+    },
+    "SDF": lambda folder, pipe: read_description(pipe),
+    **{
+        f"store {name}": lambda folder, pipe, name=name: put_store(folder, pipe, name)
+        for name in ("store.json", "nodes.npy", "means.npy")
+    },
+    "weights": lambda folder, pipe: load_lpips(pipe),
+    "summary": lambda folder, pipe: read_summary(pipe),
+    "records": lambda folder, pipe: read_records(pipe),
+}
+
+
+@pytest.fixture
+def pipe(tmp_path):
+    """A pipe that a thread writes nothing into, as often as somebody opens it: to read it ends, at once."""
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    kept = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # later names lead to the same pipe
+    done = threading.Event()
+
+    def write():
+        while not done.is_set():
+            os.close(os.open(f"/proc/self/fd/{kept}", os.O_WRONLY))
+            done.wait(0.01)
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    yield path
+    done.set()
+    writer.join()
+    os.close(kept)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_a_pipe_in_place_of_an_input_is_refused_and_not_waited_for(name, tmp_path, pipe):
+    with pytest.raises(InputError, match="must be a regular file, got a pipe"):
+        INPUTS[name](tmp_path, pipe)
+
+
+ODD = "a\udcff$x$"  # a byte that is not UTF-8, and what matplotlib takes for mathematics
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz", ".glb", ".gltf", ".usda", ".usdc", ".fss"])
+def test_splat_files_with_names_that_are_not_utf8(tmp_path, suffix):
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr.UsdVol", reason="pip install 'fidsplat[usd]'")
+    folder = tmp_path / ODD
+    folder.mkdir()
+    file = folder / f"{ODD}{suffix}"
+    if suffix == ".fss":
+        fs.save_ply(CLOUD, folder / f"{ODD}.ply")
+        build_store([folder / f"{ODD}.ply"], file)
+        assert Store(file).header.splats == 1
+        return
+    save_splats(CLOUD, file)
+    assert not file.is_symlink()
+    assert len(load_splats(file)) == 1
+
+
+def test_a_video_with_a_name_that_is_not_utf8_is_read(tmp_path):
+    file = tmp_path / f"{ODD}.avi"
+    write_avi(tmp_path / "a.avi").rename(file)
+    assert [image.shape for _, image in pictures(file)] == [(48, 64, 3)] * 3
+
+
+def write_avi(file):
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for k in range(3):
+        video.write(np.full((48, 64, 3), 80 * k, np.uint8))
+    video.release()
+    return file
+
+
+def test_a_bag_with_a_name_that_is_not_utf8(tmp_path):
+    from fidsplat.logs import RobotLog, log_pictures
+
+    with RobotLog(tmp_path / ODD) as log:
+        log.image(0.5, "front", np.zeros((4, 5, 3)))
+    assert [one.image.shape for one in log_pictures(tmp_path / ODD)] == [(4, 5, 3)]
+
+
+def test_pages_and_charts_of_names_that_are_not_utf8(tmp_path):
+    with chart(tmp_path / f"{ODD}.svg") as (_, (axes,)):
+        bars(axes, [ODD, "a$\\frac$"], {ODD: [1, 2], "b": [2, 3]})
+    assert "$x$" in (tmp_path / f"{ODD}.svg").read_text()
+    camera = fs.Camera.look_at(8, 6, 1.0, (0, 0, -1), (0, 0, 0))
+    piece = Piece(ODD, ODD, fs.Scene([CLOUD], camera=camera), "")
+    *_, page = write_gallery(tmp_path / ODD, [piece], "reference")
+    assert "a%FF%24x%24-rgb" in page.read_text()
+
+
+def test_a_script_of_ffmpeg_is_no_video_and_opens_no_other_file(tmp_path):
+    """FFmpeg knows them by their content, whatever they are called."""
+    write_avi(tmp_path / "secret.avi")
+    for text in ("ffconcat version 1.0\nfile secret.avi\n", "#EXTM3U\n#EXTINF:1,\nsecret.avi\n"):
+        (tmp_path / "a.mp4").write_text(text)
+        with pytest.raises(InputError, match="not a video"):
+            next(pictures(tmp_path / "a.mp4"))
+
+
+def test_damaged_images_and_videos_are_one_line(tmp_path, capfd):
+    """libpng and FFmpeg write to stderr by themselves."""
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    write_png(tmp_path / "a.png", noise)
+    write_avi(tmp_path / "a.avi")
+    for name, size in (("a.png", 4000), ("a.avi", 300)):
+        os.truncate(tmp_path / name, size)
+        assert main(["detect", str(tmp_path / name)]) == 2
+    (tmp_path / "a.mp4").write_bytes(b"\0\0\0\x18ftypisom" + bytes(90))
+    assert main(["detect", str(tmp_path / "a.mp4")]) == 2
+    out, err = capfd.readouterr()
+    assert [line[:9] for line in (out + err).splitlines()] == ["fidsplat:"] * 3
+
+
+def test_a_durable_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
+    done, sync, replace = [], os.fsync, os.replace
+
+    def synced(descriptor):
+        done.append("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "file")
+        sync(descriptor)
+
+    def replaced(*names):
+        done.append("replace")
+        replace(*names)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    with atomic_write(tmp_path / "a", durable=True) as stream:
+        stream.write(b"x")
+    assert done == ["file", "replace", "folder"]
+
+
+@pytest.mark.parametrize("value", ["1" + "0" * 400, "1e999"])
+def test_a_pose_beyond_all_numbers_is_an_input_error(tmp_path, value):
+    matrix = [[1, 0, 0, 7], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    text = json.dumps({"frames": [{"file_path": "a.png", "transform_matrix": matrix}]})
+    (tmp_path / "transforms.json").write_text(text.replace("7", value))
+    with pytest.raises(InputError, match=r"frame 0 needs .* 4 x 4 finite numbers"):
+        load_dataset(tmp_path)
+
+
+def test_an_array_of_usd_that_is_damaged_is_an_input_error(tmp_path):
+    """USD reads arrays late, when they are requested."""
+    pytest.importorskip("pxr.UsdVol", reason="pip install 'fidsplat[usd]'")
+    means = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    ones = np.ones((50, 4))
+    cloud = fs.SplatCloud(means, ones, ones[:, :2], ones[:, 0], colors=ones[:, :3])
+    save_splats(cloud, tmp_path / "a.usdc")
+    data = bytearray((tmp_path / "a.usdc").read_bytes())
+    count = data.index(cloud.means.tobytes()) - 8
+    assert int.from_bytes(data[count : count + 8], "little") == 50
+    data[count : count + 8] = (2**60).to_bytes(8, "little")
+    (tmp_path / "a.usdc").write_bytes(data)
+    with pytest.raises(InputError, match="not a USD file that can be read"):
+        load_splats(tmp_path / "a.usdc")
+
+
+def test_a_bag_that_names_a_file_outside_of_it(tmp_path):
+    """The file of that name within the bag is meant, or none."""
+    from fidsplat.logs import RobotLog, log_pictures
+
+    for name in ("bag", "other"):
+        with RobotLog(tmp_path / name) as log:
+            log.image(0.5, "front", np.zeros((4, 5, 3)))
+    (tmp_path / "other" / "other.db3").rename(tmp_path / "other.db3")
+    note = tmp_path / "bag" / "metadata.yaml"
+    note.write_text(note.read_text().replace("bag.db3", "../other.db3"))
+    with pytest.raises(InputError, match=r"files are missing: .*bag/other\.db3"):
+        next(log_pictures(tmp_path / "bag"))

@@ -14,11 +14,13 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "limits", "rotations", "scalars", "summaries"}
+BASE = {"errors", "files", "input_limit", "limits", "rotations", "scalars", "stderr", "summaries"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
+    "input_limit": {"errors"},
+    "stderr": set(),
     "files": BASE,
     "rotations": BASE,
     "scalars": {"errors"},

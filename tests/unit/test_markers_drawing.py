@@ -210,7 +210,7 @@ def test_files_that_are_no_drawings(tmp_path):
         file.write_text(text)
         with pytest.raises(fs.InputError, match=says):
             marker(f"svg:{file}")
-    with pytest.raises(fs.InputError, match="cannot read the drawing"):
+    with pytest.raises(fs.InputError, match=r"cannot read .*: No such file"):
         marker(f"svg:{tmp_path / 'missing.svg'}")
     for text, says in (("svg:", "names no file"), ("svg-0:a", "1 to 2048"), ("svg-x:a", "svg-512:FILE")):
         with pytest.raises(fs.InputError, match=says):

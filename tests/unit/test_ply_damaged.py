@@ -124,12 +124,12 @@ def test_missing_file(tmp_path):
 
 
 def test_folder(tmp_path):
-    refused(tmp_path, "is a folder")
+    refused(tmp_path, "must be a regular file, got a folder")
 
 
 def test_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
-    refused(tmp_path / "pipe.ply", "not a regular file")
+    refused(tmp_path / "pipe.ply", "must be a regular file, got a pipe")
 
 
 def test_name_that_cannot_be_one():
@@ -144,7 +144,7 @@ def test_unreadable_file(tmp_path, content, monkeypatch):
     def deny(*_):  # the tests may run as root, who may read everything
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(type(path), "open", deny)
+    monkeypatch.setattr(os, "open", deny)
     refused(path, "cannot read .*Permission denied")
 
 

@@ -177,7 +177,7 @@ def test_a_matrix_wrong(refused, rows, words):
     [
         (b"\x89PNG\r\n\x1a\n\xff\xfe", "not text in UTF-8"),
         (b"a = " + b"[" * 100000, "is not a scene file"),
-        (b"#" * (2**24 + 1), "longer than 16777216 bytes"),
+        (b"#" * (2**24 + 1), "at most 16,777,216 bytes"),
         (b"camera" + b".a" * 100_000 + b" = 1", "a dotted key has more than 8 parts"),
         (b"[" + b"a . " * 1_000_000 + b"a]", "a dotted key has more than 8 parts"),
         (b"a = {b = {" + b"'x'.\"y\"." * 4 + b"z = 1}}", "a dotted key has more than 8 parts"),
@@ -231,7 +231,7 @@ def test_what_is_no_path(path):
 def test_missing_and_unreadable_files(tmp_path):
     with pytest.raises(fs.InputError, match=r"cannot read .*none\.toml: No such file"):
         fs.Scene.load(tmp_path / "none.toml")
-    with pytest.raises(fs.InputError, match=r"cannot read .*: Is a directory"):
+    with pytest.raises(fs.InputError, match="must be a regular file, got a folder"):
         fs.Scene.load(tmp_path)
     with pytest.raises(fs.InputError, match="names no file"):
         fs.Scene.load("a\0b")

@@ -218,12 +218,15 @@ def test_a_checkpoint_of_another_run_is_refused(dataset, tmp_path):
             Trainer(dataset, renderer, checkpoint=file, iterations=3, **QUICK)
 
 
-def test_what_is_not_finite_ends_the_run_and_leaves_the_checkpoint(dataset, tmp_path):
+def test_what_is_not_finite_ends_the_run_and_leaves_the_checkpoint(dataset, tmp_path, monkeypatch):
     file = tmp_path / "scene.training.npz"
     renderer = fs.Renderer("reference")
     trainer = Trainer(dataset, renderer, iterations=9, checkpoint=file, **QUICK)
     trainer.step()
+    synced = []
+    monkeypatch.setattr(os, "fsync", synced.append)
     trainer.save_checkpoint()
+    assert len(synced) == 2  # the file and its folder: a power cut loses neither
     kept = sha(file)
     splats = trainer._work.store()
     splats.values["sh"][:] = np.nan

@@ -221,7 +221,7 @@ def test_files_that_hold_no_trajectory(tmp_path):
         stream.truncate(5 * 2**30)  # no disk is used
     (tmp_path / "bytes.tum").write_bytes(b"\xff\xfe")
     for name, words in (
-        ("large.tum", "5368709120 bytes; a trajectory has at most"),
+        ("large.tum", "at most 268,435,456 bytes, got 5,368,709,120"),
         ("bytes.tum", "not text"),
         ("none.tum", "cannot read"),
         (".", "t.json|without images.bin"),

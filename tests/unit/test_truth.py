@@ -159,6 +159,23 @@ def test_coco_reads_what_we_write(tmp_path, truth, scene, frame):
     assert outline["area"] == pytest.approx(mask.sum(), rel=0.05)
 
 
+def test_a_camera_of_bop_is_where_ours_is(tmp_path, scene, renderer):
+    """World to camera and marker to camera, in millimetres, say the same of a marker."""
+    moved = replace(scene, camera=a_camera(rigid_matrix((0.2, -0.1, 0.4), (1, 0.05, -0.1, 0.15))))
+    frame = renderer.render(moved)
+    with BopScene(tmp_path / "set/train/000000") as ours:
+        ours.add(frame, truth_of(frame, moved))
+    camera, gt = (
+        json.loads((tmp_path / f"set/train/000000/scene_{name}.json").read_text())["0"]
+        for name in ("camera", "gt")
+    )
+    turn, move = np.reshape(camera["cam_R_w2c"], (3, 3)), np.array(camera["cam_t_w2c"])
+    np.testing.assert_allclose(move, 1000 * moved.camera.world_to_camera[:3, 3], rtol=1e-12)
+    tag = moved.markers[0]
+    by_marker = 1000 * tag.marker.corners @ np.reshape(gt[0]["cam_R_m2c"], (3, 3)).T + gt[0]["cam_t_m2c"]
+    np.testing.assert_allclose(1000 * tag.corners @ turn.T + move, by_marker, atol=1e-9)
+
+
 def test_bop_has_what_its_format_asks_for(tmp_path, truth, frame, scene):
     folder = tmp_path / "set/train/000000"
     with BopScene(folder) as ours:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from types import ModuleType
 from fidsplat.backends.checked_cache import check_once
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
+from fidsplat.stderr import without_stderr
 
 MISSING = "Warp is not installed; install it with: pip install 'fidsplat[warp]' (or pip install warp-lang)"
 _PACKAGE = "fidsplat_warp_kernels"
@@ -40,7 +40,7 @@ def load() -> ModuleType:
         import warp
     except Exception as error:  # a broken installation, whatever it raises
         raise DeviceError(f"Warp cannot be imported: {error}") from error
-    with quiet(), _without_stderr():
+    with quiet(), without_stderr():
         warp.init()
     if folder := warp.config.kernel_cache_dir:
         check_once(Path(folder), lambda name: name.endswith(_LOADED), lambda _: True)
@@ -57,21 +57,6 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         warp.config.log_level = level
-
-
-@contextmanager
-def _without_stderr() -> Iterator[None]:
-    # Warp's native start says there that no CUDA driver is here, which is no error: `fidsplat devices` lists
-    # what is
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        with open(os.devnull, "w") as nothing:
-            os.dup2(nothing.fileno(), 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
 
 
 @cache

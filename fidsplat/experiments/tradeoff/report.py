@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from fidsplat.errors import InputError
-from fidsplat.experiments.charts import Axes, chart, label_points, plain_ticks
+from fidsplat.experiments.charts import Axes, chart, label_points, literal, plain_ticks
 from fidsplat.experiments.pages import fixed, number, percent, places, write_page
 from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.tradeoff.linear import ANGLES, DISTANCES
@@ -195,7 +195,7 @@ def _draw_panel(axes: Axes, device: Device, scene: str) -> list[tuple[float, flo
     )  # fmt: skip
     axes.margins(0.08)
     plain_ticks(axes.xaxis)
-    axes.set_title(f"{scene} on {device.title}")
+    axes.set_title(literal(f"{scene} on {device.title}"))
     named = points[names.notna()]
     return list(zip(named["ms"], named["error"], names[names.notna()], strict=True))
 
