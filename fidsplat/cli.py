@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from fidsplat.interrupts import Terminated, raised_in_time
+from fidsplat import interrupts
 
 ABOUT = """Fiducial markers made of 2D Gaussian splats: make them, set them in scenes, draw them, read them
 back.
@@ -48,9 +48,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     try:
-        with warnings.catch_warnings(), raised_in_time():
+        with warnings.catch_warnings(), interrupts.handled():
             warnings.showwarning = _show_warning
-            status = _parse(words).run()
+            interrupts.check()
+            command = _parse(words)
+            interrupts.check()
+            status = command.run()
+            interrupts.check()
         sys.stdout.flush()
         return status
     except SystemExit as stop:  # help, or words that could not be parsed
@@ -58,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         if not debug:  # what was stopped while it was made may complain when it is thrown away
             sys.unraisablehook = lambda _: None
-        return _fail(*(("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)))
+        terminated = isinstance(stop, interrupts.Terminated)
+        return _fail(*(("terminated", 143) if terminated else ("interrupted", 130)))
     except BrokenPipeError:
         _drop_output()  # whoever read it has gone; nothing is left to say to them
         return 1

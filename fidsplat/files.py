@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from fidsplat import interrupts
 from fidsplat.errors import InputError
 
 MAX_NAME, MAX_PATH = 255, 4095
@@ -78,6 +79,7 @@ def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path
 
     suffix: what that name ends with, for those that go by it.
     """
+    interrupts.check()
     target = ordinary_file(path)
     try:
         descriptor, name = tempfile.mkstemp(

@@ -10,6 +10,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.backends.base import (
     Adopts,
     DeviceInfo,
@@ -310,6 +311,7 @@ class Renderer:
                     )
 
     def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
+        interrupts.check()
         features, batch = prepare_batch(resident.whole, views)
         with self._lock:
             drawn = (batch.one(number) for number in range(len(batch.slots)))
@@ -340,6 +342,7 @@ class Renderer:
         ),
         band: tuple[int, int] | None = None,
     ) -> Frame:
+        interrupts.check()
         features, view = prepare(resident.whole, capture)
         if band is not None:
             view = replace(view, band=(band[0] * view.samples, band[1] * view.samples))

@@ -25,9 +25,9 @@ from fidsplat.commands.output import (
     writable_file,
 )
 from fidsplat.commands.sweeps import asked, need_reports
+from fidsplat import interrupts
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
-from fidsplat.interrupts import held_back
 
 if TYPE_CHECKING:
     from fidsplat.train import Step, Trainer, ViewScore
@@ -103,7 +103,7 @@ class Train:
             renderer = Renderer(self.device)
         trainer = Trainer(dataset, renderer, settings, checkpoint, restart=self.overwrite)
         before, begun = trainer.iteration, time.perf_counter()
-        with held_back() as stopped, _bar(trainer) as show:
+        with interrupts.postponed() as stopped, _bar(trainer) as show:
 
             def told(step: Step) -> None:
                 show(step)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter, Trajectory
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError
@@ -155,9 +156,9 @@ class Localise:
             for picture in self.pictures(variant, run, renderer):
                 waiting.append(pool.submit(detect, picture, (FAMILY,), qr=False))
                 if len(waiting) > 2 * workers:
-                    yield waiting.popleft().result()
+                    yield interrupts.result_of(waiting.popleft())
             while waiting:
-                yield waiting.popleft().result()
+                yield interrupts.result_of(waiting.popleft())
 
     def localised(
         self,

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.errors import InputError, bytes_words
 from fidsplat.files import atomic_write, from_json
 from fidsplat.formats.collect import Progress
@@ -145,9 +146,9 @@ class _Build:
         for one in given:
             waiting.append(pool.submit(work, one))
             if len(waiting) > (self.workers if most is None else most - 1):
-                yield waiting.popleft().result()
+                yield interrupts.result_of(waiting.popleft())
         while waiting:
-            yield waiting.popleft().result()
+            yield interrupts.result_of(waiting.popleft())
 
     # inputs to buckets
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.backends.derivatives import CompilesAhead, Differentiates, Trains
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.prepare import prepare
@@ -211,6 +212,7 @@ class Trainer:
 
     def _advance(self, late: bool) -> None:
         """An iteration. late: its loss may be asked for when others have followed."""
+        interrupts.check()
         made, settings = self._made, self.settings
         if self._failure is not None:
             raise self._failure
