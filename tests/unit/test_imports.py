@@ -14,7 +14,7 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "rotations", "scalars", "summaries"}
+BASE = {"errors", "files", "interrupts", "rotations", "scalars", "summaries"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
