@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from fidsplat import interrupts
 from fidsplat.commands.output import (
     Device,
     Json,
@@ -25,7 +26,6 @@ from fidsplat.commands.output import (
     writable_file,
 )
 from fidsplat.commands.sweeps import asked, need_reports
-from fidsplat import interrupts
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
 

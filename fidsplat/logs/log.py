@@ -33,14 +33,23 @@ class RobotLog:
         path: NAME.mcap, or a folder to be made.
         world: name of the frame in which poses are.
         overwrite: whether a log of that name is replaced.
+        source: text that identifies what the log is made from, kept in its metadata, by which `check_log`
+            finds that it is complete.
 
     Raises:
         InputError: the log exists, cannot be written, or the packages are missing (extra `logs`).
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, world: str = "map", overwrite: bool = False) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        world: str = "map",
+        overwrite: bool = False,
+        source: str = "",
+    ) -> None:
         self._store = typestore()
-        self._file = log_file(path, self._store, overwrite)
+        self._file = log_file(path, self._store, overwrite, source)
         self._path, self.world = path, world
         self._last: dict[str, float] = {}
 

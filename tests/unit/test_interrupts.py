@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from concurrent.futures import Future
 
 import interrupt
@@ -101,24 +102,33 @@ def test_an_interrupt_at_the_start_is_one_line(module):
     assert (ended.returncode, ended.stderr) == (130, "fidsplat: interrupted\n")
 
 
-@pytest.mark.parametrize("what", ["sleep", "task", "process", "output"])
-def test_what_waits_is_interrupted(what):
-    command = [sys.executable, "-c", "import time; time.sleep(60)"]
+SILENT = (sys.executable, "-c", "import time; time.sleep(60)")
+
+
+def _output_of_a_silent_process():
+    with subprocess.Popen(SILENT, stdout=subprocess.PIPE) as silent:
+        try:
+            list(interrupts.lines_of(silent.stdout))
+        finally:
+            silent.kill()
+
+
+@pytest.mark.parametrize(
+    "waiting",
+    [
+        lambda: interrupts.sleep(60),
+        lambda: interrupts.result_of(Future()),
+        lambda: interrupts.run(SILENT),
+        _output_of_a_silent_process,
+    ],
+    ids=["sleep", "task", "process", "output"],
+)
+def test_what_waits_is_interrupted(waiting):
+    later = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM))
     with interrupts.handled():
-        os.kill(os.getpid(), signal.SIGTERM)
+        later.start()
         with pytest.raises(interrupts.Terminated):
-            if what == "sleep":
-                interrupts.sleep(60)
-            elif what == "task":
-                interrupts.result_of(Future())
-            elif what == "process":
-                interrupts.run(command)
-            else:
-                with subprocess.Popen(command, stdout=subprocess.PIPE) as silent:
-                    try:
-                        list(interrupts.lines_of(silent.stdout))
-                    finally:
-                        silent.kill()
+            waiting()
     interrupts.check()  # the next command begins without the flag
 
 
