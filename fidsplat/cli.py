@@ -51,9 +51,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings(), interrupts.handled():
             warnings.showwarning = _show_warning
             interrupts.check()
-            command = _parse(words)
-            interrupts.check()
-            status = command.run()
+            try:
+                command = _parse(words)
+                interrupts.check()
+                status = command.run()
+            except Exception:
+                interrupts.check()  # it may be a consequence of the signal
+                raise
             interrupts.check()
         sys.stdout.flush()
         return status
