@@ -11,6 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from fidsplat import interrupts
+from fidsplat.arguments import whole_number
 from fidsplat.backends.base import (
     Adopts,
     DeviceInfo,
@@ -27,7 +28,7 @@ from fidsplat.cameras import Camera
 from fidsplat.capture import Capture, CaptureParts, output_names
 from fidsplat.errors import InputError, unknown
 from fidsplat.frame import Frame, check_process, stacked
-from fidsplat.quality import Quality, whole_number
+from fidsplat.quality import Quality
 from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud

@@ -6,9 +6,9 @@ import math
 import pickle
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any
 
+from fidsplat.arguments import as_float
 from fidsplat.budget import prices, store
 from fidsplat.budget.prices import Candidate
 from fidsplat.budget.search import Calibration, Search
@@ -191,8 +191,7 @@ def check_bounds(error: float | None, ms: float | None) -> None:
     if error is None and ms is None:
         raise InputError("a budget of nothing: give error=1e-3, or ms=20 with scene=... and capture=...")
     for name, value, example in (("error", error, "1e-3"), ("ms", ms, "20")):
-        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-        if value is not None and not number:
+        if value is not None and not math.isfinite(as_float(value)):
             raise InputError(f"{name} is {value!r}; it must be a finite number, e.g. {name}={example}")
 
 

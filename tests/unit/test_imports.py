@@ -14,13 +14,14 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "interrupts", "rotations", "scalars", "summaries"}
+BASE = {"arguments", "errors", "files", "interrupts", "rotations", "scalars", "summaries"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
     "rotations": BASE,
+    "arguments": {"errors"},
     "scalars": {"errors"},
     "interrupts": set(),
     "summaries": set(),
