@@ -183,7 +183,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         fs.place_store, {"store": _store(folder), "out": folder / "placed.fss", "poses": [np.eye(4)], "overwrite": True}, None
     ),
     "TrainingView": lambda _: (
-        TrainingView, {"name": "a", "camera": VIEWS[0].camera, "picture": VIEWS[0].picture, "mask": np.ones((12, 16), bool)}, None
+        TrainingView, {"name": "a", "camera": VIEWS[0].camera, "picture": VIEWS[0].picture, "mask": np.ones((18, 24), bool)}, None
     ),
     "Dataset": lambda _: (
         Dataset,
