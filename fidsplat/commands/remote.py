@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 RayAddress = Annotated[
     str | None,
-    option("ADDRESS", "let a Ray cluster do it: local, auto, ray://HOST:10001 (extra: ray; docs/command-line.md)"),
+    option(
+        "ADDRESS", "let a Ray cluster do it: local, auto, ray://HOST:10001 (extra: ray; docs/command-line.md)"
+    ),
 ]
 Workers = Annotated[
     int | None, option("N", "of --ray (default: one for each GPU, or for each machine without any)")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.arguments import as_float, callback, instance, whole_number
+from fidsplat.arguments import as_float, callback, instance, invalid, whole_number
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError
@@ -90,8 +90,8 @@ def refine(
     """
     start = time.perf_counter()
     instance("made", made, Marker, "what fs.marker returns")
-    if renderer is not None:
-        instance("renderer", renderer, Renderer, "an fs.Renderer or None")
+    if renderer is not None and not hasattr(renderer, "backend"):
+        raise invalid("renderer", "an fs.Renderer or None", renderer)
     callback("progress", progress)
     iterations = whole_number("iterations", iterations, 1, 100_000)
     if not 0 <= as_float(leak) <= 1:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fidsplat import interrupts
-from fidsplat.arguments import callback, instance, items
+from fidsplat.arguments import callback, instance, invalid, items
 from fidsplat.backends.derivatives import CompilesAhead, Differentiates, Trains
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.prepare import prepare
@@ -97,8 +97,8 @@ class Trainer:
         **changes: Any,
     ) -> None:
         self.dataset = instance("dataset", dataset, Dataset, remedy="load_dataset reads one")
-        if renderer is not None:
-            instance("renderer", renderer, Renderer, "an fs.Renderer or None")
+        if renderer is not None and not hasattr(renderer, "backend"):
+            raise invalid("renderer", "an fs.Renderer or None", renderer)
         if start is not None:
             instance("start", start, SplatCloud, "an fs.SplatCloud or None")
         self.settings = settings_with(settings, changes)
