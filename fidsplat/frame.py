@@ -175,17 +175,17 @@ class Frame(Mapping):
             InputError: rows that the picture does not have, or an array of another shape or type.
         """
         self._check(name)
-        by_rows = isinstance(self._images, ReadsRows)
+        by_rows = self._images if isinstance(self._images, ReadsRows) else None
         if into is None:
-            into = self._images.empty(name) if by_rows else np.empty_like(self[name])
-        elif not isinstance(into, np.ndarray) or not (by_rows or into.shape == self[name].shape):
+            into = by_rows.empty(name) if by_rows is not None else np.empty_like(self[name])
+        elif not isinstance(into, np.ndarray) or not (by_rows is not None or into.shape == self[name].shape):
             raise invalid("into", "an array of the shape of the output", into)
         whole_number("the end of the rows", end, 0, len(into))
         whole_number("the first row", first, 0, end)
-        if not by_rows:
+        if by_rows is None:
             into[first:end] = self[name][first:end]
             return into
-        self._images.read_rows(name, first, end, into)
+        by_rows.read_rows(name, first, end, into)
         if name == "splat_id":
             into[first:end] = numbered(name, into[first:end], self._ids)
         return into

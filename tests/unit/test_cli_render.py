@@ -276,7 +276,7 @@ def test_every_eighth_pixel_of_the_reference(scene, tmp_path, capsys):
         (("--device", "opencl:pocl", "--every", "8"), "draws whole pictures only"),
         (
             ("--device", "reference", "--every", "0"),
-            "step must be a whole number from 1 to 2147483647, got 0",
+            "step must be a whole number from 1",
         ),
     ):
         assert main(["render", scene, *words]) == 2
