@@ -4,7 +4,10 @@ Names are loaded on first use, so that ``import fidsplat`` imports no OpenCL, sh
 """
 
 from importlib import import_module
-from typing import Any
+
+TYPE_CHECKING = False  # typing would take most of the time of `import fidsplat`
+if TYPE_CHECKING:
+    from typing import Any
 
 __version__ = "0.1.0"
 
@@ -55,7 +58,7 @@ _PACKAGES = ("train",)
 __all__ = ["__version__", *sorted(_HOME), *_PACKAGES]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name in _PACKAGES:
         return import_module(f"fidsplat.{name}")
     home = _HOME.get(name)

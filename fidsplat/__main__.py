@@ -1,7 +1,24 @@
-"""`python -m fidsplat`: the command line of the interpreter at hand."""
+"""The `fidsplat` command and `python -m fidsplat`.
 
+Signals are handled before anything else is imported. Once the command is done they end the process at once.
+"""
+
+import signal
 import sys
 
-from fidsplat.cli import main
+from fidsplat import interrupts
 
-sys.exit(main())
+
+def main() -> int:
+    """Run the command line; returns its exit status."""
+    replaced = interrupts.install()
+    from fidsplat import cli
+
+    status = cli.main()
+    for number in replaced:
+        signal.signal(number, signal.SIG_DFL)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from fidsplat.interrupts import Terminated, raised_in_time
+from fidsplat import interrupts
 from fidsplat.limits import check_imports
 
 ABOUT = """Fiducial markers made of 2D Gaussian splats: make them, set them in scenes, draw them, read them
@@ -49,10 +49,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     try:
-        with warnings.catch_warnings(), raised_in_time():
+        with warnings.catch_warnings(), interrupts.handled():
             warnings.showwarning = _show_warning
-            check_imports()
-            status = _parse(words).run()
+            interrupts.check()
+            try:
+                check_imports()
+                command = _parse(words)
+                interrupts.check()
+                status = command.run()
+            except Exception:
+                interrupts.check()  # it may be a consequence of the signal
+                raise
+            interrupts.check()
         sys.stdout.flush()
         return status
     except SystemExit as stop:  # help, or words that could not be parsed
@@ -60,7 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         if not debug:  # what was stopped while it was made may complain when it is thrown away
             sys.unraisablehook = lambda _: None
-        return _fail(*(("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)))
+        terminated = isinstance(stop, interrupts.Terminated)
+        return _fail(*(("terminated", 143) if terminated else ("interrupted", 130)))
     except BrokenPipeError:
         _drop_output()  # whoever read it has gone; nothing is left to say to them
         return 1

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from fidsplat import interrupts
 from fidsplat.errors import InputError
 from fidsplat.input_limit import check_expansion
 
@@ -171,6 +172,7 @@ def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path
 
     suffix: what that name ends with, for those that go by it.
     """
+    interrupts.check()
     target = ordinary_file(path)
     try:
         descriptor, name = tempfile.mkstemp(

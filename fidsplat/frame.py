@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from fidsplat.arguments import invalid, whole_number
 from fidsplat.backends.base import GivesArrays, GivesUint8, Images, ReadsRows, Waits
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError, MissingOutputError
@@ -199,14 +200,23 @@ class Frame(Mapping):
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray | None = None) -> np.ndarray:
         """An array for an output, `into` or a new one, in which rows of pixels [first, end) are those of the
-        picture: they alone are copied where the device can do that."""
+        picture: they alone are copied where the device can do that.
+
+        Raises:
+            InputError: rows that the picture does not have, or an array of another shape or type.
+        """
         self._check(name)
-        if not isinstance(self._images, ReadsRows) or name == "error":
-            into = np.empty_like(self[name]) if into is None else into
+        by_rows = self._images if isinstance(self._images, ReadsRows) and name != "error" else None
+        if into is None:
+            into = by_rows.empty(name) if by_rows is not None else np.empty_like(self[name])
+        elif not isinstance(into, np.ndarray) or not (by_rows is not None or into.shape == self[name].shape):
+            raise invalid("into", "an array of the shape of the output", into)
+        whole_number("the end of the rows", end, 0, len(into))
+        whole_number("the first row", first, 0, end)
+        if by_rows is None:
             into[first:end] = self[name][first:end]
             return into
-        into = self._images.empty(name) if into is None else into
-        self._images.read_rows(name, first, end, into)
+        by_rows.read_rows(name, first, end, into)
         if name == "splat_id":
             into[first:end] = numbered(name, into[first:end], self._ids)
         return into

@@ -6,13 +6,13 @@ A `Quality` says what is computed, never where: the same object works on every b
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import Any
 
 import numpy as np
 
+from fidsplat.arguments import as_float, whole_number
 from fidsplat.errors import InputError, unknown
 
 LOWPASS = ("screen", "pixel", "none")
@@ -29,17 +29,6 @@ TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, *BY_FORMULA)
 """Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in those
 by a formula (fidsplat/markers/nested.py)"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
-
-
-def whole_number(name: str, value: Any, low: int, high: int) -> int:
-    """The value as an int. Raises InputError unless it is a whole number within the range."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or isinstance(value, bool) or not low <= number <= high:
-        raise InputError(f"{name} is {value!r}; it must be a whole number from {low} to {high}")
-    return number
 
 
 def _one_of(what: str, value: Any, known: tuple) -> None:
@@ -180,12 +169,11 @@ class Quality:
 
         def within(name: str, low: float, high: float, low_open: bool, high_open: bool) -> None:
             value = getattr(self, name)
+            found = as_float(value)
             ok = (
-                isinstance(value, (int, float))
-                and not isinstance(value, bool)
-                and math.isfinite(value)
-                and (value > low if low_open else value >= low)
-                and (value < high if high_open else value <= high)
+                math.isfinite(found)
+                and (found > low if low_open else found >= low)
+                and (found < high if high_open else found <= high)
             )
             if not ok:
                 left, right = "(" if low_open else "[", ")" if high_open else "]"

@@ -10,6 +10,8 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from fidsplat import interrupts
+from fidsplat.arguments import whole_number
 from fidsplat.backends.base import (
     Adopts,
     DeviceInfo,
@@ -27,7 +29,7 @@ from fidsplat.capture import Capture, CaptureParts, output_names
 from fidsplat.errors import InputError, unknown
 from fidsplat.frame import Frame, check_process, stacked
 from fidsplat.ideal import ErrorImage, ideal_of
-from fidsplat.quality import Quality, whole_number
+from fidsplat.quality import Quality
 from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
@@ -315,6 +317,7 @@ class Renderer:
                     )
 
     def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
+        interrupts.check()
         features, batch = prepare_batch(resident.whole, views)
         with self._lock:
             drawn = (batch.one(number) for number in range(len(batch.slots)))
@@ -345,6 +348,7 @@ class Renderer:
         ),
         band: tuple[int, int] | None = None,
     ) -> Frame:
+        interrupts.check()
         features, view = prepare(resident.whole, capture)
         view = _banded(view, band)
         plan = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None

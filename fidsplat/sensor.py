@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.arguments import as_float
 from fidsplat.errors import InputError
 from fidsplat.scalars import own_scalars
 
@@ -130,7 +131,7 @@ class Sensor:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, (int, float)) and not math.isnan(as_float(value))
 
 
 def _numbers(name: str, values: Any, least: int, most: int) -> tuple[float, ...]:

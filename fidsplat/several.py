@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.arguments import invalid, items
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError
@@ -52,7 +53,7 @@ class SeveralDevices:
     """
 
     def __init__(self, devices: Iterable[str], memory_budget: int | None = None) -> None:
-        names = [devices] if isinstance(devices, str) else list(devices)
+        names = items("devices", [devices] if isinstance(devices, str) else devices, str, "names of devices")
         if not names:
             raise InputError("devices is empty; name one device at least, e.g. ['opencl']")
         self.renderers = [Renderer(name, memory_budget) for name in names]
@@ -79,6 +80,8 @@ class SeveralDevices:
     ) -> Frame:
         """Draw one picture. Arguments and errors as those of `Renderer.render`; scene: also what `upload` has
         returned."""
+        if capture is not None and not isinstance(capture, Capture | Camera):
+            raise invalid("capture", "a Capture or a Camera", capture)
         given = self._given(scene)
         camera = capture.camera if isinstance(capture, Capture) else capture
         camera = camera or given[0].capture.camera
@@ -143,7 +146,10 @@ class SeveralDevices:
 
     def _given(self, scene: Scene | SplatCloud | Store | Sequence[ResidentCloud]) -> Sequence[ResidentCloud]:
         """A scene on all devices."""
-        given = scene if isinstance(scene, Sequence) else self.upload(scene)
+        if isinstance(scene, Sequence):
+            given = items("scene", scene, ResidentCloud, "a scene, or what `upload` has returned")
+        else:
+            given = self.upload(scene)
         if len(given) != len(self.renderers):
             raise InputError(f"a scene on {len(given)} devices was given to {len(self.renderers)}")
         return given
@@ -201,7 +207,7 @@ class _Line:
         self._thread.join()
 
     def _captures(self) -> Iterator[Any]:
-        for capture in iter(self._asked.get, self._END):
+        while (capture := self._asked.get()) is not self._END:
             if self._stopped:
                 return
             yield capture

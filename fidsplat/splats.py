@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fidsplat.arguments import number
 from fidsplat.cloud_arrays import (
     F32,
     as_single,
@@ -261,6 +262,7 @@ class SplatCloud(PickledByFields, Summarised):
     def reach(self, sigmas: float) -> np.ndarray:
         """Half extents (n, 3) float64 [m] of splats along the world's axes: of Gaussians to that many
         standard deviations, of boxes to their corners."""
+        sigmas = number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         turns = quaternion_to_matrix(self.quats)
         axes = turns[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]
         squares = (axes * axes).sum(axis=2)

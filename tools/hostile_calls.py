@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,14 @@ import numpy as np
 import fidsplat as fs
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.scenes import PlacedMarker
+from fidsplat.sim import Rig, RigCamera, read_description
+from fidsplat.train import Dataset, Trainer, TrainingView, TrainSettings, load_dataset, refine, splats_within
 from fidsplat.vision import images
+from fidsplat.vision.coco import CocoAnnotations
 from fidsplat.vision.detect import detect
 from fidsplat.vision.pose import marker_pose
+from fidsplat.vision.readback import read_back
+from fidsplat.vision.truth import optical_flow, points_of, truth_of
 
 Call = tuple[Callable[..., Any], dict[str, Any], Callable[[Any], Any] | None]
 """a function, arguments by name, and a use of what it gives"""
@@ -50,7 +56,213 @@ def _seen_by(made: Any) -> None:
     RENDERER.render(CLOUD, made)
 
 
+def _rows(made: Any) -> None:
+    list(made)
+
+
+VIEWS = tuple(
+    TrainingView(
+        f"{x}", fs.Camera.look_at(12, 8, 1.0, (x, 0, -4), (0, 0, 0)), np.full((8, 12, 3), 90, np.uint8)
+    )
+    for x in (-1.0, 0.0, 1.0)
+)
+DATASET = Dataset("views", VIEWS[:2], VIEWS[2:], np.zeros((2, 3)), np.full((2, 3), 99, np.uint8))
+SETTINGS = TrainSettings(iterations=1, max_splats=10)
+POSES = np.array([[0, 0, 0, 1, 0, 0, 0.0]])
+
+
+@cache
+def _rig() -> Rig:
+    return Rig(fs.Scene([CLOUD]), {0: "box"}, {"eye": CAMERA}, renderer=RENDERER)
+
+
+@cache
+def _pictures() -> Any:
+    return _rig().render({"box": POSES})
+
+
+@cache
+def _store(folder: Path) -> fs.Store:
+    fs.save_ply(CLOUD, folder / "stored.ply")
+    return fs.Store(fs.build_store([folder / "stored.ply"], folder / "stored.fss", overwrite=True))
+
+
+@cache
+def _pictures_of(folder: Path) -> Path:
+    """A data set of VIEWS."""
+    poses = np.stack([np.linalg.inv(view.camera.world_to_camera) for view in VIEWS])
+    names = [f"{number}.png" for number in range(len(VIEWS))]
+    for view, name in zip(VIEWS, names, strict=True):
+        images.write_png(folder / name, view.picture)
+    fs.save_trajectory(
+        fs.Trajectory(range(len(VIEWS)), poses), folder / "transforms.json", VIEWS[0].camera, names
+    )
+    return folder
+
+
+@cache
+def _several() -> fs.SeveralDevices:
+    return fs.SeveralDevices(["reference", "reference"])
+
+
+def _log(method: str, **given: Any) -> Callable[[Path], Call]:
+    """A message of a RobotLog."""
+
+    def call(folder: Path) -> Call:
+        from fidsplat.logs import RobotLog
+
+        def write(**given: Any) -> None:
+            with RobotLog(folder / "log.mcap", overwrite=True) as log:
+                getattr(log, method)(**given)
+
+        return write, given, None
+
+    return call
+
+
+def _robot_log(folder: Path) -> Call:
+    from fidsplat.logs import RobotLog
+
+    return (
+        RobotLog,
+        {"path": folder / "log.mcap", "world": "map", "overwrite": True, "source": ""},
+        lambda log: log.__exit__(ValueError),
+    )
+
+
 CALLS: dict[str, Callable[[Path], Call]] = {
+    "SplatCloud.reach": lambda _: (CLOUD.reach, {"sigmas": 3.0}, None),
+    "Camera.project of several": lambda _: (fs.Camera.equirectangular(24, 12).project, {"points": MEANS}, None),
+    "BrownConrady.opencv": lambda _: (fs.BrownConrady.opencv, {"coefficients": (0.1, 0, 0, 0)}, None),
+    "focal_length": lambda _: (fs.cameras.focal_length, {"width": 24, "fov_x": 1.0}, None),
+    "look_at_matrix": lambda _: (fs.cameras.look_at_matrix, {"position": (0, 0, -1), "target": (0, 0, 0), "up": (0, -1, 0)}, None),
+    "Trajectory()": lambda _: (PATH, {"time": 0.5}, None),
+    "Trajectory.sampled": lambda _: (PATH.sampled, {"rate": 3.0}, None),
+    "Motion.camera_at": lambda _: (fs.Motion(PATH).camera_at, {"time": 0.5}, None),
+    "Motion.groups_at": lambda _: (fs.Motion(groups={0: PATH}).groups_at, {"time": 0.5}, None),
+    "Motion.moved": lambda _: (fs.Motion(PATH).moved, {"camera": CAMERA, "time": 0.5}, None),
+    "Shutter.bands": lambda _: (fs.Shutter(readout=0.1).bands, {"height": 9}, None),
+    "Shutter.times": lambda _: (fs.Shutter(exposure_time=0.1, sub_poses=3).times, {"middle": 0.5}, None),
+    "Layer": lambda _: (
+        fs.Layer, {"rgb": np.ones((16, 24, 3)), "depth": np.ones((16, 24)), "label": 0},
+        lambda layer: RENDERER.render(CLOUD, CAMERA, layer=layer),
+    ),
+    "Renderer.render_every": lambda _: (
+        RENDERER.render_every, {"step": 4, "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None, "tell": None}, None
+    ),
+    "Renderer.render_band": lambda _: (
+        RENDERER.render_band, {"band": (2, 4), "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None}, None
+    ),
+    "Frame.read_rows": lambda _: (_frame().read_rows, {"name": "rgb", "first": 1, "end": 3, "into": None}, None),
+    "FrameBatch.frame": lambda _: (RENDERER.render_batch(CLOUD, [CAMERA]).frame, {"number": 0}, dict),
+    "SeveralDevices": lambda _: (fs.SeveralDevices, {"devices": ["reference"], "memory_budget": None}, None),
+    "SeveralDevices.upload": lambda _: (_several().upload, {"scene": CLOUD}, None),
+    "SeveralDevices.render": lambda _: (
+        _several().render, {"scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None}, dict
+    ),
+    "SeveralDevices.render_views": lambda _: (
+        _several().render_views, {"scene": CLOUD, "captures": [CAMERA], "outputs": ("rgb",), "quality": None}, _rows
+    ),
+    "Store": lambda folder: (fs.Store, {"path": _store(folder).path}, None),
+    "Store.bounds": lambda folder: (_store(folder).bounds, {"sigmas": 3.0}, None),
+    "Store.boxes": lambda folder: (_store(folder).boxes, {"sigmas": 3.0}, None),
+    "Store.load": lambda folder: (_store(folder).load, {"number": 0, "placed": True}, None),
+    "Store.counts": lambda folder: (_store(folder).counts, {"numbers": np.array([0])}, None),
+    "Store.first_of": lambda folder: (_store(folder).first_of, {"numbers": np.array([0])}, None),
+    "Store.pixels_of": lambda folder: (_store(folder).pixels_of, {"quality": fs.Quality()}, None),
+    "Store.verify": lambda folder: (_store(folder).verify, {"progress": None}, None),
+    "build_store": lambda folder: (
+        fs.build_store,
+        {
+            "inputs": [_store(folder).path.parent / "stored.ply"], "out": folder / "built.fss", "chunk": 64, "memory": 2**28,
+            "levels": True, "sh_degree": None, "colors": "float32", "overwrite": True, "progress": None,
+        },
+        None,
+    ),
+    "place_store": lambda folder: (
+        fs.place_store, {"store": _store(folder), "out": folder / "placed.fss", "poses": [np.eye(4)], "overwrite": True}, None
+    ),
+    "TrainingView": lambda _: (
+        TrainingView, {"name": "a", "camera": VIEWS[0].camera, "picture": VIEWS[0].picture, "mask": np.ones((18, 24), bool)}, None
+    ),
+    "Dataset": lambda _: (
+        Dataset,
+        {
+            "name": "a", "views": VIEWS[:2], "held_out": VIEWS[2:], "points": np.zeros((2, 3)),
+            "colors": np.full((2, 3), 99, np.uint8), "background": (0.0, 0.0, 0.0),
+        },
+        lambda made: (made.digest, made.extent, Trainer(made, RENDERER, SETTINGS).step()),
+    ),
+    "Dataset.with_random_points": lambda _: (DATASET.with_random_points, {"count": 3, "seed": 0}, None),
+    "TrainSettings": lambda _: (
+        TrainSettings,
+        {
+            "iterations": 1, "strategy": "default", "max_splats": 10, "sh_degree": 1, "seed": 0, "quality": "surfel", "position_rate": 1e-3,
+            "prune_scale": 0.1,
+        },
+        lambda made: Trainer(DATASET, RENDERER, made).step(),
+    ),
+    "TrainSettings.degree_at": lambda _: (SETTINGS.degree_at, {"iteration": 5}, None),
+    "Trainer": lambda folder: (
+        Trainer,
+        {"dataset": DATASET, "renderer": RENDERER, "settings": SETTINGS, "checkpoint": None, "start": None, "restart": True, "seed": 0},
+        lambda trainer: trainer.step(),
+    ),
+    "Trainer.run": lambda _: (Trainer(DATASET, RENDERER, SETTINGS).run, {"progress": None, "prompt": True}, None),
+    "Trainer.save": lambda folder: (Trainer(DATASET, RENDERER, SETTINGS).save, {"path": folder / "trained.ply"}, None),
+    "Trainer.evaluate": lambda _: (Trainer(DATASET, RENDERER, SETTINGS).evaluate, {"views": VIEWS}, None),
+    "load_dataset": lambda folder: (
+        load_dataset, {"path": _pictures_of(folder), "hold_out": None, "random_points": 3, "seed": 0, "progress": None}, None
+    ),
+    "splats_within": lambda _: (splats_within, {"settings": SETTINGS, "budget": 2**30, "dataset": DATASET}, None),
+    "refine": lambda _: (
+        partial(refine, iterations=1), {"made": TAG, "renderer": RENDERER, "leak": 0.05, "seed": 0, "progress": None}, None
+    ),
+    "RigCamera": lambda _: (
+        RigCamera, {"camera": CAMERA, "body": None, "sensor": None, "outputs": ("rgb",), "rate": 30.0},
+        lambda camera: Rig(fs.Scene([CLOUD]), {}, {"eye": camera}, renderer=RENDERER),
+    ),
+    "Rig": lambda _: (
+        Rig,
+        {
+            "scene": fs.Scene([CLOUD]), "bodies": {0: "box"}, "cameras": {"eye": CAMERA}, "renderer": RENDERER,
+            "rest": {"box": POSES[0]}, "outputs": ("rgb",),
+        },
+        None,
+    ),
+    "Rig.render": lambda _: (
+        _rig().render,
+        {"bodies": {"box": POSES}, "cameras": {"eye": POSES}, "outputs": ("rgb",), "layers": None, "mask": np.array([True])},
+        dict,
+    ),
+    "Rig.outputs_of": lambda _: (_rig().outputs_of, {"camera": "eye"}, None),
+    "Rig.placed": lambda _: (_rig().placed, {"bodies": {"box": POSES[0]}}, None),
+    "Pictures.camera": lambda _: (_pictures().camera, {"name": "eye", "environment": 0}, None),
+    "Pictures.of": lambda _: (_pictures().of, {"camera": "eye"}, None),
+    "Pictures.scene": lambda _: (_pictures().scene, {"name": "eye", "environment": 0}, None),
+    "Pictures[]": lambda _: (_pictures().__getitem__, {"name": "rgb"}, None),
+    "read_description": lambda folder: (read_description, {"path": folder / "none.sdf", "models": ()}, None),
+    "read_back": lambda _: (read_back, {"picture": np.zeros((16, 24, 3), np.uint8), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),
+    "truth_of": lambda _: (truth_of, {"picture": _frame(), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),
+    "points_of": lambda _: (points_of, {"depth": np.ones((16, 24)), "camera": CAMERA}, None),
+    "optical_flow": lambda _: (
+        optical_flow, {"depth": np.ones((16, 24)), "before": CAMERA, "after": CAMERA, "label": None, "motions": None}, None
+    ),
+    "CocoAnnotations.add": lambda _: (
+        lambda **given: CocoAnnotations().add(**given), {"file_name": "a.png", "truth": truth_of(_frame(), fs.Scene([CLOUD]), CAMERA)}, None
+    ),
+    "CocoAnnotations.save": lambda folder: (CocoAnnotations().save, {"path": folder / "truth.json"}, None),
+    "RobotLog": _robot_log,
+    "RobotLog.image": _log("image", time=0.0, camera="eye", image=np.zeros((4, 4, 3)), output="rgb", compress=None),
+    "RobotLog.image of depth": _log("image", time=0.0, camera="eye", image=np.zeros((4, 4)), output="depth"),
+    "RobotLog.image compressed": _log("image", time=0.0, camera="eye", image=np.zeros((4, 4, 3)), compress="png"),
+    "RobotLog.camera_info": _log("camera_info", time=0.0, name="eye", camera=CAMERA),
+    "RobotLog.transform": _log("transform", time=0.0, frame="eye", pose=np.eye(4), parent=None),
+    "RobotLog.odometry": _log(
+        "odometry", time=0.0, pose=np.eye(4), velocity=(0, 0, 0), turning=(0, 0, 0), frame="base", topic="/odom", covariance=np.eye(6)
+    ),
+    "RobotLog.imu": _log("imu", time=0.0, turning=(0, 0, 0), acceleration=(0, 0, 0), frame="imu", topic="/imu"),
+    "RobotLog.detections": _log("detections", time=0.0, camera="eye", found=[]),
     "SplatCloud": lambda _: (
         fs.SplatCloud,
         {

@@ -34,11 +34,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from fidsplat.formats import save_ply
+from fidsplat.random_clouds import random_splats
+
 SIGNALS = ("SIGINT", "SIGTERM", "SIGKILL")
 DISK = "full disk"
 TIMED = ("repeats", "seconds.svg")
 """values and charts that depend on the time that something takes, and may agree by chance"""
-FIDSPLAT = (sys.executable, "-c", "import sys; from fidsplat.cli import main; sys.exit(main())")
+FIDSPLAT = (sys.executable, "-m", "fidsplat")
 SCENE = """\
 [camera]
 width = 320
@@ -51,6 +54,7 @@ look_at = [0.0, 0.0, 0.0]
 spec = "apriltag:36h11:5"
 size = 0.16
 """
+FLIGHT = "0 0.3 0.1 -0.8 0 0 0 1\n1 0.2 0.1 -0.8 0 0 0 1\n"
 
 
 class Command(NamedTuple):
@@ -74,6 +78,9 @@ COMMANDS = {
     "demo": Command("demo --out .", 51, 2),
     "dataset": Command("experiment dataset --category apriltag --markers 1 -o .", 8, 2),
     "tradeoff": Command("tradeoff --quick --scenes apriltag --knobs transmittance_stop -o .", 51, 2),
+    "convert": Command("convert ../splats.ply splats.spz --overwrite", 60, 4),
+    "fly": Command("fly ../scene.toml --trajectory ../flight.tum --rate 5 -o run.mcap", 60, 4),
+    "bag": Command("fly ../scene.toml --trajectory ../flight.tum --rate 5 --log bag", 12, 0),
     "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 51, 1),
 }
 Facts = dict[Any, Any]
@@ -134,6 +141,8 @@ class Trial:
     def __init__(self, command: Command, work: Path) -> None:
         self.command, self.work = command, work
         (work / "scene.toml").write_text(SCENE)
+        (work / "flight.tum").write_text(FLIGHT)
+        save_ply(random_splats(20_000, 0), work / "splats.ply")
         found = []
         for name in ("first", "second"):
             start = time.monotonic()
@@ -228,8 +237,10 @@ def disturb(trial: Trial, name: str, how: str, at: float) -> dict[str, Any]:
         if not full:
             time.sleep(at * trial.seconds)
             child.send_signal(getattr(signal, how))
+        begun = time.monotonic()
         status, said = _end(child)
-        return {"stopped": status != 0, "lost": list(trial.lost(folder, status, said))}
+        delay = round(time.monotonic() - begun, 2)
+        return {"stopped": status != 0, "delay": delay, "lost": list(trial.lost(folder, status, said))}
 
 
 def planned(name: str, seed: int) -> dict[str, tuple[str, float]]:
@@ -261,13 +272,15 @@ def read(file: Path) -> list[dict[str, Any]]:
 
 
 def table_of(done: list[dict[str, Any]]) -> Table:
-    """By command: how many trials of each kind, how many of them stopped it, and in how many something was
-    lost."""
-    table = Table("command", *SIGNALS, DISK, "of these, stopped it", "lost something")
+    """By command: how many trials of each kind, how many of them stopped it, how long the slowest took to end
+    after its signal, and in how many something was lost."""
+    table = Table("command", *SIGNALS, DISK, "of these, stopped it", "slowest end, s", "lost something")
     for name in [*dict.fromkeys(row["command"] for row in done), None]:
         rows = [row for row in done if name in (None, row["command"])]
         kinds = [sum(row["how"] == how for row in rows) for how in (*SIGNALS, DISK)]
-        counts = [*kinds, sum(row["stopped"] for row in rows), sum(bool(row["lost"]) for row in rows)]
+        slowest = max((row["delay"] for row in rows if row["how"] != DISK), default=0.0)
+        lost = sum(bool(row["lost"]) for row in rows)
+        counts = [*kinds, sum(row["stopped"] for row in rows), slowest, lost]
         table.add_row(name or "all", *map(str, counts))
     return table
 

@@ -6,10 +6,10 @@ import math
 import pickle
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any
 
 from fidsplat.accuracy import draws_float64
+from fidsplat.arguments import as_float
 from fidsplat.budget import prices, store
 from fidsplat.budget.prices import FREE, Candidate
 from fidsplat.budget.search import Calibration, Search
@@ -231,18 +231,16 @@ def check_bounds(error: float | None, ms: float | None) -> None:
     """Raises InputError for bounds that are no numbers. Only measuring shows which of the others cannot be
     kept."""
     if error is None and ms is None:
-        raise InputError("a budget of nothing: give error=1e-3, or ms=20 with scene=... and capture=...")
+        raise InputError("an empty budget: give error=1e-3, or ms=20 with scene=... and capture=...")
     for name, value, example in (("error", error, "1e-3"), ("ms", ms, "20")):
-        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-        if value is not None and not number:
+        if value is not None and not math.isfinite(as_float(value)):
             raise InputError(f"{name} is {value!r}; it must be a finite number, e.g. {name}={example}")
 
 
 def _color_range(value: Any) -> float:
-    ok = isinstance(value, Real) and not isinstance(value, bool)
-    if not (ok and 0 < float(value) < math.inf):
+    if not 0 < (found := as_float(value)) < math.inf:
         raise InputError(f"colors must be a positive range, got {value!r}; give the largest colour, e.g. 1.0")
-    return float(value)
+    return found
 
 
 def _from_list(

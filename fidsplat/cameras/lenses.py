@@ -14,6 +14,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.scalars import real_array
 
 FISHEYE_LIMIT = math.radians(100)
 """a fisheye sees no further from its axis: 200 degrees in all"""
@@ -21,6 +22,7 @@ MAX_COEFFICIENT = 1e12
 """of a lens, in size: far beyond any that can be inverted, and products of several still are numbers"""
 _STEPS = 4096  # of the tables from which Newton's iteration starts
 _ITERATIONS = 12
+_NOTHING = 1e-200  # a leading coefficient that would overflow when roots are found
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class BrownConrady:
                 with CALIB_RATIONAL_MODEL, must be 0.
         """
         order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
-        values = np.ravel(coefficients).tolist()
+        values = real_array("distortion", coefficients).ravel().tolist()
         if len(values) not in (4, 5, 8, 12, 14):
             raise InputError(
                 f"distortion has {len(values)} coefficients; OpenCV's orders have 4, 5, 8, 12 or 14"
@@ -317,7 +319,7 @@ def _check(lens) -> None:
 
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     """Smallest root above 0; inf if there is none."""
-    coefficients = np.trim_zeros(polynomial.coef, "b")
+    coefficients = polynomial.trim(_NOTHING).coef
     # a root that overflows lies beyond all pictures
     with np.errstate(over="ignore"):
         roots = np.polynomial.Polynomial(coefficients).roots() if len(coefficients) > 1 else np.empty(0)

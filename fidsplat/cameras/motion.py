@@ -7,16 +7,15 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
+from fidsplat.arguments import as_float, instance, number, whole_number
+from fidsplat.cameras.pinhole import Camera
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
 from fidsplat.scalars import own_scalars
-
-if TYPE_CHECKING:
-    from fidsplat.cameras.pinhole import Camera
 
 MAX_SUB_POSES = 1024
 
@@ -48,7 +47,7 @@ class Shutter:
         own_scalars(self)
         for name in ("time", "exposure_time", "readout"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            if not math.isfinite(as_float(value)):
                 raise InputError(f"shutter {name} must be a finite number of seconds, not {value!r}")
             if name != "time" and value < 0:
                 raise InputError(f"shutter {name} must be 0 or more seconds, not {value!r}")
@@ -60,6 +59,7 @@ class Shutter:
 
     def bands(self, height: int) -> list[tuple[int, int, float]]:
         """(first row, end row, middle of its exposure time) of the bands of a picture of `height` rows."""
+        height = whole_number("the height of a picture", height, 1, 2**24)
         rows = self.rows_per_band if self.readout > 0 else height
         cuts = [*range(0, height, rows), height]
         return [
@@ -69,6 +69,7 @@ class Shutter:
 
     def times(self, middle: float) -> list[float]:
         """The times of the sub-poses of an exposure time with its middle there."""
+        middle = number("the middle of an exposure", middle)
         n = self.sub_poses if self.exposure_time > 0 else 1
         return [middle + self.exposure_time * ((k + 0.5) / n - 0.5) for k in range(n)]
 
@@ -107,6 +108,7 @@ class Motion:
 
     def camera_at(self, time: float) -> np.ndarray | None:
         """world_to_camera (4, 4) then; None if it does not move."""
+        time = number("the time of a motion", time)
         return None if self.camera is None else _checked(self.camera(time), "the camera", time)
 
     def sampled(self, times: Iterable[float]) -> Motion:
@@ -118,12 +120,14 @@ class Motion:
 
     def moved(self, camera: Camera, time: float) -> Camera:
         """The camera as it stands then."""
+        instance("the camera of a motion", camera, Camera)
         pose = self.camera_at(time)
         # the position follows from the pose
         return camera if pose is None else replace(camera, world_to_camera=pose, position=None)
 
     def groups_at(self, time: float) -> list[tuple[int, np.ndarray]]:
         """(label, motion (4, 4)) then, of each group."""
+        time = number("the time of a motion", time)
         return [
             (label, _checked(pose(time), f"the splats of label {label}", time))
             for label, pose in sorted(self.groups.items())

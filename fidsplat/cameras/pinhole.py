@@ -70,7 +70,7 @@ class Camera(PickledByFields):
                     f"{getattr(self, name)!r}; it is half the width / tan(half the field of view)"
                 )
         for name in ("cx", "cy"):
-            if not math.isfinite(getattr(self, name)):
+            if not abs(getattr(self, name)) <= LARGEST:
                 raise InputError(f"camera {name} must be finite, not {getattr(self, name)!r}")
         if not self.far > self.near:
             raise InputError(f"camera far ({self.far!r}) must be above near ({self.near!r})")
@@ -233,7 +233,7 @@ def focal_length(width: int, fov_x: float) -> float:
 
     Raises InputError when fov_x does not lie between 0 (above 1e-9) and pi.
     """
-    angle = _number("fov_x", fov_x)
+    width, angle = _size("width", width), _number("fov_x", fov_x)
     if not 1e-9 < angle < math.pi:
         raise InputError(f"camera fov_x must lie between 0 and pi radians (180 degrees), not {angle!r}")
     return width / 2 / math.tan(angle / 2)

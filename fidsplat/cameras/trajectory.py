@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from fidsplat.arguments import as_float, number
 from fidsplat.cameras.screw import between, exponential, twist
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity, matrix_to_quaternion, rigid_matrix
@@ -74,7 +75,8 @@ class Trajectory(PickledByFields):
         return f"Trajectory({len(self)} poses, {first:g} to {last:g} s, {kind})"
 
     def __call__(self, time: float) -> np.ndarray:
-        """(4, 4) float64."""
+        """(4, 4) float64. Raises InputError for a time that is no finite number."""
+        time = number("the time of a trajectory", time)
         times = np.asarray(self.times)
         after = int(np.searchsorted(times, time, side="right"))
         if after == 0 or after == len(times):
@@ -137,8 +139,7 @@ class Trajectory(PickledByFields):
 
 def check_rate(rate: float) -> None:
     """Raises InputError for anything but a number of poses a second."""
-    known = isinstance(rate, (int, float, np.number)) and not isinstance(rate, bool)
-    if not known or not 0 < rate < math.inf:
+    if not 0 < as_float(rate) < math.inf:
         raise InputError(f"the rate is {rate!r}; give a number of poses a second above 0, e.g. 30")
 
 

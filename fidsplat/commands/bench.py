@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from fidsplat import interrupts
 from fidsplat.commands.output import (
     Devices,
     console,
@@ -115,12 +116,13 @@ class Bench:
             except KeyboardInterrupt:
                 interrupted = True
         results = measuring.results if measuring else []
-        if measuring:
-            self._save(measuring, scenes, interrupted)
-        if self.plot is not None and any(result.timer.ms for result in results):
-            from fidsplat.experiments.bench.plot import write_plot
+        with interrupts.postponed():
+            if measuring:
+                self._save(measuring, scenes, interrupted)
+            if self.plot is not None and any(result.timer.ms for result in results):
+                from fidsplat.experiments.bench.plot import write_plot
 
-            write_plot(results, Path(self.plot))
+                write_plot(results, Path(self.plot))
         if self.json == "-":
             print(json_text(_record(results, scenes, interrupted)))
         else:

@@ -28,7 +28,7 @@ def write_log(folder: FlightFolder, path: str, overwrite: bool) -> Iterator[int]
     assert camera is not None
     # a log's clock starts at 0 or later
     start = min(0.0, float(flight.path.times[0]))
-    with RobotLog(path, overwrite=overwrite) as log:
+    with RobotLog(path, overwrite=overwrite, source=folder.key) as log:
         for k, (time, pose) in enumerate(zip(flight.path.times, flight.path.poses, strict=True)):
             moment = float(time) - start
             for name, image in _images(folder, k).items():

@@ -118,10 +118,6 @@ class Fly:
         check_rate(self.rate)
         if self.video is not None:
             check_video(self.video)
-        if self.log is not None:
-            from fidsplat.logs import check_log
-
-            check_log(self.log, self.overwrite)
         if self.coco is not None:
             writable_file(self.coco)
         given = self.trajectory
@@ -133,6 +129,7 @@ class Fly:
         times = path.sampled(self.rate).times if self.times is None else _times(self.times)
         flight = Flight(scene, path, times, scene.capture.with_(outputs=names, quality=self.quality))
         with self._drawn_by(flight, budget, where) as (title, draw):
+            logged = self._logged(flight.key(title))
             folder = FlightFolder(self.out, flight, title, self.overwrite, self.source)
             begun = time.perf_counter()
             left = len(folder.left())
@@ -141,11 +138,19 @@ class Fly:
         sheet = folder.write_sheet()
         if self.video is not None:
             list(counted("video", folder.write_video(self.video, self.rate), len(flight)))
-        if self.log is not None:
+        if self.log is not None and not logged:
             list(counted("log", write_log(folder, self.log, self.overwrite), len(flight)))
         if self.coco is not None:
             list(counted("truth", write_truth(folder, self.coco), len(flight)))
         return self._tell(folder, sheet, left, seconds)
+
+    def _logged(self, source: str) -> bool:
+        """Whether the log of a flight is there already, of a run that was stopped later."""
+        if self.log is None:
+            return False
+        from fidsplat.logs import check_log
+
+        return check_log(self.log, self.overwrite, source)
 
     @contextmanager
     def _drawn_by(

@@ -54,6 +54,7 @@ class Localise:
         from fidsplat.commands.sweeps import need_reports
         from fidsplat.experiments.localise import VARIANTS
         from fidsplat.experiments.localise import Localise as Asked
+        from fidsplat.provenance import digest_of
         from fidsplat.vision.video import check_video
 
         need_reports()
@@ -63,12 +64,13 @@ class Localise:
         names = list(self.variant) or (list(VARIANTS)[:3] if self.quick else list(VARIANTS))
         if self.video is not None:
             check_video(self.video)
+        _ = asked.house  # what is wrong with it is said before a device is opened
+        renderer = fs.Renderer(self.device)
+        logged, source = False, digest_of((asked, renderer.device.title, fs.__version__))
         if self.log is not None:
             from fidsplat.logs import check_log
 
-            check_log(self.log, self.overwrite)
-        _ = asked.house  # what is wrong with it is said before a device is opened
-        renderer = fs.Renderer(self.device)
+            logged = check_log(self.log, self.overwrite, source)
         done = 0
 
         def step(name: str, share: float) -> None:
@@ -83,7 +85,7 @@ class Localise:
                 step(record.key["variant"], 0.0)
         found, device = found_of(sweep.results), renderer.device.title
         page = write_report(folder, asked, device, found)
-        self._record(asked, renderer)
+        self._record(asked, renderer, None if logged else source)
         rows, length = table_of(found), found[names[0]]["length_m"]
         rows = rows.iloc[:, :6]  # as many as a terminal has room for; the page has all
         return tell(
@@ -93,16 +95,16 @@ class Localise:
             table=(f"{length:.1f} m", rows.columns, rows.itertuples(index=False)),
         )
 
-    def _record(self, asked: Asked, renderer: Renderer) -> None:
-        """The log and the video."""
+    def _record(self, asked: Asked, renderer: Renderer, source: str | None) -> None:
+        """Write the log and the video. source: of the log; None: a run that was stopped has written it."""
         from fidsplat.experiments.localise import RATE, VARIANTS, write_log
         from fidsplat.vision.video import write_video
 
-        if self.log is None and self.video is None:
+        if (self.log is None or source is None) and self.video is None:
             return
         pictures = asked.pictures(VARIANTS["exact"], asked.run(), renderer)
-        if self.log is not None:
-            pictures = write_log(asked, "exact", renderer, self.log, self.overwrite)
+        if self.log is not None and source is not None:
+            pictures = write_log(asked, "exact", renderer, self.log, self.overwrite, source)
         steps = pictures if self.video is None else write_video(self.video, pictures, RATE)
         with console(True).status("recording"):
             for _ in steps:

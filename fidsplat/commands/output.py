@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
+from fidsplat import interrupts
 from fidsplat.errors import InputError
 from fidsplat.files import ordinary_file, path_of, writable_folder
 
@@ -154,8 +155,13 @@ def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str,
     timer = threading.Timer(after, shown.start)
     timer.daemon = True
     timer.start()
+
+    def show(words: str, share: float) -> None:
+        interrupts.check()
+        shown.update(task, description=words, completed=share)
+
     try:
-        yield lambda words, share: shown.update(task, description=words, completed=share)
+        yield show
     finally:
         timer.cancel()
         timer.join()
@@ -173,6 +179,7 @@ def counted(
     with progress_bar(console(True), *columns) as progress:
         bar = progress.add_task(name, total=total, completed=done)
         for step in steps:
+            interrupts.check()
             progress.update(bar, advance=1, description=f"{name} {words(step)}".strip())
             yield step
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from fidsplat import interrupts
 from fidsplat.commands.output import (
     Device,
     Json,
@@ -27,7 +28,6 @@ from fidsplat.commands.output import (
 from fidsplat.commands.sweeps import asked, need_reports
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
-from fidsplat.interrupts import held_back
 
 if TYPE_CHECKING:
     from fidsplat.train import Step, Trainer, ViewScore
@@ -103,7 +103,7 @@ class Train:
             renderer = Renderer(self.device)
         trainer = Trainer(dataset, renderer, settings, checkpoint, restart=self.overwrite)
         before, begun = trainer.iteration, time.perf_counter()
-        with held_back() as stopped, _bar(trainer) as show:
+        with interrupts.postponed() as stopped, _bar(trainer) as show:
 
             def told(step: Step) -> None:
                 show(step)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from fidsplat import interrupts
 from fidsplat.commands.output import (
     MemoryBudget,
     SceneDevice,
@@ -92,7 +92,7 @@ class View:
         say(console(False), f"{viewer.address} shows {self.source or 'the demo'}; Ctrl-C ends it")
         try:
             while True:
-                time.sleep(1.0)
+                interrupts.sleep(1.0)
         finally:
             viewer.close()
 

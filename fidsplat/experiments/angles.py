@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.errors import InputError
 from fidsplat.experiments.methods import IDEAL, Painter, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, Category
@@ -91,8 +92,8 @@ def measure_angles(point: dict, painter: Painter, seed: int, pool: ThreadPoolExe
         else:
             waiting.append(pool.submit(look, draw(camera), tilt))
         while len(waiting) > 2 * workers:  # pictures that wait are memory
-            seen.append(waiting.popleft().result())
-    seen += [future.result() for future in waiting]
+            seen.append(interrupts.result_of(waiting.popleft()))
+    seen += [interrupts.result_of(future) for future in waiting]
     return {
         "spec": spec if category.kind == "apriltag" else made.family,
         "readers": {

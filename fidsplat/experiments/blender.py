@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from fidsplat import interrupts
 from fidsplat.cameras import Camera
 from fidsplat.errors import DeviceError, InputError
 from fidsplat.experiments.methods import plain_marker
@@ -105,7 +106,7 @@ def environment_python(environment: Path) -> Path:
 
 
 def _call(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = interrupts.run(command)
     if done.returncode:
         lines = (done.stderr or done.stdout).strip().splitlines() or ["no message"]
         raise DeviceError(f"installing Blender failed at '{' '.join(command[1:4])}': {lines[-1]}")
@@ -203,13 +204,13 @@ def drawn(python: Path, worker: Path, things: Iterable[dict], job: dict) -> Iter
         with open(log, "wb") as errors:
             process = subprocess.Popen(
                 [str(python), str(worker), str(file)],
-                stdout=subprocess.PIPE, stderr=errors, text=True, env=_clean_environment(),
+                stdout=subprocess.PIPE, stderr=errors, env=_clean_environment(),
             )  # fmt: skip
             try:
                 assert process.stdout is not None
-                for line in process.stdout:
+                for line in interrupts.lines_of(process.stdout):
                     if line.startswith("done "):  # Blender says much else
-                        yield Path(line.removeprefix("done ").rstrip("\n"))
+                        yield Path(line.removeprefix("done "))
                 status = process.wait()
             finally:
                 if process.poll() is None:

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.cameras import Camera
 from fidsplat.experiments.methods import Painter, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, Category
@@ -65,7 +66,7 @@ def measure_localisation(point: dict, painter: Painter, seed: int, pool: ThreadP
             camera = camera_at(distance, tilt, f"{seed} pose {name} {distance} {tilt}")
             errors = pool.submit(_errors, plain, camera, draw(camera))
             waiting.append(({"distance_m": distance, "tilt_deg": tilt}, errors))
-    return {"views": [place | errors.result() for place, errors in waiting]}
+    return {"views": [place | interrupts.result_of(errors) for place, errors in waiting]}
 
 
 def _errors(plain: Marker, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter, Trajectory
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError
@@ -155,9 +156,9 @@ class Localise:
             for picture in self.pictures(variant, run, renderer):
                 waiting.append(pool.submit(detect, picture, (FAMILY,), qr=False))
                 if len(waiting) > 2 * workers:
-                    yield waiting.popleft().result()
+                    yield interrupts.result_of(waiting.popleft())
             while waiting:
-                yield waiting.popleft().result()
+                yield interrupts.result_of(waiting.popleft())
 
     def localised(
         self,
@@ -243,10 +244,11 @@ def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
 
 
 def write_log(
-    asked: Localise, name: str, renderer: Renderer, path: str, overwrite: bool
+    asked: Localise, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
 ) -> Iterator[np.ndarray]:
     """One variant's drive as a log: pictures (JPEG), intrinsics, detections, the gyroscope, where the camera
-    is (/tf) and where the robot takes itself to be (/odom). Yields the pictures as they are logged.
+    is (/tf) and where the robot takes itself to be (/odom). Yields the pictures as they are logged. source:
+    as `RobotLog`.
 
     Raises InputError for a variant that takes no pictures, and as `RobotLog`.
     """
@@ -258,7 +260,7 @@ def write_log(
     run = asked.run()
     shots, camera = asked.shots(run), replace(asked.camera, lens=variant.lens)
     sightings = []
-    with RobotLog(path, overwrite=overwrite) as log:
+    with RobotLog(path, overwrite=overwrite, source=source) as log:
         for k, picture in zip(shots.tolist(), asked.pictures(variant, run, renderer), strict=True):
             time, codes = float(run.times[k]), detect(picture, (FAMILY,), qr=False)
             sightings.append(codes)

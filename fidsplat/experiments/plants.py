@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.arguments import whole_number
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.blender import camera_facts, drawn, ready
@@ -19,7 +20,6 @@ from fidsplat.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.formats import save_ply
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.provenance import code_hash
-from fidsplat.quality import whole_number
 from fidsplat.render import Renderer
 from fidsplat.sim.plant_meshes import GOLDEN, MESHES, Mesh
 from fidsplat.splats import SplatCloud

@@ -10,6 +10,7 @@ from threading import Lock
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
 from fidsplat.experiments.blender import VIEW_NAMES, novel_picture
@@ -157,7 +158,7 @@ def measure_views(
         pool.submit(compare, i, camera, kept.get("drawn", about, i, partial(draw, camera)))
         for i, camera in enumerate(cameras)
     ]
-    measured = [future.result() for future in waiting]
+    measured = [interrupts.result_of(future) for future in waiting]
     names = ("psnr", "ssim", "flip", "lpips")
     return {name: [one[name] for one in measured] if name in measured[0] else None for name in names}
 

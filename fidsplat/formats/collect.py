@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.cloud_arrays import find_defects, with_thinnest_last
 
 PADDED_LOG_SCALE = np.log(1e-6)
@@ -59,6 +60,7 @@ def collect(rows: Rows, progress: Progress | None = None) -> tuple[dict[str, np.
     scratch = np.empty((min(WINDOW, rows.count), 3), np.float32)
     dropped: dict[str, int] = {}
     for first in range(0, rows.count, WINDOW):
+        interrupts.check()
         part = kept.room(min(WINDOW, rows.count - first), first)
         good, reasons = _filled(rows, first, part, scratch if thick else None)
         kept.keep(part, good)

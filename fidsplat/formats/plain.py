@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.cloud_arrays import find_defects
 from fidsplat.errors import InputError
 from fidsplat.files import open_input, read_input
@@ -62,6 +63,7 @@ def cloud_of(
 
     Raises InputError for arrays that make no splats, or planes that cannot be.
     """
+    interrupts.check()
     scales = np.array(scales, np.float32)
     scales[scales[:, 2] <= np.float32(disk * (1 + 1e-5)), 2] = 0
     cloud = SplatCloud(means, quats, scales, opacities, sh=sh, labels=labels, source=str(path))

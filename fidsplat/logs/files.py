@@ -14,10 +14,12 @@ from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, path_of, printable, writable_folder
 
 try:
+    from mcap.reader import make_reader
     from mcap.writer import Writer as McapWriter
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as BagWriter
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from ruamel.yaml import YAML  # of rosbags, whose reader does not give a bag's own metadata
 except ImportError as error:
     raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
 
@@ -52,22 +54,45 @@ class LogFile(Protocol):
         ...
 
 
-def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool) -> LogFile:
-    """NAME.mcap for a file, any other name for a rosbag2 folder.
+_METADATA = "fidsplat.source"
+"""key of a log's metadata"""
+
+
+def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool, source: str) -> LogFile:
+    """NAME.mcap for a file, any other name for a rosbag2 folder. source: as `RobotLog`.
 
     Raises:
         InputError: it is there and is not to be overwritten, or cannot be written.
     """
     target = _target(path, overwrite)
     try:
-        return _McapFile(target, store) if target.suffix == ".mcap" else _Bag(target, store)
+        return (_McapFile if target.suffix == ".mcap" else _Bag)(target, store, source)
     except OSError as error:
         raise InputError(f"cannot write {target}: {error.strerror or error}") from error
 
 
-def check_log(path: str | os.PathLike[str], overwrite: bool) -> None:
-    """Asked before long work: raises InputError where a log could not be written."""
+def check_log(path: str | os.PathLike[str], overwrite: bool, source: str) -> bool:
+    """Check before long work that a log can be written; returns whether it is there already, complete and of
+    the same source. Raises InputError when it cannot be written."""
+    if not overwrite and source and _source_of(path_of(path)) == source:
+        return True
     writable_folder(_target(path, overwrite).parent)
+    return False
+
+
+def _source_of(path: Path) -> str | None:
+    """The source of a log that was written with one; None for anything else."""
+    try:
+        if path.is_dir():
+            found = YAML(typ="safe").load(path / "metadata.yaml")
+            return found["rosbag2_bagfile_information"]["custom_data"][_METADATA]
+        if path.is_file():
+            with path.open("rb") as stream:
+                found = make_reader(stream).iter_metadata()
+                return next((one.metadata["source"] for one in found if one.name == _METADATA), None)
+    except Exception:  # of two packages with errors of their own: no log
+        pass
+    return None
 
 
 def _target(path: str | os.PathLike[str], overwrite: bool) -> Path:
@@ -86,8 +111,8 @@ class _Dropped(Exception):
 
 
 class _McapFile:
-    def __init__(self, target: Path, store: Any) -> None:
-        self._store = store
+    def __init__(self, target: Path, store: Any, source: str) -> None:
+        self._store, self._source = store, source
         with ExitStack() as stack:
             self._writer = McapWriter(stack.enter_context(atomic_write(target)))
             self._writer.start(profile="ros2", library="fidsplat")
@@ -109,15 +134,19 @@ class _McapFile:
         with suppress(_Dropped), self._file:
             if not keep:
                 raise _Dropped
+            if self._source:
+                self._writer.add_metadata(_METADATA, {"source": self._source})
             self._writer.finish()
 
 
 class _Bag:
-    def __init__(self, target: Path, store: Any) -> None:
+    def __init__(self, target: Path, store: Any, source: str) -> None:
         self._target, self._store = target, store
         self._folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
         self._made = self._folder / printable(target.name)
         self._writer = BagWriter(self._made, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        if source:
+            self._writer.set_custom_data(_METADATA, source)
         self._writer.open()
         self._connections: dict[str, Any] = {}
 

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.arguments import instance, invalid, items, number, text
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
 from fidsplat.errors import InputError, unknown
 from fidsplat.logs.files import log_file, typestore
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.scalars import real_array
 from fidsplat.vision.detect import Detection
-from fidsplat.vision.images import encoded, to_uint8
+from fidsplat.vision.images import encoded, pixels_of, to_uint8
 
 _ENCODINGS = {"rgb": "rgb8", "label": "32SC1", "splat_id": "32SC1", "blended": "32SC1"}
 """of outputs; the others are 32FC1 or 32FC3"""
@@ -33,14 +34,23 @@ class RobotLog:
         path: NAME.mcap, or a folder to be made.
         world: name of the frame in which poses are.
         overwrite: whether a log of that name is replaced.
+        source: text that identifies what the log is made from, kept in its metadata, by which `check_log`
+            finds that it is complete.
 
     Raises:
         InputError: the log exists, cannot be written, or the packages are missing (extra `logs`).
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, world: str = "map", overwrite: bool = False) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        world: str = "map",
+        overwrite: bool = False,
+        source: str = "",
+    ) -> None:
         self._store = typestore()
-        self._file = log_file(path, self._store, overwrite)
+        self._file = log_file(path, self._store, overwrite, source)
         self._path, self.world = path, world
         self._last: dict[str, float] = {}
 
@@ -64,20 +74,25 @@ class RobotLog:
         Raises:
             InputError: a time before the last, a compression that nobody knows.
         """
+        text("output", output)
+        pixels = pixels_of(image)
+        if pixels.ndim not in (2, 3) or not pixels.size or (output == "rgb" and pixels.shape[2:] != (3,)):
+            raise InputError(f"an image must be (h, w) or (h, w, k), rgb (h, w, 3), got {pixels.shape}")
         topic = f"/{camera}/image_raw" if output == "rgb" else f"/{camera}/{output}/image_raw"
         if compress is not None:
-            if compress not in ("jpeg", "png") or output != "rgb":
+            if not isinstance(compress, str) or compress not in ("jpeg", "png") or output != "rgb":
                 raise InputError(
                     f"compress is {compress!r} for {output}; rgb alone is compressed, as 'jpeg' or 'png'"
                 )
-            data = np.frombuffer(encoded(image, compress), np.uint8)
+            data = np.frombuffer(encoded(pixels, compress), np.uint8)
             message = self._of("sensor_msgs/msg/CompressedImage")(self._header(time, camera), compress, data)
             self._write(f"{topic}/compressed", time, message)
             return
-        pixels = to_uint8(image) if output == "rgb" else np.asarray(image)
+        pixels = to_uint8(pixels) if output == "rgb" else pixels
         kind = _ENCODINGS.get(output, f"32FC{1 if pixels.ndim == 2 else pixels.shape[2]}")
         dtype = np.uint8 if kind == "rgb8" else np.int32 if kind == "32SC1" else np.float32
-        pixels = np.ascontiguousarray(pixels, dtype)
+        with np.errstate(over="ignore"):
+            pixels = np.ascontiguousarray(pixels, dtype)
         height, width = pixels.shape[:2]
         data = pixels.reshape(-1).view(np.uint8)
         self._write(
@@ -95,7 +110,7 @@ class RobotLog:
         Raises:
             InputError: a lens that ROS does not know.
         """
-        model, factors = _distortion(camera)
+        model, factors = _distortion(instance("camera", camera, Camera))
         k = camera.matrix - [[0, 0, PIXEL], [0, 0, PIXEL], [0, 0, 0]]
         roi = self._of("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
         message = self._of("sensor_msgs/msg/CameraInfo")(
@@ -107,7 +122,7 @@ class RobotLog:
     def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
         """Where a frame is, parent from frame (4, 4), as `/tf`; the parent is the world by default. A
         camera's frame has OpenCV's axes, as ROS's optical frames have."""
-        position, turn = self._pose_parts(f"the pose of {frame}", pose)
+        position, turn = self._pose_parts(f"the pose of {text('the name of a frame', frame)}", pose)
         made = self._of("geometry_msgs/msg/Transform")(self._of("geometry_msgs/msg/Vector3")(*position), turn)
         stamped = self._of("geometry_msgs/msg/TransformStamped")(
             self._header(time, self.world if parent is None else parent), frame, made
@@ -121,7 +136,10 @@ class RobotLog:
         """World from body (4, 4), with velocities (3,) in metres and radians a second in the body's axes, and
         the pose's covariance (6, 6)."""
         position, turn = self._pose_parts("the pose of odometry", pose)
-        spread = np.zeros(36) if covariance is None else np.asarray(covariance, np.float64).ravel()
+        spread = np.zeros((6, 6)) if covariance is None else real_array("covariance", covariance)
+        if spread.shape != (6, 6):
+            raise invalid("covariance", "(6, 6) numbers", covariance)
+        text("frame", frame)
         vector, point = self._of("geometry_msgs/msg/Vector3"), self._of("geometry_msgs/msg/Point")
         body = self._of("geometry_msgs/msg/Pose")(point(*position), turn)
         twist = self._of("geometry_msgs/msg/Twist")(
@@ -130,7 +148,7 @@ class RobotLog:
         message = self._of("nav_msgs/msg/Odometry")(
             self._header(time, self.world),
             frame,
-            self._of("geometry_msgs/msg/PoseWithCovariance")(body, spread),
+            self._of("geometry_msgs/msg/PoseWithCovariance")(body, spread.ravel()),
             self._of("geometry_msgs/msg/TwistWithCovariance")(twist, np.zeros(36)),
         )
         self._write(topic, time, message)
@@ -154,7 +172,7 @@ class RobotLog:
         """Tags of a picture as `/CAMERA/detections` (apriltag_msgs); a QR code's family is its payload."""
         point, tag = (self._of(f"apriltag_msgs/msg/{name}") for name in ("Point", "AprilTagDetection"))
         tags = []
-        for code in found:
+        for code in items("found", found, Detection, "a list of Detection"):
             corners = [point(float(x), float(y)) for x, y in np.asarray(code.corners) - PIXEL]
             middle = point(*(np.asarray(code.corners).mean(0) - PIXEL).tolist())
             family, number = (code.payload or "", -1) if code.id is None else (code.family or "", code.id)
@@ -166,6 +184,7 @@ class RobotLog:
         return self._store.types[kind]
 
     def _header(self, time: float, frame: str) -> Any:
+        text("the name of a frame", frame)
         seconds, rest = divmod(_nanoseconds(time), 10**9)
         return self._of("std_msgs/msg/Header")(self._of("builtin_interfaces/msg/Time")(seconds, rest), frame)
 
@@ -175,6 +194,7 @@ class RobotLog:
         return position.tolist(), self._of("geometry_msgs/msg/Quaternion")(x, y, z, w)
 
     def _write(self, topic: str, time: float, message: Any) -> None:
+        text("topic", topic)
         if time < self._last.get(topic, -math.inf):
             raise InputError(
                 f"{topic} jumps back in time, from {self._last[topic]:g} s to {time:g} s; a simulator that "
@@ -190,10 +210,7 @@ class RobotLog:
 
 
 def _nanoseconds(time: float) -> int:
-    value = float(time)
-    if not 0 <= value < 2**31:
-        raise InputError(f"a log's time is {time!r}; it must be seconds from 0 to 2^31")
-    return round(value * 1e9)
+    return round(number("a log's time", time, "seconds from 0 to 2^31", 0.0, 2**31 - 1) * 1e9)
 
 
 def _three(name: str, value: Any) -> list[float]:

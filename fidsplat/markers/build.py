@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from fidsplat.arguments import text, whole_number
 from fidsplat.errors import InputError
 from fidsplat.markers.facets import count_facets, facet_cloud
 from fidsplat.markers.kinds import bits_of, kind_of, parse_spec
@@ -34,7 +35,7 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
-from fidsplat.quality import MIXTURES, MarkerQuality, whole_number
+from fidsplat.quality import MIXTURES, MarkerQuality
 from fidsplat.scalars import PickledByFields
 
 if TYPE_CHECKING:
@@ -302,13 +303,13 @@ def _chosen(
         raise InputError(
             f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"
         )
-    name = quality.mixture if mixture is None else mixture
+    name = quality.mixture if mixture is None else text("mixture", mixture)
     if name == "refined":
         raise InputError(
             "the mixture 'refined' is made on a device: give what is made as 'fitted' to fs.train.refine, or "
             "write `fidsplat marker --mixture refined`"
         )
-    if not isinstance(name, str) or name not in MIXTURES:
+    if name not in MIXTURES:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
     given = {key: value for key, value in given.items() if value is not None}
     of_paper = [key for key in ("levels", "density") if key in given]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
+from fidsplat import interrupts
 from fidsplat.markers.partition import partition
 
 BAND = 2.5
@@ -153,6 +154,7 @@ def _widths(sides: _Sides, edges: np.ndarray, tree: shapely.STRtree) -> np.ndarr
     at, radius = at.reshape(-1, 2), np.full(angle.size, BAND)
     left = np.arange(angle.size)
     while len(left):
+        interrupts.check()
         middle = at[left] + radius[left, None] * normal[left]
         nearest = tree.query_nearest(shapely.points(middle), all_matches=False)[1]
         a, step = edges[nearest, 0], edges[nearest, 1] - edges[nearest, 0]

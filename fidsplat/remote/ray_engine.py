@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from fidsplat import __version__
+from fidsplat import __version__, interrupts
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.provenance import code_hash
 from fidsplat.remote.queue import WorkerLost
@@ -90,7 +90,9 @@ class RayEngine:
 
     def wait(self, tickets: Sequence[Any]) -> Any:
         """The first of them that is done."""
-        return _ray().wait(list(tickets), num_returns=1)[0][0]
+        while not (done := _ray().wait(list(tickets), num_returns=1, timeout=interrupts.PERIOD)[0]):
+            interrupts.check()
+        return done[0]
 
     def result(self, ticket: Any) -> Any:
         """What was made of a ticket's item. Raises WorkerLost, FidsplatError."""
@@ -110,6 +112,7 @@ class RayEngine:
     def _get(self, ticket: Any) -> Any:
         from ray.exceptions import RayError, RayTaskError  # type: ignore[import-not-found]
 
+        self.wait([ticket])
         try:
             return _ray().get(ticket)
         except RayTaskError as error:

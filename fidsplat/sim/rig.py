@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.arguments import instance, invalid, whole_number
 from fidsplat.batch import FrameBatch
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture, output_names
@@ -95,6 +96,10 @@ class Rig:
         self.bodies = tuple(dict.fromkeys((*self.labels.values(), *mounts)))
         """names of the bodies whose poses are asked for, in the order of the axis `body`"""
         self._rest = {}
+        if renderer is not None:
+            instance("renderer", renderer, Renderer, "an fs.Renderer or None")
+        if not isinstance(rest, Mapping | None):
+            raise invalid("rest", "{name of a body: pose (7,)}", rest)
         for name, pose in ({} if rest is None else rest).items():
             if name not in self.bodies:
                 raise InputError(unknown("body", name, self.bodies))
@@ -153,13 +158,18 @@ class Rig:
 
     def outputs_of(self, camera: str) -> tuple[str, ...]:
         """Names of a camera's output images, where `render` is not told others."""
+        _known("camera", camera, self.cameras)
         return self.cameras[camera].outputs or self._capture.outputs
 
     def placed(self, bodies: Mapping[str, np.ndarray]) -> list[PlacedMarker]:
         """The scene's markers where they are when the bodies have these poses (7,)."""
+        if not isinstance(bodies, Mapping):
+            raise invalid("bodies", "{name of a body: pose (7,)}", bodies)
         placed = []
         for marker in self.scene.markers:
             name = self.labels.get(marker.label)
+            if name is not None and name not in bodies:
+                raise invalid("bodies", f"poses of all bodies, {name!r} among them", sorted(bodies))
             if name is not None:
                 pose = compose(bodies[name], self._rest.get(name, IDENTITY))
                 marker = replace(marker, pose=matrix_of(pose) @ marker.pose)
@@ -243,6 +253,8 @@ class Pictures(Mapping):
         self._arrays: dict[str, np.ndarray] = {}
 
     def __getitem__(self, name: str) -> np.ndarray:
+        if not isinstance(name, str):
+            raise MissingOutputError(str(invalid("an output", "a name", name)))
         if name not in self._arrays:
             sizes = {(rig.camera.width, rig.camera.height) for rig in self.rig.cameras.values()}
             if len(sizes) > 1:
@@ -276,19 +288,25 @@ class Pictures(Mapping):
 
     def of(self, camera: str) -> FrameBatch:
         """What one camera sees: (env, h, w[, c]). Raises InputError for a camera that the rig has not."""
-        if camera not in self._batches:
-            raise InputError(unknown("camera", camera, self._batches))
+        _known("camera", camera, self._batches)
         return self._batches[camera]
 
     def camera(self, name: str, environment: int = 0) -> Camera:
         """A camera with the pose that it had."""
+        self.of(name)  # a camera of the rig
+        whole_number("environment", environment, 0, len(self.cameras[name]) - 1)
         camera = self.of(name).frame(environment).capture.camera
-        assert camera is not None  # what took a picture
+        assert camera is not None  # of a rendered image
         return camera
 
     def placed(self, environment: int = 0) -> list[PlacedMarker]:
         """The scene's markers where they were."""
         return self.rig.placed({body: pose[environment] for body, pose in self.bodies.items()})
+
+
+def _known(what: str, name: Any, names: Iterable[str]) -> None:
+    if not isinstance(name, str) or name not in names:
+        raise InputError(unknown(what, name, names))
 
 
 def _cameras_of(cameras: Any) -> dict[str, RigCamera]:
@@ -362,7 +380,10 @@ def _environments(bodies: Mapping[str, np.ndarray], cameras: Mapping[str, np.nda
 def _mask_of(mask: Any, count: int) -> np.ndarray | None:
     if mask is None:
         return None
-    array = np.asarray(mask)
+    try:
+        array = np.asarray(mask)
+    except ValueError:  # rows that differ in length
+        array = np.empty(0, object)
     if array.dtype != bool or array.shape != (count,):
         raise InputError(f"mask must be ({count},) bool, one for each environment, not {mask!r}")
     return array

@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat import interrupts
+from fidsplat.arguments import callback
 from fidsplat.errors import InputError, bytes_words
 from fidsplat.files import atomic_write, from_json, read_input
 from fidsplat.formats.collect import Progress
@@ -66,6 +68,7 @@ def build_store(
         InputError: an input that cannot be used, a store that is there or that another process builds, a disk
             without room.
     """
+    progress = callback("progress", progress)
     folder = store_folder(out)
     refuse_existing(folder, overwrite)
     plan = plan_of(open_sources(inputs), chunk, memory, levels, sh_degree, colors)
@@ -145,9 +148,9 @@ class _Build:
         for one in given:
             waiting.append(pool.submit(work, one))
             if len(waiting) > (self.workers if most is None else most - 1):
-                yield waiting.popleft().result()
+                yield interrupts.result_of(waiting.popleft())
         while waiting:
-            yield waiting.popleft().result()
+            yield interrupts.result_of(waiting.popleft())
 
     # inputs to buckets
 

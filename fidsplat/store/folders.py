@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from fidsplat.arguments import flag
 from fidsplat.errors import InputError
 from fidsplat.files import path_of, writable_folder
 from fidsplat.store.layout import HEADER, SUFFIX
@@ -26,7 +27,7 @@ def store_folder(out: str | os.PathLike[str]) -> Path:
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:
     """Raises InputError for a store that is there and is not to be replaced, or what is no store."""
-    if folder.exists() and not overwrite:
+    if not flag("overwrite", overwrite) and folder.exists():
         raise InputError(f"{folder} is there already; give another name, or --overwrite")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is not a folder, so it is no store; give another name")

@@ -13,6 +13,7 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 from fidsplat.rotations import check_similarity
+from fidsplat.scalars import real_array
 from fidsplat.store.folders import emptied, filled, refuse_existing, store_folder
 from fidsplat.store.layout import MOST_SPLATS, PLACES
 from fidsplat.store.store import Store
@@ -47,7 +48,7 @@ def place_store(
             "scene file"
         )
     try:
-        given = np.stack([np.asarray(pose, np.float64) for pose in poses])
+        given = np.stack([real_array("a pose", pose) for pose in poses])
     except (TypeError, ValueError):
         given = np.empty(0)
     if given.ndim != 3 or not len(given):

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
+from fidsplat.arguments import flag, whole_number
 from fidsplat.errors import InputError
 from fidsplat.files import printable
 from fidsplat.formats.collect import WINDOW
@@ -111,10 +112,11 @@ def plan_of(
         raise InputError(f"chunk is {chunk!r}; it must be a whole number of splats from 64 to {1 << 22}")
     if isinstance(memory, bool) or not isinstance(memory, int) or memory < _LEAST_MEMORY:
         raise InputError(f"memory is {memory!r}; building takes at least {_LEAST_MEMORY >> 20} MiB")
-    if colors not in COLORS:
+    flag("levels", levels)
+    if not isinstance(colors, str) or colors not in COLORS:
         raise InputError(f"colors is {colors!r}; known: {', '.join(COLORS)}")
-    if sh_degree is not None and (isinstance(sh_degree, bool) or sh_degree not in (0, 1, 2, 3)):
-        raise InputError(f"sh_degree is {sh_degree!r}; it must be 0, 1, 2 or 3")
+    if sh_degree is not None:
+        whole_number("sh_degree", sh_degree, 0, 3)
     degree = max(map(degree_of, sources))
     if sh_degree is not None:
         degree = min(degree, sh_degree) or -1

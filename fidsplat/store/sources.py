@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.arguments import invalid
 from fidsplat.cloud_arrays import choose_origin, unit_quaternions
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
@@ -39,6 +40,8 @@ def open_sources(inputs: Sequence[str | os.PathLike[str] | Source]) -> list[Sour
     """Raises InputError for no input, and as `load_splats` for a path of no file of splats."""
     if isinstance(inputs, (str, os.PathLike)):
         inputs = [inputs]
+    if not isinstance(inputs, Sequence):
+        raise invalid("inputs", "a list of files of splats", inputs)
     opened = [one if isinstance(one, Source) else _open(path_of(one)) for one in inputs]
     if not opened:
         raise InputError("a store is built of files of splats; give one at least")

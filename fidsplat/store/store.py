@@ -9,11 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.arguments import callback, flag, instance, invalid, whole_number
+from fidsplat.arguments import number as checked_number
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
 from fidsplat.formats.collect import Progress
 from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
+from fidsplat.scalars import real_array
 from fidsplat.splats import SplatCloud
 from fidsplat.store import layout
 from fidsplat.store.detail import Detail, load_details, pixels
@@ -156,6 +159,7 @@ class Store(Summarised):
 
         Raises InputError where it was not measured.
         """
+        instance("quality", quality, Quality)
         if not self.levels:
             return (0.0,)  # nothing stands for others: always exact
         measured = [detail for detail in self.details if detail.lowpass == quality.lowpass]
@@ -172,6 +176,7 @@ class Store(Summarised):
     def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corners, (places * nodes, 3) float64 [m] from the origin, of boxes around the
         splats of each node to that many standard deviations; 0: around their centres."""
+        sigmas = checked_number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         nodes, share = self.nodes, min(sigmas / layout.FAR, 1.0)
         beyond = np.maximum(sigmas - layout.FAR, 0.0) * nodes["reach"].astype(np.float64)[:, None]
         # what a box reaches is convex in the number of standard deviations: below its chord
@@ -205,18 +210,27 @@ class Store(Summarised):
     def first_of(self, numbers: np.ndarray) -> np.ndarray:
         """(k,) int64: the index in the whole scene of the first splat of chunks, by their numbers; -1 for
         nodes that stand for others."""
-        place, node = np.divmod(numbers, max(len(self.nodes), 1))
+        place, node = np.divmod(self._checked(numbers), max(len(self.nodes), 1))
         own = self.nodes[node]
         return np.where(own["level"] == 0, own["first"] + place * self._own.splats, -1)
 
     def counts(self, numbers: np.ndarray) -> np.ndarray:
         """(k,) splats of nodes, by their numbers."""
-        return self.nodes["count"][numbers % max(len(self.nodes), 1)]
+        return self.nodes["count"][self._checked(numbers) % max(len(self.nodes), 1)]
+
+    def _checked(self, numbers: np.ndarray) -> np.ndarray:
+        """Numbers of nodes, (k,). Raises InputError for others."""
+        given, count = real_array("numbers", numbers), self.places * len(self.nodes)
+        if not ((given == np.rint(given)) & (given >= 0) & (given < count)).all():
+            raise invalid("numbers", f"whole numbers of nodes, 0 to {count - 1}", numbers)
+        return given.astype(np.int64)
 
     def load(self, number: int, placed: bool = True) -> dict[str, np.ndarray]:
         """The splats of a node, by its number: arrays as a cloud has them, relative to `origin`. placed:
         whether where the node is placed, or as the store has them that stands there."""
-        place, node = divmod(int(number), len(self.nodes))
+        last = self.places * len(self.nodes) - 1
+        flag("placed", placed)
+        place, node = divmod(whole_number("the number of a node", number, 0, last), len(self.nodes))
         first = int(self.nodes["first"][node])
         return self._rows(first, first + int(self.nodes["count"][node]), place if placed else None)
 
@@ -254,6 +268,7 @@ class Store(Summarised):
     def verify(self, progress: Progress | None = None) -> list[str]:
         """What is damaged, in words: every chunk is read and compared with its checksum. Empty: it is
         whole."""
+        callback("progress", progress)
         wrong = []
         for number, node in enumerate(self.nodes):
             first, end = int(node["first"]), int(node["first"] + node["count"])

@@ -10,15 +10,19 @@ from functools import cached_property
 
 import numpy as np
 
+from fidsplat.arguments import instance, invalid, items, text, whole_number
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
 from fidsplat.files import printable
+from fidsplat.scalars import real_array
+from fidsplat.surroundings import three_numbers
 from fidsplat.train.random_numbers import Purpose, uniform
 
 FAR = 1e4
 """extents from the world's origin beyond which means have an origin of their own: float32 would blur them"""
 _FACING, _AHEAD = 0.5, 3.0
 """cosine from which cameras look at a point; extents, to which they see where they look at none"""
+MOST_POINTS = 2**31 - 1
 _STILL = 1e-9
 """share of a camera's distance from the world's origin, below which movements are what rounding leaves"""
 
@@ -35,6 +39,9 @@ class TrainingView:
     """(h, w) bool, False where the picture does not matter"""
 
     def __post_init__(self) -> None:
+        text("the name of a training view", self.name)
+        instance(f"the camera of {self.name}", self.camera, Camera)
+        instance(f"the picture {self.name}", self.picture, np.ndarray, "an array (h, w, 3) of uint8")
         camera, shape = self.camera, self.picture.shape
         if self.picture.dtype != np.uint8 or shape != (camera.height, camera.width, 3):
             size = f"{shape[1]} x {shape[0]}" if len(shape) >= 2 else f"of the shape {shape}"
@@ -42,6 +49,9 @@ class TrainingView:
                 f"the picture {self.name} is {size}, but its camera has {camera.width} x {camera.height} "
                 "pixels; give pictures of the size that their cameras were found for"
             )
+        mask = self.mask
+        if mask is not None and not (isinstance(mask, np.ndarray) and mask.dtype == bool and mask.ndim == 2):
+            raise invalid(f"the mask of {self.name}", "an array (h, w) of bool, or None", mask)
         if self.mask is not None and self.mask.shape != shape[:2]:
             raise InputError(
                 f"the mask of {self.name} is {self.mask.shape[1]} x {self.mask.shape[0]}, its picture "
@@ -75,6 +85,18 @@ class Dataset:
     """display values behind everything"""
 
     def __post_init__(self) -> None:
+        text("the name of a data set", self.name)
+        for name in ("views", "held_out"):
+            views = items(f"{name} of {self.name}", getattr(self, name), TrainingView, "TrainingViews")
+            object.__setattr__(self, name, views)
+        points = real_array(f"the points of {self.name}", self.points)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise invalid(f"the points of {self.name}", "an array (m, 3)", self.points)
+        colors = self.colors
+        if not isinstance(colors, np.ndarray) or colors.dtype != np.uint8 or colors.shape != points.shape:
+            raise invalid(f"the colours of {self.name}", f"an array {points.shape} of uint8", colors)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "background", three_numbers("background", self.background))
         if len(self.views) < 2:
             raise InputError(
                 f"{self.name} has {len(self.views)} view{'' if len(self.views) == 1 else 's'} to train on; a "
@@ -125,6 +147,8 @@ class Dataset:
     def with_random_points(self, count: int, seed: int) -> Dataset:
         """The data set with points at random places, in random colours, where its cameras look: in a cube,
         or, where most of them look ahead or around, before each to three extents."""
+        count = whole_number("the number of random points", count, 0, MOST_POINTS)
+        seed = whole_number("the seed", seed, 0, 2**63 - 1)
         cameras, draws = [view.camera for view in self.views], uniform(seed, Purpose.POINTS, 0, count)
         shades = uniform(seed, Purpose.POINTS, 0, count, draw=1)
         low, high, faced = looked_at(cameras)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from fidsplat.arguments import instance, whole_number
 from fidsplat.errors import InputError
 from fidsplat.train.dataset import Dataset
 from fidsplat.train.settings import TrainSettings
@@ -23,6 +24,9 @@ def splats_within(settings: TrainSettings, budget: int, dataset: Dataset) -> Tra
     Raises:
         InputError: the pictures alone take it.
     """
+    instance("settings", settings, TrainSettings)
+    instance("dataset", dataset, Dataset)
+    budget = whole_number("budget", budget, 1, 2**63 - 1)
     pictures = sum(view.picture.nbytes for view in (*dataset.views, *dataset.held_out))
     pixels = max(view.camera.width * view.camera.height for view in dataset.views)
     fixed = pictures + 4 * _FLOATS_OF_A_PIXEL * pixels

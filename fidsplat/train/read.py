@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.arguments import callback, whole_number
 from fidsplat.errors import InputError
 from fidsplat.files import from_json, path_of, read_text
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
-from fidsplat.quality import whole_number
-from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.dataset import MOST_POINTS, Dataset, TrainingView
 from fidsplat.train.flat import flat_view
 from fidsplat.train.transforms import Found, has_transforms, load_transforms
 from fidsplat.vision.images import read_image, read_over
@@ -21,7 +21,6 @@ NOTES = ("dataset.json", "marker.json")
 """files beside a data set of ours that may say its `background`: one display value, or three"""
 _MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """where COLMAP's model may lie in a data set"""
-MOST_POINTS = 2**31 - 1
 HOLD_OUT, ENOUGH = 8, 16
 """every eighth view is held out where no other views are and there are this many"""
 
@@ -54,10 +53,10 @@ def load_dataset(
     folder = path_of(path)
     if not folder.exists():
         raise InputError(f"{folder} is not there; give the folder of a data set")
-    if hold_out is not None and (hold_out < 0 or hold_out == 1):
+    if hold_out is not None and whole_number("--hold-out", hold_out, 0, 2**31) == 1:
         raise InputError(f"--hold-out is {hold_out}; give 2 or more, every n-th view, or 0 for none")
     random_points = whole_number("--random-points", random_points, 0, MOST_POINTS)
-    tell = progress or (lambda words, share: None)
+    tell = callback("progress", progress) or (lambda words, share: None)
     found = (load_transforms if has_transforms(folder) else _load_colmap)(folder, tell)
     views, held_out = _divided(found.views, found.held_out, hold_out)
     points, colors = found.points, found.colors

@@ -12,16 +12,16 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from fidsplat.arguments import as_float, callback, instance, invalid, whole_number
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError
 from fidsplat.markers import Marker
-from fidsplat.quality import Quality, whole_number
+from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 from fidsplat.train.derivatives import drawn
@@ -89,8 +89,12 @@ def refine(
             ``max_splats``.
     """
     start = time.perf_counter()
+    instance("made", made, Marker, "what fs.marker returns")
+    if renderer is not None and not hasattr(renderer, "backend"):
+        raise invalid("renderer", "an fs.Renderer or None", renderer)
+    callback("progress", progress)
     iterations = whole_number("iterations", iterations, 1, 100_000)
-    if isinstance(leak, bool) or not (isinstance(leak, Real) and 0 <= leak <= 1):
+    if not 0 <= as_float(leak) <= 1:
         raise InputError(f"leak is {leak!r}; it must lie from 0 to 1")
     seed = whole_number("the seed", seed, 0, 2**63 - 1)
     if made.regions is not None:

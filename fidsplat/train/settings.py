@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import Any
 
+from fidsplat.arguments import as_float, instance, whole_number
 from fidsplat.errors import InputError, unknown
 from fidsplat.harmonics import MAX_DEGREE
-from fidsplat.quality import Quality, whole_number
+from fidsplat.quality import Quality
 
 STRATEGIES = ("default", "mcmc")
 MOST_ITERATIONS = 10_000_000
@@ -130,7 +130,7 @@ class TrainSettings:
     def __post_init__(self) -> None:
         for name, (least, most) in _COUNTS.items():
             _put(self, name, whole_number(f"training: {name}", getattr(self, name), least, most))
-        if self.strategy not in STRATEGIES:
+        if not isinstance(self.strategy, str) or self.strategy not in STRATEGIES:
             raise InputError(f"training: strategy is {self.strategy!r}; known: {', '.join(STRATEGIES)}")
         if not isinstance(self.quality, str):  # checkpoints hold it as text
             raise InputError(f"training: quality is {self.quality!r}; give it as text, e.g. 'surfel'")
@@ -140,7 +140,7 @@ class TrainSettings:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type == "float":
-                if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= float(value) < math.inf:
+                if not 0 <= as_float(value) < math.inf:
                     raise InputError(
                         f"training: {field.name} is {value!r}; it must be a number of at least 0"
                     )
@@ -160,11 +160,13 @@ class TrainSettings:
 
     def position_rate_at(self, iteration: int) -> float:
         """Learning rate of the means, in units of the extent: falls evenly in its logarithm."""
+        iteration = whole_number("iteration", iteration, 0, 2**63 - 1)
         share = min(iteration / self.position_steps, 1.0)
         return self.position_rate ** (1 - share) * self.position_rate_end**share
 
     def degree_at(self, iteration: int) -> int:
         """SH degree that is trained at this iteration."""
+        iteration = whole_number("iteration", iteration, 0, 2**63 - 1)
         return min(self.sh_degree, iteration // self.sh_every)
 
     def surface_weights_at(self, iteration: int) -> tuple[float, float]:
@@ -193,6 +195,8 @@ def _put(settings: TrainSettings, name: str, value: Any) -> None:
 
 def settings_with(settings: TrainSettings | None, changes: dict[str, Any]) -> TrainSettings:
     """Settings, the defaults if None, with some changed. Raises InputError for one that does not exist."""
+    if settings is not None:
+        instance("settings", settings, TrainSettings)
     for name in changes:
         if name not in TrainSettings.__dataclass_fields__:
             raise InputError(unknown("training setting", name, TrainSettings.__dataclass_fields__))

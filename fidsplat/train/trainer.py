@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fidsplat import interrupts
+from fidsplat.arguments import callback, instance, invalid, items
 from fidsplat.backends.derivatives import CompilesAhead, Differentiates, Trains
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.prepare import prepare
@@ -94,7 +96,11 @@ class Trainer:
         restart: bool = False,
         **changes: Any,
     ) -> None:
-        self.dataset = dataset
+        self.dataset = instance("dataset", dataset, Dataset, remedy="load_dataset reads one")
+        if renderer is not None and not hasattr(renderer, "backend"):
+            raise invalid("renderer", "an fs.Renderer or None", renderer)
+        if start is not None:
+            instance("start", start, SplatCloud, "an fs.SplatCloud or None")
         self.settings = settings_with(settings, changes)
         self.renderer = Renderer() if renderer is None else renderer
         self.checkpoint = None if checkpoint is None else _writable(checkpoint)
@@ -165,6 +171,7 @@ class Trainer:
             InputError: as `step`; or a checkpoint cannot be written, and the last one is whole.
             TrainingError: as `step`.
         """
+        callback("progress", progress)
         last = told = time.monotonic()
         while not self.done:
             self._advance(late=progress is None or not prompt)
@@ -205,12 +212,14 @@ class Trainer:
     def evaluate(self, views: tuple[TrainingView, ...] | None = None) -> list[ViewScore]:
         """Compare the splats with views: those that were held out, unless others are given."""
         views = self.dataset.held_out if views is None else views
+        views = items("views", views, TrainingView, "a list of TrainingView")
         captures = [self._capture(view) for view in views]
         frames = self.renderer.render_views(self.cloud(), captures)
         return [scored(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
 
     def _advance(self, late: bool) -> None:
         """An iteration. late: its loss may be asked for when others have followed."""
+        interrupts.check()
         made, settings = self._made, self.settings
         if self._failure is not None:
             raise self._failure

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.arguments import instance, text
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, ordinary_file
 from fidsplat.vision.truth import GroupTruth, MarkerTruth, Truth
@@ -41,6 +42,8 @@ class CocoAnnotations:
         Raises:
             InputError: the picture is there already.
         """
+        text("file_name", file_name)
+        instance("truth", truth, Truth, "what truth_of returns")
         if any(image["file_name"] == file_name for image in self._images):
             raise InputError(f"the picture {file_name!r} is annotated already; each has a name of its own")
         camera = truth.camera

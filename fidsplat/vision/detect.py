@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import zxingcpp
 
+from fidsplat.arguments import invalid, items
 from fidsplat.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefined
@@ -70,8 +71,10 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
     pixels = pixels_of(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
         raise InputError(f"detect needs uint8 (h, w) or (h, w, 3), not {pixels.dtype} {pixels.shape}")
-    if families is not None and (isinstance(families, str) or not isinstance(families, Iterable)):
-        raise InputError(f"families must be several names, as ('36h11',), not {families!r}")
+    if isinstance(families, str):
+        raise invalid("families", "several names", families, "write ('36h11',)")
+    if families is not None:
+        families = items("families", families, str, "several names, as ('36h11',)")
     if not isinstance(qr, bool | np.bool_ | int):
         raise InputError(f"qr must be True or False, not {type(qr).__name__}")
     wanted = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]

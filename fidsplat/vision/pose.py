@@ -18,6 +18,9 @@ SAME = 1e-6
 LOOSE = 0.1
 """Share of the points' spread by which a stand-in may miss them."""
 
+SMALLEST = 1e-9
+"""Metres of a code's edge."""
+
 
 def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
     """camera_from_marker, (4, 4) float64, metres.
@@ -38,8 +41,8 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
     corners, edge = real_array("corners", corners), real_array("size", size)
     if corners.shape != (4, 2):
         raise InputError(f"corners must be (4, 2) pixels, not {corners.shape}")
-    if edge.shape != () or not 0 < edge < LARGEST:
-        raise InputError(f"size must be metres above 0, not {size!r}")
+    if edge.shape != () or not SMALLEST <= edge < LARGEST:
+        raise InputError(f"size must be metres above 0, {SMALLEST:g} at least, not {size!r}")
     if not isinstance(camera, Camera):
         raise InputError(f"camera must be a Camera, not {type(camera).__name__}")
     half = float(edge) / 2

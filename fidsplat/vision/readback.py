@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fidsplat.arguments import invalid
 from fidsplat.cameras import Camera
 from fidsplat.markers import Marker
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.vision.boards import BOARDS, board_pose
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.dictionaries import parse_family
-from fidsplat.vision.images import to_uint8
+from fidsplat.vision.images import pixels_of, to_uint8
 from fidsplat.vision.pose import marker_pose, pose_error
 from fidsplat.vision.truth import MarkerTruth, marker_truth, standing
 
@@ -81,7 +82,9 @@ def read_back(
     Raises:
         InputError: no camera, or one of another size than the picture.
     """
-    image = to_uint8(picture["rgb"] if isinstance(picture, Mapping) else np.asarray(picture))
+    if isinstance(picture, Mapping) and "rgb" not in picture:
+        raise invalid("picture", "a Frame with rgb, or an array", list(picture))
+    image = to_uint8(pixels_of(picture["rgb"] if isinstance(picture, Mapping) else picture))
     label = picture["label"] if isinstance(picture, Mapping) and "label" in picture else None
     camera, markers = standing(picture, scene, camera, image.shape)
     found = detect(image, families_of(placed.marker for placed in markers) if families is None else families)

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.arguments import instance, invalid
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
+from fidsplat.scalars import real_array
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.vision.visible import visible
 
@@ -84,8 +86,10 @@ def truth_of(picture: Mapping[str, np.ndarray], scene: Scene, camera: Camera | N
     Raises:
         InputError: no camera, or one of another size than the image.
     """
+    if not isinstance(picture, Mapping) or not picture:
+        raise invalid("picture", "a Frame, or images by name", picture)
     first = next(iter(picture))
-    camera, markers = standing(picture, scene, camera, picture[first].shape)
+    camera, markers = standing(picture, scene, camera, np.shape(picture[first]))
     label = picture.get("label")
     return Truth(
         camera,
@@ -99,12 +103,17 @@ def standing(
 ) -> tuple[Camera, list[PlacedMarker]]:
     """The camera and the markers at the shutter's time of the capture that made an image of that shape: a
     Frame's own capture, for other images the scene's. Arguments and errors: as `truth_of`."""
+    instance("scene", scene, Scene, remedy="fs.Scene([cloud]) makes one of splats")
+    if camera is not None:
+        instance("camera", camera, Camera, "a Camera or None")
     capture = getattr(picture, "capture", None) or scene.capture
     time = capture.shutter.time
     if camera is None:
         camera = capture.camera and capture.motion.moved(capture.camera, time)
     if camera is None:
         raise InputError("the scene has no camera, so the pose of its markers is unknown; give one")
+    if len(shape) < 2:
+        raise InputError(f"the picture must be an array (h, w) or (h, w, 3), got the shape {tuple(shape)}")
     if (camera.height, camera.width) != tuple(shape[:2]):
         raise InputError(
             f"the picture has {shape[1]} x {shape[0]} pixels and the camera {camera.width} x "
@@ -138,6 +147,8 @@ def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
 def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """World points (h, w, 3) float64 that pixels show, from any of a frame's depths (`depth`, `depth_median`,
     `depth_first`); NaN where that is 0."""
+    instance("camera", camera, Camera)
+    depth = real_array("depth", depth)
     if depth.shape != (camera.height, camera.width):
         raise InputError(
             f"the depth has the shape {depth.shape}; the camera's have {(camera.height, camera.width)}"
@@ -172,6 +183,11 @@ def optical_flow(
     Raises:
         InputError: sizes that differ, motions without labels or that are not rigid.
     """
+    instance("after", after, Camera)
+    if not isinstance(motions, Mapping | None):
+        raise invalid("motions", "{label: (4, 4)} or None", motions)
+    if label is not None and (not isinstance(label, np.ndarray) or label.shape != np.shape(depth)):
+        raise invalid("label", "an image of the size of depth, or None", label)
     points = points_of(depth, before)
     if motions and label is None:
         raise InputError("motions say how labels move, but there is no label image; render with 'label'")

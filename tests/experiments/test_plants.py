@@ -93,7 +93,7 @@ def test_a_stock_of_sampled_plants_fills_a_greenhouse(tmp_path, capsys):
     for more, message in (
         (["--seed", "1"], "give another folder"),
         (["--kind", "tomatoe"], "unknown kind of plant 'tomatoe' (did you mean 'tomato'?)"),
-        (["--splats", "1"], "plants: splats is 1; it must be a whole number from 100"),
+        (["--splats", "1"], "plants: splats must be a whole number from 100"),
     ):
         assert main([*words, *more]) == 2
         assert message in capsys.readouterr().err

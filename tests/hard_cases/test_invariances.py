@@ -59,6 +59,18 @@ def test_one_tile_for_the_whole_picture(renderer):
 
 
 def test_a_batch_is_its_single_pictures(renderer):
+    cloud = CLOUDS["around the camera"]
+    cameras = [
+        fs.Camera.look_at(93, 77, 1.0, position, (0, 0, 3))
+        for position in ((0, 0, -0.1), (1, 0.2, 0), (-1, 0, 6))
+    ]
+    batch = renderer.render_batch(cloud, [fs.Capture(view, outputs=ALL_OUTPUTS) for view in cameras])
+    for number, view in enumerate(cameras):
+        alone = fs.Renderer(renderer.device.name).render(cloud, view, ALL_OUTPUTS)
+        assert differing(batch.frame(number), alone, ALL_OUTPUTS) == 0
+
+
+def test_pictures_of_one_upload_are_those_of_a_fresh_renderer(renderer):
     """Several cameras in turn with one renderer and one upload, against a fresh renderer for each."""
     cloud = CLOUDS["around the camera"]
     cameras = [

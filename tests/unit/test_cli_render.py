@@ -290,7 +290,10 @@ def test_every_eighth_pixel_of_the_reference(scene, tmp_path, capsys):
     np.testing.assert_array_equal(read_image(tmp_path / "some.png"), to_uint8(pixels))
     for words, why in (
         (("--device", "opencl:pocl", "--every", "8"), "draws whole pictures only"),
-        (("--device", "reference", "--every", "0"), "step is 0"),
+        (
+            ("--device", "reference", "--every", "0"),
+            "step must be a whole number from 1",
+        ),
     ):
         assert main(["render", scene, *words]) == 2
         assert why in capsys.readouterr().err

@@ -157,6 +157,36 @@ def test_a_flight_goes_on_where_it_was(here, capsys):
     assert sorted(name for name in first if first[name] != again[name]) == ["000001.png", "000004.png"]
 
 
+def _bytes_of(log):
+    files = sorted(log.iterdir()) if log.is_dir() else [log]
+    return [(file.name, file.read_bytes()) for file in files]
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "bag"])
+def test_a_flight_that_was_stopped_after_its_log_goes_on(here, capsys, monkeypatch, name):
+    """The same command ends, with the same bytes; another flight's log stays."""
+    pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
+    words = ["--times", "0,1", "--log", name, "--coco", "truth.json"]
+    with monkeypatch.context() as patch:
+
+        def stopped(folder, path):
+            raise KeyboardInterrupt
+
+        patch.setattr("fidsplat.commands.flight_records.write_truth", stopped)
+        assert fly(*words) == 130
+    first = _bytes_of(here / name)
+    assert fly(*words) == 0
+    assert (here / "truth.json").exists()
+    assert _bytes_of(here / name) == first
+    assert fly(*words, "--overwrite") == 0
+    assert _bytes_of(here / name) == first
+    capsys.readouterr()
+    assert fly("--times", "0,0.5", "--log", name, "-o", "other") == 2
+    assert f"{name} is there already" in capsys.readouterr().err
+    assert not (here / "other").exists()
+    assert _bytes_of(here / name) == first
+
+
 def test_what_is_drawn_is_not_mixed_with_another_flight(here, capsys):
     assert fly("--times", "0,1") == 0
     (here / "poses.tum").write_text(POSES.replace("0.3", "0.2"))

@@ -1,14 +1,21 @@
 """A short run of tools/hostile.py: inputs at random are used, or refused in one clear line."""
 
+import contextlib
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import hostile
+import numpy as np
 import pytest
+from hostile_calls import CALLS
+from hostile_files import ground
 from hostile_inputs import KINDS
 from sampling import sampled
+
+import fidsplat as fs
 
 ROOT = Path(__file__).parents[2]
 
@@ -25,6 +32,25 @@ def test_inputs_at_random(seed):
     done = run("--count", 8 * len(KINDS), "--seed", seed)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("\n| ") == len(KINDS)
+
+
+ODD = (object(), np.zeros((0, 3)), 10**400, "\ud800", float("nan"))
+
+
+@pytest.mark.parametrize("name", sorted(CALLS))
+def test_every_argument_is_validated(name, tmp_path, monkeypatch):
+    """Each argument of a public function in turn takes two values that nobody expects: it does its work, or
+    refuses them with an error of ours."""
+    monkeypatch.chdir(tmp_path)
+    ground(tmp_path)
+    monkeypatch.setattr(warnings, "showwarning", lambda *_: None)
+    for number, key in enumerate(CALLS[name](tmp_path)[1]):
+        for odd in (ODD[0], ODD[1 + number % 4]):
+            function, good, use = CALLS[name](tmp_path)
+            with contextlib.suppress(fs.FidsplatError):
+                made = function(**good | {key: odd})
+                if use is not None:
+                    use(made)
 
 
 WAYS = (

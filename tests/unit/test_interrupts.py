@@ -3,11 +3,16 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import threading
+from concurrent.futures import Future
 
 import interrupt
 import pytest
+
+from fidsplat import interrupts
 
 IN_A_LIBRARY = """
 import os, signal, sys
@@ -24,25 +29,38 @@ sys.setprofile(stop)
 sys.exit(main(["devices"]))
 """
 """sends a signal when PyOpenCL calls Python while it is loaded"""
-IN_A_QUESTION = """
-import abc, os, signal, sys, time
-import numpy as np
-from fidsplat.interrupts import raised_in_time
+WHERE_EXCEPTIONS_ARE_DROPPED = """
+import os, signal, sys, weakref
+from fidsplat import cli, interrupts
+from fidsplat.commands import COMMANDS
 
-def stop(frame, event, argument):
-    if event == "call" and frame.f_code is abc.ABCMeta.__instancecheck__.__code__:
-        sys.setprofile(None)
-        os.kill(os.getpid(), signal.SIGINT)
+class Finalised:
+    def __del__(self):
+        os.kill(os.getpid(), signal.{name})
 
-with raised_in_time(), open(os.devnull, "wb") as file:
-    sys.setprofile(stop)
-    try:
-        np.save(file, np.zeros(3))
-        time.sleep(10)
-    except KeyboardInterrupt:
-        print("interrupted")
+def run(self):
+    Finalised()
+    {then}
+    return 0
+
+COMMANDS["devices"].run = run
+sys.exit(cli.main(["devices"]))
 """
-"""sends one when NumPy asks whether the file that it saves to is a path"""
+"""sends a signal within a finalizer"""
+AT_THE_START = """
+import os, signal, sys
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "{module}":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Finder())
+sys.argv = ["fidsplat", "devices"]
+from fidsplat.__main__ import main
+sys.exit(main())
+"""
+"""sends one when the command imports a module"""
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +85,79 @@ def test_a_library_that_is_being_loaded_is_not_interrupted(name, status, said):
     assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {said}\n")
 
 
-def test_a_question_of_numpys_is_not_interrupted():
-    """It took the exception for a yes, and said that a file is no path."""
-    ended = subprocess.run([sys.executable, "-c", IN_A_QUESTION], capture_output=True, text=True, check=False)
-    assert (ended.stdout, ended.stderr) == ("interrupted\n", "")
+@pytest.mark.parametrize(
+    ("name", "then", "status", "said"),
+    [
+        ("SIGINT", "interrupts.check()", 130, "interrupted"),
+        ("SIGTERM", "raise OSError('interrupted system call')", 143, "terminated"),
+    ],
+)
+def test_a_signal_in_a_finalizer_is_not_lost(name, then, status, said):
+    """Python drops what is raised there: the command went on, and its status was 0. An error that
+    follows is a consequence of the signal."""
+    code = WHERE_EXCEPTIONS_ARE_DROPPED.format(name=name, then=then)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {said}\n")
+
+
+@pytest.mark.parametrize("module", ["fidsplat.cli", "tyro"])
+def test_an_interrupt_at_the_start_is_one_line(module):
+    code = AT_THE_START.format(module=module)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (130, "fidsplat: interrupted\n")
+
+
+SILENT = (sys.executable, "-c", "import time; time.sleep(60)")
+
+
+def _output_of_a_silent_process():
+    with subprocess.Popen(SILENT, stdout=subprocess.PIPE) as silent:
+        try:
+            list(interrupts.lines_of(silent.stdout))
+        finally:
+            silent.kill()
+
+
+@pytest.mark.parametrize(
+    "waiting",
+    [
+        lambda: interrupts.sleep(60),
+        lambda: interrupts.result_of(Future()),
+        lambda: interrupts.run(SILENT),
+        _output_of_a_silent_process,
+    ],
+    ids=["sleep", "task", "process", "output"],
+)
+def test_what_waits_is_interrupted(waiting):
+    later = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM))
+    with interrupts.handled():
+        later.start()
+        with pytest.raises(interrupts.Terminated):
+            waiting()
+    interrupts.check()  # the next command begins without the flag
+
+
+def test_what_is_waited_for_comes():
+    task = Future()
+    task.set_result(3)
+    assert interrupts.result_of(task) == 3
+    done = interrupts.run([sys.executable, "-c", "print('out'); exit(4)"])
+    assert (done.returncode, done.stdout) == (4, "out\n")
+    with subprocess.Popen(
+        [sys.executable, "-c", r"print('one\ntwo'); print('rest', end='')"], stdout=subprocess.PIPE
+    ) as said:
+        assert list(interrupts.lines_of(said.stdout)) == ["one", "two"]
+
+
+def test_the_second_signal_does_not_wait(monkeypatch):
+    with interrupts.handled(), interrupts.postponed() as stopped:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)  # the same once more, as a terminal and a parent send it
+        interrupts.check()
+        assert isinstance(stopped(), KeyboardInterrupt)
+        monkeypatch.setattr(interrupts, "REPEAT", 0.0)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")

@@ -66,12 +66,12 @@ def test_the_paper_s_numbers_at_two_and_three_levels():
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"levels": 0}, "levels is 0"),
+        ({"levels": 0}, "levels must be .* got 0"),
         ({"levels": 9}, "1 to 8"),
         ({"levels": 2.5}, "whole number"),
-        ({"density": 0}, "density is 0"),
-        ({"density": float("nan")}, "density is nan"),
-        ({"density": "many"}, "density is 'many'"),
+        ({"density": 0}, "density must be .* got 0"),
+        ({"density": float("nan")}, "density must be .* got nan"),
+        ({"density": "many"}, "density must be .* got 'many'"),
     ],
 )
 def test_options_of_the_paper_s_mixture(options, says):

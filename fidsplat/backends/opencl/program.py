@@ -11,6 +11,7 @@ from typing import Any
 
 import pyopencl as cl
 
+from fidsplat import interrupts
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl
@@ -77,6 +78,7 @@ def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
     try:
         if getattr(in_background, "on", False):
             return built()
+        interrupts.check()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)
             return built()

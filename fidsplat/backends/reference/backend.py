@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fidsplat import interrupts
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.culling import may_see
@@ -244,6 +245,7 @@ class _Progress:
     done: int = 0
 
     def add(self, count: int) -> None:
+        interrupts.check()
         self.done += count
         if self.tell is not None:
             self.tell(self.done / self.total)
