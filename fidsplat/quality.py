@@ -135,10 +135,10 @@ class Quality:
     cost n^2 times the blending."""
 
     detail_error: float = 0.0
-    """Of stores: how far rgb may be off from the exact picture where cells of splats are drawn as one, in
-    [0, 1). Nodes are chosen by what was measured with the store, this low-pass and an `alpha_cutoff` of 1e-8:
-    with a larger one more may be lost (docs/large-scenes.md). 0 is the exact scene. Scenes in memory are
-    always exact."""
+    """Of stores: largest error of rgb where cells of splats are drawn as one, in [0, 1), on the views that
+    were measured with the store, this low-pass and an `alpha_cutoff` of 1e-8. It is not a bound for every
+    view: others may exceed it, the more with a larger cut-off (docs/large-scenes.md). 0 is the exact scene.
+    Scenes in memory are always exact."""
 
     first_hit: float = 0.1
     """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment
@@ -151,8 +151,8 @@ class Quality:
     arithmetic: str = "fast"
     """Exponentials and logarithms of blending. `fast`: our own polynomials, bit-identical wherever devices
     fuse multiply-adds (images are not: compilers decide on the rest); exponentials within 2.3 units of the
-    last place, logarithms within 1.1. `precise`: the library's, of which OpenCL promises 3. Colours differ by
-    less than 1e-6, and by the stop at most where a pixel reaches it a splat earlier."""
+    last place, logarithms within 1.1. `precise`: the library's, of which OpenCL promises 3. Colours
+    differ by less than 1e-6, and by the stop at most where a pixel reaches it a splat earlier."""
 
     blend_precision: str = "float32"
     """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many

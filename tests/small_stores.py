@@ -21,11 +21,13 @@ def two_files(folder: Path) -> list[Path]:
     first = first.with_planes(np.where(np.arange(COUNT) % 1000 < 3, np.arange(COUNT) // 3000, -1))
     fs.save_ply(first, folder / "a.ply")
     other = random_splats(COUNT, 2)
-    thick = np.where(np.arange(COUNT) % 2, 0.01, 0.0)[:, None]
+    third = (
+        other.scales.max(axis=1) * np.array([0.0, 0.1, 2.0])[np.arange(COUNT) % 3]
+    )  # also the longest axis
     other = fs.SplatCloud(
         other.means + np.array([5.0, 0, 0]),
         other.quats,
-        np.hstack([other.scales, thick]),
+        np.column_stack([other.scales, third]),
         other.opacities,
         colors=other.colors,
         labels=other.labels,

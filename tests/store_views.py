@@ -20,7 +20,10 @@ def splats(seed, thick=False, sh_degree=None):
     cloud = random_splats(COUNT, seed, depth=(-4, 4), scale=(3e-3, 0.1), across=4.0, sh_degree=sh_degree)
     if not thick:
         return cloud
-    scales = np.column_stack([cloud.scales, np.where(np.arange(COUNT) % 2, cloud.scales[:, 0], 0)])
+    third = (
+        cloud.scales.max(axis=1) * np.array([0.0, 0.5, 1.2])[np.arange(COUNT) % 3]
+    )  # also the longest axis
+    scales = np.column_stack([cloud.scales, third])
     return fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors=cloud.colors)
 
 

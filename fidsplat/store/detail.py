@@ -14,8 +14,8 @@ from fidsplat.store.layout import header_crc
 
 FILE = "detail.json"
 MARGIN = 3.0
-"""how many times below the error that is asked for the largest measured one must lie: that of other views is
-larger"""
+"""how many times below the requested error the largest measured one must be: other views exceed the measured
+ones, and a few exceed the requested error too"""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,9 @@ class Detail:
 
 
 def pixels(details: Iterable[Detail], level: int, error: float) -> float:
-    """The largest size [samples] at which cells of a level may stand for those below them, so that pictures
-    are off by at most `error`; 0: none. Nothing is promised of a size that was not met.
+    """The largest size [samples] at which cells of a level may stand for those below them, so that the
+    measured views are off by at most `error` / `MARGIN`; 0: none. Other views may exceed `error`. Sizes that
+    no measured view met are not used.
 
     The level above and the one below count too: cells of a size err alike, but few views meet a level's cells
     where they err most, in the gaps between what they are of.

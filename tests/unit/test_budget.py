@@ -365,7 +365,7 @@ def test_an_error_that_nothing_keeps(renderer, scene, error):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ({}, "a budget of nothing"),
+        ({}, "an empty budget"),
         ({"error": float("nan")}, "error is nan"),
         ({"error": "small"}, "error is 'small'"),
         ({"error": True}, "error is True"),

@@ -99,6 +99,21 @@ def test_a_box_is_as_tight_as_the_labels(renderer):
     assert reading.corner_error < 0.1
 
 
+@pytest.mark.parametrize("spec", ["charuco:5x3:4x4_50", "aprilgrid:3x2:36h11"])
+def test_the_outline_of_a_marker_that_is_not_square(spec):
+    """Wider than high, head on, by a camera whose focal lengths differ: a module is added on each side."""
+    placed = PlacedMarker(fs.marker(spec, size=0.3), rigid_matrix((0.1, -0.05, 2.0)))
+    camera = fs.Camera.pinhole(320, 240, 200, 260, 150, 125)
+    rows, columns = placed.marker.bits.shape
+    assert columns > rows
+    corners = placed.marker.corners
+    margin = min(1, placed.marker.quiet_zone) * placed.marker.module
+    low, high = corners.min(0)[:2] - margin, corners.max(0)[:2] + margin
+    (x0, y0), (x1, y1) = ((at + np.array([0.1, -0.05])) * (200, 260) / 2.0 + (150, 125) for at in (low, high))
+    assert visible(placed, camera).box == pytest.approx((x0, y0, x1, y1), abs=1e-9)
+    assert visible(placed, camera).share == pytest.approx(1.0)
+
+
 def test_what_the_pictures_edge_cuts_off():
     """Half of a tag that is seen straight on; a tag that reaches behind the camera; one that is seen from
     behind."""

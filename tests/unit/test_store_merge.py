@@ -34,6 +34,41 @@ def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
     assert spread.max() < size**2
 
 
+@pytest.mark.parametrize("thick", [False, True], ids=["disks", "ellipsoids"])
+def test_merged_splats_of_any_rotation_have_the_moments_of_those_they_stand_for(thick):
+    """Mass, mean and second moments; of disks in the planes of the merged ones, whose thinnest axis goes."""
+    generator = np.random.default_rng(8)
+    count, turns = 300, generator.normal(size=(300, 4))
+    splats = {"means": generator.uniform((2, -1, 5), (2.3, -0.8, 5.6), (count, 3))}
+    splats["quats"] = turns / np.linalg.norm(turns, axis=1, keepdims=True)
+    splats |= {"scales": generator.uniform(0.01, 0.06, (count, 2)), "colors": generator.random((count, 3))}
+    splats["opacities"] = generator.uniform(0.01, 0.05, count)
+    if thick:  # often the longest axis
+        splats["thickness"] = generator.uniform(0.01, 0.12, count)
+    splats = {name: array.astype(np.float32) for name, array in splats.items()}
+
+    def moments(given):
+        frames = quaternion_to_matrix(given["quats"])
+        third = given["thickness"] if thick else np.zeros(len(frames))
+        axes = np.column_stack([given["scales"], third]).astype(np.float64)
+        weights = given["opacities"] * axes[:, :2].max(1) * np.maximum(axes[:, :2].min(1), axes[:, 2])
+        means = given["means"].astype(np.float64)
+        second = np.einsum("nij,nj,nkj->nik", frames, axes**2, frames) + means[:, :, None] * means[:, None]
+        return weights.sum(), *(np.tensordot(weights, each, 1) / weights.sum() for each in (means, second))
+
+    made, _ = merged(splats, Grid((0.0, -4.0, 0.0), 8.0))
+    assert 1 < len(made["means"]) <= count / 4
+    (mass, mean, second), (mass_made, mean_made, second_made) = moments(splats), moments(made)
+    assert mass_made == pytest.approx(mass, rel=1e-5)
+    assert mean_made == pytest.approx(mean, abs=1e-5)
+    lost = np.linalg.eigvalsh(second - second_made)
+    if thick:
+        assert np.abs(lost).max() < 1e-5
+    else:  # nothing is added, and less is lost than what stays
+        assert lost.min() > -1e-5
+        assert lost.max() < 0.5 * np.linalg.eigvalsh(second - np.outer(mean, mean)).max()
+
+
 def test_splats_on_top_of_each_other_become_several():
     count = 64
     generator = np.random.default_rng(4)
