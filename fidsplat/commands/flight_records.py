@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from fidsplat.flights import FlightFolder
 from fidsplat.vision.coco import CocoAnnotations
 from fidsplat.vision.images import read_image
-from fidsplat.vision.output_files import suffixes_of
+from fidsplat.vision.output_files import load_output, suffixes_of
 from fidsplat.vision.truth import truth_of
 
 CAMERA = "camera"
@@ -56,10 +55,11 @@ def write_truth(folder: FlightFolder, path: str) -> Iterator[int]:
 
 def _images(folder: FlightFolder, k: int) -> dict[str, np.ndarray]:
     """The outputs of a picture that are kept whole: rgb, and arrays."""
-    found = {}
+    found, camera = {}, folder.flight.capture.camera
+    assert camera is not None
     for name in folder.flight.capture.outputs:
         if ".npy" in suffixes_of(name):
-            found[name] = np.load(Path(folder.file(k, name, ".npy")))
+            found[name] = load_output(folder.file(k, name, ".npy"), (camera.height, camera.width))
         elif name == "rgb":
             found[name] = read_image(folder.file(k, name, ".png"))
     return found

@@ -19,13 +19,13 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, from_json
+from fidsplat.npy import load_npy
 
 FORMAT, VERSION = "fidsplat store", 1
 SUFFIX = ".fss"
@@ -167,14 +167,6 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
     return shapes | ({"colors": (3,)} if sh_degree < 0 else {"sh": ((sh_degree + 1) ** 2, 3)})
 
 
-def load_array(file: Path) -> np.ndarray:
-    """The array of an .npy file. Raises OSError, EOFError or ValueError, whatever is damaged."""
-    try:
-        return np.load(file, allow_pickle=False)
-    except TokenError as error:  # of the header's Python
-        raise ValueError(f"its header is damaged: {error}") from None
-
-
 def npy_header(kind: str, shape: tuple[int, ...]) -> bytes:
     """The header of a .npy file, always as long: it is written before anybody knows how many rows follow."""
     text = f"{{'descr': '{np.dtype(kind).str}', 'fortran_order': False, 'shape': {shape!r}, }}"
@@ -237,10 +229,10 @@ def read_nodes(folder: Path, crc: int) -> np.ndarray:
     """The index, (n,) of `NODE`. Raises InputError where it is missing or damaged."""
     file = folder / NODES
     try:
-        nodes = load_array(file)
+        nodes = load_npy(file)
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}; the store is not whole") from error
-    except (ValueError, EOFError):
+    except ValueError:
         nodes = np.empty(0)
     if nodes.dtype != NODE or nodes.ndim != 1 or zlib.crc32(nodes.tobytes()) != crc:
         raise InputError(f"{file} is damaged: its checksum is another; build the store again")

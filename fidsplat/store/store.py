@@ -12,6 +12,7 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
 from fidsplat.formats.collect import Progress
+from fidsplat.npy import load_npy
 from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.splats import SplatCloud
@@ -300,8 +301,8 @@ def _rounded(middles: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _read_poses(folder: Path, crc: int | None) -> np.ndarray:
     try:
-        poses = layout.load_array(folder / layout.PLACES)
-    except (OSError, ValueError, EOFError) as error:
+        poses = load_npy(folder / layout.PLACES)
+    except (OSError, ValueError) as error:
         raise InputError(
             f"{folder / layout.PLACES} cannot be read ({error}); place the store again"
         ) from None

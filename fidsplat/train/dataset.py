@@ -111,14 +111,18 @@ class Dataset:
     def digest(self) -> str:
         """SHA-256 of all that training depends on."""
         found = hashlib.sha256(json.dumps(self.background).encode())
+
+        def update(*arrays: np.ndarray | None) -> None:
+            for array in arrays:  # with types and shapes: a mask is never taken for part of a picture
+                found.update(b"-" if array is None else f"{array.dtype.str} {array.shape}".encode())
+                found.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+
         for view in self.views:
             camera = view.camera
             lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-            found.update(f"{view.name} {lens}".encode() + camera.world_to_camera.tobytes())
-            found.update(np.ascontiguousarray(view.picture).tobytes())
-            if view.mask is not None:
-                found.update(np.ascontiguousarray(view.mask).tobytes())
-        found.update(np.ascontiguousarray(self.points).tobytes() + self.colors.tobytes())
+            found.update(json.dumps([view.name, *lens, camera.near, camera.far]).encode())
+            update(camera.world_to_camera, view.picture, view.mask)
+        update(self.points, self.colors)
         return found.hexdigest()
 
     def with_random_points(self, count: int, seed: int) -> Dataset:

@@ -7,7 +7,7 @@ import pytest
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, writable_folder
-from fidsplat.store.layout import load_array
+from fidsplat.npy import load_npy
 from fidsplat.train.read import load_dataset
 
 
@@ -80,4 +80,4 @@ def test_a_damaged_header_is_a_damaged_array(tmp_path):
     whole = (tmp_path / "a.npy").read_bytes()
     (tmp_path / "a.npy").write_bytes(whole.replace(b"(3,)", b"(3, "))
     with pytest.raises(ValueError, match="header"):
-        load_array(tmp_path / "a.npy")
+        load_npy(tmp_path / "a.npy")

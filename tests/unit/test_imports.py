@@ -14,12 +14,13 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "rotations", "scalars", "summaries"}
+BASE = {"errors", "files", "npy", "rotations", "scalars", "summaries"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
+    "npy": set(),
     "rotations": BASE,
     "scalars": {"errors"},
     "interrupts": set(),
