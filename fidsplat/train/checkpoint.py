@@ -86,8 +86,11 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
         splats = Splats.of(_group(arrays, "values", len(arrays["values.means"]), degree))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{file} is no checkpoint of `fidsplat train` that can be read: {error}") from error
-    red, green, blue = background.tolist()
-    return splats.cloud(degree, origin), (red, green, blue)
+    values, (red, green, blue) = splats.values, background.tolist()
+    with np.errstate(over="ignore"):  # the cloud leaves out splats whose scales overflow
+        shapes = values["means"], values["quats"], splats.scales, splats.opacities
+    cloud = SplatCloud(*shapes, sh=values["sh"], origin=origin, source=str(file))
+    return cloud, (red, green, blue)
 
 
 def load_checkpoint(
