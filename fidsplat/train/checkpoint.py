@@ -137,8 +137,8 @@ def _facts(arrays: Arrays) -> dict[str, Any]:
 
 
 def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Splats, Arrays]:
-    """The splats and the history of a checkpoint, without those in `arrays`. Raises ValueError where they do not
-    fit the settings."""
+    """The splats and the history of a checkpoint, which `arrays` releases. Raises ValueError where they do
+    not fit the settings."""
     count = len(arrays["values.means"])
     if count > settings.max_splats:
         raise ValueError(f"its splats must be at most max_splats, {settings.max_splats}, got {count}")

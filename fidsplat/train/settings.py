@@ -178,8 +178,8 @@ class TrainSettings:
         return self.densify_from < iteration < until and iteration % self.densify_every == 0
 
     def adam_steps(self, iteration: int) -> int:
-        """Number of the optimiser's steps up to this iteration. By the default strategy an iteration after which
-        splats are made has none."""
+        """Number of the optimiser's steps up to this iteration. By the default strategy an iteration after
+        which splats are made has none."""
         if self.strategy == "mcmc":
             return iteration
         last, every = min(iteration, self.densify_until - 1), self.densify_every
