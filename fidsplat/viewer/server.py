@@ -21,6 +21,7 @@ from fidsplat.backends import devices
 from fidsplat.cameras import Trajectory
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.formats import save_trajectory
+from fidsplat.markdown import escaped
 from fidsplat.scenes import Scene
 from fidsplat.viewer.controls import NOBODY, Controls
 from fidsplat.viewer.edits import Body, SceneFile
@@ -214,7 +215,7 @@ class Viewer:
         found = view.at(*event.screen_pos)
         depth = "nothing" if found["depth"] is None else f"{found['depth']:.4f} m"
         rows = [f"pixel {found['pixel']}", f"depth {depth}", f"label {found['label']}"]
-        rows += [f"splat {found['splat_id']}", f"marker {found['marker'] or '-'}"]
+        rows += [f"splat {found['splat_id']}", f"marker {escaped(found['marker'] or '-')}"]
         said.content = "  \n".join(rows)
 
     def read(self, client: Any) -> None:
@@ -230,14 +231,14 @@ class Viewer:
             scene = replace(view.drawn.scene, shutter=None)
             readings, others = read_back(view.frame, scene, camera)
         except FidsplatError as error:
-            said.content = str(error)
+            said.content = escaped(error)
             return
         lines = ["| marker | mm | deg |", "|---|---|---|"]
         for facts in (reading.as_dict() for reading in readings):
             errors = (facts["position_error_mm"], facts["angle_error_deg"])
             cells = ["not read", ""] if errors[0] is None else [f"{value:.2f}" for value in errors]
-            lines.append(f"| {facts['marker']} | {' | '.join(cells)} |")
-        lines += [f"\nnot of the scene: {code.name}" for code in others]
+            lines.append(f"| {escaped(facts['marker'])} | {' | '.join(cells)} |")
+        lines += [f"\nnot of the scene: {escaped(code.name)}" for code in others]
         said.content = "\n".join(lines)
 
     def picture(self, client: Any) -> None:

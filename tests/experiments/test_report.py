@@ -327,7 +327,7 @@ def test_cells_of_a_table(tmp_path):
     assert pages.markdown_table(frame).splitlines() == [
         "| name | value |",
         "| --- | ---: |",
-        "| x\\|y | 1.5 |",
+        "| x&#124;y | 1.5 |",
     ]
     assert (pages.number(None), pages.fixed(float("nan")), pages.percent(None)) == ("-", "-", "-")
     assert (pages.percent(1.123), pages.percent(0.5), pages.percent(1.004)) == ("+12 %", "-50 %", "+0.4 %")

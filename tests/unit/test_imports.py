@@ -14,12 +14,13 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "npy", "rotations", "scalars", "summaries"}
+BASE = {"errors", "files", "npy", "rotations", "scalars", "summaries", "markdown"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
+    "markdown": set(),
     "npy": set(),
     "rotations": BASE,
     "scalars": {"errors"},
@@ -71,7 +72,8 @@ HOME_OF = {
     "zxingcpp": ("vision",),
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
-    "viser": ("viewer.server",),
+    "viser": ("viewer.server", "viewer.guard"),
+    "zstandard": ("viewer.guard",),
     "websockets": ("viewer.guard",),
     "torch": ("frame", "train.torch_bridge"),
     "ray": ("remote.ray_engine",),
