@@ -155,9 +155,16 @@ class Viewer:
             self._rate,
         )
         self._streams[client.client_id] = stream
-        client.camera.on_update(lambda camera: stream.look(_viewpoint(camera)))
+        client.camera.on_update(lambda camera: self._look(stream, camera))
         threading.Thread(target=stream.run, name=f"viewer stream {client.client_id}", daemon=True).start()
-        stream.look(_viewpoint(client.camera))
+        self._look(stream, client.camera)
+
+    def _look(self, stream: Stream, camera: Any) -> None:
+        """Take over a browser's camera; one that no image can be rendered from changes nothing."""
+        try:
+            stream.look(_viewpoint(camera))
+        except FidsplatError as error:
+            self._controls.say(str(error))
 
     def _leave(self, client: Any) -> None:
         stream = self._streams.pop(client.client_id, None)
@@ -255,7 +262,10 @@ class Viewer:
 
     def add_keyframe(self, client: Any) -> None:
         """Keep where this browser looks from."""
-        self._keyframes.append(_viewpoint(client.camera).pose)
+        try:
+            self._keyframes.append(_viewpoint(client.camera).pose)
+        except FidsplatError as error:
+            self._controls.say(str(error))
         self._nodes.show_keyframes(self.session.drawn.scene.camera, self._keyframes)
 
     def clear_keyframes(self, client: Any) -> None:
@@ -367,15 +377,15 @@ def _viser() -> Any:
 
 
 def _viewpoint(camera: Any) -> Viewpoint:
-    """What viser says of a browser's camera."""
+    """The viewpoint of viser's camera of a browser. Raises InputError for numbers that make none."""
     position, wxyz = np.asarray(camera.position, float), np.asarray(camera.wxyz, float)
     away = float(np.linalg.norm(np.asarray(camera.look_at, float) - position))
     return Viewpoint(
         tuple(position.tolist()),
         tuple(wxyz.tolist()),
         float(camera.fov),
-        max(1, int(camera.image_width)),
-        max(1, int(camera.image_height)),
+        max(1, camera.image_width),
+        max(1, camera.image_height),
         max(away, 1e-3),
     )
 
