@@ -133,20 +133,20 @@ def policy() -> str:
         program = zstandard.ZstdDecompressor().decompress(_decoded(packed, json.loads(alphabet)), size)
     except (OSError, ValueError, zstandard.ZstdError) as error:
         raise FidsplatError(
-            "this version of viser builds its page in a way for which fidsplat has no content security policy; "
-            "pip install 'viser==1.1.1'"
+            "the page of this version of viser is of a form for which fidsplat has no content security "
+            "policy; pip install 'viser==1.1.1'"
         ) from error
     hashes = [b64encode(sha256(text).digest()).decode() for text in (loader.encode(), program[int(style) :])]
     scripts = " ".join(f"'sha256-{each}'" for each in hashes)
     return (
-        f"default-src 'self' data: blob:; connect-src 'self' data: blob: ws: wss:; style-src 'unsafe-inline'; "
-        f"script-src {scripts} 'unsafe-eval'; worker-src data: blob:; "
+        "default-src 'self' data: blob:; connect-src 'self' data: blob: ws: wss:; "
+        f"style-src 'unsafe-inline'; script-src {scripts} 'unsafe-eval'; worker-src data: blob:; "
         "frame-src 'none'; object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
     )
 
 
 def _decoded(text: str, alphabet: str) -> bytes:
-    """What the loader makes of its attribute: four bytes of five digits, and of d further digits d - 1 bytes."""
+    """The packed bytes: four of every five digits, and d - 1 of d further digits."""
     table = np.zeros(128, np.uint64)
     table[[ord(letter) for letter in alphabet]] = np.arange(len(alphabet))
     values, base = table[np.frombuffer(text.encode("ascii"), np.uint8)], np.uint64(len(alphabet))

@@ -50,7 +50,8 @@ class Viewpoint:
             )
         if not (1 <= self.width <= _MOST and 1 <= self.height <= _MOST):
             raise InputError(
-                f"the page must be 1 to {_MOST} pixels a side, got {self.width} x {self.height}; make it smaller"
+                f"the page must be 1 to {_MOST} pixels a side, got {self.width} x {self.height}; "
+                "make it smaller"
             )
 
     @property
