@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fidsplat.files import open_input
 from fidsplat.flights import FlightFolder
 from fidsplat.vision.coco import CocoAnnotations
 from fidsplat.vision.images import read_image
-from fidsplat.vision.output_files import suffixes_of
+from fidsplat.vision.output_files import load_output, suffixes_of
 from fidsplat.vision.truth import truth_of
 
 CAMERA = "camera"
@@ -56,11 +55,11 @@ def write_truth(folder: FlightFolder, path: str) -> Iterator[int]:
 
 def _images(folder: FlightFolder, k: int) -> dict[str, np.ndarray]:
     """The outputs of a picture that are kept whole: rgb, and arrays."""
-    found = {}
+    found, camera = {}, folder.flight.capture.camera
+    assert camera is not None
     for name in folder.flight.capture.outputs:
         if ".npy" in suffixes_of(name):
-            with open_input(folder.file(k, name, ".npy")) as stream:
-                found[name] = np.load(stream)
+            found[name] = load_output(folder.file(k, name, ".npy"), (camera.height, camera.width))
         elif name == "rgb":
             found[name] = read_image(folder.file(k, name, ".png"))
     return found

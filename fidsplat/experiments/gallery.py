@@ -19,6 +19,7 @@ from fidsplat.vision.images import write_png
 from fidsplat.vision.output_files import picture_of
 
 PAGE = "index.html"
+_POLICY = "script-src 'none'; object-src 'none'; frame-src 'none'; base-uri 'none'; form-action 'none'"
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 80rem; padding: 0 1rem;
        background: #fff; color: #222 }
@@ -105,5 +106,6 @@ def _page(parts: Sequence[str]) -> str:
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>fidsplat</title>'
         '<meta name="viewport" content="width=device-width">'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f"<style>{_STYLE}</style><h1>fidsplat</h1><main>{''.join(parts)}</main></html>\n"
     )

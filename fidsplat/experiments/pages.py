@@ -8,9 +8,11 @@ from typing import Any
 
 import jinja2
 import pandas as pd
+from markupsafe import Markup
 
 from fidsplat.experiments.summary import Frame
 from fidsplat.files import atomic_write, printable, writable_folder
+from fidsplat.markdown import escaped
 
 NOTHING = "-"
 
@@ -28,7 +30,8 @@ def write_page(page: Path, folder: Path, template: str, context: Mapping[str, An
 
     Args:
         folder: of charts; the template has its name, relative to the page, as `folder`.
-        context: what the template needs; pandas tables are filtered by `table`.
+        context: what the template needs; pandas tables are filtered by `table`. Text is escaped, as names of
+            data sets and files may hold HTML; Markdown of our own is a `Markup`.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
@@ -36,6 +39,7 @@ def write_page(page: Path, folder: Path, template: str, context: Mapping[str, An
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
+        finalize=_inserted,
     )
     environment.filters |= {"table": markdown_table, "number": number, "percent": percent, "listed": listed}
     beside = "" if folder == page.parent else f"{folder.name}/"
@@ -44,10 +48,10 @@ def write_page(page: Path, folder: Path, template: str, context: Mapping[str, An
         stream.write(printable(text).encode())
 
 
-def markdown_table(frame: Frame) -> str:
+def markdown_table(frame: Frame) -> Markup:
     """A table; its first column is text, the others stand at the right."""
     rows = [frame.columns, ["---", *["---:"] * (len(frame.columns) - 1)], *frame.itertuples(index=False)]
-    return "\n".join("| " + " | ".join(_cell(cell) for cell in row) + " |" for row in rows)
+    return Markup("\n".join("| " + " | ".join(_cell(cell) for cell in row) + " |" for row in rows))
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -74,4 +78,8 @@ def listed(words: list[str]) -> str:
 
 
 def _cell(value: object) -> str:
-    return (NOTHING if value is None else str(value)).replace("|", "\\|")
+    return NOTHING if value is None else _inserted(value)
+
+
+def _inserted(value: object) -> str:
+    return str(value) if isinstance(value, Markup) else escaped(value)

@@ -4,6 +4,7 @@ the picture below which cells are not told apart."""
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +87,10 @@ def load_details(folder: Path, identity: str) -> list[Detail]:
         for one in made:
             if len(one.sizes) != len(one.errors) or list(one.sizes) != sorted(map(float, one.sizes)):
                 raise ValueError
-            _ = [float(error) for error in one.errors if error is not None]
+            numbers = [*one.sizes, *(error for error in one.errors if error is not None)]
+            known = isinstance(one.lowpass, str) and type(one.level) is int
+            if not known or not all(type(n) in (int, float) and 0 <= n < math.inf for n in numbers):
+                raise ValueError
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{file} is damaged; remove it, and run `fidsplat store measure` again") from None
     return made

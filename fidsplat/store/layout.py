@@ -18,14 +18,16 @@ import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from itertools import pairwise
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, from_json, open_input, read_input
+from fidsplat.npy import load_npy
+from fidsplat.scalars import LARGEST
 
 FORMAT, VERSION = "fidsplat store", 1
 SUFFIX = ".fss"
@@ -39,6 +41,12 @@ MOST_SPLATS = 2**31 - 1
 """of a scene: their indices are int32"""
 NPY_HEADER = 128
 """bytes of a column's own header, whatever its shape"""
+
+_MOST_ROWS = 2**32
+"""of a store: its splats, and those of all levels of detail, which are fewer"""
+_TYPES = dict.fromkeys(("means", "quats", "scales", "opacities", "thickness"), ("<f4",))
+_TYPES |= dict.fromkeys(("labels", "planes"), ("<i4",))
+"""NumPy's types that a column may have"""
 
 NODE = np.dtype(
     [
@@ -138,20 +146,34 @@ def _check(header: Header) -> None:
     counts = (header.splats, header.rows, header.pinned, header.chunk, header.sh_degree, header.nodes_crc)
     if not all(type(value) is int for value in counts):
         raise ValueError("a count is no whole number")
-    if not (0 <= header.splats <= header.rows and header.chunk > 0 and -1 <= header.sh_degree <= 3):
+    if not 0 <= header.splats <= header.rows <= _MOST_ROWS or not 0 < header.chunk <= MOST_SPLATS:
+        raise ValueError("a count is out of range")
+    if not (0 <= header.pinned <= header.splats and -1 <= header.sh_degree <= 3):
         raise ValueError("a count is out of range")
     if not isinstance(header.columns, dict) or not isinstance(header.dropped, dict):
         raise ValueError("the columns, or what was left out, are no table")
-    if len(header.origin) != 3 or not np.isfinite(header.origin).all():
+    if not all(type(value) is int for value in header.dropped.values()):
+        raise ValueError("the numbers of what was left out are no whole numbers")
+    if not all(isinstance(text, str) for text in (header.identity, *header.sources)):
+        raise ValueError("a name is no text")
+    if (
+        len(header.origin) != 3
+        or not np.isfinite(header.origin).all()
+        or np.abs(header.origin).max() > LARGEST
+    ):
         raise ValueError("the origin is no point")
-    if header.store is None:
-        shapes = column_shapes(header)
-        for name, kind in header.columns.items():
-            if name not in shapes or np.dtype(kind).kind not in "fi":
-                raise ValueError(f"the column {name}")
-        if missing := {"means", "quats", "scales", "opacities"} - set(header.columns):
-            raise ValueError(f"no column {min(missing)}")
-    elif not isinstance(header.store, str):
+    types = _TYPES | {"colors" if header.sh_degree < 0 else "sh": ("<f2", "<f4")}
+    for name, kind in header.columns.items():
+        if kind not in types.get(name, ()):
+            raise ValueError(f"the column {name} of the type {kind}")
+    # all but three columns are in every store
+    if missing := types.keys() - {"labels", "planes", "thickness"} - header.columns.keys():
+        raise ValueError(f"no column {min(missing)}")
+    if header.ellipsoids not in ("none", "some", "all"):
+        raise ValueError("its 3D Gaussians are neither none nor some nor all")
+    if header.ellipsoids != "none" and "thickness" not in header.columns:
+        raise ValueError("3D Gaussians have a column thickness")
+    if not isinstance(header.store, (str, type(None))):
         raise ValueError("the store that is placed has no name")
 
 
@@ -165,15 +187,6 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": ()}
     shapes |= {"labels": (), "planes": (), "thickness": ()}
     return shapes | ({"colors": (3,)} if sh_degree < 0 else {"sh": ((sh_degree + 1) ** 2, 3)})
-
-
-def load_array(file: Path) -> np.ndarray:
-    """The array of an .npy file. Raises OSError, EOFError or ValueError, whatever is damaged."""
-    try:
-        with open_input(file) as stream:
-            return np.load(stream, allow_pickle=False)
-    except TokenError as error:  # of the header's Python
-        raise ValueError(f"its header is damaged: {error}") from None
 
 
 def npy_header(kind: str, shape: tuple[int, ...]) -> bytes:
@@ -234,15 +247,50 @@ def write_nodes(folder: Path, nodes: np.ndarray) -> int:
     return zlib.crc32(nodes.tobytes())
 
 
-def read_nodes(folder: Path, crc: int) -> np.ndarray:
-    """The index, (n,) of `NODE`. Raises InputError where it is missing or damaged."""
+def read_nodes(folder: Path, header: Header) -> np.ndarray:
+    """The index, (n,) of `NODE`. Raises InputError where it is missing, damaged or unlike its header."""
     file = folder / NODES
     try:
-        nodes = load_array(file)
+        nodes = load_npy(file)
     except InputError as error:
         raise InputError(f"{error}; the store is not whole") from error
-    except (ValueError, EOFError):
+    except ValueError:
         nodes = np.empty(0)
-    if nodes.dtype != NODE or nodes.ndim != 1 or zlib.crc32(nodes.tobytes()) != crc:
+    if nodes.dtype != NODE or nodes.ndim != 1 or zlib.crc32(nodes.tobytes()) != header.nodes_crc:
         raise InputError(f"{file} is damaged: its checksum is another; build the store again")
+    if wrong := _misfit(nodes, header):
+        raise InputError(f"{file} does not fit {HEADER}: {wrong}; build the store again")
     return nodes
+
+
+def _misfit(nodes: np.ndarray, header: Header) -> str:
+    """How an index differs from one that was built with its header; empty where it does not. Whoever renders
+    a store relies on every line of this."""
+    first, count, level, parent = (
+        nodes[name].astype(np.int64) for name in ("first", "count", "level", "parent")
+    )
+    chunk, ends = level == 0, np.cumsum(count)
+    if (count < 1).any() or (count[chunk] > header.chunk).any():
+        return f"a node must have 1 to {header.chunk} splats"
+    if ends.max(initial=0) != header.rows or (first != ends - count).any():
+        return f"its nodes must be {header.rows} rows, one after the other"
+    if not np.isin(np.diff(level, prepend=0), (0, 1)).all():
+        return "levels must rise from 0, one by one"
+    if count[chunk].sum() != header.splats:
+        return f"its chunks must have {header.splats} splats"
+    if header.pinned not in {*first[chunk].tolist(), header.splats}:
+        return "splats on planes must begin with a chunk"
+    above = np.flatnonzero(parent != -1)
+    if not ((parent >= -1) & (parent < len(nodes))).all() or (level[parent[above]] != level[above] + 1).any():
+        return "a node's parent must be of the level above"
+    if (parent[chunk & (first >= header.pinned)] != -1).any():
+        return "splats on planes must have no parent"
+    lengths = ("size", "reach", "low", "high", "far_low", "far_high")
+    if not all(np.isfinite(nodes[name]).all() for name in lengths):
+        return "sizes and boxes must be finite"
+    if (nodes["size"] < 0).any() or (nodes["size"][chunk] != 0).any() or (nodes["reach"] < 0).any():
+        return "sizes must be at least 0, and 0 for chunks"
+    corners = [nodes[name] for name in ("far_low", "low", "high", "far_high")]
+    if any((a > b).any() for a, b in pairwise(corners)):
+        return "a box must lie within the larger one of its node"
+    return ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from fidsplat.arguments import number as checked_number
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
 from fidsplat.formats.collect import Progress
+from fidsplat.npy import load_npy
 from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.scalars import real_array
@@ -52,8 +54,19 @@ class Store(Summarised):
             if own.identity != header.identity or own.store is not None:
                 raise InputError(f"{self._folder} is not what {self.path} was made of; place the store again")
             self.poses = _read_poses(self.path, header.places_crc)
+            if (
+                replace(
+                    own,
+                    splats=own.splats * len(self.poses),
+                    rows=own.rows * len(self.poses),
+                    store=header.store,
+                    places_crc=header.places_crc,
+                )
+                != header
+            ):
+                raise InputError(f"{self.path / layout.HEADER} does not fit its poses; place the store again")
         self._own = own
-        self.nodes = layout.read_nodes(self._folder, own.nodes_crc)
+        self.nodes = layout.read_nodes(self._folder, own)
         """(n,) records of `layout.NODE`: chunks and the nodes above them, of one place"""
         self._columns = self._mapped()
 
@@ -286,9 +299,6 @@ class Store(Summarised):
 
     def _mapped(self) -> dict[str, np.ndarray]:
         own, shapes = self._own, layout.shapes_of(self._own.sh_degree)
-        ends = self.nodes["first"] + self.nodes["count"]
-        if len(self.nodes) and (ends.max() > own.rows or self.nodes["first"].min() < 0):
-            raise InputError(f"{self._folder}: its index does not fit its header; build the store again")
         return {
             name: layout.map_column(self._folder, name, kind, (own.rows, *shapes[name]), self.nodes["first"])
             for name, kind in own.columns.items()
@@ -315,8 +325,8 @@ def _rounded(middles: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _read_poses(folder: Path, crc: int | None) -> np.ndarray:
     try:
-        poses = layout.load_array(folder / layout.PLACES)
-    except (OSError, ValueError, EOFError) as error:
+        poses = load_npy(folder / layout.PLACES)
+    except (OSError, ValueError) as error:
         raise InputError(
             f"{folder / layout.PLACES} cannot be read ({error}); place the store again"
         ) from None

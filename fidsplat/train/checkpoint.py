@@ -1,4 +1,4 @@
-"""Checkpoints: all that a run needs to go on to the same bits, in one file that is whole or not there."""
+"""Training checkpoints: the state from which a run goes on to bit-identical results, in one file."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from fidsplat import __version__
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, open_input
+from fidsplat.files import atomic_write, from_json
+from fidsplat.harmonics import MAX_DEGREE
+from fidsplat.npy import load_npz
 from fidsplat.provenance import code_hash
+from fidsplat.quality import whole_number
 from fidsplat.splats import SplatCloud
 from fidsplat.train.dataset import Dataset
-from fidsplat.train.parameters import NAMES, Splats
-from fidsplat.train.settings import TrainSettings
+from fidsplat.train.parameters import NAMES, Arrays, Splats
+from fidsplat.train.settings import MOST_ITERATIONS, TrainSettings
 
-_FORMAT = 2
+_FORMAT = 3
 _GROUPS = ("values", "first", "second")
-_HISTORY = ("losses", "psnrs", "counts")
-_DAMAGED = (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError, AttributeError, RuntimeError)
-"""what NumPy and zipfile raise for files that are not theirs any more"""
+_VALUES = tuple(f"values.{name}" for name in NAMES)
+_HISTORY = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
 _MAY_DIFFER = ("iterations",)
 """settings that do not change what an iteration does: a run may be made longer"""
 
@@ -34,11 +35,14 @@ class Progressed:
 
     iteration: int
     """iterations that are done"""
-    adam_step: int
-    """steps of the optimiser, which are fewer: an iteration that makes splats has none"""
     splats: Splats
-    history: dict[str, np.ndarray]
+    history: Arrays
     """`losses` and `psnrs` (iteration,) float32, `counts` (iteration,) int32 of splats"""
+
+    @staticmethod
+    def begun(splats: Splats) -> Progressed:
+        """A run of no iteration yet."""
+        return Progressed(0, splats, {name: np.zeros(0, dtype) for name, dtype in _HISTORY.items()})
 
 
 def save_checkpoint(
@@ -47,15 +51,14 @@ def save_checkpoint(
     """Write a checkpoint.
 
     Args:
-        dataset: that is trained on; its digest, origin and background are kept.
-        device: title of what draws.
+        dataset: the data set of the run; the checkpoint holds its digest, origin and background.
+        device: title of the device that renders.
 
     Raises InputError when the file cannot be written, as when the disk is full; an older one then stays.
     """
     facts = {
         "format": _FORMAT,
         "iteration": made.iteration,
-        "adam_step": made.adam_step,
         "settings": asdict(settings),
         "dataset": dataset.digest,
         "origin": dataset.origin.tolist(),
@@ -69,62 +72,99 @@ def save_checkpoint(
 
 
 def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
-    """The splats of a checkpoint as they are drawn, and the background before which they are trained.
+    """The splats of a checkpoint, activated, and the background of its data set.
 
     Raises InputError for a file that is damaged or of another version.
     """
     try:
-        with open_input(file) as stream, np.load(stream, allow_pickle=False) as arrays:
-            facts = from_json(bytes(arrays["facts"]))
-            red, green, blue = map(float, facts["background"])
-            splats = Splats.of({name: arrays[f"values.{name}"] for name in NAMES})
-        cloud = splats.cloud(int(facts["settings"]["sh_degree"]), np.array(facts["origin"], np.float64))
-    except InputError:
-        raise
-    except _DAMAGED as error:
+        arrays = load_npz(file, ("facts", *_VALUES))
+        facts = _facts(arrays)
+        origin, background = (np.array(facts[name], np.float64) for name in ("origin", "background"))
+        if not (origin.shape == background.shape == (3,) and np.isfinite([origin, background]).all()):
+            raise ValueError("the origin and the background must be three finite numbers each")
+        degree = whole_number("sh_degree", facts["settings"]["sh_degree"], 0, MAX_DEGREE)
+        splats = Splats.of(_group(arrays, "values", len(arrays["values.means"]), degree))
+    except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{file} is no checkpoint of `fidsplat train` that can be read: {error}") from error
+    values, (red, green, blue) = splats.values, background.tolist()
+    with np.errstate(over="ignore"):  # the cloud leaves out splats whose scales overflow
+        shapes = values["means"], values["quats"], splats.scales, splats.opacities
+    cloud = SplatCloud(*shapes, sh=values["sh"], origin=origin, source=str(file))
     return cloud, (red, green, blue)
 
 
 def load_checkpoint(
     file: Path, settings: TrainSettings, digest: str, device: str
 ) -> tuple[Progressed, list[str]]:
-    """Read a checkpoint of the same run.
+    """Read a checkpoint of the same run. Every array is checked before a device uses it.
 
     Args:
         digest: of the data set.
-        device: title of what draws from now on.
+        device: title of the device that renders from now on.
 
     Returns:
-        how far it came; and by what else it was made, if not by this device and these sources: "another
-        device (PoCL, not H100)".
+        the progress of the run; and which device and sources made it, where they are others: "another device
+        (PoCL, not H100)".
 
-    Raises InputError for a file that is damaged or of another run, which it names the difference of.
+    Raises InputError for a file that is damaged or of another run; the message names the difference.
     """
     try:
-        with open_input(file) as stream, np.load(stream, allow_pickle=False) as arrays:
-            facts = from_json(bytes(arrays["facts"]))
-            if facts.get("format") != _FORMAT:
-                raise ValueError("it is of another version of fidsplat")
-            values, first, second = ({name: arrays[f"{group}.{name}"] for name in NAMES} for group in _GROUPS)
-            splats = Splats(values, first, second, arrays["gradients"], arrays["seen"])
-            history = {name: arrays[name] for name in _HISTORY}
-            before = [str(facts["by"][name]) for name in _made_by(device)]
-    except InputError:
-        raise
-    except _DAMAGED as error:
+        arrays = load_npz(file)
+        facts = _facts(arrays)
+        iteration = whole_number("iteration", facts["iteration"], 0, MOST_ITERATIONS)
+        before = [str(facts["by"][name]) for name in _made_by(device)]
+        differ = _differences(facts, settings, digest)
+        made = None if differ else Progressed(iteration, *_state(arrays, settings, iteration))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(
             f"{file} is no checkpoint that can be read: {error}; remove it, or give --overwrite to begin "
             "again"
         ) from error
-    if differ := _differences(facts, settings, digest):
+    if made is None:
         raise InputError(
             f"{file} is of a run with another {' and another '.join(differ)}; give another name with -o, or "
             "--overwrite to begin again"
         )
     now = zip(_made_by(device).items(), before, strict=True)
-    others = [f"another {name} ({was}, not {here})" for (name, here), was in now if was != here]
-    return Progressed(facts["iteration"], facts["adam_step"], splats, history), others
+    return made, [f"another {name} ({was}, not {here})" for (name, here), was in now if was != here]
+
+
+def _facts(arrays: Arrays) -> dict[str, Any]:
+    facts = from_json(arrays["facts"].tobytes())
+    if not isinstance(facts, dict) or facts.get("format") != _FORMAT:
+        raise ValueError("it is of another version of fidsplat")
+    return facts
+
+
+def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Splats, Arrays]:
+    """The splats and the history of a checkpoint, which `arrays` releases. Raises ValueError where they do
+    not fit the settings."""
+    count = len(arrays["values.means"])
+    if count > settings.max_splats:
+        raise ValueError(f"its splats must be at most max_splats, {settings.max_splats}, got {count}")
+    groups = [_group(arrays, name, count, settings.sh_degree) for name in _GROUPS]
+    sums = {name: _checked(arrays, name, (count,)) for name in ("gradients", "seen")}
+    for name, array in (groups[2] | sums).items():
+        if (array < 0).any():
+            raise ValueError(f"{name} must not be negative")
+    history = {name: _checked(arrays, name, (iteration,), dtype) for name, dtype in _HISTORY.items()}
+    return Splats(*groups, **sums), history
+
+
+def _group(arrays: Arrays, group: str, count: int, degree: int) -> Arrays:
+    shapes = {"means": (3,), "log_scales": (2,), "quats": (4,), "logits": (), "sh": ((degree + 1) ** 2, 3)}
+    return {name: _checked(arrays, f"{group}.{name}", (count, *shape)) for name, shape in shapes.items()}
+
+
+def _checked(arrays: Arrays, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+    """A writable copy of an array, which `arrays` releases."""
+    array = arrays.pop(name)
+    if array.dtype != dtype or array.shape != shape:
+        wanted = f"{np.dtype(dtype)} of the shape {shape}"
+        raise ValueError(f"{name} must be {wanted}, got {array.dtype} of the shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite")
+    return np.array(array, order="C")
 
 
 def _made_by(device: str) -> dict[str, str]:

@@ -13,7 +13,6 @@ import numpy as np
 from fidsplat.arguments import instance, invalid, items, text, whole_number
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
-from fidsplat.files import printable
 from fidsplat.scalars import real_array
 from fidsplat.surroundings import three_numbers
 from fidsplat.train.random_numbers import Purpose, uniform
@@ -134,14 +133,18 @@ class Dataset:
     def digest(self) -> str:
         """SHA-256 of all that training depends on."""
         found = hashlib.sha256(json.dumps(self.background).encode())
+
+        def update(*arrays: np.ndarray | None) -> None:
+            for array in arrays:  # with types and shapes: a mask is never taken for part of a picture
+                found.update(b"-" if array is None else f"{array.dtype.str} {array.shape}".encode())
+                found.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+
         for view in self.views:
             camera = view.camera
             lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-            found.update(printable(f"{view.name} {lens}").encode() + camera.world_to_camera.tobytes())
-            found.update(np.ascontiguousarray(view.picture).tobytes())
-            if view.mask is not None:
-                found.update(np.ascontiguousarray(view.mask).tobytes())
-        found.update(np.ascontiguousarray(self.points).tobytes() + self.colors.tobytes())
+            found.update(json.dumps([view.name, *lens, camera.near, camera.far]).encode())
+            update(camera.world_to_camera, view.picture, view.mask)
+        update(self.points, self.colors)
         return found.hexdigest()
 
     def with_random_points(self, count: int, seed: int) -> Dataset:

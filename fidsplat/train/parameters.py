@@ -85,8 +85,11 @@ class Splats:
         return Splats(values, first, second, gradients, np.concatenate([self.seen, more.seen]))
 
     def check(self, when: str) -> None:
-        """Raises TrainingError where a value is not finite."""
-        for name, array in self.values.items():
+        """Raises TrainingError where a number is not finite."""
+        remembered = {f"Adam's mean of {n}": a for n, a in self.first.items()}
+        remembered |= {f"Adam's mean square of {n}": a for n, a in self.second.items()}
+        remembered |= {"gradients": self.gradients}
+        for name, array in (self.values | remembered).items():
             if not np.isfinite(array).all():
                 rows = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(1))
                 raise TrainingError(

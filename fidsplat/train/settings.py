@@ -174,6 +174,19 @@ class TrainSettings:
         normal = self.normal_weight if iteration > self.normal_from else 0.0
         return normal, self.distortion_weight if iteration > self.distortion_from else 0.0
 
+    def makes_splats_after(self, iteration: int) -> bool:
+        """Whether splats are made and removed after this iteration."""
+        until = self.relocate_until if self.strategy == "mcmc" else self.densify_until
+        return self.densify_from < iteration < until and iteration % self.densify_every == 0
+
+    def adam_steps(self, iteration: int) -> int:
+        """Number of the optimiser's steps up to this iteration. By the default strategy an iteration after
+        which splats are made has none."""
+        if self.strategy == "mcmc":
+            return iteration
+        last, every = min(iteration, self.densify_until - 1), self.densify_every
+        return iteration - max(0, last // every - self.densify_from // every)
+
     def changes_after(self, iteration: int) -> int | None:
         """The next iteration of the run of which other kernels draw: the degree grows, or a loss begins."""
         degree = self.degree_at(iteration) + 1

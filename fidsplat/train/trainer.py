@@ -205,7 +205,7 @@ class Trainer:
         if self.checkpoint is None:
             return
         self._made.splats = self._stored()
-        kept = Progressed(self.iteration, self._made.adam_step, self._made.splats, self.history)
+        kept = Progressed(self.iteration, self._made.splats, self.history)
         title = self.renderer.device.title
         save_checkpoint(self.checkpoint, kept, self.settings, self.dataset, title)
 
@@ -236,7 +236,7 @@ class Trainer:
         except TooLittleRoom:
             value, taken = self._compared(iteration, number, waits=True)
         self._waiting.append((iteration, view.name, value))
-        if not late or len(self._waiting) > self._work.late or self._due(iteration):
+        if not late or len(self._waiting) > self._work.late or settings.makes_splats_after(iteration):
             self._settle()  # not before: the device goes on meanwhile
         self._change(taken, iteration, view)
         made.iteration = iteration
@@ -324,15 +324,13 @@ class Trainer:
                     stacklevel=3,
                 )
         else:
-            nothing = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
-            history = {name: np.zeros(0, dtype) for name, dtype in nothing.items()}
             dataset = self.dataset
             splats = (
                 first_splats(dataset, settings)
                 if start is None
                 else splats_from(start, settings, dataset.origin)
             )
-            made = Progressed(0, 0, splats, history)
+            made = Progressed.begun(splats)
         left = settings.iterations - made.iteration
         made.history = {name: np.append(a, np.zeros(left, a.dtype)) for name, a in made.history.items()}
         return made
@@ -345,18 +343,12 @@ class Trainer:
             self._order = round_, permutation(self.settings.seed, Purpose.VIEWS, round_, count)
         return int(self._order[1][place])
 
-    def _due(self, iteration: int) -> bool:
-        """Whether splats are made and taken away after an iteration."""
-        settings = self.settings
-        until = settings.relocate_until if settings.strategy == "mcmc" else settings.densify_until
-        return settings.densify_from < iteration < until and iteration % settings.densify_every == 0
-
     def _make_splats(self) -> None:
         """By the default rule, after the last iteration that was done. It comes before the next one: a run
         that ends here keeps splats that were fitted, and opacities that were not reset, as the authors'
         trainer, which saves them first."""
         settings, iteration = self.settings, self.iteration
-        if settings.strategy == "mcmc" or not self._due(iteration):
+        if settings.strategy == "mcmc" or not settings.makes_splats_after(iteration):
             return
         self._settle()
         made = densify.plan(self._work.shapes(), settings, iteration, self.dataset.extent)
@@ -370,16 +362,15 @@ class Trainer:
         which new splats have no gradient yet."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
         origin = self.dataset.origin
-        if not mcmc_runs and self._due(iteration):
+        if not mcmc_runs and settings.makes_splats_after(iteration):
             self._work.count(taken, view.camera, origin)
             return
         camera = view.camera if not mcmc_runs and iteration < settings.densify_until else None
-        self._made.adam_step += 1
         rate = rates(settings, iteration, self.dataset.extent)
-        self._work.step(taken, rate, self._made.adam_step, camera, origin)
+        self._work.step(taken, rate, settings.adam_steps(iteration), camera, origin)
         if mcmc_runs:
             with self._not_half():
-                if self._due(iteration):
+                if settings.makes_splats_after(iteration):
                     self._work.load(mcmc.moved(self._work.store(), settings, iteration))
                 self._work.shake(iteration, rate["means"])
 

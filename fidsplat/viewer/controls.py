@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
 
+from fidsplat.markdown import escaped
 from fidsplat.quality import PRESETS
 from fidsplat.scenes import Scene
 from fidsplat.viewer.session import Session
@@ -70,8 +71,8 @@ class Controls:
     def say(self, problem: str) -> None:
         """How it is drawn now, and what went wrong, if anything did."""
         drawn = self._session.drawn
-        lines = [f"{len(drawn.resident):,} splats, {drawn.renderer.device.title}"]
-        self.status.content = "\n\n".join(lines + ([f"**{problem}**"] if problem else []))
+        lines = [f"{len(drawn.resident):,} splats, {escaped(drawn.renderer.device.title)}"]
+        self.status.content = "\n\n".join(lines + ([f"**{escaped(problem)}**"] if problem else []))
 
     def offer(self, names: list[str]) -> None:
         """Let what another scene has be moved; none of it is held at first."""

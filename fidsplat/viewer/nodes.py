@@ -70,8 +70,9 @@ class Nodes:
         self._gizmo = gizmo
 
         def tell(event: Any) -> None:
-            pose = rigid_matrix(np.asarray(gizmo.position), np.asarray(gizmo.wxyz))
-            moved(pose, event.phase == "end")
+            position, wxyz = np.asarray(gizmo.position, float), np.asarray(gizmo.wxyz, float)
+            if np.isfinite([*position, *wxyz]).all() and wxyz.any():  # a message may say anything
+                moved(rigid_matrix(position, wxyz), event.phase == "end")
 
         gizmo.on_update(tell)
 

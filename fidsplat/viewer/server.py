@@ -20,6 +20,7 @@ from fidsplat.backends import devices
 from fidsplat.cameras import Trajectory
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.formats import save_trajectory
+from fidsplat.markdown import escaped
 from fidsplat.scenes import Scene
 from fidsplat.viewer.controls import NOBODY, Controls
 from fidsplat.viewer.edits import Body, SceneFile
@@ -153,9 +154,16 @@ class Viewer:
             self._rate,
         )
         self._streams[client.client_id] = stream
-        client.camera.on_update(lambda camera: stream.look(_viewpoint(camera)))
+        client.camera.on_update(lambda camera: self._look(stream, camera))
         threading.Thread(target=stream.run, name=f"viewer stream {client.client_id}", daemon=True).start()
-        stream.look(_viewpoint(client.camera))
+        self._look(stream, client.camera)
+
+    def _look(self, stream: Stream, camera: Any) -> None:
+        """Take over a browser's camera; one that no image can be rendered from changes nothing."""
+        try:
+            stream.look(_viewpoint(camera))
+        except FidsplatError as error:
+            self._controls.say(str(error))
 
     def _leave(self, client: Any) -> None:
         stream = self._streams.pop(client.client_id, None)
@@ -213,7 +221,7 @@ class Viewer:
         found = view.at(*event.screen_pos)
         depth = "nothing" if found["depth"] is None else f"{found['depth']:.4f} m"
         rows = [f"pixel {found['pixel']}", f"depth {depth}", f"label {found['label']}"]
-        rows += [f"splat {found['splat_id']}", f"marker {found['marker'] or '-'}"]
+        rows += [f"splat {found['splat_id']}", f"marker {escaped(found['marker'] or '-')}"]
         said.content = "  \n".join(rows)
 
     def read(self, client: Any) -> None:
@@ -227,14 +235,14 @@ class Viewer:
         try:
             readings, others = read_back(view.frame, view.drawn.scene)
         except FidsplatError as error:
-            said.content = str(error)
+            said.content = escaped(error)
             return
         lines = ["| marker | mm | deg |", "|---|---|---|"]
         for facts in (reading.as_dict() for reading in readings):
             errors = (facts["position_error_mm"], facts["angle_error_deg"])
             cells = ["not read", ""] if errors[0] is None else [f"{value:.2f}" for value in errors]
-            lines.append(f"| {facts['marker']} | {' | '.join(cells)} |")
-        lines += [f"\nnot of the scene: {code.name}" for code in others]
+            lines.append(f"| {escaped(facts['marker'])} | {' | '.join(cells)} |")
+        lines += [f"\nnot of the scene: {escaped(code.name)}" for code in others]
         said.content = "\n".join(lines)
 
     def picture(self, client: Any) -> None:
@@ -251,7 +259,10 @@ class Viewer:
 
     def add_keyframe(self, client: Any) -> None:
         """Keep where this browser looks from."""
-        self._keyframes.append(_viewpoint(client.camera).pose)
+        try:
+            self._keyframes.append(_viewpoint(client.camera).pose)
+        except FidsplatError as error:
+            self._controls.say(str(error))
         self._nodes.show_keyframes(self.session.drawn.scene.camera, self._keyframes)
 
     def clear_keyframes(self, client: Any) -> None:
@@ -363,15 +374,15 @@ def _viser() -> Any:
 
 
 def _viewpoint(camera: Any) -> Viewpoint:
-    """What viser says of a browser's camera."""
+    """The viewpoint of viser's camera of a browser. Raises InputError for numbers that make none."""
     position, wxyz = np.asarray(camera.position, float), np.asarray(camera.wxyz, float)
     away = float(np.linalg.norm(np.asarray(camera.look_at, float) - position))
     return Viewpoint(
         tuple(position.tolist()),
         tuple(wxyz.tolist()),
         float(camera.fov),
-        max(1, int(camera.image_width)),
-        max(1, int(camera.image_height)),
+        max(1, camera.image_width),
+        max(1, camera.image_height),
         max(away, 1e-3),
     )
 

@@ -22,7 +22,7 @@ AT_REST = ("rgb", "depth", "label", "splat_id")
 _MOVING = Quality.named("fast")
 """constants of the small pictures that are drawn while one moves, where the quality asked for is finer"""
 _FOG_COLOR = (0.7, 0.7, 0.7)
-_LEAST = 16  # pixels a side
+_LEAST, _MOST = 16, 16384  # pixels a side
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,20 @@ class Viewpoint:
     height: int
     distance: float = 1.0
     """metres to what it turns about: as much is seen by parallel rays as at that distance by others"""
+
+    def __post_init__(self) -> None:
+        numbers = (*self.position, *self.quaternion, self.fov_y, self.distance)
+        if not all(math.isfinite(number) for number in numbers) or not any(self.quaternion):
+            raise InputError(f"the page's camera must be of finite numbers, got {numbers}; reload the page")
+        if not 1e-3 <= self.fov_y <= math.pi - 1e-3:
+            raise InputError(
+                f"the page's field of view must be 0.001 to 3.14 radians, got {self.fov_y}; reload the page"
+            )
+        if not (1 <= self.width <= _MOST and 1 <= self.height <= _MOST):
+            raise InputError(
+                f"the page must be 1 to {_MOST} pixels a side, got {self.width} x {self.height}; "
+                "make it smaller"
+            )
 
     @property
     def pose(self) -> np.ndarray:
@@ -153,7 +167,8 @@ class Settings:
             exposure_time=self.exposure_ms / 1e3,
             readout=self.readout_ms / 1e3,
         )
-        full_well = math.inf if self.noise <= 0 else max(1.0, 1 / self.noise**2)
+        # not for a noise whose square is 0
+        full_well = max(1.0, 1 / self.noise**2) if self.noise > 1e-9 else math.inf
         read_noise = 0.0 if math.isinf(full_well) else min(own.sensor.read_noise, full_well)
         sensor = replace(own.sensor, exposure=self.exposure, full_well=full_well, read_noise=read_noise)
         still = not scene.motion.groups

@@ -14,13 +14,13 @@ from collections.abc import Callable
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import open_input, read_input
+from fidsplat.files import read_input
+from fidsplat.npy import load_npz
 
 _SIGMA, _RADIUS = 1.5, 5  # pixels: Wang et al. 2004, as in the 3DGS and 2DGS papers
 _C1, _C2 = 0.01**2, 0.03**2
@@ -97,11 +97,11 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
     Raises InputError when the file cannot be read or lacks an array or one has another shape.
     """
     try:
-        with open_input(file) as stream, np.load(stream, allow_pickle=False) as arrays:
-            weights = {name: np.asarray(arrays[name], np.float64) for name in arrays.files}
+        arrays = load_npz(file)
+        weights = {name: arrays[name].astype(np.float64) for name in sorted(arrays)}
     except InputError:
         raise
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
+    except (ValueError, TypeError) as error:
         raise InputError(f"{file} is no .npz file with LPIPS weights: {error}") from error
     for k, (out, into, size) in enumerate(_CHANNELS):
         shapes = {
@@ -112,6 +112,8 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
         for name, shape in shapes.items():
             if name not in weights or weights[name].shape != shape:
                 raise InputError(f"{file} needs an array {name} of shape {shape} (see docs/experiments.md)")
+            if not np.isfinite(weights[name]).all():
+                raise InputError(f"the array {name} of {file} must be finite; see docs/experiments.md")
 
     def measure(picture: np.ndarray, truth: np.ndarray) -> float:
         total = 0.0

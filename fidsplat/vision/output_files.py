@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
+from fidsplat.npy import load_npy
 from fidsplat.vision.images import write_png
 from fidsplat.vision.paint import (
     count_picture,
@@ -45,6 +47,20 @@ def save_output(
     if _is_depth(name):
         arrays.append(write_png(name_of(name, ".png"), depth_millimetres(image)))
     return [*arrays, write_png(name_of(name, suffixes_of(name)[-1]), picture_of(name, image))]
+
+
+def load_output(file: Path, shape: tuple[int, int]) -> np.ndarray:
+    """An output image (h, w) that `save_output` wrote as an array.
+
+    Raises InputError for a file that is damaged, or of an image of another shape.
+    """
+    try:
+        image = load_npy(file)
+        if image.shape != shape or image.dtype.kind not in "fi":
+            raise ValueError(f"its shape must be {shape}, got {image.shape} of {image.dtype}")
+        return image
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {file}: {error}; remove it, and render the image again") from error
 
 
 def picture_of(name: str, image: np.ndarray) -> np.ndarray:

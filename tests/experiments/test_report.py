@@ -1,5 +1,6 @@
 """Tables, charts and the report from results that are known."""
 
+import html
 import re
 import xml.dom.minidom
 from itertools import pairwise
@@ -327,7 +328,7 @@ def test_cells_of_a_table(tmp_path):
     assert pages.markdown_table(frame).splitlines() == [
         "| name | value |",
         "| --- | ---: |",
-        "| x\\|y | 1.5 |",
+        "| x&#124;y | 1.5 |",
     ]
     assert (pages.number(None), pages.fixed(float("nan")), pages.percent(None)) == ("-", "-", "-")
     assert (pages.percent(1.123), pages.percent(0.5), pages.percent(1.004)) == ("+12 %", "-50 %", "+0.4 %")
@@ -364,3 +365,24 @@ def test_labels_of_a_chart_do_not_overlap(tmp_path):
         extents.insert(1, across.get_window_extent(renderer))  # its own words may come close to it
         for i, one in enumerate(extents):
             assert i == 1 or not any(one.overlaps(other) for other in extents[:i])
+
+
+def test_names_in_a_page_are_no_markup(tmp_path):
+    """A data set and its views have the names of files, which may hold HTML."""
+    name = "<img src=x onerror=y>![a](b) | c"
+    facts = {"dataset": name, "splats": 1, "iterations": 1, "device": name, "iterations_per_second": 0}
+    context = {
+        "facts": facts,
+        "scores": pd.DataFrame([{"view": name, "PSNR, dB": "1.0"}]),
+        "pictures": [{"name": name, "file": "held-out-0.png"}],
+        "settings": pd.DataFrame([{"setting": "quality", "value": name}]),
+        "run": run_facts("a device", 0),
+    }
+    pages.write_page(tmp_path / "report.md", tmp_path, "training.md.j2", context)
+    text = (tmp_path / "report.md").read_text()
+    assert html.unescape(text).count(name) == 5
+    assert "<" not in text
+    assert "![a]" not in text
+    assert "![" in text  # our own images stay
+    (row,) = [line for line in text.splitlines() if line.endswith("| 1.0 |")]
+    assert row.count("|") == 3

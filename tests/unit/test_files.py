@@ -18,9 +18,9 @@ from fidsplat.experiments.sweep import read_records
 from fidsplat.files import atomic_write, writable_folder
 from fidsplat.formats import load_splats, save_splats
 from fidsplat.formats.colmap import save_colmap
+from fidsplat.npy import load_npy
 from fidsplat.sim import read_description
 from fidsplat.store.build import build_store
-from fidsplat.store.layout import load_array
 from fidsplat.store.store import Store
 from fidsplat.train import splats_of
 from fidsplat.train.read import load_dataset
@@ -97,7 +97,7 @@ def test_a_damaged_header_is_a_damaged_array(tmp_path):
     whole = (tmp_path / "a.npy").read_bytes()
     (tmp_path / "a.npy").write_bytes(whole.replace(b"(3,)", b"(3, "))
     with pytest.raises(ValueError, match="header"):
-        load_array(tmp_path / "a.npy")
+        load_npy(tmp_path / "a.npy")
 
 
 def put_scene(folder, pipe, name):

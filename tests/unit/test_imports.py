@@ -15,8 +15,8 @@ import fidsplat
 PACKAGE = Path(fidsplat.__file__).parent
 
 BASE = {
-    *("arguments", "errors", "files", "input_limit", "interrupts", "limits", "rotations", "scalars"),
-    *("stderr", "summaries"),
+    *("arguments", "errors", "files", "input_limit", "interrupts", "limits", "markdown", "npy", "rotations"),
+    *("scalars", "stderr", "summaries"),
 }
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
@@ -25,6 +25,8 @@ MAY_IMPORT = {
     "input_limit": {"errors"},
     "stderr": set(),
     "files": BASE,
+    "markdown": set(),
+    "npy": {"files"},
     "rotations": BASE,
     "arguments": {"errors"},
     "scalars": {"errors"},
@@ -79,7 +81,8 @@ HOME_OF = {
     "zxingcpp": ("vision",),
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
-    "viser": ("viewer.server",),
+    "viser": ("viewer.server", "viewer.guard"),
+    "zstandard": ("viewer.guard",),
     "websockets": ("viewer.guard",),
     "torch": ("frame", "train.torch_bridge"),
     "ray": ("remote.ray_engine",),

@@ -2,6 +2,7 @@
 
 import json
 import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
@@ -134,7 +135,7 @@ def test_what_is_no_whole_store_is_refused(store, tmp_path):
         ({"format": "zip"}, "of another kind"),
         ({"rows": -1}, "out of range"),
         ({"columns": []}, "no table"),
-        ({"rows": header["rows"] + 1}, "cut short"),
+        ({"rows": header["rows"] + 1}, "one after the other"),
         ({"columns": {"means": "<f4"}}, "no column"),
         ({"nodes_crc": 1}, "checksum"),
         ({"origin": [0, 0]}, "origin"),
@@ -150,6 +151,79 @@ def test_what_is_no_whole_store_is_refused(store, tmp_path):
     nodes["count"][0] += 1
     np.save(folder / "nodes.npy", nodes)
     refused("its checksum is another")
+
+
+def crafted(folder, nodes=None, **changes):
+    """Changes a store as somebody who knows its checksums."""
+    header = json.loads((folder / "store.json").read_text()) | changes
+    if nodes is not None:
+        np.save(folder / "nodes.npy", nodes)
+        header["nodes_crc"] = zlib.crc32(nodes.tobytes())
+    (folder / "store.json").write_text(json.dumps(header | {"crc": header_crc(header)}))
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "value", "match"),
+    [
+        ("count", 0, -5, "1 to 500 splats"),
+        ("count", 1, 0, "1 to 500 splats"),
+        ("count", 1, 501, "1 to 500 splats"),
+        ("count", -1, 2**31 - 1, "rows, one after the other"),
+        ("first", 1, 0, "rows, one after the other"),
+        ("first", 0, -1, "rows, one after the other"),
+        ("first", -1, 2**62, "rows, one after the other"),
+        ("level", -1, 2**31 - 1, "levels must rise"),
+        ("level", 0, -1, "levels must rise"),
+        ("level", 0, 1, "levels must rise"),
+        ("parent", 0, 2**30, "of the level above"),
+        ("parent", 0, -2, "of the level above"),
+        ("parent", 0, 0, "of the level above"),
+        ("parent", -1, 0, "of the level above"),
+        ("size", 0, 0.1, "0 for chunks"),
+        ("size", -1, -0.1, "at least 0"),
+        ("size", -1, np.nan, "finite"),
+        ("reach", 2, -1.0, "at least 0"),
+        ("low", 2, np.inf, "finite"),
+        ("low", 2, 1e9, "within the larger one"),
+        ("far_high", 2, -1e9, "within the larger one"),
+    ],
+)
+def test_an_index_that_does_not_fit_is_refused(store, tmp_path, name, number, value, match):
+    """With valid checksums too: a negative count took a device beyond its buffers."""
+    folder, nodes = copied(store, tmp_path), store.nodes.copy()
+    nodes[name][number] = value
+    crafted(folder, nodes)
+    with pytest.raises(
+        fs.InputError, match=rf"nodes.npy does not fit store.json: .*{match}.*; build the store"
+    ):
+        fs.Store(folder)
+
+
+def test_a_header_that_does_not_fit_its_index_is_refused(store, tmp_path):
+    folder, columns = copied(store, tmp_path), store.header.columns
+    for changes, match in [
+        ({"splats": store.header.splats - 1}, "chunks must have"),
+        ({"chunk": 100}, "1 to 100 splats"),
+        ({"pinned": store.header.pinned - 1}, "begin with a chunk"),
+        ({"pinned": 0}, "must have no parent"),
+        ({"pinned": -1}, "out of range"),
+        ({"rows": 2**62}, "out of range"),
+        ({"columns": columns | {"means": "<f8"}}, "the column means of the type <f8"),
+        ({"columns": columns | {"labels": "<f4"}}, "the column labels of the type <f4"),
+        ({"columns": columns | {"../x": "<f4"}}, "the column ../x"),
+        ({"sh_degree": -1}, "the column sh"),
+        ({"ellipsoids": "maybe"}, "neither none nor some nor all"),
+        ({"origin": [0, 0, 1e300]}, "origin"),
+        ({"identity": 5}, "no text"),
+        ({"dropped": {"nan": "<b>"}}, "no whole numbers"),
+    ]:
+        said = (store.path / "store.json").read_bytes()
+        (folder / "store.json").write_bytes(said)
+        crafted(folder, **changes)
+        with pytest.raises(fs.InputError, match=match):
+            fs.Store(folder)
+    (folder / "store.json").write_bytes(said)
+    assert len(fs.Store(folder)) == len(store)
 
 
 @pytest.mark.parametrize(
@@ -203,6 +277,10 @@ def test_a_store_of_places_has_the_splats_as_many_times(store, files, tmp_path):
         fs.place_store(store, tmp_path / "p.fss", [np.eye(4)])
     poses = [np.eye(4), rigid_matrix((30, 1, 2), (1, 0.2, -0.5, 0.1))]
     street = fs.Store(fs.place_store(flat, tmp_path / "street.fss", poses))
+    wrong = fs.place_store(flat, tmp_path / "wrong.fss", poses)
+    crafted(wrong, splats=len(flat))
+    with pytest.raises(fs.InputError, match="does not fit its poses; place the store again"):
+        fs.Store(wrong)
     assert len(street) == 2 * len(flat)
     assert street.chunks == 2 * flat.chunks
     cloud, moved = street.cloud(), flat.cloud().transformed(poses[1])

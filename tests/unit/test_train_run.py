@@ -15,7 +15,7 @@ from training_scene import QUICK, scene
 
 import fidsplat as fs
 from fidsplat.backends.gradients import TooLittleRoom
-from fidsplat.train import Trainer, TrainingError, TrainSettings, splats_within
+from fidsplat.train import Trainer, TrainingError, TrainSettings, splats_of, splats_within
 
 ITERATIONS = 26
 
@@ -216,6 +216,101 @@ def test_a_checkpoint_of_another_run_is_refused(dataset, tmp_path):
         file.write_bytes(damaged)
         with pytest.raises(fs.InputError, match="no checkpoint that can be read"):
             Trainer(dataset, renderer, checkpoint=file, iterations=3, **QUICK)
+
+
+def test_a_checkpoint_whose_arrays_do_not_fit_is_refused(dataset, tmp_path):
+    """Before a device writes beyond a buffer that is too short, or trains on what it misreads."""
+    file, renderer = tmp_path / "scene.training.npz", fs.Renderer("reference")
+    settings = {"iterations": 4, "checkpoint": file, **QUICK}
+    Trainer(dataset, renderer, iterations=3, checkpoint=file, **QUICK).run()
+    arrays = dict(np.load(file))
+    facts = json.loads(arrays["facts"].tobytes())
+
+    def refused(words, changes, of_viewer=False):
+        np.savez(file, **{name: array for name, array in (arrays | changes).items() if array is not None})
+        with pytest.raises(fs.InputError, match=f"{words}.*remove it, or give --overwrite"):
+            Trainer(dataset, renderer, **settings)
+        if of_viewer:
+            with pytest.raises(fs.InputError, match=words):
+                splats_of(file)
+
+    for name, array in arrays.items():
+        if name == "facts":
+            continue
+        spoiled = np.full_like(array, np.nan) if array.dtype.kind == "f" else array.astype(np.float32)
+        shown = name.startswith("values.")
+        refused(f"the array '{name}' is missing|{name}", {name: None}, shown)
+        refused(f"{name} must be|its splats must be", {name: array[None]}, shown)
+        refused(f"{name} must be", {name: array.astype(np.float64)}, shown)
+        refused(f"{name} must be", {name: spoiled}, shown)
+        if name != "values.means":
+            refused(f"{name} must be .* of the shape", {name: array[:-1]}, shown)
+        if name in ("gradients", "seen") or name.startswith("second."):
+            refused("must not be negative", {name: np.full_like(array, -1)})
+    for change in (
+        {"iteration": 2.5},
+        {"iteration": -1},
+        {"iteration": True},
+        {"by": None},
+        {"settings": []},
+    ):
+        refused("", {"facts": np.frombuffer(json.dumps(facts | change).encode(), np.uint8)})
+    more = {name: np.concatenate([array] * 2) for name, array in arrays.items() if len(array) == 16}
+    refused("at most max_splats, 30, got 32", more)
+
+
+def test_a_data_set_has_the_digest_of_all_that_training_depends_on(dataset):
+    """One thing at a time, so that none is left out."""
+
+    def other(place, **changes):
+        views = list(dataset.views)
+        views[place] = replace(views[place], **changes)
+        return replace(dataset, views=tuple(views)).digest
+
+    view, points = dataset.views[1], dataset.points.copy()
+    picture, colors, mask = view.picture.copy(), dataset.colors.copy(), np.ones(view.picture.shape[:2], bool)
+    picture[3, 4, 1] ^= 1
+    points[5, 2] += 1e-9
+    colors[5, 2] ^= 1
+    hole = mask.copy()
+    hole[3, 4] = False
+    pose = view.camera.world_to_camera.copy()
+    pose[0, 3] += 1e-9
+    names = ("fx", "fy", "cx", "cy", "near")
+    digests = [
+        dataset.digest,
+        other(1, name="other.png"),
+        other(1, picture=picture),
+        other(1, mask=mask),
+        other(1, mask=hole),
+        other(2, mask=mask),
+        other(1, camera=replace(view.camera, world_to_camera=pose)),
+        other(1, camera=replace(view.camera, far=100.0)),
+        *(other(1, camera=replace(view.camera, **{n: getattr(view.camera, n) * 1.001})) for n in names),
+        replace(dataset, points=points).digest,
+        replace(dataset, colors=colors).digest,
+        replace(dataset, background=(0.2, 0.3, 0.41)).digest,
+        replace(dataset, views=dataset.views[::-1]).digest,
+    ]
+    assert len(set(digests)) == len(digests)
+    assert scene().digest == dataset.digest
+
+
+def test_steps_of_adam_are_those_of_iterations_that_make_no_splats():
+    for strategy, start, until, every in (("default", 7, 40, 8), ("default", 8, 24, 8), ("mcmc", 7, 40, 8)):
+        settings = TrainSettings(
+            strategy=strategy,
+            densify_from=start,
+            densify_until=until,
+            relocate_until=until,
+            densify_every=every,
+        )
+        rests = [strategy == "default" and settings.makes_splats_after(i) for i in range(1, 61)]
+        steps = np.cumsum(np.logical_not(rests))
+        assert [settings.adam_steps(i) for i in range(1, 61)] == steps.tolist()
+        assert strategy == "mcmc" or any(rests)
+    settings = TrainSettings(densify_until=0)
+    assert settings.adam_steps(5000) == 5000
 
 
 def test_what_is_not_finite_ends_the_run_and_leaves_the_checkpoint(dataset, tmp_path, monkeypatch):

@@ -1,6 +1,11 @@
 """The viewer's page, with a client that is no browser."""
 
+import base64
+import hashlib
+import html
+import re
 import socket
+import urllib.request
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -70,6 +75,88 @@ def test_a_marker_that_moves_is_read_where_it_is_at_the_time_of_the_image(viewer
     viewer._views[1] = View(drawn.renderer.render(moving, capture), drawn, HERE)
     viewer.read(client)
     assert "| aruco:4x4_50:7 | 0." in client.said.content  # millimetres, not 100 of them
+
+
+def test_texts_of_a_scene_are_no_markup(viewer, monkeypatch):
+    """viser's Markdown holds raw HTML, and images by the server's own files: a marker's text, which scene
+    files and photographs bring, could run scripts and read files."""
+    hostile = "qr:<iframe srcdoc='<script>x</script>'>![a](/etc/passwd)[b](javascript:x) | &lt;\n\n<b>"
+    shown = " ".join(hostile.split())
+    client, box = Client(), viewer.session
+    drawn = box.drawn
+    marker = replace(drawn.scene.markers[0].marker, spec=hostile)
+    placed = replace(drawn.scene.markers[0], marker=marker)
+    viewer._enter(client)
+    assert until(lambda: 1 in viewer._views)
+    view = viewer._views[1]
+    scene = replace(drawn.scene, markers=(placed,))
+    viewer._views[1] = replace(view, drawn=replace(view.drawn, scene=scene))
+
+    def is_text(content, text):
+        assert text in html.unescape(content)
+        assert not re.search(r"[<\[\]!]|&(?!#\d+;)", content), content
+
+    viewer._click(SimpleNamespace(client_id=1, screen_pos=(0.5, 0.5)))
+    is_text(client.said.content, f"marker {shown}")
+    reading = SimpleNamespace(
+        as_dict=lambda: {"marker": hostile, "position_error_mm": 1.0, "angle_error_deg": 2.0}
+    )
+    code = SimpleNamespace(name=hostile)
+    monkeypatch.setattr("fidsplat.viewer.server.read_back", lambda *_: ([reading], [code]))
+    viewer.read(client)
+    is_text(client.said.content, f"| {shown} | 1.00 | 2.00 |")
+    is_text(client.said.content, f"not of the scene: {shown}")
+    assert client.said.content.count("|") == 12  # three cells a row
+
+    def fails(*_):
+        raise fs.InputError(hostile)
+
+    monkeypatch.setattr("fidsplat.viewer.server.read_back", fails)
+    viewer.read(client)
+    is_text(client.said.content, shown)
+    viewer._controls.say(hostile)
+    is_text(viewer._controls.status.content, f"**{shown}**")
+
+
+def test_the_page_runs_its_own_scripts_alone(viewer):
+    with urllib.request.urlopen(viewer.address) as answer:
+        policy, page = answer.headers["Content-Security-Policy"], answer.read().decode()
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    assert rules["frame-src"] == rules["object-src"] == rules["base-uri"] == "'none'"
+    scripts = rules["script-src"].split()
+    assert "'unsafe-inline'" not in scripts
+    (loader,) = re.findall(r"<script [^>]*>(.*?)</script>", page, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(loader.encode()).digest()).decode()
+    assert f"'sha256-{digest}'" in scripts
+    assert len([word for word in scripts if word.startswith("'sha256-")]) == 2  # and the packed program
+
+
+def test_a_camera_that_is_none_does_not_end_a_stream(viewer):
+    client = Client()
+    viewer._enter(client)
+    assert until(lambda: 1 in viewer._views)
+    before, near = dict(vars(client.camera)), viewer._views[1].frame["label"] == 1
+    for changes in (
+        {"fov": 0.0},
+        {"fov": np.nan},
+        {"fov": 3.2},
+        {"position": (np.nan, 0, 0)},
+        {"wxyz": (0, 0, 0, 0)},
+        {"look_at": (np.inf, 0, 0)},
+        {"image_width": 10**6},
+    ):
+        vars(client.camera).update(before | changes)
+        viewer._controls.say("")
+        client.turned(client.camera)
+        assert "the page" in viewer._controls.status.content
+        viewer.add_keyframe(client)
+        viewer.picture(client)
+        assert viewer._keyframes == client.files == []
+    vars(client.camera).update(before | {"position": (0, 0, -2)})
+    client.turned(client.camera)
+    assert until(lambda: viewer._views[1].viewpoint.position == (0, 0, -2))
+    far = viewer._views[1].frame["label"] == 1
+    assert 0.15 < far.sum() / near.sum() < 0.35, "the image after the move: a quarter of the area"
 
 
 def test_what_a_button_cannot_do_is_said(viewer, monkeypatch):
