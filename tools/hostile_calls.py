@@ -239,7 +239,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "Rig.placed": lambda _: (_rig().placed, {"bodies": {"box": POSES[0]}}, None),
     "Pictures.camera": lambda _: (_pictures().camera, {"name": "eye", "environment": 0}, None),
     "Pictures.of": lambda _: (_pictures().of, {"camera": "eye"}, None),
-    "Pictures.scene": lambda _: (_pictures().scene, {"name": "eye", "environment": 0}, None),
+    "Pictures.placed": lambda _: (_pictures().placed, {"environment": 0}, None),
     "Pictures[]": lambda _: (_pictures().__getitem__, {"name": "rgb"}, None),
     "read_description": lambda folder: (read_description, {"path": folder / "none.sdf", "models": ()}, None),
     "read_back": lambda _: (read_back, {"picture": np.zeros((16, 24, 3), np.uint8), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),

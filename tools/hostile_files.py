@@ -278,7 +278,7 @@ def results(rng: Random, folder: Path) -> None:
     for path in place.iterdir():
         path.unlink()
     name = rng.choice(["counts", "angles", "views", "localisation"])
-    lines = (Path(__file__).parents[1] / "docs" / "results" / f"{name}.csv").read_text().split("\n")
+    lines = (Path(__file__).parents[1] / "devlog" / "results" / f"{name}.csv").read_text().split("\n")
     lines = lines[:2] + rng.sample(lines[2:-1], 12) + [""]
     raw = rng.random() < 0.5
     if raw:

@@ -239,8 +239,8 @@ def _is_python(mutation: Mutation) -> bool:
 
 
 def tests_for(mutation: Mutation) -> list[str]:
-    """Arguments of pytest: the files of the map that mention the words of the file's name, and its public
-    classes and functions, most often."""
+    """Arguments of pytest: the files of the map that mention most often the words of the file's name, its
+    public classes and functions."""
     patterns, expression = TESTS[mutation.package]
     first = 2 if mutation.path.startswith("kernels/") else 1
     words = [word for word in re.split(r"[_/.]", mutation.path)[first:-1] if len(word) > 2]

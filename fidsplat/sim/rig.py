@@ -301,6 +301,8 @@ class Pictures(Mapping):
 
     def placed(self, environment: int = 0) -> list[PlacedMarker]:
         """The scene's markers where they were."""
+        most = min((len(poses) for poses in (*self.bodies.values(), *self.cameras.values())), default=1) - 1
+        whole_number("environment", environment, 0, most)
         return self.rig.placed({body: pose[environment] for body, pose in self.bodies.items()})
 
 

@@ -82,7 +82,7 @@ HOME_OF = {
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
     "viser": ("viewer.server", "viewer.guard"),
-    "zstandard": ("viewer.guard",),
+    "zstandard": ("viewer.guard", "logs.reader"),
     "websockets": ("viewer.guard",),
     "torch": ("frame", "train.torch_bridge"),
     "ray": ("remote.ray_engine",),
