@@ -15,8 +15,9 @@ from fidsplat.effects.catalogue import CATALOGUE
 BACKEND = "opencl"
 SPLATS = random_splats(40, 21, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
 CAMERA = fs.Camera.pinhole(*SIZE, 30.0, 30.0, 18.0, 11.0)
-ELSEWHERE = {"distortion", "overdraw", "tile_ends"}
-"""tests/contract/test_gradients.py has the first two, tests/unit/test_store_hidden.py the third"""
+ELSEWHERE = {"distortion", "overdraw", "rounding", "tile_ends"}
+"""tests/contract/test_gradients.py has the first two, test_error_output.py the third, and
+tests/unit/test_store_hidden.py the last"""
 
 
 def taken(cloud, outputs=tuple(OUTPUTS), **how):
@@ -38,6 +39,10 @@ PICTURES = {
         quality="standard,order=pixel",
         motion=fs.Motion(turning, {0: sliding}),
         shutter=fs.Shutter(exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=8),
+    ),
+    "splats whose centres a fisheye does not see": lambda: Combination(
+        random_splats(60, 0, depth=(-5.0, 6.0)),
+        fs.Capture(fs.Camera.fisheye(*SIZE, 2.0), ("rgb", "depth", "normal"), quality="standard"),
     ),
     "boxes in float64": lambda: taken(SPLATS.with_boxes(), quality="standard,blend_precision=float64"),
 }

@@ -40,17 +40,19 @@
             away &= VMASK(FMA(dot_x, dot_x, dot_y * dot_y) * filter > half_r2);
         }
 //@ fragment_mask
-// Vectors of pixels pass over a dot that is far away; to single pixels the question costs what it saves.
-#if LANES > 1
+// A splat without a dot has it far away, or at NaN where the lens does not see the centre. Vectors of pixels skip it; for single pixels the
+// test costs what it saves.
 #define HAS_DOT(s) ((s)->dot_x < 1e17f)
+#if LANES > 1
+#define SKIPS_DOT(s) (!HAS_DOT(s))
 #else
-#define HAS_DOT(s) true
+#define SKIPS_DOT(s) false
 #endif
 
 static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y, wide half_r2, wide filter,
                                  vfloat *screen) {
     *screen = 0.0f;
-    if (!HAS_DOT(s)) return c.inside;
+    if (SKIPS_DOT(s)) return c.inside;
     vfloat ex = x - s->dot_x;
     vfloat ey = y - s->dot_y;
     *screen = FMA(ex, ex, ey * ey) * filter;
@@ -59,7 +61,7 @@ static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y,
 //@ fragment_half_rho
 static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat inverse_d, vfloat screen) {
     vfloat half_rho = (c.q * inverse_d) * inverse_d;
-    return HAS_DOT(s) ? VSELECT(screen, VMIN(half_rho, screen), c.inside) : half_rho;
+    return SKIPS_DOT(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
 }
 //@ dot_crossing
     vfloat screen;              // rho / 2 of the dot
