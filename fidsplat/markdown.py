@@ -3,6 +3,7 @@
 import re
 
 _ACTIVE = re.compile(r"[&<>\[\]!|\\]")
+_SPACE = re.compile(r"\s+")
 
 
 def escaped(text: object) -> str:
@@ -10,5 +11,4 @@ def escaped(text: object) -> str:
 
     Emphasis and code (`*`, `_`, a backtick) stay: they change a typeface, no more.
     """
-    line = " ".join(str(text).split())
-    return _ACTIVE.sub(lambda found: f"&#{ord(found[0])};", line)
+    return _ACTIVE.sub(lambda found: f"&#{ord(found[0])};", _SPACE.sub(" ", str(text)))

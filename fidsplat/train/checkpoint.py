@@ -148,7 +148,8 @@ def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Spl
         if (array < 0).any():
             raise ValueError(f"{name} must not be negative")
     history = {name: _checked(arrays, name, (iteration,), dtype) for name, dtype in _HISTORY.items()}
-    return Splats(*groups, **sums), history
+    values, first, second = groups
+    return Splats(values, first, second, sums["gradients"], sums["seen"]), history
 
 
 def _group(arrays: Arrays, group: str, count: int, degree: int) -> Arrays:

@@ -48,7 +48,7 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert main([*words[:-1], "3", "--overwrite"]) == 0
     for wrong, said in (
         (["-o", "a.png"], "-o is a.png"),
-        (["--random-points", "-1"], "--random-points is -1; it must"),
+        (["--random-points", "-1"], "--random-points must be"),
         (["--random-points", "99999999999"], "--random-points is 99999999999; it must"),
         (["--within-memory", "0"], "--within-memory is 0"),
         (["--within-memory", "1e-6"], "alone take 0.0001 GiB of the 1e-06 GiB"),

@@ -115,7 +115,7 @@ def test_a_panorama_is_on_the_device_once_and_as_long_as_it_is_used(renderer):
     assert not np.array_equal(renderer.render(CLOUD, CAMERA, background=again)["rgb"], first["rgb"])
     assert np.array_equal(renderer.render(CLOUD, CAMERA, background=sky)["rgb"], first["rgb"])
     assert second["alpha"].any()
-    del sky, again
+    del sky, again, first, second  # frames hold their captures
     gc.collect()
     assert len(held) == before
 
