@@ -49,11 +49,11 @@ def check_pictures(folder: Path, view: str, seed: int, samples: int | None = Non
 
     Raises InputError when that is another seed or number of samples (None: any).
     """
+    if not _note(folder, view).exists():
+        return {}
     try:
         about = from_json(read_text(_note(folder, view)))
-    except (FileNotFoundError, NotADirectoryError):
-        return {}
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise InputError(f"cannot read {_note(folder, view)}: {error}") from error
     for name, wanted in (("seed", seed), ("samples", samples)):
         if wanted is not None and about.get(name) != wanted:

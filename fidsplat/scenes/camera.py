@@ -69,6 +69,7 @@ def read_focal_lengths(camera: Table, width: int, height: int, lens: Lens | None
         if isinstance(lens, Orthographic):
             raise camera.error("fov_x_deg", "and orthographic exclude each other; give metres_wide there")
         angle = math.radians(camera.number("fov_x_deg"))
+        width = min(max(width, 1), 32767)  # the camera refuses others, by their own key
         with camera.at("fov_x_deg"):
             fisheye = isinstance(lens, Fisheye)
             f = fisheye_focal_length(width, angle, lens) if fisheye else focal_length(width, angle)

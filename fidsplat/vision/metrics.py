@@ -88,7 +88,10 @@ _EPSILON = 1e-10
 def weights_name(file: Path) -> str:
     """What tells weights apart in results: the start of the file's hash. Raises InputError when it cannot be
     read."""
-    return hashlib.sha256(read_input(file)).hexdigest()[:12]
+    try:
+        return hashlib.sha256(read_input(file)).hexdigest()[:12]
+    except InputError as error:
+        raise InputError(f"cannot read the LPIPS weights: {error}") from error
 
 
 def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:

@@ -111,7 +111,7 @@ def test_lpips_is_that_of_its_definition(tmp_path):
 
 
 def test_lpips_weights_that_cannot_be_used(tmp_path):
-    with pytest.raises(fs.InputError, match="no \\.npz file with LPIPS weights"):
+    with pytest.raises(fs.InputError, match=r"cannot read .*none\.npz: No such file"):
         load_lpips(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("weights")
     with pytest.raises(fs.InputError, match="no \\.npz file with LPIPS weights"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,6 +90,10 @@ class _Needs:
         return tuple(name for name in names if name in self.effects)
 
 
+_MAKING = threading.RLock()
+"""kernels and structs are cached by their arguments; two threads that miss at once would make two of one"""
+
+
 class Program:
     """The stages' kernels, and what the host must know of them."""
 
@@ -107,7 +112,7 @@ class Program:
         self.tile_area = shape.tile_width * shape.tile_height
         """samples"""
         self.needs = needs = _Needs.of(features)
-        with quiet():
+        with _MAKING, quiet():
             self._make_lists(features, needs)
             self._make_blend(needs)
             self._make_resolve(features, needs)
@@ -185,7 +190,7 @@ class Program:
 
     def load_banding(self) -> None:
         """Compile what only a picture with more pairs than the budget needs."""
-        with quiet():
+        with _MAKING, quiet():
             self.compile(self.lists.histogram)
             self.compile(self.lists.count)
 
@@ -206,7 +211,7 @@ class GradientKernels:
         effects, outputs = needs.among(_SAMPLE), needs.blending
         backward, names = kernels("blend_backward"), kernels("fragment_backward").moments_of(effects, outputs)
         grouped, block = shape.schedule == "group", program.tile_area
-        with quiet():
+        with _MAKING, quiet():
             self.blend = backward.make_blend_backward(effects, outputs, self.losses, grouped, block)
             self.slots = backward.make_slots("lowpass_screen" in effects)
             made = kernels("project_backward").make_project_backward
