@@ -115,6 +115,8 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
         for name, shape in shapes.items():
             if name not in weights or weights[name].shape != shape:
                 raise InputError(f"{file} needs an array {name} of shape {shape} (see docs/experiments.md)")
+            if not np.isfinite(weights[name]).all():
+                raise InputError(f"the array {name} of {file} must be finite; see docs/experiments.md")
 
     def measure(picture: np.ndarray, truth: np.ndarray) -> float:
         total = 0.0

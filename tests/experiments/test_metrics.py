@@ -119,6 +119,9 @@ def test_lpips_weights_that_cannot_be_used(tmp_path):
     np.savez(tmp_path / "short.npz", **{k: v for k, v in weights().items() if k != "lin3"})
     with pytest.raises(fs.InputError, match=r"needs an array lin3 of shape \(256,\)"):
         load_lpips(tmp_path / "short.npz")
+    np.savez(tmp_path / "infinite.npz", **{k: np.full_like(v, np.inf) for k, v in weights().items()})
+    with pytest.raises(fs.InputError, match="must be finite"):
+        load_lpips(tmp_path / "infinite.npz")
     with pytest.raises(fs.InputError, match="cannot read the LPIPS weights"):
         weights_name(tmp_path / "none.npz")
     assert weights_name(tmp_path / "text.npz") != weights_name(tmp_path / "short.npz")
