@@ -22,7 +22,8 @@ class FrameBatch(Mapping):
     (views, h, w) or (views, h, w, channels), copied from the device on first use.
 
     Names, types and units are those of Frame. Views that were masked out hold -1 in `label` and `splat_id`
-    and 0 in all else. View i has the bits that `Renderer.render` gives it alone.
+    and 0 in all else. View i is bit-identical to `Renderer.render` alone, but for stores with
+    `detail_error` (`Renderer.render_batch`).
     """
 
     def __init__(self, images: BatchImages, views: Views, ids: Ids = None) -> None:

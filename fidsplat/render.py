@@ -275,7 +275,10 @@ class Renderer:
         groups: Mapping[int, Any] | None = None,
         mask: Any = None,
     ) -> FrameBatch:
-        """Draw many views of one cloud at once. View i has the bits of `render` alone, whatever the batch.
+        """Render many views of one cloud at once. View i is bit-identical to `render` alone.
+
+        The exception are stores with `Quality.detail_error` above 0: the view with the highest demand
+        selects the levels of detail of all views.
 
         Args:
             scene: what to draw; a ResidentCloud transfers no splat.
