@@ -62,8 +62,8 @@ def load_usd(path: Path) -> SplatCloud:
             raise InputError(f"{path}: {done.stdout}")
         if done.returncode != 0:
             raise InputError(
-                f"{path} must be a USD file that usd-core reads with {bytes_words(limit)} of memory, got exit "
-                f"status {done.returncode} of its process; if you trust the file, set {VARIABLE}={4 * limit}"
+                f"{path} must be a USD file that usd-core reads with {bytes_words(limit)} of memory, got "
+                f"exit status {done.returncode} of its process; if you trust it, set {VARIABLE}={4 * limit}"
             )
         with np.load(arrays, allow_pickle=False) as stored:
             found = dict(stored)
