@@ -70,7 +70,8 @@ def load_usd(path: Path) -> SplatCloud:
     clouds = []
     for k in range(len([name for name in found if name.startswith("matrix")])):
         names = ("means", "quats", "scales", "opacities", "sh", "labels", "planes")
-        cloud = cloud_of(path, **{name: found.get(f"{name} {k}") for name in names})
+        fields: dict[str, Any] = {name: found.get(f"{name} {k}") for name in names}
+        cloud = cloud_of(path, **fields)
         matrix = found[f"matrix {k}"]
         clouds.append(cloud if np.abs(matrix - np.eye(4)).max() < 1e-12 else cloud.transformed(matrix))
     return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
@@ -122,7 +123,7 @@ def _check_layers(pxr: Any, source: str) -> None:
                 known.add(file)
 
 
-def _read(pxr: Any, name: str) -> dict[str, np.ndarray]:
+def _read(pxr: Any, name: str) -> dict[str, Any]:
     """Arrays of each field of Gaussians, their names followed by its number."""
     stage = pxr.Usd.Stage.Open(name, pxr.Usd.Stage.LoadAll)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in _KINDS]
