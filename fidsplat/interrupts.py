@@ -112,12 +112,13 @@ def run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
     import subprocess
 
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, errors="replace") as process:
         try:
             while True:
                 check()
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     out, err = process.communicate(timeout=PERIOD)
+                    check()  # Ctrl-C in a terminal ends the process too
                     return subprocess.CompletedProcess(command, process.returncode, out, err)
         except BaseException:
             process.kill()

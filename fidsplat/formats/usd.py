@@ -3,17 +3,25 @@ ParticleField3DGaussianSplat (extra `usd`). Schemas: openusd.org, usdVol.
 
 USD stages here have y up: the splats are written as they are, under a half turn about x. Labels and planes
 stand in attributes of our own, fidsplat:labels and fidsplat:planes.
+
+Damaged files crash usd-core, or make it run for ever or use gigabytes: a child process with limits of memory
+and processor time reads them.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_path, open_input, utf8_path
+from fidsplat import interrupts
+from fidsplat.errors import InputError, bytes_words
+from fidsplat.files import atomic_path, open_input, regular_file, utf8_path
 from fidsplat.formats.plain import (
     HALF_TURN,
     cloud_of,
@@ -22,67 +30,115 @@ from fidsplat.formats.plain import (
     three_scales,
     world_means,
 )
-from fidsplat.input_limit import check_expansion
+from fidsplat.input_limit import VARIABLE, input_limit
 from fidsplat.splats import SplatCloud
 
 _SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
-_ENTRY = 32
-"""bytes of memory that an entry of a section takes"""
 _KINDS = ("ParticleField", "ParticleField3DGaussianSplat")
+_SECONDS = 30
+"""of processor time for any file, and one more for each MiB"""
+_REFUSED = 3
+"""exit status of the child process when it prints why it refuses the file"""
+_CHILD = (
+    "import sys; sys.path[:] = sys.argv[4:]; from fidsplat.formats.usd import _child; _child(*sys.argv[1:4])"
+)
 
 
 def load_usd(path: Path) -> SplatCloud:
     """Read the splats of a .usda, .usdc or .usd file, all its fields of Gaussians, as one cloud.
 
     Raises:
-        InputError: it is damaged, holds no such field, or one whose kernel is not known; the extra is
-            missing.
+        InputError: it is damaged, holds no such field, or one whose kernel is not known; reading crashes or
+            exceeds `input_limit`; the extra is missing.
     """
-    pxr = _pxr()
-    try:
-        _check_sections(path)
-        with utf8_path(path) as name:
-            return _load(pxr, path, name)
-    except InputError:
-        raise
-    # also of arrays, which are read late, when they are requested
-    except (pxr.Tf.ErrorException, RuntimeError, OSError, OverflowError, ValueError):
-        raise InputError(f"{path} is not a USD file that can be read") from None
-
-
-def _check_sections(path: Path) -> None:
-    """Check the counts of a crate file's sections, by which USD takes memory before it reads what they count
-    (pxr/usd/sdf/crateFile.cpp). Raises InputError beyond the limit."""
     with open_input(path) as stream:
-        head = stream.read(24)
-        if head[:8] != b"PXR-USDC" or len(head) < 24:
-            return
-        stream.seek(int.from_bytes(head[16:24], "little"))
-        count = int.from_bytes(stream.read(8), "little")
-        sections = [stream.read(32) for _ in range(min(count, 64))]
-        for section in sections:
-            stream.seek(int.from_bytes(section[16:24], "little"))
-            name, numbers = section[:16].rstrip(b"\0").decode("ascii", "replace"), stream.read(16)
-            counts = [int.from_bytes(numbers[at : at + 8], "little") for at in (0, 8)]
-            need = max(_ENTRY * counts[0], counts[1] if name == "TOKENS" else 0)  # tokens also have a length
-            check_expansion(path, need, f"{counts[0]:,} entries in its section {name}")
+        status = os.fstat(stream.fileno())
+    limit = input_limit(min(status.st_size, 512 * status.st_blocks))
+    with tempfile.TemporaryDirectory() as folder, utf8_path(path) as name:
+        arrays = Path(folder, "arrays.npz")
+        words = [str(limit), str(name), str(arrays), *sys.path]
+        done = interrupts.run([sys.executable, "-c", _CHILD, *words])
+        if done.returncode == _REFUSED:
+            raise InputError(f"{path}: {done.stdout}")
+        if done.returncode != 0:
+            raise InputError(
+                f"{path} must be a USD file that usd-core reads with {bytes_words(limit)} of memory, got "
+                f"exit status {done.returncode} of its process; if you trust it, set {VARIABLE}={4 * limit}"
+            )
+        with np.load(arrays, allow_pickle=False) as stored:
+            found = dict(stored)
+    clouds = []
+    for k in range(len([name for name in found if name.startswith("matrix")])):
+        names = ("means", "quats", "scales", "opacities", "sh", "labels", "planes")
+        fields: dict[str, Any] = {name: found.get(f"{name} {k}") for name in names}
+        cloud = cloud_of(path, **fields)
+        matrix = found[f"matrix {k}"]
+        clouds.append(cloud if np.abs(matrix - np.eye(4)).max() < 1e-12 else cloud.transformed(matrix))
+    return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
 
 
-def _load(pxr: Any, path: Path, name: Path) -> SplatCloud:
-    stage = pxr.Usd.Stage.Open(str(name), pxr.Usd.Stage.LoadAll)
+def _child(limit: str, source: str, target: str) -> None:
+    """Write the arrays of a USD file into an .npz file; runs in a process of its own.
+
+    limit: bytes of memory, in addition to what the libraries take.
+    """
+    os.environ["PXR_WORK_THREAD_LIMIT"] = "1"  # the stacks of threads would count
+    try:
+        pxr = _pxr()
+        _set_limits(int(limit), _SECONDS + os.stat(source).st_size // 2**20)
+        _check_layers(pxr, source)
+        np.savez(target, **_read(pxr, source))
+    except MemoryError:
+        raise
+    except Exception as error:  # USD's own, also of arrays, which are read late, when they are requested
+        text = str(error) if isinstance(error, InputError) else "it is not a USD file that can be read"
+        sys.stdout.buffer.write(text.encode("ascii", "backslashreplace"))
+        sys.stdout.flush()
+        os._exit(_REFUSED)  # not through the finalizers of a library with a damaged stage
+
+
+def _set_limits(limit: int, seconds: int) -> None:
+    """Limit this process to its present size and so many bytes, and to a processor time, where the system
+    can."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+        pages = int(Path("/proc/self/statm").read_bytes().split()[0])
+        most = min(pages * resource.getpagesize() + limit, 2**62)
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        if soft == resource.RLIM_INFINITY or most < soft:
+            resource.setrlimit(resource.RLIMIT_AS, (most, hard))
+
+
+def _check_layers(pxr: Any, source: str) -> None:
+    """Check that all files that layers refer to are regular files, before USD opens them."""
+    todo, known = [source], {source}
+    while todo:
+        layer = pxr.Sdf.Layer.FindOrOpen(todo.pop())
+        for name in layer.GetCompositionAssetDependencies() if layer else ():
+            file = layer.ComputeAbsolutePath(name)
+            if file not in known and os.path.lexists(file):
+                todo.append(str(regular_file(file)))
+                known.add(file)
+
+
+def _read(pxr: Any, name: str) -> dict[str, Any]:
+    """Arrays of each field of Gaussians, their names followed by its number."""
+    stage = pxr.Usd.Stage.Open(name, pxr.Usd.Stage.LoadAll)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in _KINDS]
     if not prims:
-        raise InputError(f"{path} holds no ParticleField")
+        raise InputError("it holds no ParticleField")
     up = HALF_TURN if pxr.UsdGeom.GetStageUpAxis(stage) == "Y" else np.eye(4)
     metres = pxr.UsdGeom.GetStageMetersPerUnit(stage) if stage.HasAuthoredMetadata("metersPerUnit") else 1.0
-    clouds = []
-    for prim in prims:
+    found = {}
+    for k, prim in enumerate(prims):
         # USD's matrices act on rows
         placed = np.array(pxr.UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0)).T
         matrix = np.diag([metres, metres, metres, 1.0]) @ up @ placed
-        cloud = _cloud(path, prim)
-        clouds.append(cloud if np.abs(matrix - np.eye(4)).max() < 1e-12 else cloud.transformed(matrix))
-    return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
+        arrays = {"matrix": matrix, **_field(prim)}
+        found |= {f"{name} {k}": array for name, array in arrays.items()}
+    return found
 
 
 def save_usd(cloud: SplatCloud, path: Path) -> None:
@@ -135,32 +191,37 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
             raise InputError(f"cannot write {path}: USD says no more; is the disk full?")
 
 
-def _cloud(path: Path, prim: Any) -> SplatCloud:
+def _field(prim: Any) -> dict[str, np.ndarray]:
+    """Arguments of `cloud_of`."""
     surflet = _SURFLET in prim.GetAppliedSchemas()
     if prim.GetTypeName() == _KINDS[0] and not surflet:
-        raise InputError(f"{path}: the kernel of {prim.GetPath()} is not known; Gaussian surflets are")
+        raise InputError(f"the kernel of {prim.GetPath()} is not known; Gaussian surflets are")
 
-    def array(name: str) -> np.ndarray:
+    def array(name: str, *columns: int) -> np.ndarray:
         found = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()  # h: in half precision
         if found is None:
-            raise InputError(f"{path}: {prim.GetPath()} has no {name}")
-        return np.array(found)
+            raise InputError(f"{prim.GetPath()} has no {name}")
+        values = np.array(found, np.float32)
+        if values.shape[1:] != columns or values.ndim != 1 + len(columns):
+            raise InputError(
+                f"{name} of {prim.GetPath()} must have the shape n x {columns}, got {values.shape}"
+            )
+        return values
 
-    means = array("positions").astype(np.float32)
-    imaginary_first = array("orientations").astype(np.float32)
-    scales = array("scales").astype(np.float32)
+    means, scales = array("positions", 3), array("scales", 3)
     if surflet:
         scales[:, 2] = 0
     degree = int(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() or 0)
-    sh = array("radiance:sphericalHarmonicsCoefficients").astype(np.float32)
+    sh = array("radiance:sphericalHarmonicsCoefficients", 3)
     n, k = len(means), (degree + 1) ** 2
     if len(sh) != n * k:
-        raise InputError(f"{path}: {prim.GetPath()} has {len(sh)} SH coefficients for {n} splats of {k}")
-    labels, planes = (prim.GetAttribute(f"fidsplat:{name}").Get() for name in ("labels", "planes"))
-    quats = imaginary_first[:, [3, 0, 1, 2]]
-    labels, planes = (None if each is None else np.array(each) for each in (labels, planes))
-    sh = sh.reshape(n, k, 3)
-    return cloud_of(path, means, quats, scales, array("opacities"), sh, labels=labels, planes=planes)
+        raise InputError(f"{prim.GetPath()} has {len(sh)} SH coefficients for {n} splats of {k}")
+    found = {"means": means, "scales": scales, "sh": sh.reshape(n, k, 3), "opacities": array("opacities")}
+    found["quats"] = array("orientations", 4)[:, [3, 0, 1, 2]]  # USD's have the imaginary parts first
+    for name in ("labels", "planes"):
+        if (numbers := prim.GetAttribute(f"fidsplat:{name}").Get()) is not None:
+            found[name] = np.array(numbers, np.int32)
+    return found
 
 
 def _pxr() -> Any:
