@@ -26,7 +26,7 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
     1, x, y from the anchor; by ln(opacity), by the colour, by the further numbers of the record."""
     names = list(_FORMS)
     names += ("dot_x", "dot_y") if "lowpass_screen" in effects else ()
-    names += ("z_numerator", "z_center") if "ray_depth" in effects else ()
+    names += ("z_numerator", "z_numerator_x", "z_numerator_y", "z_center") if "ray_depth" in effects else ()
     names += ("nx", "ny", "nz") if "normal" in outputs else ()
     return tuple(names)
 
@@ -128,7 +128,8 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         inverse_d: float,
         low_pass: float,
     ):
-        """Depth of a fragment, and its derivatives by z_numerator, z_center, D; by q and by the low-pass's
+        """Depth of a fragment, and its derivatives by z_numerator, by z_center, by D at constant
+        z_numerator - z_center D; by q and by the low-pass's
         half rho `low_pass`, which may be the circle that z_center + circle (z_numerator - z_center D) D / q
         is mirrored at. It leaves the splat's range by rounding alone, and then has the centre's."""
         place = index * each
@@ -142,11 +143,11 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             met = numerator * inverse_d
             z = wp.clamp(met, center - reach, center + reach)
             if met == z:
-                by_record = wp.vec3(inverse_d, 0.0, -z * inverse_d)
+                by_record = wp.vec3(inverse_d, 0.0, (center - z) * inverse_d)
         elif ahead:
             beyond, taken = numerator - center * c.d, circle * c.d / c.q
             z = wp.clamp(fma(taken, beyond, center), center - reach, center + reach)
-            by_record = wp.vec3(taken, 1.0 - taken * c.d, circle / c.q * (beyond - center * c.d))
+            by_record = wp.vec3(taken, 1.0 - taken * c.d, circle / c.q * beyond)
             by_dot = wp.vec2(-taken * beyond / c.q, wp.where(circle == low_pass, beyond * c.d / c.q, 0.0))
         return z, by_record, by_dot
 
@@ -224,7 +225,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             by_d = plane * half_rho
         m = Moments()
         if wp.static(has_depth):
-            m[wp.static(at.get("z_numerator", 0))] = by_z * by_record[0]
+            numerator = by_z * by_record[0]
+            m[wp.static(at.get("z_numerator", 0))] = numerator
+            m[wp.static(at.get("z_numerator_x", 0))] = numerator * x
+            m[wp.static(at.get("z_numerator_y", 0))] = numerator * y
             m[wp.static(at.get("z_center", 0))] = by_z * by_record[1]
             by_d += by_z * by_record[2]
             by_nu += 2.0 * by_z * by_dot_depth[0] * nu

@@ -73,6 +73,7 @@ def make_project_backward(
     at = {name: place for place, name in enumerate(names)}
     Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
     screen_filter, has_depth, normal = (name in at for name in ("dot_x", "z_center", "nx"))
+    zc_line, zc_lane = layout.place("z_center")
     terms = max(sh_terms, 1)
     dot_x, z_numerator, nx = (at.get(name, 0) for name in ("dot_x", "z_numerator", "nx"))
 
@@ -169,14 +170,17 @@ def make_project_backward(
         g_u = n_scale * (total[0] * ray + wp.vec3d(total[1] * per_x, total[2] * per_y, _ZERO))
         g_v = n_scale * (total[3] * ray + wp.vec3d(total[4] * per_x, total[5] * per_y, _ZERO))
         g_d = scale * (total[6] * ray + wp.vec3d(total[7] * per_x, total[8] * per_y, _ZERO))
+        if wp.static(has_depth):
+            # by z_numerator - z_center D, with z_numerator = (a x b) p: small differences of large numbers
+            volume = scale * total[z_numerator]
+            along = wp.vec3d(total[z_numerator + 1] * per_x, total[z_numerator + 2] * per_y, _ZERO)
+            center = wp.float64(line_of(lines, i * each + zc_line)[zc_lane])
+            g_d += volume * (p - center * ray) - scale * center * along
         by_a = wp.cross(g_v, p) + wp.cross(b, g_d)
         by_b = wp.cross(p, g_u) + wp.cross(g_d, a)
         by_p = wp.cross(g_u, b) + wp.cross(a, g_v)
         by_log = total[9]
         if wp.static(has_depth):
-            volume = scale * total[z_numerator]  # z_numerator is the height
-            by_a += volume * form_u
-            by_b += volume * form_v
             by_p += volume * form_d
         if wp.static(screen_filter):
             by_x, by_y = total[dot_x] * view.focal_x / p[2], total[dot_x + 1] * view.focal_y / p[2]
@@ -186,7 +190,7 @@ def make_project_backward(
         down = wp.float64(view.height) * by_p[1] * per_y
         screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
         if wp.static(has_depth):
-            by_p[2] = by_p[2] + total[z_numerator + 1]
+            by_p[2] = by_p[2] + total[z_numerator + 3]
         by_su, by_sv = wp.dot(by_a, unit_a), wp.dot(by_b, unit_b)
         by_scales[i] = wp.vec2(
             wp.where(size[0] >= SMALLEST_SCALE, float(by_su), 0.0),
