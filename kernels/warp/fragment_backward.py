@@ -22,8 +22,10 @@ _FORMS = ("nu0", "nux", "nuy", "nv0", "nvx", "nvy", "d0", "dx", "dy", "log_opaci
 
 
 def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
-    """What a fragment adds to a loss's derivatives by its splat's record: by each form its derivative times
-    1, x, y from the anchor; by ln(opacity), by the colour, by the further numbers of the record."""
+    """What a fragment adds to a loss's derivatives by its splat's record: by each form and by
+    z_numerator its derivative times 1, x, y from the anchor; by ln(opacity), by the colour, by the further
+    numbers of the record. That by D is at constant z_numerator - z_center D: the rest cancels most of that by
+    z_numerator, so `make_project_backward` adds it in float64."""
     names = list(_FORMS)
     names += ("dot_x", "dot_y") if "lowpass_screen" in effects else ()
     names += ("z_numerator", "z_numerator_x", "z_numerator_y", "z_center") if "ray_depth" in effects else ()
@@ -128,10 +130,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         inverse_d: float,
         low_pass: float,
     ):
-        """Depth of a fragment, and its derivatives by z_numerator, by z_center, by D at constant
-        z_numerator - z_center D; by q and by the low-pass's
-        half rho `low_pass`, which may be the circle that z_center + circle (z_numerator - z_center D) D / q
-        is mirrored at. It leaves the splat's range by rounding alone, and then has the centre's."""
+        """Depth of a fragment, and its derivatives by z_numerator, z_center, and D at constant
+        z_numerator - z_center D; by q and by the low-pass's half rho `low_pass`, which may be the circle that
+        z_center + circle (z_numerator - z_center D) D / q is mirrored at. It leaves the splat's range by
+        rounding alone, and then has the centre's."""
         place = index * each
         center = line_of(lines, place + zc_line)[zc_lane]
         reach = line_of(lines, place + zr_line)[zr_lane]
