@@ -15,11 +15,11 @@ import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
+from fidsplat.capture.views import Views, pose_matrices
 from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.random_clouds import load_scene
-from fidsplat.rotations import matrix_to_quaternion
-from fidsplat.timing import Timer
-from fidsplat.views import Views, pose_matrices
+from fidsplat.scenes.random_clouds import load_scene
+from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.util.timing import Timer
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from measuring import PROGRESS, keep, options
 from rich.progress import Progress
 
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
-from fidsplat.timing import Clock, Timer, quartiles, ratios, take_turns
+from fidsplat.util.timing import Clock, Timer, quartiles, ratios, take_turns
 
 ARRAYS = ("means", "quats", "scales", "opacities", "colors", "boxes", "planes")
 ROOT = Path(__file__).resolve().parent.parent

@@ -1,15 +1,15 @@
-"""Makes fidsplat/budget/prices.json: the candidates that `fs.quality_within` chooses among, with their errors
-over random scenes and what they cost.
+"""Makes fidsplat/accuracy/prices.json: the candidates that `fs.quality_within` chooses among, with their
+errors over random scenes and what they cost.
 
     python benchmarks/budget_prices.py --device opencl:pocl       about 15 minutes on two busy cores
     python benchmarks/budget_prices.py --device opencl:nvidia     adds the candidates of GPUs
 
 Each scene of `random_scenes.py` is drawn with every candidate and compared with the same
-definition at full precision, which the device draws in float64 (`fidsplat.accuracy.reference_for`). Costs are
-medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a second
-round the candidates on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside
-them; what is on that front then is kept. Knobs that the device does not have are left out. What the file
-says of another kind of device stays.
+definition at full precision, which the device draws in float64 (`fidsplat.accuracy.error.reference_for`).
+Costs are medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a
+second round the candidates on the front of error and cost are drawn with every set of MODIFIERS, and FINEST
+beside them; what is on that front then is kept. Knobs that the device does not have are left out. What the
+file says of another kind of device stays.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ import numpy as np
 from random_scenes import random_scene
 
 import fidsplat as fs
-from fidsplat.accuracy import error_bound, errors, reference_for, truth
-from fidsplat.budget.prices import FILE, Candidate
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
-from fidsplat.random_clouds import random_cloud, standard_camera
-from fidsplat.timing import Timer, frame_timer, take_turns
+from fidsplat.accuracy.error import error_bound, errors, reference_for, truth
+from fidsplat.accuracy.price_list import FILE, Candidate
+from fidsplat.scenes.random_clouds import random_cloud, standard_camera
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
+from fidsplat.util.timing import Timer, frame_timer, take_turns
 
 CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
 STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)

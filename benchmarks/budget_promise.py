@@ -23,11 +23,11 @@ from random_scenes import HELD_OUT, RandomScene, random_scene
 from rich.progress import track
 
 import fidsplat as fs
-from fidsplat.accuracy import errors, truth
-from fidsplat.budget import choose
-from fidsplat.errors import InputError
+from fidsplat.accuracy.error import errors, truth
+from fidsplat.accuracy.quality_within import choose
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
-from fidsplat.timing import Timer, frame_timer, take_turns
+from fidsplat.util.errors import InputError
+from fidsplat.util.timing import Timer, frame_timer, take_turns
 
 BOUNDS = (1e-2, 1e-3, 1e-4)
 SCENES = ("tag", "r100k_720p", "r1m_1080p")

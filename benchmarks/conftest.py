@@ -9,10 +9,10 @@ from dataclasses import asdict
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.base import Measurable
+from fidsplat.backends.interface import Measurable
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.experiments.bench.measure import SceneRun
-from fidsplat.timing import Clock
+from fidsplat.util.timing import Clock
 
 try:
     import pytest_benchmark  # noqa: F401  the fixture `benchmark`

@@ -2,7 +2,7 @@
 
     python benchmarks/detail_promise.py [--splats 4e5] [--views 200] [--size 160x90] [--json FILE]
 
-Builds a city (`fidsplat.store.city`), measures its levels of detail from other places, then flies a path
+Builds a city (`fidsplat.worlds.city`), measures its levels of detail from other places, then flies a path
 that turns around it and away from it, from a fifth of its side to a hundred sides. For each allowed error: of
 how many views the largest error of rgb is within it; splats and time of a view beside the exact picture's;
 and the largest jump, by how much the error of a pixel changes from one view to the next.
@@ -19,9 +19,9 @@ import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
-from fidsplat.accuracy import TRUTH_CUTOFF
-from fidsplat.detail import measure_detail
-from fidsplat.store.city import City
+from fidsplat.accuracy.error import TRUTH_CUTOFF
+from fidsplat.accuracy.level_of_detail import measure_detail
+from fidsplat.worlds.city import City
 
 ERRORS = (1 / 255, 4 / 255)
 

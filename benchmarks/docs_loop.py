@@ -14,7 +14,7 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.experiments.demo_scene import demo_scene
-from fidsplat.flights import Flight, FlightFolder
+from fidsplat.render.flight import Flight, FlightFolder
 
 WIDTH, HEIGHT, RATE = 480, 270, 16.0
 AIM = (0.0, 0.05, 0.0)

@@ -15,11 +15,11 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.experiments.localise import FAMILY, RATE, VARIANTS, Localise
-from fidsplat.sim.greenhouse import BENCH
-from fidsplat.sim.robot import Run
 from fidsplat.vision.detect import detect
 from fidsplat.vision.images import write_png
 from fidsplat.vision.paint import outlined, shrunk
+from fidsplat.worlds.greenhouse import BENCH
+from fidsplat.worlds.robot import Run
 
 START, END, FASTER = 23.0, 43.0, 3.0
 """seconds of the drive, and how much faster it is shown"""

@@ -23,8 +23,8 @@ from rich.progress import track
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
 from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.random_clouds import SCENES, load_scene
-from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
+from fidsplat.scenes.random_clouds import SCENES, load_scene
+from fidsplat.util.timing import frame_timer, quartiles, ratios, take_turns
 
 TABLE = tuple(np.linspace(0, 1, 64) ** 0.5)
 SENSORS = {

@@ -30,9 +30,9 @@ import fidsplat as fs
 from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
-from fidsplat.errors import InputError
-from fidsplat.random_clouds import load_scene
-from fidsplat.timing import Timer, take_turns
+from fidsplat.scenes.random_clouds import load_scene
+from fidsplat.util.errors import InputError
+from fidsplat.util.timing import Timer, take_turns
 
 
 def errors(backend: Differentiates, scenes: int) -> list[dict[str, float | str]]:

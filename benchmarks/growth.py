@@ -23,14 +23,14 @@ from measuring import PROGRESS, keep, options, show
 from rich.progress import Progress, TextColumn
 
 import fidsplat as fs
-from fidsplat.backends.base import Measurable, Rates
+from fidsplat.backends.interface import Measurable, Rates
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.experiments.bench.measure import SceneRun, overdraw
 from fidsplat.experiments.sweep import Results, name_of, read_records
-from fidsplat.files import atomic_write
-from fidsplat.provenance import run_facts
-from fidsplat.random_clouds import random_cloud, standard_camera
-from fidsplat.timing import take_turns
+from fidsplat.scenes.random_clouds import random_cloud, standard_camera
+from fidsplat.util.files import atomic_write
+from fidsplat.util.provenance import run_facts
+from fidsplat.util.timing import take_turns
 
 MILLION = 1_000_000
 

@@ -21,8 +21,8 @@ from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
 from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.random_clouds import SCENES, random_cloud, standard_camera
-from fidsplat.timing import Timer
+from fidsplat.scenes.random_clouds import SCENES, random_cloud, standard_camera
+from fidsplat.util.timing import Timer
 
 SCENE = SCENES["r20m_4k"]
 

@@ -17,8 +17,8 @@ import fidsplat as fs
 from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.random_clouds import SCENES, load_scene
-from fidsplat.timing import Timer, take_turns
+from fidsplat.scenes.random_clouds import SCENES, load_scene
+from fidsplat.util.timing import Timer, take_turns
 
 WAYS = ("ordered", "tiled")
 

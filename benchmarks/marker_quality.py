@@ -30,8 +30,8 @@ from rich.progress import track
 from rich.table import Table
 
 import fidsplat as fs
+from fidsplat.capture.quality import TEMPLATE_SIZES
 from fidsplat.markers import Marker, marker
-from fidsplat.quality import TEMPLATE_SIZES
 
 PICTURE = 800
 FINE = 12

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 import fidsplat as fs
-from fidsplat.files import atomic_write
+from fidsplat.util.files import atomic_write
 
 PROGRESS = Console(stderr=True)
 """where progress is shown, so that stdout has figures alone"""

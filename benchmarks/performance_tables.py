@@ -24,7 +24,7 @@ from growth import exponents
 
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.experiments.sweep import read_records
-from fidsplat.files import atomic_write
+from fidsplat.util.files import atomic_write
 
 
 def load(files: Iterable[Path]) -> dict[str, list[dict]]:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.random_clouds import log_uniform
-from fidsplat.rotations import quaternion_to_matrix
-from fidsplat.splats import SplatCloud
+from fidsplat.scenes.random_clouds import log_uniform
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 MOST_SPLATS = 1500
 MOST_HAZE = 600

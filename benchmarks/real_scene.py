@@ -20,9 +20,9 @@ from rich.console import Console
 from rich.table import Table
 
 import fidsplat as fs
-from fidsplat.errors import FidsplatError
-from fidsplat.files import writable_folder
 from fidsplat.scenes import PlacedMarker
+from fidsplat.util.errors import FidsplatError
+from fidsplat.util.files import writable_folder
 from fidsplat.vision import read_back
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet, outlined

@@ -16,9 +16,9 @@ import numpy as np
 import ray
 
 import fidsplat as fs
-from fidsplat.flights import Flight, FlightFolder
 from fidsplat.remote.flights import FlightWork, draw
 from fidsplat.remote.ray_engine import ray_engine
+from fidsplat.render.flight import Flight, FlightFolder
 from fidsplat.scenes import PlacedMarker
 
 

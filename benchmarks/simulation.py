@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.files import atomic_write
-from fidsplat.provenance import run_facts
-from fidsplat.random_clouds import random_splats
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
+from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.sim import Rig
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.files import atomic_write
+from fidsplat.util.provenance import run_facts
 from fidsplat.vision import read_back
 from fidsplat.vision.readback import Reading
 

@@ -2,7 +2,7 @@
 
     python benchmarks/store_build.py [--splats 10e6] [--memory 2GiB] [--no-levels] [--json FILE]
 
-Writes a PLY of a city (`fidsplat.store.city`) first, which is not counted, then runs `fidsplat store build`
+Writes a PLY of a city (`fidsplat.worlds.city`) first, which is not counted, then runs `fidsplat store build`
 as a process of its own.
 """
 
@@ -22,8 +22,8 @@ from measuring import keep, options, show
 
 import fidsplat as fs
 from fidsplat.formats.collect import WINDOW
-from fidsplat.harmonics import C0
-from fidsplat.store.city import City
+from fidsplat.splats.harmonics import C0
+from fidsplat.worlds.city import City
 
 _FIELDS = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1")
 _QUATERNION = tuple(f"rot_{k}" for k in range(4))

@@ -18,9 +18,9 @@ from measuring import PROGRESS, facts, keep, options
 from store_views import path_of, placed
 
 import fidsplat as fs
-from fidsplat.detail import measure_detail
-from fidsplat.store.city import City
-from fidsplat.store.hidden import Hidden
+from fidsplat.accuracy.level_of_detail import measure_detail
+from fidsplat.streaming.occlusion_culling import Hidden
+from fidsplat.worlds.city import City
 
 
 def cameras(store: fs.Store, size: tuple[int, int], count: int, step: float) -> list[fs.Camera]:

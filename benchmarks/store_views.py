@@ -2,7 +2,7 @@
 
     python benchmarks/store_views.py [--splats 20e6] [--places 1 5 50] [--errors 0.004 0.016] [--json FILE]
 
-Builds a city once (`fidsplat.store.city`; under --folder it is kept), measures its levels of detail, and
+Builds a city once (`fidsplat.worlds.city`; under --folder it is kept), measures its levels of detail, and
 places it on a grid. For each number of places a camera comes down from where all is in the picture to a
 street. Of each view and allowed error: seconds of the first frame, of the next view, 1 % of its distance
 further, and of that once more; splats and nodes that it is drawn of, of how many; its largest difference from
@@ -23,11 +23,11 @@ import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
-from fidsplat.accuracy import TRUTH_CUTOFF
+from fidsplat.accuracy.error import TRUTH_CUTOFF
+from fidsplat.accuracy.level_of_detail import measure_detail
 from fidsplat.backends.prepare import prepare
-from fidsplat.detail import measure_detail
-from fidsplat.store.city import City
-from fidsplat.store.streamed import Streamed
+from fidsplat.streaming.selection import Streamed
+from fidsplat.worlds.city import City
 
 
 def path_of(city: City, folder: Path) -> Path:

@@ -18,8 +18,8 @@ from dataclasses import replace
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.random_clouds import SCENES, random_cloud, standard_camera
-from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.scenes.random_clouds import SCENES, random_cloud, standard_camera
+from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.viewer.server import JPEG
 from fidsplat.viewer.session import Session
 from fidsplat.viewer.settings import Viewpoint

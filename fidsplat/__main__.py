@@ -6,7 +6,7 @@ Signals are handled before anything else is imported. Once the command is done t
 import signal
 import sys
 
-from fidsplat import interrupts
+from fidsplat.util import interrupts
 
 
 def main() -> int:

@@ -17,8 +17,8 @@ import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from fidsplat import interrupts
-from fidsplat.limits import check_imports
+from fidsplat.util import interrupts
+from fidsplat.util.process_limits import check_imports
 
 ABOUT = """Fiducial markers made of 2D Gaussian splats: make them, set them in scenes, draw them, read them
 back.
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        from fidsplat.errors import FidsplatError
+        from fidsplat.util.errors import FidsplatError
 
         if isinstance(error, FidsplatError):
             return _fail(str(error), error.exit_status)
@@ -148,7 +148,7 @@ def _parse(words: list[str]):
         known, words = getattr(kind, "PARTS", {}), words[1:]
     if known and not hasattr(kind, "run"):  # a group, and no word that leads on
         if words and not words[0].startswith("-"):
-            from fidsplat.errors import unknown
+            from fidsplat.util.errors import unknown
 
             _fail(f"{unknown('command', words[0], known)}; see {program} --help", 2)
             raise SystemExit(2)

@@ -5,11 +5,11 @@ import pickle
 
 import numpy as np
 
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, compare, draw
-from fidsplat.hard_cases.agreement import truth_of as draw_truth
-from fidsplat.quality import Quality
-from fidsplat.random_clouds import random_splats
-from fidsplat.splats import SplatCloud
+from fidsplat.capture.quality import Quality
+from fidsplat.scenes.random_clouds import random_splats
+from fidsplat.selftest.agreement import ALL_OUTPUTS, Picture, compare, draw
+from fidsplat.selftest.agreement import truth_of as draw_truth
+from fidsplat.splats.cloud import SplatCloud
 
 __all__ = [
     "ALL_OUTPUTS",

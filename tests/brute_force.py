@@ -3,7 +3,7 @@
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.splats import sh_basis
+from fidsplat.splats.cloud import sh_basis
 
 
 def ideal(cloud: fs.SplatCloud, camera: fs.Camera, quality: fs.Quality, background=(0.0, 0.0, 0.0)):

@@ -15,7 +15,7 @@ import fidsplat as fs
 from fidsplat.backends.prepare import view_of
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import OUTPUTS, FeatureSet, select
-from fidsplat.hard_cases.agreement import compare
+from fidsplat.selftest.agreement import compare
 
 SIZE = (37, 22)
 

@@ -12,11 +12,11 @@ from fidsplat.backends.gradients import on_host
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
-from fidsplat.capture import Capture
+from fidsplat.capture.capture import Capture
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
-from fidsplat.random_clouds import random_splats
-from fidsplat.splats import SplatCloud
+from fidsplat.scenes.random_clouds import random_splats
+from fidsplat.splats.cloud import SplatCloud
 
 NORM, COSINE = 1e-4, 1e-6
 """what a device may be off at most, as `Difference` has it; or by twice what `last_place` changes"""

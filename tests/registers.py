@@ -22,7 +22,7 @@ from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.device import OpenCLBackend
 from fidsplat.backends.opencl.program import build
 from fidsplat.effects import select
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 RECORD = Path(__file__).parent / "compile" / "registers.json"
 Numbers = dict[str, dict[str, int]]

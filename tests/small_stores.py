@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.random_clouds import random_splats
-from fidsplat.store import build, plan
+from fidsplat.scenes.random_clouds import random_splats
+from fidsplat.store import build, build_plan
 
 COUNT = 9_000
 SMALL = {"chunk": 500, "memory": 1 << 20}
@@ -43,9 +43,9 @@ def store_fixtures() -> tuple[Any, Any, Any]:
     @pytest.fixture(scope="module", autouse=True)
     def cut():
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(plan, "_LEAST_MEMORY", 0)
-            patch.setattr(plan, "_MERGING", (0, 0.01))
-            patch.setattr(plan, "WINDOW", WINDOW)
+            patch.setattr(build_plan, "_LEAST_MEMORY", 0)
+            patch.setattr(build_plan, "_MERGING", (0, 0.01))
+            patch.setattr(build_plan, "WINDOW", WINDOW)
             patch.setattr(build, "_NOTED", NOTED)
             yield
 

@@ -20,7 +20,7 @@ from rich.progress import track
 import fidsplat as fs
 from fidsplat.backends.opencl.device import OpenCLBackend
 from fidsplat.backends.probing import Probed
-from fidsplat.hard_cases.f_arithmetic import worst
+from fidsplat.selftest.arithmetic import worst
 
 AT_ONCE = 1 << 22
 EXPONENTS, SHARES = (2.0**-26, 87.0), (2.0**-24, 1.0)

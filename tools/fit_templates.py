@@ -30,11 +30,11 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from fidsplat.files import atomic_write
 from fidsplat.markers import marker
 from fidsplat.markers.mixture import in_pieces
 from fidsplat.markers.partition import partition
 from fidsplat.markers.seams import grow
+from fidsplat.util.files import atomic_write
 
 GROWTH = 0.4  # modules; measured together with the templates, see docs/markers.md
 THINNEST = 0.025  # least sigma in half widths: thinner lines alias between the samples of a pixel

@@ -41,7 +41,7 @@ class HangError(BaseException):
 
 def outcome(kind: str, seed: int, number: int, folder: Path) -> tuple[str, str]:
     """How an input ends, and in what words."""
-    from fidsplat.errors import FidsplatError
+    from fidsplat.util.errors import FidsplatError
 
     rng = random.Random(f"{seed}-{kind}-{number}")
     signal.setitimer(signal.ITIMER_PROF, SECONDS)

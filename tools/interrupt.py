@@ -35,7 +35,7 @@ from rich.console import Console
 from rich.table import Table
 
 from fidsplat.formats import save_ply
-from fidsplat.random_clouds import random_splats
+from fidsplat.scenes.random_clouds import random_splats
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGKILL")
 DISK = "full disk"

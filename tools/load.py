@@ -31,7 +31,7 @@ from rich.progress import track
 from rich.table import Table
 
 import fidsplat as fs
-from fidsplat.random_clouds import random_splats
+from fidsplat.scenes.random_clouds import random_splats
 
 THREADS, PROCESSES, VIEWS = 16, 8, 8
 OUTPUTS = ("rgb", "depth", "normal", "label")

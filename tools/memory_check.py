@@ -132,9 +132,9 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     import fidsplat as fs
     from fidsplat.backends.view import View
     from fidsplat.effects import select
-    from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, truth_of
-    from fidsplat.hard_cases.clouds import camera, splats
-    from fidsplat.random_clouds import random_splats
+    from fidsplat.scenes.random_clouds import random_splats
+    from fidsplat.selftest.agreement import ALL_OUTPUTS, Picture, truth_of
+    from fidsplat.selftest.clouds import camera, splats
 
     backend = renderer.backend
     lanes = replace(backend.shape, schedule="lanes", lanes=4, tile_width=4, tile_height=8, scan_items=1)

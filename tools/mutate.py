@@ -33,7 +33,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-CONTRACT = "tests/contract tests/stages tests/hard_cases"
+CONTRACT = "tests/contract tests/stages tests/selftest"
 UNIT, EXPERIMENTS = "tests/unit", "tests/experiments"
 TESTS = {  # package or file: test files and folders, and an expression for -k; the longest prefix holds
     "kernels/opencl": (f"{CONTRACT} tests/unit/test_store_hidden.py", "not warp"),
@@ -45,13 +45,13 @@ TESTS = {  # package or file: test files and folders, and an expression for -k; 
     "fidsplat/backends/opencl": (f"{CONTRACT} tests/unit/test_store*.py", "not warp"),
     "fidsplat/backends/reference": (f"{UNIT}/test_*reference.py {CONTRACT}", "not warp"),
     "fidsplat/backends/warp": (f"{CONTRACT} tests/unit/test_warp*.py", "warp"),
-    "fidsplat/budget": ("tests/unit/test_budget.py tests/unit/test_accuracy.py", ""),
+    "fidsplat/accuracy": ("tests/unit/test_budget.py tests/unit/test_accuracy.py", ""),
     "fidsplat/cameras": (f"{UNIT}/test_[clmt]*.py tests/contract/test_lens_pictures.py", "not warp"),
     "fidsplat/commands": (f"{UNIT} {EXPERIMENTS}", ""),
     "fidsplat/effects": (f"{UNIT} tests/compile tests/contract", "not warp"),
     "fidsplat/experiments": (f"{EXPERIMENTS} {UNIT}", ""),
-    "fidsplat/formats": (f"{UNIT} {EXPERIMENTS}/test_dataset.py tests/hard_cases", "not warp"),
-    "fidsplat/hard_cases": ("tests/hard_cases tests/contract/test_certificates.py", "not warp"),
+    "fidsplat/formats": (f"{UNIT} {EXPERIMENTS}/test_dataset.py tests/selftest", "not warp"),
+    "fidsplat/selftest": ("tests/selftest tests/contract/test_certificates.py", "not warp"),
     "fidsplat/logs": (f"{UNIT}/test_logs.py {UNIT}/test_flights.py", ""),
     "fidsplat/markers": (f"{UNIT}/test_[mv]*.py tests/contract/test_facets.py", "not warp"),
     "fidsplat/remote": (f"{UNIT}/test_remote*.py {UNIT}/test_flights.py", ""),

@@ -22,8 +22,8 @@ import numpy as np
 import torch
 
 import fidsplat as fs
-from fidsplat.rotations import quaternion_to_matrix
-from fidsplat.timing import Timer, take_turns
+from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.util.timing import Timer, take_turns
 from fidsplat.vision.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))

@@ -19,11 +19,11 @@ import torch
 from turns import arguments, compared, peer_device, report
 
 from fidsplat.cameras import Camera
+from fidsplat.capture.quality import Quality
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
 from fidsplat.experiments.bench.measure import Result, SceneRun
-from fidsplat.quality import Quality
-from fidsplat.splats import SplatCloud
-from fidsplat.timing import Timer
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.timing import Timer
 from fidsplat.vision.metrics import psnr
 
 SAME = Quality.named("gsplat").with_(opacity_ceiling=0.999)

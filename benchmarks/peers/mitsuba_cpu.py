@@ -24,8 +24,8 @@ from turns import arguments, compared, peer_device, report
 from fidsplat.cameras import Camera
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
 from fidsplat.experiments.bench.measure import Result, SceneRun
-from fidsplat.splats import SplatCloud
-from fidsplat.timing import Timer
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.timing import Timer
 
 THICKNESS = 1e-4  # metres, standard deviation
 C0 = 0.28209479177387814  # of the constant spherical harmonic

@@ -12,9 +12,9 @@ import numpy as np
 from rich.progress import Progress
 
 import fidsplat as fs
-from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.interface import DeviceInfo
 from fidsplat.experiments.bench.measure import Result, SceneRun
-from fidsplat.timing import Timer, take_turns
+from fidsplat.util.timing import Timer, take_turns
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from measuring import PROGRESS, keep, options, show

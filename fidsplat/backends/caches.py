@@ -14,8 +14,8 @@ import weakref
 from functools import cache
 from pathlib import Path
 
-from fidsplat.errors import InputError
-from fidsplat.files import user_cache, writable_folder
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import user_cache, writable_folder
 
 LEAST_FREE = 2**25
 """bytes, several times what the kernels of a picture take"""

@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
 
 _RECORD = "fidsplat-checksums.json"
 _watched: set[Path] = set()

@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from fidsplat.backends.base import Backend, Images, ResidentData
+from fidsplat.backends.interface import Backend, Images, ResidentData
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.effects import FeatureSet

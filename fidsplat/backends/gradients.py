@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Images
+from fidsplat.backends.interface import Images
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 NOT_THE_LAST = (
     "backward takes the images that forward has made last on this device; call it before the next picture"

@@ -8,14 +8,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from fidsplat.backends.stack import ViewBatch, ViewStack
+from fidsplat.backends.batched_views import ViewBatch, ViewStack
 from fidsplat.backends.view import FAR_EYE, Shot, View
-from fidsplat.capture import Capture
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.views import Views
 from fidsplat.effects import FeatureSet, select
 from fidsplat.effects.select import Traits
-from fidsplat.errors import InputError
-from fidsplat.splats import SplatCloud
-from fidsplat.views import Views
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import InputError
 
 
 class Origined(Traits, Protocol):

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from fidsplat.backends.base import Backend, Pipeline
+from fidsplat.backends.interface import Backend, Pipeline
 from fidsplat.effects import FeatureSet
 
 

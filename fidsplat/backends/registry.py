@@ -8,10 +8,10 @@ import os
 import warnings
 from importlib import import_module
 
-from fidsplat.backends.base import Backend, DeviceInfo
 from fidsplat.backends.caches import ensure_caches
-from fidsplat.errors import DeviceError, UnknownDeviceError, unknown
-from fidsplat.limits import check_driver
+from fidsplat.backends.interface import Backend, DeviceInfo
+from fidsplat.util.errors import DeviceError, UnknownDeviceError, unknown
+from fidsplat.util.process_limits import check_driver
 
 FAMILIES = {
     "opencl": "fidsplat.backends.opencl.device",

@@ -11,10 +11,10 @@ import numpy as np
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.cameras.lenses import Lens
 from fidsplat.cameras.raster import RayRaster, raster_of
-from fidsplat.capture import Capture
-from fidsplat.errors import InputError
-from fidsplat.sensor import Sensor
-from fidsplat.surroundings import Gradient, Layer, Panorama
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.environment import Gradient, Layer, Panorama
+from fidsplat.capture.sensor import Sensor
+from fidsplat.util.errors import InputError
 
 FAR_EYE = 1e9
 """metres: where the eye of a parallel projection is taken to be"""

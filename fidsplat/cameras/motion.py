@@ -11,11 +11,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fidsplat.arguments import as_float, instance, number, whole_number
 from fidsplat.cameras.pinhole import Camera
-from fidsplat.errors import InputError
-from fidsplat.rotations import check_similarity
-from fidsplat.scalars import own_scalars
+from fidsplat.splats.rotations import check_similarity
+from fidsplat.util.arguments import as_float, instance, number, whole_number
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import own_scalars
 
 MAX_SUB_POSES = 1024
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
-from fidsplat.errors import InputError
-from fidsplat.rotations import check_similarity
-from fidsplat.scalars import LARGEST, PickledByFields, real_array
+from fidsplat.splats.rotations import check_similarity
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import LARGEST, PickledByFields, real_array
 
 MAX_SIZE = 32767
 """largest width and height in pixels: pixel numbers fit 16 bits on every device"""

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.splats.rotations import matrix_to_quaternion
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:

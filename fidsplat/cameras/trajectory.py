@@ -10,11 +10,11 @@ from functools import cached_property
 
 import numpy as np
 
-from fidsplat.arguments import as_float, number
 from fidsplat.cameras.screw import between, exponential, twist
-from fidsplat.errors import InputError
-from fidsplat.rotations import check_similarity, matrix_to_quaternion, rigid_matrix
-from fidsplat.scalars import PickledByFields, real_array
+from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, rigid_matrix
+from fidsplat.util.arguments import as_float, number
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import PickledByFields, real_array
 
 UNIT = 1e-3
 """how far from 1 the length of a quaternion may be: files round them"""

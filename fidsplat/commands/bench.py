@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from fidsplat import interrupts
 from fidsplat.commands.output import (
     Devices,
     console,
@@ -17,8 +16,9 @@ from fidsplat.commands.output import (
 )
 from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
 from fidsplat.commands.sweeps import check_plot
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -86,7 +86,7 @@ class Bench:
 
         from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
         from fidsplat.experiments.bench.measure import Bench as Measuring
-        from fidsplat.render import default_device
+        from fidsplat.render.renderer import default_device
 
         if self.repeats < 1:
             raise InputError(f"--repeats is {self.repeats}; give a number of frames, at least 1")

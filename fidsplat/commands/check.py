@@ -14,16 +14,16 @@ from fidsplat.commands.output import (
     print_table,
     say,
 )
-from fidsplat.errors import InputError
-from fidsplat.files import writable_folder
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import writable_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fidsplat.hard_cases.check import CaseResult, CheckResult
-    from fidsplat.hard_cases.f_arithmetic import Arithmetic
-    from fidsplat.hard_cases.fuzz import FuzzState
-    from fidsplat.render import Renderer
+    from fidsplat.render.renderer import Renderer
+    from fidsplat.selftest.arithmetic import Arithmetic
+    from fidsplat.selftest.check import CaseResult, CheckResult
+    from fidsplat.selftest.fuzz import FuzzState
 
 
 @dataclass
@@ -61,8 +61,8 @@ class Check:
             renderer = fs.Renderer(self.device)
         if self.fuzz is not None:
             return self._fuzz(renderer, folder, where)
-        from fidsplat.hard_cases.catalogue import all_cases
-        from fidsplat.hard_cases.check import run_check, worst_picture
+        from fidsplat.selftest.catalogue import all_cases
+        from fidsplat.selftest.check import run_check, worst_picture
         from fidsplat.vision.images import write_png
 
         with where.status("starting") as status:
@@ -77,7 +77,7 @@ class Check:
         return 0 if result.passed else 1
 
     def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:
-        from fidsplat.hard_cases.fuzz import fuzz_run
+        from fidsplat.selftest.fuzz import fuzz_run
 
         wanted = self.fuzz or 0
         state = None
@@ -93,7 +93,7 @@ class Check:
 
 
 def _print(result: "CheckResult", where: "Console") -> None:
-    from fidsplat.hard_cases.agreement import COLOR_TOLERANCE, DEPTH_TOLERANCE
+    from fidsplat.selftest.agreement import COLOR_TOLERANCE, DEPTH_TOLERANCE
 
     device = result.device
     if result.arithmetic is not None:
@@ -113,7 +113,7 @@ def _print(result: "CheckResult", where: "Console") -> None:
 
 
 def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
-    from fidsplat.hard_cases.f_arithmetic import BOUNDS
+    from fidsplat.selftest.arithmetic import BOUNDS
 
     rows = []
     for name, ulp in facts.ulp.items():
@@ -123,8 +123,8 @@ def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
 
 
 def _row(letter: str, results: "list[CaseResult]") -> tuple[str, ...]:
-    from fidsplat.hard_cases.catalogue import GROUPS
-    from fidsplat.hard_cases.check import rank_of
+    from fidsplat.selftest.catalogue import GROUPS
+    from fidsplat.selftest.check import rank_of
 
     cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(one.pictures for one in results))]
     for outputs in (("rgb", "alpha"), ("depth",)):

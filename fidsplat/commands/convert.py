@@ -20,7 +20,7 @@ from fidsplat.commands.output import (
     switch,
     tell,
 )
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 
 @dataclass

@@ -15,7 +15,7 @@ from fidsplat.commands.output import (
     say,
     tell,
 )
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.demo import DemoResult, Sighting

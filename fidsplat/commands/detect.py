@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
-from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -111,7 +111,7 @@ class Detect:
 
     def _pictures(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
         """Names, pictures, and the scene as it was in each."""
-        from fidsplat.flights import RECORD, seen_in_flight
+        from fidsplat.render.flight import RECORD, seen_in_flight
         from fidsplat.vision.images import is_video, pictures
 
         if path.endswith(".mcap") or (Path(path) / "metadata.yaml").is_file():
@@ -127,8 +127,8 @@ class Detect:
             yield name, image, None if scene is None else seen_in_flight(scene, Path(name))
 
     def _logged(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
-        from fidsplat.flights import seen_from
         from fidsplat.logs import log_pictures, log_poses
+        from fidsplat.render.flight import seen_from
 
         poses = {} if scene is None else log_poses(path)
         for one in log_pictures(path, self.topic):

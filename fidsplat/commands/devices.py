@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from fidsplat.commands.output import Json, tell
 
 if TYPE_CHECKING:
-    from fidsplat.backends.base import DeviceInfo
+    from fidsplat.backends.interface import DeviceInfo
 
 
 @dataclass

@@ -20,7 +20,7 @@ from fidsplat.commands.output import Json, console, counted, option, say, switch
 from fidsplat.commands.plants import Plants
 from fidsplat.commands.remote import RayAddress, measure_by
 from fidsplat.commands.sweeps import Names, Overwrite, Seed, asked, need_reports, run_sweeps
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.run import Options
@@ -212,7 +212,7 @@ def draw_sheets(options: Options) -> list[str]:
     from fidsplat.experiments.pictures import write_sheets
     from fidsplat.experiments.run import check
     from fidsplat.experiments.setup import chosen_categories
-    from fidsplat.render import Renderer
+    from fidsplat.render.renderer import Renderer
 
     check(options)
     categories = chosen_categories(options.category)

@@ -20,7 +20,7 @@ from fidsplat.commands.sweeps import (
     need_reports,
     run_in_turn,
 )
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
 
@@ -57,7 +57,7 @@ class Dataset:
         from fidsplat.experiments.dataset import dataset_scenes, write_scene
         from fidsplat.experiments.setup import MARKERS, chosen_categories
         from fidsplat.experiments.views import TRUTHS
-        from fidsplat.files import writable_folder
+        from fidsplat.util.files import writable_folder
 
         if self.truth not in TRUTHS:
             raise InputError(f"unknown truth {self.truth!r}; known: {', '.join(TRUTHS)}")
@@ -112,7 +112,7 @@ class Baseline:
     def run(self) -> int:
         from fidsplat.experiments.trained import Baseline as Wanted
         from fidsplat.experiments.trained import baseline_sweeps
-        from fidsplat.render import Renderer
+        from fidsplat.render.renderer import Renderer
 
         wanted = asked(Wanted, self, out=Path(self.out))
         wanted.check()  # says what is wrong before the device is opened

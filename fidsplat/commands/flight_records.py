@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fidsplat.flights import FlightFolder
+from fidsplat.render.flight import FlightFolder
 from fidsplat.vision.coco import CocoAnnotations
 from fidsplat.vision.images import read_image
 from fidsplat.vision.output_files import load_output, suffixes_of

@@ -30,7 +30,7 @@ from fidsplat.commands.output import (
 )
 from fidsplat.commands.remote import RayAddress, Workers, check_workers
 from fidsplat.commands.render import load_source
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fidsplat.cameras import Trajectory
-    from fidsplat.flights import Flight, FlightFolder
+    from fidsplat.render.flight import Flight, FlightFolder
     from fidsplat.scenes import Scene
 
 DEFAULT_FOLDER = "fidsplat-flight"
@@ -106,7 +106,7 @@ class Fly:
         import fidsplat as fs
         from fidsplat.cameras.trajectory import check_rate
         from fidsplat.commands.flight_records import write_log, write_truth
-        from fidsplat.flights import Flight, FlightFolder
+        from fidsplat.render.flight import Flight, FlightFolder
         from fidsplat.vision.video import check_video
 
         names = names_of(self.outputs)
@@ -157,7 +157,7 @@ class Fly:
         self, flight: Flight, budget: int | None, where: Console
     ) -> Iterator[tuple[str, Callable[[FlightFolder], Iterator[int]]]]:
         """What draws, in words, and how it draws what is left of a flight."""
-        from fidsplat.render import Renderer, default_device
+        from fidsplat.render.renderer import Renderer, default_device
 
         device = self.device or flight.scene.device or default_device()
         if self.ray is None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.store import Store
 
 WIDTH, HEIGHT = 1280, 720

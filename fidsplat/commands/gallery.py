@@ -10,8 +10,8 @@ import tyro
 
 from fidsplat.commands.output import Device, Json, console, late_progress, option, tell
 from fidsplat.commands.render import load_source
-from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
 
 
 @dataclass

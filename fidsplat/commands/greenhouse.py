@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from fidsplat.commands.output import Json, Overwrite, option, tell
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of, writable_folder
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, path_of, writable_folder
 
 
 @dataclass
@@ -38,8 +38,8 @@ class Greenhouse:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.sim.greenhouse import Greenhouse as Made
-        from fidsplat.sim.plants import load_plants
+        from fidsplat.worlds.greenhouse import Greenhouse as Made
+        from fidsplat.worlds.plants import load_plants
 
         stock = None if self.plants_from is None else load_plants(self.plants_from)
         made = Made(self.rows, self.plants, self.seed, self.mixture, stock)

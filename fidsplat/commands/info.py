@@ -11,7 +11,7 @@ import tyro
 from fidsplat.commands.output import Json, console, late_progress, option, tell
 
 if TYPE_CHECKING:
-    from fidsplat.splats import SplatCloud
+    from fidsplat.splats.cloud import SplatCloud
 
 SHARES = (1, 50, 99)
 """percent"""
@@ -87,7 +87,7 @@ def guess_up(cloud: SplatCloud) -> tuple[str, str]:
     is by far the longest, as a thing stands."""
     import numpy as np
 
-    from fidsplat.rotations import quaternion_to_matrix
+    from fidsplat.splats.rotations import quaternion_to_matrix
 
     level = np.abs(quaternion_to_matrix(cloud.quats)[:, :, 2]) > FLAT
     area = cloud.scales.prod(1).astype(np.float64) * cloud.opacities

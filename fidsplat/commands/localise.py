@@ -12,7 +12,7 @@ from fidsplat.commands.output import Device, Json, console, late_progress, optio
 
 if TYPE_CHECKING:
     from fidsplat.experiments.localise import Localise as Asked
-    from fidsplat.render import Renderer
+    from fidsplat.render.renderer import Renderer
 
 
 @dataclass
@@ -54,7 +54,7 @@ class Localise:
         from fidsplat.commands.sweeps import need_reports
         from fidsplat.experiments.localise import VARIANTS
         from fidsplat.experiments.localise import Localise as Asked
-        from fidsplat.provenance import digest_of
+        from fidsplat.util.provenance import digest_of
         from fidsplat.vision.video import check_video
 
         need_reports()

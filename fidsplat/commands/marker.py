@@ -17,7 +17,7 @@ from fidsplat.commands.output import (
     option,
     tell,
 )
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     import fidsplat as fs
@@ -86,7 +86,7 @@ class Marker:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.quality import LADDER
+        from fidsplat.capture.quality import LADDER
 
         if self.native_2dgs and self.out is None:
             raise InputError("--native-2dgs is about the file that -o names; give -o FILE.ply")
@@ -100,7 +100,7 @@ class Marker:
         mixture = "fitted" if refined else self.mixture
         quality = fs.Quality.of(self.quality).marker
         if refined and self.quality is None:
-            from fidsplat.quality import LADDER
+            from fidsplat.capture.quality import LADDER
 
             quality = fs.MarkerQuality(template=LADDER)
         with late_progress(console(self.json)) as progress:

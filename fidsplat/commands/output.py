@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
-from fidsplat import interrupts
-from fidsplat.errors import InputError
-from fidsplat.files import ordinary_file, path_of, writable_folder
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import ordinary_file, path_of, writable_folder
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -8,7 +8,7 @@ import tyro
 
 from fidsplat.commands.output import console, late_progress, option
 from fidsplat.commands.render import load_source
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.bench.catalogue import BenchScene

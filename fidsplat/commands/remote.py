@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from fidsplat.commands.output import counted, option
 from fidsplat.commands.sweeps import words
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.run import Options

@@ -21,15 +21,15 @@ from fidsplat.commands.output import (
     option,
     tell,
 )
-from fidsplat.errors import FidsplatError, InputError
-from fidsplat.files import path_of, writable_folder
+from fidsplat.util.errors import FidsplatError, InputError
+from fidsplat.util.files import path_of, writable_folder
 
 if TYPE_CHECKING:
-    from fidsplat.budget import Choice
+    from fidsplat.accuracy.quality_within import Choice
+    from fidsplat.capture.quality import Quality
     from fidsplat.formats import Progress
-    from fidsplat.frame import Frame
-    from fidsplat.quality import Quality
-    from fidsplat.render import Renderer
+    from fidsplat.render.frame import Frame
+    from fidsplat.render.renderer import Renderer
     from fidsplat.scenes import Scene
 
 _OTHER_PICTURES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gif", ".npy")
@@ -99,7 +99,7 @@ class Render:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.budget import check_bounds
+        from fidsplat.accuracy.quality_within import check_bounds
         from fidsplat.vision.output_files import save_output
 
         names = names_of(self.outputs)
@@ -145,7 +145,7 @@ class Render:
 
     def _measured(self, scene: "Scene", renderer: "Renderer") -> "Choice":
         """The quality that keeps to --max-error and --max-ms."""
-        from fidsplat.budget import certify, choose
+        from fidsplat.accuracy.quality_within import certify, choose
 
         capture = scene.capture.with_(quality=self.quality)
         with console(self.json).status("measuring") as status:

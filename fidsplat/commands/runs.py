@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fidsplat.errors import InputError
-from fidsplat.files import from_json, read_text
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import from_json, read_text
 
 if TYPE_CHECKING:
     from fidsplat.scenes import Scene
@@ -37,7 +37,7 @@ def flown(folder: Path) -> tuple[str, str]:
     Raises:
         InputError: it is no folder of `fidsplat fly`, or what was drawn is not there any more.
     """
-    from fidsplat.flights import POSES, RECORD
+    from fidsplat.render.flight import POSES, RECORD
 
     poses = folder / POSES
     try:

@@ -8,7 +8,7 @@ import tyro
 
 from fidsplat.commands.output import SceneOutputs, SceneQuality, console, late_progress, names_of, option
 from fidsplat.commands.render import load_source
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.backends.opencl.device import OpenCLBackend

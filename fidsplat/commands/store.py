@@ -22,8 +22,8 @@ from fidsplat.commands.output import (
     switch,
     tell,
 )
-from fidsplat.errors import InputError, several
-from fidsplat.files import writable_folder
+from fidsplat.util.errors import InputError, several
+from fidsplat.util.files import writable_folder
 
 if TYPE_CHECKING:
     import fidsplat as fs
@@ -107,7 +107,7 @@ class Place:
 
     def run(self) -> int:
         from fidsplat.formats import load_trajectory
-        from fidsplat.store.places import place_store
+        from fidsplat.store.instances import place_store
         from fidsplat.store.store import Store
 
         if (self.grid is None) == (self.poses is None):
@@ -247,7 +247,7 @@ class Measure:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.detail import measure_detail
+        from fidsplat.accuracy.level_of_detail import measure_detail
 
         store, names = fs.Store(self.store), [name.strip() for name in self.lowpass.split(",")]
         with late_progress(console(True)) as progress:
@@ -291,9 +291,9 @@ class StoreDemo:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.accuracy import TRUTH_CUTOFF
-        from fidsplat.detail import measure_detail
-        from fidsplat.store.city import City, flight
+        from fidsplat.accuracy.error import TRUTH_CUTOFF
+        from fidsplat.accuracy.level_of_detail import measure_detail
+        from fidsplat.worlds.city import City, flight
 
         if not (math.isfinite(self.splats) and self.splats == int(self.splats)):
             raise InputError(f"--splats is {self.splats:g}; give a whole number")

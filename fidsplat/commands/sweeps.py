@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import tyro
 
 from fidsplat.commands.output import counted, option, switch, writable_file
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.sweep import Key, Record, Sweep

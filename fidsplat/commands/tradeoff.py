@@ -105,7 +105,7 @@ class Tradeoff:
     def run(self) -> int:
         from fidsplat.experiments.tradeoff.run import Options, prepared
         from fidsplat.experiments.tradeoff.scenes import own_pictures
-        from fidsplat.render import default_device
+        from fidsplat.render.renderer import default_device
 
         if self.plot is not None:
             check_plot(self.plot, "pandas")

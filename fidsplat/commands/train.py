@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat import interrupts
 from fidsplat.commands.output import (
     Device,
     Json,
@@ -26,8 +25,9 @@ from fidsplat.commands.output import (
     writable_file,
 )
 from fidsplat.commands.sweeps import asked, need_reports
-from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
 
 if TYPE_CHECKING:
     from fidsplat.train import Step, Trainer, ViewScore
@@ -82,7 +82,7 @@ class Train:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.render import Renderer
+        from fidsplat.render.renderer import Renderer
         from fidsplat.train import Trainer, TrainSettings, load_dataset, splats_within
 
         if path_of(self.out).suffix.lower() != ".ply":

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat import interrupts
 from fidsplat.commands.output import (
     MemoryBudget,
     SceneDevice,
@@ -21,8 +20,9 @@ from fidsplat.commands.output import (
 )
 from fidsplat.commands.render import load_source
 from fidsplat.commands.runs import TrainingRun, checkpoint_of, flown
-from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
 
 if TYPE_CHECKING:
     from fidsplat.formats import Progress

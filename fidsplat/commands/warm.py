@@ -25,7 +25,7 @@ class Warm:
 
     def run(self) -> int:
         from fidsplat.experiments.bench.warm import recipes, warm
-        from fidsplat.render import Renderer
+        from fidsplat.render.renderer import Renderer
 
         begun = time.perf_counter()
         renderer = Renderer(self.device)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from fidsplat.effects.select import FeatureSet
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 DIFFERENTIABLE = frozenset(
     (

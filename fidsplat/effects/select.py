@@ -8,11 +8,11 @@ from typing import Protocol
 
 from fidsplat.cameras import Orthographic
 from fidsplat.cameras.lenses import Lens
-from fidsplat.capture import Capture
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.environment import Gradient, Panorama
+from fidsplat.capture.quality import Quality
 from fidsplat.effects.catalogue import CATALOGUE, Output
-from fidsplat.errors import InputError, unknown
-from fidsplat.quality import Quality
-from fidsplat.surroundings import Gradient, Panorama
+from fidsplat.util.errors import InputError, unknown
 
 RGB = Output("rgb", 3, "float32")
 IMAGES: dict[str, Output] = {
@@ -23,7 +23,7 @@ IMAGES: dict[str, Output] = {
 OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
 """those that users ask for and backends render"""
 OF_TWO = ("error",)
-"""those that are made of two renderings (fidsplat/ideal.py)"""
+"""those that are made of two renderings (fidsplat/render/certified_error.py)"""
 
 _KINDS = {Gradient: "gradient", Panorama: "panorama"}
 

@@ -12,10 +12,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
-from fidsplat import interrupts
-from fidsplat.errors import InputError
 from fidsplat.experiments.methods import IDEAL, Painter, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, Category
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
 from fidsplat.vision.images import to_uint8
 from fidsplat.vision.readers import Target, attempt, readers
 

@@ -12,9 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from fidsplat import interrupts
 from fidsplat.cameras import Camera
-from fidsplat.errors import DeviceError, InputError
 from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import (
     BACKGROUND,
@@ -24,7 +22,9 @@ from fidsplat.experiments.setup import (
     novel_cameras,
     training_cameras,
 )
-from fidsplat.files import atomic_write, from_json, read_text, user_cache, writable_folder
+from fidsplat.util import interrupts
+from fidsplat.util.errors import DeviceError, InputError
+from fidsplat.util.files import atomic_write, from_json, read_text, user_cache, writable_folder
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")

@@ -17,7 +17,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
-from fidsplat.files import atomic_write, printable
+from fidsplat.util.files import atomic_write, printable
 
 Values = Sequence[float]
 _STYLE: dict[Any, Any] = {

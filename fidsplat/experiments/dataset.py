@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.experiments.blender import novel_picture, training_picture
 from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import (
@@ -30,8 +29,9 @@ from fidsplat.experiments.setup import (
     training_cameras,
 )
 from fidsplat.experiments.views import exact_view
-from fidsplat.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.formats.colmap import save_colmap
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.vision.images import read_image, write_png
 
 POINTS = 1000

@@ -10,10 +10,10 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments.demo_scene import OUTPUTS, demo_scene, demo_views
-from fidsplat.files import atomic_write, writable_folder
 from fidsplat.formats import save_ply
-from fidsplat.render import Renderer
+from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
+from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.output_files import save_output
 from fidsplat.vision.paint import (

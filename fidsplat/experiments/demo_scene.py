@@ -11,9 +11,9 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.markers import marker
-from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 
 SKY = (0.70, 0.82, 0.93)
 WIDTH, HEIGHT, FOV_X = 1280, 720, math.radians(60.0)

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.capture.environment import Layer
 from fidsplat.experiments.plane import plane_picture
 from fidsplat.scenes import PlacedMarker
-from fidsplat.surroundings import Layer
 
 _LEAST = 1 / 512
 """share of a pixel that a tag must cover to be there"""

@@ -9,11 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fidsplat import interrupts
 from fidsplat.cameras import Camera
 from fidsplat.experiments.methods import Painter, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, Category
 from fidsplat.markers import Marker
+from fidsplat.util import interrupts
 from fidsplat.vision.pose import marker_pose, pose_error
 from fidsplat.vision.readback import corner_error, own_code
 

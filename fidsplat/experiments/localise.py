@@ -13,20 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat import interrupts
 from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter, Trajectory
-from fidsplat.capture import Capture
-from fidsplat.errors import InputError
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.sensor import Sensor
 from fidsplat.experiments.ideal_tags import tag_layer
-from fidsplat.render import Renderer
+from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import PlacedMarker
-from fidsplat.sensor import Sensor
-from fidsplat.sim.greenhouse import AISLE, Greenhouse
 from fidsplat.sim.localiser import Localiser
-from fidsplat.sim.robot import BODY, Errors, Run, camera_at, drive
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.pose import marker_pose
 from fidsplat.vision.readback import corner_error
+from fidsplat.worlds.greenhouse import AISLE, Greenhouse
+from fidsplat.worlds.robot import BODY, Errors, Run, camera_at, drive
 
 RATE = 4.0
 """pictures a second"""

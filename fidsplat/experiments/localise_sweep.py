@@ -12,18 +12,18 @@ from typing import Any
 import pandas as pd
 
 from fidsplat.cameras import Trajectory
-from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.charts import COLOURS, chart, legend_above
 from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Localise, Variant
 from fidsplat.experiments.pages import fixed, write_page
 from fidsplat.experiments.summary import Frame
 from fidsplat.experiments.sweep import Key, Results, Sweep
-from fidsplat.files import writable_folder
 from fidsplat.formats import load_trajectory, save_trajectory
-from fidsplat.provenance import run_facts
-from fidsplat.render import Renderer
-from fidsplat.sim.robot import Run
+from fidsplat.render.renderer import Renderer
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.files import writable_folder
+from fidsplat.util.provenance import run_facts
 from fidsplat.vision.detect import Detection
+from fidsplat.worlds.robot import Run
 
 RESULTS, REPORT, CHART = "localise.jsonl", "localise.md", "localise.svg"
 Found = Mapping[str, Mapping[str, Any]]

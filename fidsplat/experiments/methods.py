@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
+from fidsplat.capture.quality import Quality
+from fidsplat.capture.sensor import Sensor
 from fidsplat.experiments.plane import from_srgb, plane_picture
 from fidsplat.experiments.setup import BACKGROUND, COLLECTIONS, PLANE
 from fidsplat.markers import Marker, marker
-from fidsplat.quality import Quality
-from fidsplat.render import Renderer
-from fidsplat.sensor import Sensor
+from fidsplat.render.renderer import Renderer
+from fidsplat.util.errors import InputError
 
 IDEAL = "ideal"
 _CUT = 1 / 255

@@ -11,8 +11,8 @@ import pandas as pd
 from markupsafe import Markup
 
 from fidsplat.experiments.summary import Frame
-from fidsplat.files import atomic_write, printable, writable_folder
-from fidsplat.markdown import escaped
+from fidsplat.util.files import atomic_write, printable, writable_folder
+from fidsplat.util.markdown import escaped
 
 NOTHING = "-"
 

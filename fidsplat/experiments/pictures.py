@@ -9,7 +9,7 @@ import numpy as np
 
 from fidsplat.experiments.methods import Painter, plain_marker
 from fidsplat.experiments.setup import PROTOCOLS, Category
-from fidsplat.files import writable_folder
+from fidsplat.util.files import writable_folder
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet
 

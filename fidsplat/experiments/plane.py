@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 
 def plane_picture(

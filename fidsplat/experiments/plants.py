@@ -12,18 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.arguments import whole_number
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.blender import camera_facts, drawn, ready
-from fidsplat.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.formats import save_ply
 from fidsplat.formats.colmap import save_colmap
-from fidsplat.provenance import code_hash
-from fidsplat.render import Renderer
-from fidsplat.sim.plant_meshes import GOLDEN, MESHES, Mesh
-from fidsplat.splats import SplatCloud
+from fidsplat.render.renderer import Renderer
+from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
+from fidsplat.util.arguments import whole_number
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
+from fidsplat.util.provenance import code_hash
+from fidsplat.worlds.plant_meshes import GOLDEN, MESHES, Mesh
 
 BACKGROUND = (0.9, 0.2, 0.9)
 """behind plants in training: no plant has it, so that holes show"""

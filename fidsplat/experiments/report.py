@@ -19,7 +19,7 @@ from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
 from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.targets import targets
 from fidsplat.experiments.views import LINEAR, TRUTHS
-from fidsplat.files import atomic_write, open_input
+from fidsplat.util.files import atomic_write, open_input
 
 _FURTHEST = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
 """the detectors of each kind by how far they read on the ideal texture: the first that is there is shown"""

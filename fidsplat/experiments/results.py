@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from fidsplat.errors import InputError
 from fidsplat.experiments import angles, counts, localisation, trained, views
 from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.summary import Summary, join, read_summary, records_of, summarise
 from fidsplat.experiments.sweep import Record
+from fidsplat.util.errors import InputError
 
 ALLOWED_GAP = {"exact": 0.2, "fitted": 1.0}
 """degrees by which reading may end below the ideal texture's, by mixture"""

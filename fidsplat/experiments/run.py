@@ -10,16 +10,16 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from fidsplat.errors import InputError
 from fidsplat.experiments import angles, counts, localisation, views
 from fidsplat.experiments.blender import VIEW_NAMES, check_pictures
 from fidsplat.experiments.methods import IDEAL, Painter, method_names
 from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, TEST_VIEWS, chosen_categories
 from fidsplat.experiments.sweep import Key, Results, Sweep
 from fidsplat.experiments.sweep import shard as share_of
-from fidsplat.files import writable_folder
-from fidsplat.provenance import run_facts
-from fidsplat.render import Renderer
+from fidsplat.render.renderer import Renderer
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import writable_folder
+from fidsplat.util.provenance import run_facts
 from fidsplat.vision.metrics import load_lpips, metric_versions, weights_name
 from fidsplat.vision.readers import reader_versions
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 SEED = 0
 MARKERS = 5

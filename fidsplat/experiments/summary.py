@@ -19,9 +19,9 @@ from typing import Any, TypeAlias
 
 import pandas as pd
 
-from fidsplat.errors import InputError
 from fidsplat.experiments.sweep import Record, read_records
-from fidsplat.files import atomic_write, from_json, read_text
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, from_json, read_text
 
 _MARK = "# "
 Frame: TypeAlias = Any
@@ -36,7 +36,7 @@ class Summary:
 
     rows: Frame
     runs: list[dict[str, Any]]
-    """facts of each run (`fidsplat.provenance.run_facts`), and its `points`: how many it measured"""
+    """facts of each run (`fidsplat.util.provenance.run_facts`), and its `points`: how many it measured"""
     notes: list[str] = field(default_factory=list)
     """what a reader must know of these numbers besides"""
 

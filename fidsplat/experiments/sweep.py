@@ -1,8 +1,8 @@
 """The runner of all that is measured point by point: it goes on after a kill, takes shares of the work, and
 joins what several machines found.
 
-Results are JSON lines. A line {"run": ...} holds the facts of a run (`fidsplat.provenance.run_facts`) for the
-lines after it, each of which is {"key": ..., "result": ...}: what was measured, and what was found.
+Results are JSON lines. A line {"run": ...} holds the facts of a run (`fidsplat.util.provenance.run_facts`)
+for the lines after it, each of which is {"key": ..., "result": ...}: what was measured, and what was found.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, ordinary_file, read_text, writable_folder
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, from_json, ordinary_file, read_text, writable_folder
 
 Key = dict[str, Any]
 """a point of a sweep: plain data that names what is measured"""

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.experiments import angles, views
 from fidsplat.experiments.dataset import write_scene
 from fidsplat.experiments.methods import Painter
 from fidsplat.experiments.run import Part, device_words, results_of
 from fidsplat.experiments.setup import COLLECTIONS, TEST_VIEWS, chosen_categories
 from fidsplat.experiments.sweep import Key, Sweep, shard
-from fidsplat.files import writable_folder
-from fidsplat.render import Renderer
+from fidsplat.render.renderer import Renderer
 from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import writable_folder
 from fidsplat.vision.metrics import has_flip
 
 NAME = "trained"

@@ -12,8 +12,8 @@ import pandas as pd
 
 from fidsplat.experiments.charts import COLOURS, chart
 from fidsplat.experiments.pages import fixed, places, write_page
-from fidsplat.provenance import run_facts
 from fidsplat.train import Trainer, TrainingView, ViewScore
+from fidsplat.util.provenance import run_facts
 from fidsplat.vision.images import write_png
 
 PICTURES = 4

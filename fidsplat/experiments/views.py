@@ -10,9 +10,7 @@ from threading import Lock
 
 import numpy as np
 
-from fidsplat import interrupts
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
 from fidsplat.experiments.blender import VIEW_NAMES, novel_picture
 from fidsplat.experiments.methods import (
     IDEAL,
@@ -24,6 +22,8 @@ from fidsplat.experiments.methods import (
 )
 from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS, TEST_VIEWS, Category, novel_cameras
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
 from fidsplat.vision.images import read_image, to_uint8
 from fidsplat.vision.metrics import flip, has_flip, psnr, ssim
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat import interrupts
-from fidsplat.cloud_arrays import find_defects, with_thinnest_last
+from fidsplat.splats.arrays import find_defects, with_thinnest_last
+from fidsplat.util import interrupts
 
 PADDED_LOG_SCALE = np.log(1e-6)
 """scale_2 of a disk written for tools that want three scales; SuperSplat writes the same"""

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, writable_folder
-from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, writable_folder
 
 _PINHOLE = 1  # number of the camera model with fx, fy, cx, cy
 _HEADS = {

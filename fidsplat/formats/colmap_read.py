@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens
-from fidsplat.errors import InputError
-from fidsplat.files import read_input, read_text
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import read_input, read_text
 
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),

@@ -13,10 +13,10 @@ An element sh holds the bands above 0, a byte per coefficient in [-4, 4], in the
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.formats.collect import BLOCK, Rows
 from fidsplat.formats.ply_header import Header
-from fidsplat.harmonics import C0
+from fidsplat.splats.harmonics import C0
+from fidsplat.util.errors import InputError
 
 CHUNK = 256
 _CHUNKS_AT_ONCE = BLOCK // CHUNK

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError, unknown
-from fidsplat.files import path_of
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.gltf import load_gltf, save_gltf
 from fidsplat.formats.ply import load_ply
@@ -19,7 +17,9 @@ from fidsplat.formats.sog import load_sog
 from fidsplat.formats.splat import load_splat, save_splat
 from fidsplat.formats.spz import load_spz, save_spz
 from fidsplat.formats.usd import load_usd, save_usd
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.files import path_of
 
 
 @dataclass(frozen=True)

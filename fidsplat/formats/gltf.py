@@ -18,8 +18,6 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, read_input
 from fidsplat.formats.plain import (
     HALF_TURN,
     cloud_of,
@@ -29,9 +27,11 @@ from fidsplat.formats.plain import (
     three_scales,
     world_means,
 )
-from fidsplat.input_limit import check_expansion
-from fidsplat.rotations import rigid_matrix
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, from_json, read_input
+from fidsplat.util.input_limit import check_expansion
 
 EXTENSION = "KHR_gaussian_splatting"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat import interrupts
-from fidsplat.cloud_arrays import find_defects
-from fidsplat.errors import InputError
-from fidsplat.files import open_input, read_input
-from fidsplat.harmonics import C0
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.arrays import find_defects
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import C0
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import open_input, read_input
 
 PADDED = np.float32(1e-6)
 """third scale, in metres, of a disk in formats that want three"""

@@ -5,12 +5,12 @@ import warnings
 
 import numpy as np
 
-from fidsplat.cloud_arrays import drop_report
-from fidsplat.errors import InputError
 from fidsplat.formats.collect import BLOCK, Progress, Rows, collect
 from fidsplat.formats.compressed_ply import compressed_rows, is_compressed
 from fidsplat.formats.ply_header import Element, Header, read_header
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.arrays import drop_report
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import InputError
 
 ORIGIN_COMMENT = "fidsplat origin"
 """a header comment of this beginning and three numbers holds the origin that x, y, z are relative to"""

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import open_input, path_of
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import open_input, path_of
 
 MAX_HEADER = 65536
 """bytes; a splat file's header has some 2,000"""

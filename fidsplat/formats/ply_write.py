@@ -4,12 +4,12 @@ import os
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
 from fidsplat.formats.collect import PADDED_LOG_SCALE
 from fidsplat.formats.ply import ORIGIN_COMMENT
-from fidsplat.harmonics import C0
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import C0
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
 
 _BLOCK = 65536
 MAX_LOGIT = 100.0

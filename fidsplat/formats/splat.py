@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, regular_file
 from fidsplat.formats.plain import cloud_of, plain_colors, refuse_boxes, three_scales, world_means
-from fidsplat.harmonics import C0
-from fidsplat.input_limit import check_expansion
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import C0
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, regular_file
+from fidsplat.util.input_limit import check_expansion
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _SEEN = 4096

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
 from fidsplat.formats.plain import HALF_TURN, cloud_of, coefficients, content, refuse_boxes, three_scales
 from fidsplat.formats.plain import world_means as means_of
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
 
 _HEAD = struct.Struct("<IIIBBBB")
 _MAGIC = 0x5053474E

@@ -18,11 +18,11 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory
 from fidsplat.cameras.trajectory import check_rate
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, path_of, read_input
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import image_poses
-from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, from_json, path_of, read_input
 
 MAX_BYTES = 2**28
 """of a file: TUM's two million poses"""

@@ -19,9 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat import interrupts
-from fidsplat.errors import InputError, bytes_words
-from fidsplat.files import atomic_path, open_input, regular_file, utf8_path
 from fidsplat.formats.plain import (
     HALF_TURN,
     cloud_of,
@@ -30,8 +27,11 @@ from fidsplat.formats.plain import (
     three_scales,
     world_means,
 )
-from fidsplat.input_limit import VARIABLE, input_limit
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError, bytes_words
+from fidsplat.util.files import atomic_path, open_input, regular_file, utf8_path
+from fidsplat.util.input_limit import VARIABLE, input_limit
 
 _SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
 _KINDS = ("ParticleField", "ParticleField3DGaussianSplat")

@@ -10,8 +10,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of, printable, writable_folder
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, path_of, printable, writable_folder
 
 try:
     from mcap.reader import make_reader

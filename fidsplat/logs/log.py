@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.arguments import instance, invalid, items, number, text
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
-from fidsplat.errors import InputError, unknown
 from fidsplat.logs.files import log_file, typestore
-from fidsplat.rotations import check_similarity, matrix_to_quaternion
-from fidsplat.scalars import real_array
+from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
+from fidsplat.util.arguments import instance, invalid, items, number, text
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.scalars import real_array
 from fidsplat.vision.detect import Detection
 from fidsplat.vision.images import encoded, pixels_of, to_uint8
 

@@ -11,11 +11,11 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import open_input, path_of, regular_file, utf8_path
-from fidsplat.input_limit import check_expansion
 from fidsplat.logs.files import typestore
-from fidsplat.rotations import rigid_matrix
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import open_input, path_of, regular_file, utf8_path
+from fidsplat.util.input_limit import check_expansion
 from fidsplat.vision.images import decoded
 
 try:

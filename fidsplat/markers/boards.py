@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.markers.spec import Kind, Spec
+from fidsplat.util.errors import InputError
 
 GAP = 2
 """Modules between the tags of a grid, and by which a ChArUco board's squares are larger than its tags."""

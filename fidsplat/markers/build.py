@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.arguments import text, whole_number
-from fidsplat.errors import InputError
+from fidsplat.capture.quality import MIXTURES, MarkerQuality
 from fidsplat.markers.facets import count_facets, facet_cloud
 from fidsplat.markers.kinds import bits_of, kind_of, parse_spec
 from fidsplat.markers.mixture import (
@@ -35,12 +34,13 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
-from fidsplat.quality import MIXTURES, MarkerQuality
-from fidsplat.scalars import PickledByFields
+from fidsplat.util.arguments import text, whole_number
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import PickledByFields
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
 
 MAX_MODULES = 4096
 """Longest edge of a grid with its quiet zone."""

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from fidsplat import interrupts
 from fidsplat.markers.partition import partition
+from fidsplat.util import interrupts
 
 BAND = 2.5
 """Modules, the widest. A whole module that reaches out of such bands is a module or more from any edge."""

@@ -16,8 +16,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import read_input
 from fidsplat.markers.paths import (
     FARTHEST,
     Rings,
@@ -29,6 +27,8 @@ from fidsplat.markers.paths import (
 )
 from fidsplat.markers.spec import Kind, Spec
 from fidsplat.markers.styles import COLORS, Rule, rules, styled
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import read_input
 
 MODULES = 256
 """Modules across a drawing unless its spec says otherwise."""

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.markers.printing import Printed, Progress
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import InputError
 
 DISH = 0.005
 """by how much the middles of the dish's longest edges lie before its middle, in those edges"""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.markers.spec import Kind, Spec
+from fidsplat.util.errors import InputError
 
 
 def _parse(text: str, head: str, rest: str) -> Spec:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.markers import boards, drawing, images, qr, tags
 from fidsplat.markers.spec import Kind, Spec
+from fidsplat.util.errors import InputError
 
 _kinds = {kind.name: kind for module in (tags, qr, images, drawing, boards) for kind in module.KINDS}
 

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fidsplat.arguments import whole_number
+from fidsplat.capture.quality import MAX_DENSITY, MAX_LEVELS, MarkerQuality
 from fidsplat.markers.nested import CLASSES, LADDERS, nested_gaussians
-from fidsplat.quality import MAX_DENSITY, MAX_LEVELS, MarkerQuality
+from fidsplat.util.arguments import whole_number
 
 GAMMA = 3.0
 """The paper's cut-off: a Gaussian ends at 3 standard deviations."""

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fidsplat.quality import LADDER, NESTED
+from fidsplat.capture.quality import LADDER, NESTED
 
 CUT = math.sqrt(2 * math.log(255))
 """Standard deviations at which an opaque Gaussian has fallen to 1/255."""

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.markers.mixture import Template, count_gaussians, place
 from fidsplat.markers.seams import grow
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon

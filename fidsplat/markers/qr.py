@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.markers.spec import Kind, Spec
+from fidsplat.util.errors import InputError
 
 _HEAD = re.compile(r"qr(?:-v(?P<version>\d+))?(?:-(?P<level>[A-Za-z]))?", re.IGNORECASE)
 _LEVELS = "LMQH"

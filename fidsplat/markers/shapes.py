@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from fidsplat.errors import InputError
 from fidsplat.markers.paths import Rings
+from fidsplat.util.errors import InputError
 
 FLAT = 0.005
 """Modules by which straight pieces may miss a curve."""

@@ -8,12 +8,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fidsplat.errors import InputError
 from fidsplat.experiments import counts
 from fidsplat.experiments.run import Options, check, device_words, prepared
 from fidsplat.experiments.sweep import Key, Record, Results
 from fidsplat.remote.queue import Engine, drain
-from fidsplat.render import Renderer
+from fidsplat.render.renderer import Renderer
+from fidsplat.util.errors import InputError
 
 
 @dataclass(frozen=True)

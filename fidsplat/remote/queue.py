@@ -6,7 +6,7 @@ from collections import Counter, deque
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from typing import Any, Protocol, TypeVar
 
-from fidsplat.errors import FidsplatError
+from fidsplat.util.errors import FidsplatError
 
 ATTEMPTS = 3
 """workers that an item may lose before it is the item that is at fault"""

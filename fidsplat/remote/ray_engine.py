@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from fidsplat import __version__, interrupts
-from fidsplat.errors import FidsplatError, InputError
-from fidsplat.provenance import code_hash
+from fidsplat import __version__
 from fidsplat.remote.queue import WorkerLost
+from fidsplat.util import interrupts
+from fidsplat.util.errors import FidsplatError, InputError
+from fidsplat.util.provenance import code_hash
 
 Make = Callable[[], Callable[[Any], Any]]
 """plain data that a worker calls once; what it returns does an item"""

@@ -18,9 +18,9 @@ from fidsplat.cameras import (
     fisheye_focal_length,
     focal_length,
 )
-from fidsplat.errors import InputError
-from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.scenes.table import Table, names_of
+from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.util.errors import InputError
 
 ORTHOGRAPHIC = ("metres_wide",)
 TABLES = ("distortion", "fisheye", "equirectangular", "orthographic")

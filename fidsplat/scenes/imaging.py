@@ -4,11 +4,11 @@ import os
 from pathlib import Path
 from typing import TypeVar
 
-from fidsplat.errors import InputError
+from fidsplat.capture.environment import Fog, Gradient, Panorama
+from fidsplat.capture.sensor import Sensor
 from fidsplat.scenes.parts import SceneParts
 from fidsplat.scenes.table import Table, names_of
-from fidsplat.sensor import Sensor
-from fidsplat.surroundings import Fog, Gradient, Panorama
+from fidsplat.util.errors import InputError
 
 BACKGROUND = (*names_of(Gradient), "image")
 

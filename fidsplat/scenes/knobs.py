@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fidsplat.quality import PRESETS, MarkerQuality, Quality, knobs
+from fidsplat.capture.quality import PRESETS, MarkerQuality, Quality, knobs
 from fidsplat.scenes.table import Table, names_of
 
 _OF_RENDER = ("samples", "lowpass", "first_hit")

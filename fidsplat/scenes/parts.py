@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fidsplat.cameras import Camera, Motion, Shutter
-from fidsplat.capture import Capture, output_names
-from fidsplat.errors import InputError
-from fidsplat.quality import Quality
-from fidsplat.rotations import check_similarity
-from fidsplat.scalars import PickledByFields
-from fidsplat.sensor import Sensor
-from fidsplat.splats import SplatCloud
+from fidsplat.capture.capture import Capture, output_names
+from fidsplat.capture.environment import Background, Fog, background_of
+from fidsplat.capture.quality import Quality
+from fidsplat.capture.sensor import Sensor
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import check_similarity
 from fidsplat.store.store import Store
-from fidsplat.store.streamed import Streamed
-from fidsplat.surroundings import Background, Fog, background_of
+from fidsplat.streaming.selection import Streamed
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import PickledByFields
 
 if TYPE_CHECKING:
     from fidsplat.cameras.motion import Pose

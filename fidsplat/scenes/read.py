@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory, look_at_matrix
-from fidsplat.errors import InputError
-from fidsplat.files import path_of, read_input
+from fidsplat.capture.environment import Fog
+from fidsplat.capture.quality import MarkerQuality, Quality, knobs
+from fidsplat.capture.sensor import Sensor
 from fidsplat.formats import Progress, load_splats
-from fidsplat.quality import MarkerQuality, Quality, knobs
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
 from fidsplat.scenes.imaging import read_background, read_part
 from fidsplat.scenes.knobs import quality_of
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.table import Table
-from fidsplat.sensor import Sensor
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.store.layout import SUFFIX
 from fidsplat.store.store import Store
-from fidsplat.surroundings import Fog
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of, read_input
 
 MAX_BYTES = 16 * 2**20
 MAX_PARTS = 8

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 
+from fidsplat.capture.quality import Quality
 from fidsplat.formats import Progress
-from fidsplat.quality import Quality
 from fidsplat.scenes.parts import SceneParts
 from fidsplat.scenes.read import read_scene
 from fidsplat.scenes.write import write_scene
-from fidsplat.summaries import Summarised, point
+from fidsplat.util.summaries import Summarised, point
 
 
 class Scene(SceneParts, Summarised):

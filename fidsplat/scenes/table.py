@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from typing import Any
 
-from fidsplat.errors import InputError, unknown
+from fidsplat.util.errors import InputError, unknown
 
 _MISSING = object()
 

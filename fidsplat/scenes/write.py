@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of
+from fidsplat.capture.quality import Quality
 from fidsplat.formats import save_ply
 from fidsplat.markers import with_file
 from fidsplat.markers.printing import MAX_SPLATS
-from fidsplat.quality import Quality
-from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.scenes.camera import keyframe_tables, lens_table, shutter_table
 from fidsplat.scenes.imaging import imaging_tables
 from fidsplat.scenes.knobs import marker_knobs, quality_tables
 from fidsplat.scenes.parts import PlacedMarker, SceneParts
+from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, path_of
 
 
 def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:

@@ -11,12 +11,12 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, fisheye_focal_length, focal_length
-from fidsplat.errors import InputError
-from fidsplat.files import open_input, path_of
-from fidsplat.rotations import quaternion_multiply
-from fidsplat.sensor import Sensor
+from fidsplat.capture.sensor import Sensor
 from fidsplat.sim.poses import IDENTITY, check_poses, compose, inverse, matrix_of
 from fidsplat.sim.rig import RigCamera
+from fidsplat.splats.rotations import quaternion_multiply
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import open_input, path_of
 
 OPTICAL = np.array([0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5])
 """sensor from camera: theirs looks along x with z up, ours along z with y down"""

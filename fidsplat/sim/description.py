@@ -12,8 +12,6 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fidsplat.cameras import Camera, focal_length
-from fidsplat.errors import InputError, unknown
-from fidsplat.files import path_of
 from fidsplat.sim.camera_element import (
     KINDS,
     OPTICAL,
@@ -27,6 +25,8 @@ from fidsplat.sim.camera_element import (
 )
 from fidsplat.sim.poses import IDENTITY, compose, inverse, matrix_of
 from fidsplat.sim.rig import RigCamera
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.files import path_of
 
 DEEPEST = 32
 """includes within includes, and models within models"""

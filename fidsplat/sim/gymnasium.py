@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.errors import InputError
 from fidsplat.sim.rig import Rig
+from fidsplat.util.errors import InputError
 from fidsplat.vision.images import to_uint8
 
 try:

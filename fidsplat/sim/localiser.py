@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.rotations import rigid_matrix
+from fidsplat.splats.rotations import rigid_matrix
 
 GATE = 4.0
 """standard deviations by which a tag's corners may be off before it is not believed"""

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
-from fidsplat.errors import InputError, unknown
-from fidsplat.render import Renderer
+from fidsplat.capture.environment import Layer
+from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import quaternions_of
 from fidsplat.sim.rig import Pictures, Rig, RigCamera
-from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Layer
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import InputError, unknown
 
 try:
     import mujoco as _mujoco  # type: ignore[import-not-found]

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.rotations import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
-from fidsplat.scalars import LARGEST, real_array
+from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import LARGEST, real_array
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 UNIT = 1e-3

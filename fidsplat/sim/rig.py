@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.arguments import instance, invalid, whole_number
-from fidsplat.batch import FrameBatch
 from fidsplat.cameras import Camera
-from fidsplat.capture import Capture, output_names
-from fidsplat.errors import InputError, MissingOutputError, unknown
-from fidsplat.render import Renderer
+from fidsplat.capture.capture import Capture, output_names
+from fidsplat.capture.environment import Layer
+from fidsplat.capture.sensor import Sensor
+from fidsplat.render.batch import FrameBatch
+from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.sensor import Sensor
 from fidsplat.sim.poses import IDENTITY, check_poses, compose, inverse, matrix_of, pose_of
-from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Layer
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.arguments import instance, invalid, whole_number
+from fidsplat.util.errors import InputError, MissingOutputError, unknown
 
 
 @dataclass(frozen=True, eq=False)

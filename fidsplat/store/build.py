@@ -20,17 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat import interrupts
-from fidsplat.arguments import callback
-from fidsplat.errors import InputError, bytes_words
-from fidsplat.files import atomic_write, from_json, read_input
 from fidsplat.formats.collect import Progress
+from fidsplat.store.build_plan import ON_PLANE, Plan, plan_of
 from fidsplat.store.columns import Columns, nodes_of
 from fidsplat.store.folders import emptied, filled, refuse_existing, store_folder
 from fidsplat.store.layout import CHUNK, NODE, Header, npy_header, write_nodes
 from fidsplat.store.merge import REDUCTION, merged
-from fidsplat.store.plan import ON_PLANE, Plan, plan_of
 from fidsplat.store.sources import Source, open_sources, splats_of
+from fidsplat.util import interrupts
+from fidsplat.util.arguments import callback
+from fidsplat.util.errors import InputError, bytes_words
+from fidsplat.util.files import atomic_write, from_json, read_input
 
 _NOTED = 16
 """parts of the work after which it is noted what is done"""

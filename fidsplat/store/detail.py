@@ -9,9 +9,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, read_input
 from fidsplat.store.layout import header_crc
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, from_json, read_input
 
 FILE = "detail.json"
 MARGIN = 3.0

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fidsplat.arguments import flag
-from fidsplat.errors import InputError
-from fidsplat.files import path_of, writable_folder
 from fidsplat.store.layout import HEADER, SUFFIX
+from fidsplat.util.arguments import flag
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of, writable_folder
 
 
 def store_folder(out: str | os.PathLike[str]) -> Path:

@@ -3,7 +3,7 @@
 Splats of a cell whose normals have the same main axis become one by moments in its plane: weighted by opacity
 times area, it has their mean, their covariance without the direction in which that is least, their mean
 colour, and the opacity with which its area has theirs. So far away, where cells are smaller than pixels, it
-takes the same light; what it gets wrong is measured (fidsplat/detail.py).
+takes the same light; what it gets wrong is measured (fidsplat/accuracy/level_of_detail.py).
 
 That opacity may be above 1: below a pixel, where alone it is drawn, the low-pass makes a small alpha of it.
 Across an edge of brightness a cell has two splats: one would move the edge by up to an eighth of the cell.
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.harmonics import C0
+from fidsplat.splats.harmonics import C0
 from fidsplat.store.morton import BITS, Grid
 
 REDUCTION = 4

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.arguments import invalid
-from fidsplat.cloud_arrays import choose_origin, unit_quaternions
-from fidsplat.errors import InputError
-from fidsplat.files import path_of
 from fidsplat.formats.collect import WINDOW, Rows, window
 from fidsplat.formats.files import format_of, load_splats
 from fidsplat.formats.ply import ply_rows
-from fidsplat.splats import SplatCloud
-from fidsplat.store.part import colors_of
+from fidsplat.splats.arrays import choose_origin, unit_quaternions
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.store.subset import colors_of
+from fidsplat.util.arguments import invalid
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
 
 _SAMPLES, _SAMPLE = 64, 4096
 """parts of each source, and rows of each, by which bounds and the spread of splats are judged"""

@@ -10,20 +10,20 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.arguments import callback, flag, instance, invalid, whole_number
-from fidsplat.arguments import number as checked_number
-from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.capture.quality import Quality
 from fidsplat.formats.collect import Progress
-from fidsplat.npy import load_npy
-from fidsplat.quality import Quality
-from fidsplat.rotations import check_similarity, matrix_to_quaternion
-from fidsplat.scalars import real_array
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.store import layout
 from fidsplat.store.detail import Detail, load_details, pixels
-from fidsplat.store.part import StorePart, joined, moved
-from fidsplat.summaries import Summarised, point
+from fidsplat.store.subset import StorePart, joined, moved
+from fidsplat.util.arguments import callback, flag, instance, invalid, whole_number
+from fidsplat.util.arguments import number as checked_number
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import path_of
+from fidsplat.util.npy import load_npy
+from fidsplat.util.scalars import real_array
+from fidsplat.util.summaries import Summarised, point
 
 
 class Store(Summarised):

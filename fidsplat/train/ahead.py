@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fidsplat.capture import Capture
+from fidsplat.capture.capture import Capture
 from fidsplat.effects import FeatureSet, select
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.train.settings import TrainSettings

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 
 from fidsplat import __version__
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json
-from fidsplat.harmonics import MAX_DEGREE
-from fidsplat.npy import load_npz
-from fidsplat.provenance import code_hash
-from fidsplat.quality import whole_number
-from fidsplat.splats import SplatCloud
+from fidsplat.capture.quality import whole_number
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import MAX_DEGREE
 from fidsplat.train.dataset import Dataset
 from fidsplat.train.parameters import NAMES, Arrays, Splats
 from fidsplat.train.settings import MOST_ITERATIONS, TrainSettings
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, from_json
+from fidsplat.util.npy import load_npz
+from fidsplat.util.provenance import code_hash
 
 _FORMAT = 3
 _GROUPS = ("values", "first", "second")

@@ -10,12 +10,12 @@ from functools import cached_property
 
 import numpy as np
 
-from fidsplat.arguments import instance, invalid, items, text, whole_number
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
-from fidsplat.scalars import real_array
-from fidsplat.surroundings import three_numbers
+from fidsplat.capture.environment import three_numbers
 from fidsplat.train.random_numbers import Purpose, uniform
+from fidsplat.util.arguments import instance, invalid, items, text, whole_number
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import real_array
 
 FAR = 1e4
 """extents from the world's origin beyond which means have an origin of their own: float32 would blur them"""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.train.parameters import Splats, TrainingError, logit, sigmoid
 from fidsplat.train.random_numbers import Purpose, normal
 from fidsplat.train.settings import TrainSettings

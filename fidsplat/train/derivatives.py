@@ -11,12 +11,12 @@ from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.gradients import on_host
 from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
-from fidsplat.capture import Capture
+from fidsplat.capture.capture import Capture
 from fidsplat.effects.differentiable import check_gradients
-from fidsplat.errors import DeviceError
-from fidsplat.render import Renderer
-from fidsplat.rotations import quaternion_to_matrix
-from fidsplat.splats import SplatCloud
+from fidsplat.render.renderer import Renderer
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.util.errors import DeviceError
 
 Arrays = dict[str, np.ndarray]
 _STRAIGHT = 1e-3

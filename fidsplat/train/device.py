@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Images, ResidentData
 from fidsplat.backends.derivatives import TakenBack, TrainingKernels
+from fidsplat.backends.interface import Images, ResidentData
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.densify import Plan, reset_logits

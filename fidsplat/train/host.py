@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Backend, Images, ResidentData
 from fidsplat.backends.gradients import on_host
+from fidsplat.backends.interface import Backend, Images, ResidentData
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView

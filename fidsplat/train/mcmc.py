@@ -9,7 +9,7 @@ from math import comb
 
 import numpy as np
 
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.train.densify import forgotten
 from fidsplat.train.parameters import NAMES, Splats, TrainingError, sigmoid
 from fidsplat.train.random_numbers import Purpose, normal, uniform

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fidsplat.arguments import instance, whole_number
-from fidsplat.errors import InputError
 from fidsplat.train.dataset import Dataset
 from fidsplat.train.settings import TrainSettings
+from fidsplat.util.arguments import instance, whole_number
+from fidsplat.util.errors import InputError
 
 _COPIES = 7
 """of a splat's values at most: themselves, Adam's two means, as they are drawn, their gradients by those and

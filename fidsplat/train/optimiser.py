@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fidsplat.harmonics import C0
+from fidsplat.splats.harmonics import C0
 from fidsplat.train.parameters import Arrays, Splats
 from fidsplat.train.settings import TrainSettings
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.errors import FidsplatError, InputError
-from fidsplat.harmonics import C0
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import C0
 from fidsplat.train.dataset import Dataset
 from fidsplat.train.neighbours import mean_square_distances
 from fidsplat.train.random_numbers import Purpose, uniform
 from fidsplat.train.settings import TrainSettings
+from fidsplat.util.errors import FidsplatError, InputError
 
 SHAPES = ("means", "log_scales", "quats", "logits")
 NAMES = (*SHAPES, "sh")

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.arguments import callback, whole_number
-from fidsplat.errors import InputError
-from fidsplat.files import from_json, path_of, read_text
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
 from fidsplat.train.dataset import MOST_POINTS, Dataset, TrainingView
 from fidsplat.train.flat import flat_view
 from fidsplat.train.transforms import Found, has_transforms, load_transforms
+from fidsplat.util.arguments import callback, whole_number
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import from_json, path_of, read_text
 from fidsplat.vision.images import read_image, read_over
 
 NOTES = ("dataset.json", "marker.json")

@@ -16,15 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.arguments import as_float, callback, instance, invalid, whole_number
 from fidsplat.cameras import Camera
-from fidsplat.capture import Capture
-from fidsplat.errors import InputError
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.quality import Quality
 from fidsplat.markers import Marker
-from fidsplat.quality import Quality
-from fidsplat.render import Renderer
-from fidsplat.splats import SplatCloud
+from fidsplat.render.renderer import Renderer
+from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train.derivatives import drawn
+from fidsplat.util.arguments import as_float, callback, instance, invalid, whole_number
+from fidsplat.util.errors import InputError
 
 ITERATIONS = 1000
 PIXELS = 12

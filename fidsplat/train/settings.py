@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any
 
-from fidsplat.arguments import as_float, instance, whole_number
-from fidsplat.errors import InputError, unknown
-from fidsplat.harmonics import MAX_DEGREE
-from fidsplat.quality import Quality
+from fidsplat.capture.quality import Quality
+from fidsplat.splats.harmonics import MAX_DEGREE
+from fidsplat.util.arguments import as_float, instance, whole_number
+from fidsplat.util.errors import InputError, unknown
 
 STRATEGIES = ("default", "mcmc")
 MOST_ITERATIONS = 10_000_000

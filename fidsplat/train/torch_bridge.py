@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.capture import Capture
-from fidsplat.errors import InputError
-from fidsplat.harmonics import C0
-from fidsplat.render import Renderer
-from fidsplat.splats import SplatCloud
+from fidsplat.capture.capture import Capture
+from fidsplat.render.renderer import Renderer
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import C0
 from fidsplat.train.derivatives import by_pose, drawn, moved
+from fidsplat.util.errors import InputError
 
 try:
     import torch as _torch  # type: ignore[import-not-found]

@@ -14,20 +14,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat import interrupts
-from fidsplat.arguments import callback, instance, invalid, items
 from fidsplat.backends.derivatives import CompilesAhead, Differentiates, Trains
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.prepare import prepare
-from fidsplat.capture import Capture
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
-from fidsplat.errors import DeviceError, InputError
-from fidsplat.files import ordinary_file, writable_folder
 from fidsplat.formats import save_ply
-from fidsplat.quality import Quality
-from fidsplat.render import Renderer
-from fidsplat.splats import SplatCloud
+from fidsplat.render.renderer import Renderer
+from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import densify, mcmc
 from fidsplat.train.ahead import features_after
 from fidsplat.train.checkpoint import Progressed, load_checkpoint, save_checkpoint
@@ -40,6 +36,10 @@ from fidsplat.train.parameters import Splats, TrainingError, first_splats, splat
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.scores import ViewScore, scored
 from fidsplat.train.settings import TrainSettings, settings_with
+from fidsplat.util import interrupts
+from fidsplat.util.arguments import callback, instance, invalid, items
+from fidsplat.util.errors import DeviceError, InputError
+from fidsplat.util.files import ordinary_file, writable_folder
 
 _SOLID = ("rgb", "alpha", "depth", "normal")
 """outputs of pictures whose depths and normals are in the loss"""

@@ -15,11 +15,11 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.backends.warp.device import WarpBackend
 from fidsplat.backends.warp.gradients import add_to, flat_of
 from fidsplat.backends.warp.runtime import load
-from fidsplat.capture import Capture
+from fidsplat.capture.capture import Capture
 from fidsplat.effects.differentiable import check_gradients
-from fidsplat.errors import DeviceError, InputError
-from fidsplat.render import Renderer
+from fidsplat.render.renderer import Renderer
 from fidsplat.train.derivatives import by_pose, moved
+from fidsplat.util.errors import DeviceError, InputError
 
 
 def draw(

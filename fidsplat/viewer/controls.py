@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
 
-from fidsplat.markdown import escaped
-from fidsplat.quality import PRESETS
+from fidsplat.capture.quality import PRESETS
 from fidsplat.scenes import Scene
+from fidsplat.util.markdown import escaped
 from fidsplat.viewer.session import Session
 from fidsplat.viewer.settings import LENSES, Settings
 

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, read_input
-from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.store.layout import SUFFIX as STORE
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, read_input
 
 _HEAD = re.compile(r"^[ \t]*\[.*$", re.MULTILINE)
 _TABLES = {

@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from fidsplat.errors import FidsplatError
+from fidsplat.util.errors import FidsplatError
 
 _LOCK = threading.Lock()
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fidsplat.scenes import Scene
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
 from fidsplat.viewer.edits import Body
 
 LIGHT = 100_000

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 
 _OUTLINE = (255, 60, 200)
 _CAMERA, _KEYFRAME = (40, 120, 255), (255, 160, 0)

@@ -18,10 +18,10 @@ import numpy as np
 
 from fidsplat.backends import devices
 from fidsplat.cameras import Trajectory
-from fidsplat.errors import FidsplatError, InputError
 from fidsplat.formats import save_trajectory
-from fidsplat.markdown import escaped
 from fidsplat.scenes import Scene
+from fidsplat.util.errors import FidsplatError, InputError
+from fidsplat.util.markdown import escaped
 from fidsplat.viewer.controls import NOBODY, Controls
 from fidsplat.viewer.edits import Body, SceneFile
 from fidsplat.viewer.guard import guarded

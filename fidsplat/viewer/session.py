@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fidsplat.effects import FeatureSet, select
-from fidsplat.errors import FidsplatError
-from fidsplat.frame import Frame
-from fidsplat.render import Renderer, default_device
-from fidsplat.resident import ResidentCloud
+from fidsplat.render.frame import Frame
+from fidsplat.render.renderer import Renderer, default_device
+from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
+from fidsplat.util.errors import FidsplatError
 from fidsplat.viewer.settings import Settings, Viewpoint
 
 _FIRST = Viewpoint((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)

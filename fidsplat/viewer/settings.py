@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from fidsplat.cameras import Camera, Motion, Shutter
-from fidsplat.capture import Capture
-from fidsplat.errors import InputError
-from fidsplat.quality import Quality
-from fidsplat.rotations import rigid_matrix
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.environment import Fog
+from fidsplat.capture.quality import Quality
 from fidsplat.scenes import Scene
-from fidsplat.surroundings import Fog
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.errors import InputError
 
 LENSES = ("pinhole", "fisheye", "panorama", "parallel", "scene")
 """`fisheye` sees 180 degrees across; `scene` is the lens of the scene's own camera"""

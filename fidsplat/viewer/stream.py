@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from fidsplat.errors import FidsplatError
+from fidsplat.util.errors import FidsplatError
 from fidsplat.viewer.settings import Viewpoint
 
 SMALLEST, STEPS = 1 / 4, 32

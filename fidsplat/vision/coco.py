@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.arguments import instance, text
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, ordinary_file
+from fidsplat.util.arguments import instance, text
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, ordinary_file
 from fidsplat.vision.truth import GroupTruth, MarkerTruth, Truth
 from fidsplat.vision.visible import outline
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import zxingcpp
 
-from fidsplat.arguments import invalid, items
-from fidsplat.errors import InputError
+from fidsplat.util.arguments import invalid, items
+from fidsplat.util.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefined
 from fidsplat.vision.images import pixels_of

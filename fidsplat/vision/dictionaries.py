@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 
 class Family(NamedTuple):

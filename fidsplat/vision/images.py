@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of, read_input, utf8_path
-from fidsplat.input_limit import check_expansion
-from fidsplat.stderr import without_stderr
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, path_of, read_input, utf8_path
+from fidsplat.util.input_limit import check_expansion
+from fidsplat.util.stderr import without_stderr
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")

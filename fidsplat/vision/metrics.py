@@ -18,9 +18,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import read_input
-from fidsplat.npy import load_npz
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import read_input
+from fidsplat.util.npy import load_npz
 
 _SIGMA, _RADIUS = 1.5, 5  # pixels: Wang et al. 2004, as in the 3DGS and 2DGS papers
 _C1, _C2 = 0.01**2, 0.03**2

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
-from fidsplat.npy import load_npy
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
+from fidsplat.util.npy import load_npy
 from fidsplat.vision.images import write_png
 from fidsplat.vision.paint import (
     count_picture,

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.arguments import invalid
 from fidsplat.cameras import Camera
 from fidsplat.markers import Marker
 from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.util.arguments import invalid
 from fidsplat.vision.boards import BOARDS, board_pose
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.dictionaries import parse_family

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import zxingcpp
 
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import QR_ONLY, corners_of
 from fidsplat.vision.dictionaries import predefined
 

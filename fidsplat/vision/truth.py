@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.arguments import instance, invalid
 from fidsplat.cameras import Camera, Orthographic
-from fidsplat.errors import InputError
-from fidsplat.rotations import check_similarity
-from fidsplat.scalars import real_array
 from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.splats.rotations import check_similarity
+from fidsplat.util.arguments import instance, invalid
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import real_array
 from fidsplat.vision.visible import visible
 
 Box = tuple[float, float, float, float]

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from fidsplat.cameras import Camera, Lens, Orthographic, focal_length, look_at_matrix
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 MAX_FIELD = math.radians(150)
 _NOWHERE = -1e4

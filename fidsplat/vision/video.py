@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.errors import InputError
-from fidsplat.files import atomic_path, ordinary_file, writable_folder
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_path, ordinary_file, writable_folder
 
 
 def check_video(path: str | os.PathLike[str]) -> Path:

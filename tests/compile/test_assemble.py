@@ -14,8 +14,8 @@ from fidsplat.backends.opencl import assemble as assembly
 from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
+from fidsplat.capture.quality import ELLIPSOID
 from fidsplat.effects import OUTPUTS, select
-from fidsplat.quality import ELLIPSOID
 
 BACKEND = "opencl"
 

@@ -11,8 +11,8 @@ from combined import LENSES, combination, everything
 from optimisation import as_users_compile, level
 
 import fidsplat as fs
-from fidsplat.hard_cases.catalogue import all_cases
-from fidsplat.hard_cases.check import run_case
+from fidsplat.selftest.catalogue import all_cases
+from fidsplat.selftest.check import run_case
 
 LENS = "fisheye"
 PICTURES = {

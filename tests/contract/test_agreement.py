@@ -10,7 +10,7 @@ from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.cameras.pinhole import FOCAL_LENGTHS
-from fidsplat.random_clouds import load_scene
+from fidsplat.scenes.random_clouds import load_scene
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 SMALL = stretched(fs.Camera.look_at(97, 71, 1.0, (0.7, -0.5, -0.4), (0.0, 0.1, 3.0), up=(0.4, -1.0, 0.1)))

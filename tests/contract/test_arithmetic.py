@@ -8,8 +8,8 @@ from test_agreement import coplanar_cloud
 
 import fidsplat as fs
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import Picture, differing, trace
-from fidsplat.hard_cases.f_arithmetic import BOUNDS, worst
+from fidsplat.selftest.agreement import Picture, differing, trace
+from fidsplat.selftest.arithmetic import BOUNDS, worst
 
 CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 AROUND = random_splats(200, seed=1)

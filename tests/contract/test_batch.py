@@ -8,8 +8,8 @@ from agreement import ALL_OUTPUTS, random_splats
 from derivative_errors import stretched
 
 import fidsplat as fs
-from fidsplat.rotations import rigid_matrix
-from fidsplat.views import views_of
+from fidsplat.capture.views import views_of
+from fidsplat.splats.rotations import rigid_matrix
 
 CAMERA = fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 CAMERAS = [fs.Camera.look_at(50, 40, 1.0, (x, 0.1, -0.1), (0.0, 0.0, 3.0)) for x in (-0.4, 0.0, 0.3)]

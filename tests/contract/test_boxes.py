@@ -9,8 +9,8 @@ from agreement import ALL_OUTPUTS, assert_agrees, random_splats
 from sampling import SAMPLES, alternate
 
 import fidsplat as fs
-from fidsplat.hard_cases.clouds import quaternion, splats
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.selftest.clouds import quaternion, splats
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 SMALL = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))

@@ -12,7 +12,7 @@ from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
 from fidsplat.cameras.raster import raster_of
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 SEAM = 1e-3
 each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)

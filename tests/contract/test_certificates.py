@@ -8,7 +8,7 @@ from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
-from fidsplat.hard_cases.agreement import RARE, RISKY, Picture, compare
+from fidsplat.selftest.agreement import RARE, RISKY, Picture, compare
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0, 0, -0.1), (0, 0, 3.0))
 MARKED = fs.Camera.look_at(81, 59, 0.7, (0.8, -0.3, -1.6), (0, 0, 0))

@@ -12,7 +12,7 @@ import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import Picture, compare
+from fidsplat.selftest.agreement import Picture, compare
 
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))

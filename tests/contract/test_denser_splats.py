@@ -8,10 +8,10 @@ import pytest
 from agreement import assert_agrees
 
 import fidsplat as fs
+from fidsplat.backends.frustum_culling import BRIGHTEST, seen
 from fidsplat.backends.prepare import prepare
-from fidsplat.backends.seen import BRIGHTEST, seen
 from fidsplat.store.merge import DENSEST
-from fidsplat.store.part import StorePart
+from fidsplat.store.subset import StorePart
 
 SIZE, FOCAL, DEPTH, SIGMA = (61, 47), 4000.0, 2.0, 200.0
 CAMERA = fs.Camera.pinhole(*SIZE, FOCAL, FOCAL, 30.5, 23.5)

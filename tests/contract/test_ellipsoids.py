@@ -9,10 +9,10 @@ from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_spla
 from sampling import in_turn
 
 import fidsplat as fs
-from fidsplat.hard_cases import fuzz
-from fidsplat.hard_cases.agreement import RARE, Picture
-from fidsplat.quality import ELLIPSOID
-from fidsplat.random_clouds import log_uniform
+from fidsplat.capture.quality import ELLIPSOID
+from fidsplat.scenes.random_clouds import log_uniform
+from fidsplat.selftest import fuzz
+from fidsplat.selftest.agreement import RARE, Picture
 
 CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
 

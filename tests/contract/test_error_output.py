@@ -10,8 +10,8 @@ import pytest
 from brute_force import ideal
 
 import fidsplat as fs
-from fidsplat.errors import InputError
-from fidsplat.ideal import UNLISTED, ideal_of
+from fidsplat.render.certified_error import UNLISTED, ideal_of
+from fidsplat.util.errors import InputError
 
 HAZE = fs.Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
 MIDDLE = fs.Camera.pinhole(16, 12, 60.0, 60.0, 8.0, 6.0)  # of HAZE

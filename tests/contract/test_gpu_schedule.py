@@ -16,7 +16,7 @@ from test_lens_pictures import CAMERAS
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.effects import OUTPUTS
-from fidsplat.hard_cases.agreement import Picture, compare
+from fidsplat.selftest.agreement import Picture, compare
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 EVERYTHING = tuple(OUTPUTS)

@@ -10,7 +10,7 @@ from test_memory import CAMERA, as_on_a_gpu, machines, own_device
 
 import fidsplat as fs
 from fidsplat.backends.opencl import batch
-from fidsplat.views import views_of
+from fidsplat.capture.views import views_of
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
-from fidsplat.rotations import rigid_matrix
+from fidsplat.splats.rotations import rigid_matrix
 
 SIZE = WIDTH, HEIGHT = 37, 22
 OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "depth_first", "normal", "label", "splat_id", "blended")

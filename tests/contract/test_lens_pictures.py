@@ -13,8 +13,8 @@ from test_agreement import coplanar_cloud
 import fidsplat as fs
 from fidsplat.backends.view import View
 from fidsplat.cameras import BrownConrady, Fisheye
-from fidsplat.hard_cases.agreement import Picture
-from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.selftest.agreement import Picture
+from fidsplat.splats.rotations import matrix_to_quaternion
 
 POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, 0.2, -0.1), (0.1, 0.0, 3.0)).world_to_camera
 

@@ -8,7 +8,7 @@ from agreement import ALL_OUTPUTS, assert_agrees, random_splats
 from test_lens_pictures import CAMERAS, EVERY_TERM
 
 import fidsplat as fs
-from fidsplat.rotations import matrix_to_quaternion, quaternion_to_matrix, rigid_matrix
+from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_to_matrix, rigid_matrix
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 PIXEL = fs.Quality(lowpass="pixel")

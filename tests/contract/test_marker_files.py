@@ -7,7 +7,7 @@ import pytest
 from agreement import ALL_OUTPUTS
 
 import fidsplat as fs
-from fidsplat.quality import PRESETS
+from fidsplat.capture.quality import PRESETS
 from fidsplat.vision.detect import detect
 from fidsplat.vision.metrics import psnr
 

@@ -30,7 +30,7 @@ def tag_at(position, turn):
 
 
 def pose_of(position, quaternion):
-    from fidsplat.rotations import rigid_matrix
+    from fidsplat.splats.rotations import rigid_matrix
 
     return rigid_matrix(position, quaternion)
 

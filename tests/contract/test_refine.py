@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.errors import DeviceError, InputError
-from fidsplat.quality import LADDER
+from fidsplat.capture.quality import LADDER
 from fidsplat.train import refine
+from fidsplat.util.errors import DeviceError, InputError
 
 BACKEND = "opencl"
 SPEC = "aruco:4x4_50:7"

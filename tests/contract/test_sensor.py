@@ -13,7 +13,7 @@ from sampling import SAMPLES, alternate, in_turn
 import fidsplat as fs
 from fidsplat.backends.reference.post import variates
 from fidsplat.backends.view import View
-from fidsplat.hard_cases.agreement import Picture
+from fidsplat.selftest.agreement import Picture
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 IN_FOG = ("rgb", "alpha", "depth", "distance")

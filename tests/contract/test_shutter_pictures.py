@@ -13,8 +13,8 @@ from test_agreement import coplanar_cloud
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, compare
-from fidsplat.quality import Quality
+from fidsplat.capture.quality import Quality
+from fidsplat.selftest.agreement import ALL_OUTPUTS, compare
 
 SIZE = (61, 45)
 BACKGROUND = (0.1, 0.2, 0.3)

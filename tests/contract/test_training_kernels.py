@@ -15,14 +15,14 @@ from fidsplat.backends.gradients import on_host
 from fidsplat.backends.opencl import training
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
-from fidsplat.errors import InputError
-from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.train import TrainSettings
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
 from fidsplat.train.losses import picture_loss
 from fidsplat.train.optimiser import moved_by, rates
 from fidsplat.train.parameters import NAMES, Splats
+from fidsplat.util.errors import InputError
 
 BACKEND = "opencl"
 COUNT = 70

@@ -7,9 +7,9 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
-from fidsplat.backends.base import GivesUint8
+from fidsplat.backends.interface import GivesUint8
 from fidsplat.backends.opencl.shapes import gpu_shape
-from fidsplat.errors import MissingOutputError
+from fidsplat.util.errors import MissingOutputError
 from fidsplat.vision.images import to_uint8
 
 CLOUD = random_splats(60, seed=2)

@@ -15,7 +15,7 @@ from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.picture import Picture
 from fidsplat.backends.warp.replay import Replay
 from fidsplat.backends.warp.shapes import WarpShape
-from fidsplat.views import views_of
+from fidsplat.capture.views import views_of
 
 BACKEND = "warp"
 WHOLE = random_picture(1, count=3000, degree=None, quality="surfel", outputs=("rgb",))

@@ -6,8 +6,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.experiments.ideal_tags import tag_layer
 from fidsplat.experiments.plane import plane_picture
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
+from fidsplat.splats.rotations import rigid_matrix
 
 CAMERA = fs.Camera.pinhole(120, 90, 110, 110, 61, 44)
 BEHIND = np.full((90, 120, 3), (0.2, 0.4, 0.6))

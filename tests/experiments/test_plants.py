@@ -12,10 +12,10 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments import blender, plants
 from fidsplat.experiments.plants import Plants, cameras_around, write_plants
-from fidsplat.sim.greenhouse import Greenhouse
-from fidsplat.sim.plant_meshes import MESHES, Mesh
-from fidsplat.sim.plants import load_plants
 from fidsplat.vision.images import read_rgba
+from fidsplat.worlds.greenhouse import Greenhouse
+from fidsplat.worlds.plant_meshes import MESHES, Mesh
+from fidsplat.worlds.plants import load_plants
 
 
 @pytest.mark.parametrize("kind", MESHES)

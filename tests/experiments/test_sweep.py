@@ -16,7 +16,7 @@ from fidsplat.experiments.sweep import (
     read_records,
     shard,
 )
-from fidsplat.provenance import run_facts
+from fidsplat.util.provenance import run_facts
 
 POINTS = [{"category": "small", "index": i} for i in range(5)]
 

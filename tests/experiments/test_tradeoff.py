@@ -8,6 +8,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.opencl.resident import Resident
+from fidsplat.capture.quality import ELLIPSOID, PRESETS, MarkerQuality
 from fidsplat.experiments.tradeoff import compare, run
 from fidsplat.experiments.tradeoff import session as session_module
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
@@ -24,9 +25,8 @@ from fidsplat.experiments.tradeoff.points import (
 )
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make
 from fidsplat.experiments.tradeoff.session import QUICK, Effort, Session, memory_of, time_point
-from fidsplat.hard_cases.clouds import camera, splats
-from fidsplat.quality import ELLIPSOID, PRESETS, MarkerQuality
-from fidsplat.random_clouds import SCENES
+from fidsplat.scenes.random_clouds import SCENES
+from fidsplat.selftest.clouds import camera, splats
 
 pytestmark = pytest.mark.usefixtures("optimised")
 FACING = (1.0, 0.0, 0.0, 0.0)

@@ -10,7 +10,7 @@ from fidsplat.experiments.sweep import read_records
 from fidsplat.experiments.tradeoff import compare, run
 from fidsplat.experiments.tradeoff.scenes import NAMES, scene_names
 from fidsplat.experiments.tradeoff.summary import load
-from fidsplat.random_clouds import random_cloud
+from fidsplat.scenes.random_clouds import random_cloud
 
 pytestmark = pytest.mark.usefixtures("optimised")
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")

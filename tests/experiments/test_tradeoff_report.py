@@ -6,6 +6,7 @@ import xml.dom.minidom
 import pytest
 
 import fidsplat as fs
+from fidsplat.capture.quality import PRESETS
 from fidsplat.cli import main
 from fidsplat.experiments.summary import summarise
 from fidsplat.experiments.sweep import Record
@@ -22,7 +23,6 @@ from fidsplat.experiments.tradeoff.points import (
     thick_points,
 )
 from fidsplat.experiments.tradeoff.summary import COLUMNS, Device, front, load, quality_text, rows_of
-from fidsplat.quality import PRESETS
 
 RUN = {
     "device": "A processor, driver 1", "title": "A processor", "kind": "cpu", "machine": "two cores",

@@ -11,9 +11,9 @@ import fidsplat as fs
 from fidsplat.backends.opencl.lists import GatheredLists
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.view import View
+from fidsplat.capture.views import views_of
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import out_of_order
-from fidsplat.views import views_of
+from fidsplat.selftest.agreement import out_of_order
 
 
 @pytest.mark.parametrize("scale", [(1e-3, 0.5), (0.1, 50.0)])

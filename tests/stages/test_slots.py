@@ -7,7 +7,7 @@ import pyopencl as cl
 import fidsplat as fs
 from fidsplat.backends.opencl.counts import pairs_of
 from fidsplat.backends.prepare import prepare
-from fidsplat.random_clouds import random_splats
+from fidsplat.scenes.random_clouds import random_splats
 
 BACKEND = "opencl"
 # found among 160,000 random ones: the chord of a row of tiles was rounded to be wider than the widest of all

@@ -8,11 +8,11 @@ from agreement import ALL_OUTPUTS, random_splats
 from traces import CAMERA, CULLED, listing, traced
 
 import fidsplat as fs
-from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import out_of_order
+from fidsplat.selftest.agreement import out_of_order
 
 
 def footprint(cloud, view, index, dot=True):

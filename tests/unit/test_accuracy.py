@@ -7,9 +7,9 @@ import pytest
 from agreement import random_splats, reference_pixels
 
 import fidsplat as fs
-from fidsplat.accuracy import Errors, errors, full_precision, truth
-from fidsplat.errors import InputError
-from fidsplat.hard_cases.agreement import compare
+from fidsplat.accuracy.error import Errors, errors, full_precision, truth
+from fidsplat.selftest.agreement import compare
+from fidsplat.util.errors import InputError
 
 CAMERA = fs.Camera.pinhole(24, 17, 20.0, 20.0, 12.0, 8.5)
 

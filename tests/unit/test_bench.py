@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.base import Measurable
+from fidsplat.backends.interface import Measurable
 from fidsplat.backends.opencl.device import OpenCLBackend
 from fidsplat.cli import main
 from fidsplat.experiments.bench import catalogue, measure
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, BenchScene, scene_names
 from fidsplat.experiments.bench.measure import overdraw
-from fidsplat.random_clouds import random_cloud, standard_camera
-from fidsplat.timing import WARM_UP, Timer
+from fidsplat.scenes.random_clouds import random_cloud, standard_camera
+from fidsplat.util.timing import WARM_UP, Timer
 
 CAMERA = standard_camera(64, 48)
 # of every record, and of one that has frames

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from growth import exponent, exponents, points
 
-from fidsplat.backends.base import Rates
+from fidsplat.backends.interface import Rates
 from fidsplat.experiments.bench.model import FRAGMENT_FMA, RECORD, Counts, Work, roofline_ms, roofline_work
 
 COUNTS = Counts(splats=1000, visible=600, pairs=4000, fragments=90_000, pixels=64 * 48)

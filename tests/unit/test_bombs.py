@@ -13,8 +13,8 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.formats import load_splats, save_splats, usd
-from fidsplat.input_limit import FLOOR, RATIO, VARIABLE, input_limit
 from fidsplat.sim import read_description
+from fidsplat.util.input_limit import FLOOR, RATIO, VARIABLE, input_limit
 from fidsplat.vision.images import decoded, read_bits, read_image
 
 ONE = fs.SplatCloud([[0, 0, 1.0]], [[1.0, 0, 0, 0]], [[0.1, 0.1]], [0.5], colors=[[1.0, 0, 0]])
@@ -165,8 +165,8 @@ def test_chunks_of_logs(tmp_path, monkeypatch, indexed, compression):
         for time in range(20):
             made.add_message(channel, time, zeros, time)
         made.finish()
-    monkeypatch.setattr("fidsplat.input_limit.FLOOR", 2**22)
-    monkeypatch.setattr("fidsplat.input_limit.RATIO", 1)
+    monkeypatch.setattr("fidsplat.util.input_limit.FLOOR", 2**22)
+    monkeypatch.setattr("fidsplat.util.input_limit.RATIO", 1)
     with pytest.raises(fs.InputError, match=r"a\.mcap must expand to at most 4.*chunk"):
         list(log_pictures(path))
 

@@ -8,15 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from brute_force import ideal
+from fidsplat.budget import Choice, certify, choose
 from random_scenes import HELD_OUT, random_scene
 from sampling import in_turn
 
 import fidsplat as fs
-from fidsplat.accuracy import errors, truth
-from fidsplat.budget import Choice, certify, choose, prices, search, store
-from fidsplat.budget.choose import _key
-from fidsplat.errors import InputError
-from fidsplat.timing import Clock, Timer
+from fidsplat.accuracy import cache, price_list, search
+from fidsplat.accuracy.error import errors, truth
+from fidsplat.accuracy.quality_within import _key
+from fidsplat.util.errors import InputError
+from fidsplat.util.timing import Clock, Timer
 
 BACKEND = "opencl"
 BOUNDS = (1e-2, 1e-3, 1e-4)
@@ -28,7 +29,7 @@ SMALL = fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     """What is kept is kept here, not in the user's folder."""
-    monkeypatch.setattr(store, "folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "cache")
 
 
 @pytest.fixture(scope="module")
@@ -57,11 +58,11 @@ def within(renderer, scene, error=None, ms=None, **more):
 
 
 def test_the_price_list_is_a_ladder():
-    candidates = prices.load("cpu")
+    candidates = price_list.load("cpu")
     assert [s.cost for s in candidates] == sorted(s.cost for s in candidates)
     assert all(0 < s.easy <= s.median <= s.most for s in candidates)
     assert all(isinstance(s.of(fs.Quality()), fs.Quality) for s in candidates)
-    assert prices.load("a kind that nobody measured") == candidates
+    assert price_list.load("a kind that nobody measured") == candidates
 
 
 @pytest.mark.parametrize("error", BOUNDS)
@@ -140,7 +141,7 @@ def test_a_choice_without_a_certificate_says_why(renderer):
 
 
 def test_less_error_is_never_cheaper(renderer):
-    cost = {json.dumps(s.knobs): s.cost for s in prices.load(renderer.device.kind)}
+    cost = {json.dumps(s.knobs): s.cost for s in price_list.load(renderer.device.kind)}
     chosen = [choose(error, device=renderer) for error in (0.3, *BOUNDS)]
     assert all(choice.error <= error for choice, error in zip(chosen, (0.3, *BOUNDS), strict=True))
     costs = [cost[json.dumps(choice.knobs)] for choice in chosen]
@@ -151,7 +152,7 @@ def test_less_error_is_never_cheaper(renderer):
 def test_the_definition_stays():
     base = fs.Quality(lowpass="pixel", samples=3, order="centre", first_hit=0.3)
     kept = ("lowpass", "samples", "order", "first_hit", "marker")
-    for candidate in prices.load("cpu"):
+    for candidate in price_list.load("cpu"):
         assert all(getattr(candidate.of(base), name) == getattr(base, name) for name in kept)
         parity = candidate.of(fs.Quality.named("gsplat"))
         assert (parity.opacity_ceiling, parity.stop_rule, parity.order) == (1.0, "inclusive", "centre")
@@ -201,7 +202,7 @@ def test_measuring_finds_what_is_cheaper_than_the_price_list(renderer, held_out)
 @in_turn()
 def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monkeypatch):
     first = within(renderer, scene, 1e-3)
-    (file,) = store.folder().iterdir()
+    (file,) = cache.folder().iterdir()
     with monkeypatch.context() as patch:
         patch.setattr(search.Calibration, "error", lambda *_: pytest.fail("it was measured again"))
         again = within(renderer, scene, 1e-3)
@@ -221,13 +222,13 @@ def test_what_is_kept_is_for_one_question(renderer, scene):
     within(renderer, random_scene(HELD_OUT + 2), 1e-3)
     moved = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, cx=scene.camera.cx + 1))
     within(renderer, moved, 1e-3)
-    assert len(list(store.folder().iterdir())) == 6
+    assert len(list(cache.folder().iterdir())) == 6
 
 
 @in_turn()
 def test_a_folder_that_cannot_be_written_is_no_obstacle(renderer, scene, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
-    monkeypatch.setattr(store, "folder", lambda: tmp_path / "file" / "cache")
+    monkeypatch.setattr(cache, "folder", lambda: tmp_path / "file" / "cache")
     assert within(renderer, scene, 1e-2).source == "measured"
 
 
@@ -283,7 +284,7 @@ def clock(monkeypatch):
 
 def test_the_most_accurate_in_time(renderer, scene, clock):
     choice = within(renderer, scene, ms=31)
-    cutoffs = {s.of(fs.Quality()).alpha_cutoff for s in prices.load(renderer.device.kind)}
+    cutoffs = {s.of(fs.Quality()).alpha_cutoff for s in price_list.load(renderer.device.kind)}
     assert choice.quality.alpha_cutoff == min(cutoff for cutoff in cutoffs if -10 * np.log10(cutoff) <= 31)
     assert (choice.ms, choice.ms_late) == pytest.approx((-10 * np.log10(choice.quality.alpha_cutoff),) * 2)
     assert within(renderer, scene, ms=45).error < choice.error
@@ -312,11 +313,11 @@ def test_a_time_is_kept_by_nine_frames_of_ten():
         def times(self, qualities, repeats=9):
             return [search.Times(1.0, late[quality.alpha_cutoff]) for quality in qualities]
 
-    candidates = tuple(prices.Candidate({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
+    candidates = tuple(price_list.Candidate({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
     known = search.Search(Known(), candidates)
     assert known.most_accurate_in(5.0).error == 1e-2
     assert known.most_accurate_in(10.0).error == 1e-4
-    measured = import_module("fidsplat.budget.choose")._measured
+    measured = import_module("fidsplat.accuracy.quality_within")._measured
     assert measured(known, 1e-3, 10.0).error == 1e-4
     with pytest.raises(InputError, match=r"takes 9 ms a frame on known, not 5; the least error .* 0\.01"):
         measured(known, 1e-3, 5.0)

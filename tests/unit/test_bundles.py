@@ -8,8 +8,8 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.bundles import read_bundles
 from fidsplat.vision.detect import Detection
 from fidsplat.vision.images import write_png

@@ -89,7 +89,7 @@ def test_nobody_without_a_home(ensure, monkeypatch, tmp_path):
 def test_a_picture_is_drawn_all_the_same(tmp_path):
     """And what it took is removed."""
     draw = (
-        "import fidsplat as fs, tempfile; from fidsplat.random_clouds import random_splats;"
+        "import fidsplat as fs, tempfile; from fidsplat.scenes.random_clouds import random_splats;"
         "camera = fs.Camera.pinhole(8, 8, 8, 8, 4, 4);"
         "print(fs.Renderer('opencl:pocl').render(random_splats(3, 0), camera)['rgb'].shape)"
     )

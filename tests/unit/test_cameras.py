@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import fidsplat as fs
 from fidsplat.cameras import focal_length, look_at_matrix
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 coordinate = st.floats(-50, 50)
 point = st.tuples(coordinate, coordinate, coordinate)

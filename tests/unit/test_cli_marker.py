@@ -6,8 +6,8 @@ import numpy as np
 from command_line import fails, prints_json
 
 import fidsplat as fs
+from fidsplat.capture.quality import LADDER
 from fidsplat.cli import main
-from fidsplat.quality import LADDER
 from fidsplat.vision.images import write_png
 
 

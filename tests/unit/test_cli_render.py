@@ -49,7 +49,7 @@ def names(folder) -> set[str]:
 
 
 def test_a_budget_is_measured_and_told(scene, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("fidsplat.budget.store.folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr("fidsplat.accuracy.cache.folder", lambda: tmp_path / "cache")
     words = ["render", scene, "--max-error", "1e-3", "--max-ms", "60000"]
     assert main([*words, "--json"]) == 0
     chosen = said(capsys)["chosen"]
@@ -72,7 +72,7 @@ def test_a_budget_is_measured_and_told(scene, tmp_path, capsys, monkeypatch):
     [(["--max-error", "nan"], "error is nan"), (["--max-error", "1e-12"], "the least is")],
 )
 def test_a_budget_that_cannot_be(scene, tmp_path, capsys, monkeypatch, words, message):
-    monkeypatch.setattr("fidsplat.budget.store.folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr("fidsplat.accuracy.cache.folder", lambda: tmp_path / "cache")
     assert main(["render", scene, *words]) == 2
     assert message in capsys.readouterr().err
 

@@ -8,8 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fidsplat as fs
-from fidsplat.harmonics import C0
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.harmonics import C0
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 LIMITS = [f"{end}_{part}{axis}" for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
 COLOR_LIMITS = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"]

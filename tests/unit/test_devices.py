@@ -11,7 +11,7 @@ import fidsplat as fs
 from fidsplat.backends import registry
 from fidsplat.backends.opencl import device, vendors
 from fidsplat.backends.opencl.pocl_workarounds import target_patch
-from fidsplat.errors import UnknownDeviceError
+from fidsplat.util.errors import UnknownDeviceError
 
 POCL = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-"
 

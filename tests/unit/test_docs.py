@@ -43,7 +43,7 @@ def load_scene(example: Example) -> None:
 
 PARSED_ONLY = {
     "bench": "times the machine",
-    "check": "minutes; tests/hard_cases",
+    "check": "minutes; tests/selftest",
     "demo": "tests/unit/test_demo.py runs it",
     "experiment": "minutes; tests/experiments",
     "store measure": "minutes; tests/unit/test_store_detail.py",

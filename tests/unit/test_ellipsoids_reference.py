@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 WIDTH, HEIGHT, FOCAL, NEAR = 60, 44, 40.0, 0.05
 CUT = 1e-4

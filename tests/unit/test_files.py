@@ -10,20 +10,20 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.errors import InputError
 from fidsplat.experiments.charts import bars, chart
 from fidsplat.experiments.gallery import Piece, write_gallery
 from fidsplat.experiments.summary import read_summary
 from fidsplat.experiments.sweep import read_records
-from fidsplat.files import atomic_write, writable_folder
 from fidsplat.formats import load_splats, save_splats
 from fidsplat.formats.colmap import save_colmap
-from fidsplat.npy import load_npy
 from fidsplat.sim import read_description
 from fidsplat.store.build import build_store
 from fidsplat.store.store import Store
 from fidsplat.train import splats_of
 from fidsplat.train.read import load_dataset
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, writable_folder
+from fidsplat.util.npy import load_npy
 from fidsplat.vision.images import pictures, read_image, write_png
 from fidsplat.vision.metrics import load_lpips
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.rotations import quaternion_multiply, quaternion_to_matrix, rigid_matrix
 from fidsplat.sim import read_description
+from fidsplat.splats.rotations import quaternion_multiply, quaternion_to_matrix, rigid_matrix
 from fidsplat.train.read import load_dataset
 from fidsplat.vision.images import write_png
 

@@ -14,8 +14,8 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.formats import losses
 from fidsplat.formats.files import FORMATS
-from fidsplat.harmonics import C0
-from fidsplat.rotations import quaternion_to_matrix, rigid_matrix
+from fidsplat.splats.harmonics import C0
+from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
 
 USD = [pytest.param(suffix, id=suffix) for suffix in (".usda", ".usdc", ".usd")]
 

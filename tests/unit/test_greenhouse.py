@@ -7,9 +7,9 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.sim.greenhouse import AISLE, BENCH, SPACING, TAG_HEIGHT, Greenhouse, facing
-from fidsplat.sim.plants import KINDS
 from fidsplat.vision import read_back
+from fidsplat.worlds.greenhouse import AISLE, BENCH, SPACING, TAG_HEIGHT, Greenhouse, facing
+from fidsplat.worlds.plants import KINDS
 
 
 @pytest.fixture(scope="module")

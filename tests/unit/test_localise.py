@@ -9,15 +9,15 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.rotations import rigid_matrix
 from fidsplat.sim.localiser import Localiser
+from fidsplat.splats.rotations import rigid_matrix
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
 
 from fidsplat.experiments.localise import Localise, errors_of, write_log  # noqa: E402 (needs MuJoCo)
 from fidsplat.experiments.localise_sweep import write_report  # noqa: E402
-from fidsplat.sim.greenhouse import Greenhouse  # noqa: E402
-from fidsplat.sim.robot import (  # noqa: E402
+from fidsplat.worlds.greenhouse import Greenhouse  # noqa: E402
+from fidsplat.worlds.robot import (  # noqa: E402
     BODY,
     CAMERA_AT,
     CONTROL,

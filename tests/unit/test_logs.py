@@ -9,7 +9,7 @@ from full_disk import small_files
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.rotations import rigid_matrix
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.images import to_uint8
 

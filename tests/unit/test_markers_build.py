@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.capture.quality import NESTED
 from fidsplat.markers import Marker, Rectangle, marker
-from fidsplat.quality import NESTED
 from fidsplat.vision.images import write_png
 
 

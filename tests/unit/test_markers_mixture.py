@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from fidsplat.errors import InputError
+from fidsplat.capture.quality import TEMPLATE_SIZES
 from fidsplat.markers.kinds import bits_of, parse_spec
 from fidsplat.markers.mixture import (
     OVERLAP,
@@ -22,7 +22,7 @@ from fidsplat.markers.mixture import (
 )
 from fidsplat.markers.partition import partition
 from fidsplat.markers.seams import LONG, grow
-from fidsplat.quality import TEMPLATE_SIZES
+from fidsplat.util.errors import InputError
 from fidsplat.vision.dictionaries import dictionary_bits, families
 
 

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from fidsplat.errors import InputError
 from fidsplat.markers import marker, parse_spec
 from fidsplat.markers.kinds import bits_of
 from fidsplat.markers.qr import qr_capacity
+from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import detect
 from fidsplat.vision.dictionaries import dictionary_bits, families
 

@@ -10,8 +10,8 @@ from agreement import random_splats
 import fidsplat as fs
 from fidsplat.backends.prepare import view_of
 from fidsplat.cameras.screw import between
-from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.scenes import PlacedMarker
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 
 def random_pose(generator, angle=None):

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.prepare import view_of as moved_view_of
-from fidsplat.backends.stack import ViewStack
 from fidsplat.backends.view import View
-from fidsplat.hard_cases.clouds import splats, taken, turned
-from fidsplat.rotations import quaternion_to_matrix
-from fidsplat.views import views_of
+from fidsplat.capture.views import views_of
+from fidsplat.selftest.clouds import splats, taken, turned
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.4, -0.2, -2.0), (0, 0, 0))
 

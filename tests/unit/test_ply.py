@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import fidsplat as fs
 from fidsplat.formats import collect
-from fidsplat.harmonics import C0
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.harmonics import C0
+from fidsplat.splats.rotations import quaternion_to_matrix
 
 F32 = np.float32
 PLAIN = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1"]

@@ -80,7 +80,7 @@ def test_the_patch_is_announced_once(tmp_path):
 
 LEAK = """
 import gc, resource, fidsplat as fs
-from fidsplat.random_clouds import random_splats
+from fidsplat.scenes.random_clouds import random_splats
 cloud, camera = random_splats(3, 0), fs.Camera.pinhole(8, 8, 8, 8, 4, 4)
 def used():
     for _ in range(20):

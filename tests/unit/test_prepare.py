@@ -4,7 +4,7 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare, view_of
-from fidsplat.random_clouds import random_splats
+from fidsplat.scenes.random_clouds import random_splats
 
 CAMERA = fs.Camera.pinhole(32, 24, 30.0, 30.0, 16.0, 12.0)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat import provenance
 from fidsplat.cameras import Motion, Trajectory
+from fidsplat.util import provenance
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +21,8 @@ def tree():
 @pytest.mark.parametrize(
     "folder",
     [
-        "kernels/opencl", "kernels/warp", "fidsplat/scenes", "fidsplat/hard_cases",
-        "fidsplat/experiments/bench", "fidsplat/budget", "fidsplat/backends/warp", "fidsplat/vision",
+        "kernels/opencl", "kernels/warp", "fidsplat/scenes", "fidsplat/selftest",
+        "fidsplat/experiments/bench", "fidsplat/accuracy", "fidsplat/backends/warp", "fidsplat/vision",
     ],
 )  # fmt: skip
 def test_a_changed_source_is_other_code(tree, tmp_path, monkeypatch, folder):
@@ -38,7 +38,7 @@ def test_a_changed_source_is_other_code(tree, tmp_path, monkeypatch, folder):
 
 
 def test_data_counts_and_what_python_makes_of_sources_does_not(tree):
-    assert "fidsplat/budget/prices.json" in tree
+    assert "fidsplat/accuracy/prices.json" in tree
     assert not [name for name in tree if "__pycache__" in name or name.endswith(".pyc")]
 
 

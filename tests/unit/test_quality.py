@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.capture.quality import TEMPLATE_SIZES
 from fidsplat.markers.mixture import fitted_templates
-from fidsplat.quality import TEMPLATE_SIZES
 
 TEMPLATES = files("fidsplat.markers").joinpath("templates.json")
 WRONG = {

@@ -11,8 +11,8 @@ from sampling import in_turn
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments.demo_scene import demo_scene, demo_views
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision import read_back
 from fidsplat.vision.detect import Detection
 from fidsplat.vision.images import write_png

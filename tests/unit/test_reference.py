@@ -8,8 +8,8 @@ from combined import LENSES, SWITCHES
 import fidsplat as fs
 from fidsplat.backends.reference import backend
 from fidsplat.effects import OUTPUTS
-from fidsplat.hard_cases.agreement import Picture, truth_of
-from fidsplat.rotations import rigid_matrix
+from fidsplat.selftest.agreement import Picture, truth_of
+from fidsplat.splats.rotations import rigid_matrix
 
 CAMERAS = {"pinhole": fs.Camera.pinhole(37, 22, 30.0, 30.0, 18.0, 11.0)}
 CAMERAS |= {name: SWITCHES[name].camera for name in LENSES}

@@ -8,10 +8,10 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.flights import Flight, FlightFolder
 from fidsplat.remote.flights import FlightWork, draw
 from fidsplat.remote.queue import ATTEMPTS, WorkerLost, drain
 from fidsplat.remote.ray_engine import _share
+from fidsplat.render.flight import Flight, FlightFolder
 from fidsplat.scenes import PlacedMarker
 
 

@@ -6,11 +6,11 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments.sweep import read_records
-from fidsplat.flights import Flight, FlightFolder
 from fidsplat.remote import ray_engine as module
 from fidsplat.remote.flights import FlightWork, draw
 from fidsplat.remote.queue import WorkerLost
 from fidsplat.remote.ray_engine import ray_engine
+from fidsplat.render.flight import Flight, FlightFolder
 from fidsplat.scenes import PlacedMarker
 
 ray = pytest.importorskip("ray", reason="the extra ray is not installed")

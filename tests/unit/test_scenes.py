@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fidsplat as fs
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
+from fidsplat.splats.rotations import rigid_matrix
 
 F32 = np.float32
 

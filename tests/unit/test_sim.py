@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.scenes import PlacedMarker
 from fidsplat.sim import Rig, RigCamera
 from fidsplat.sim.poses import compose, inverse, matrix_of, pose_of, quaternions_of
+from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.vision import read_back
 
 SIZE = 160, 120

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.harmonics import C0
+from fidsplat.splats.harmonics import C0
 
 F32 = np.float32
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.rotations import quaternion_to_matrix, rigid_matrix
+from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
 
 F32 = np.float32
 

@@ -8,9 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fidsplat as fs
-from fidsplat.harmonics import rotation_of_coefficients
-from fidsplat.rotations import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix, rigid_matrix
-from fidsplat.splats import sh_basis
+from fidsplat.splats.cloud import sh_basis
+from fidsplat.splats.harmonics import rotation_of_coefficients
+from fidsplat.splats.rotations import (
+    matrix_to_quaternion,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    rigid_matrix,
+)
 
 F32 = np.float32
 component = st.floats(-1, 1, allow_subnormal=False)

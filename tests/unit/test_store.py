@@ -9,7 +9,7 @@ import pytest
 from small_stores import COUNT, SMALL, contents, store_fixtures
 
 import fidsplat as fs
-from fidsplat.rotations import rigid_matrix
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.store.layout import FAR, NODE, NPY_HEADER, header_crc
 from fidsplat.store.merge import REDUCTION
 
@@ -315,7 +315,7 @@ def test_a_store_of_places_has_the_splats_as_many_times(store, files, tmp_path):
 
 
 def test_sh_turns_with_its_splats(store, files, tmp_path):
-    from fidsplat.store.part import moved
+    from fidsplat.store.subset import moved
 
     part = store.load(0)
     pose = rigid_matrix((1, 2, 3), (0.3, 0.1, -0.7, 0.2))

@@ -12,7 +12,7 @@ from full_disk import small_files
 from small_stores import COUNT, NOTED, SMALL, WINDOW, contents, store_fixtures
 
 import fidsplat as fs
-from fidsplat.store import build, plan
+from fidsplat.store import build, build_plan
 
 cut, files, store = store_fixtures()
 
@@ -108,7 +108,7 @@ def test_chunks_whose_levels_take_more_than_the_memory_are_refused(files, tmp_pa
             with lock:
                 under_way -= 1
 
-    monkeypatch.setattr(plan, "_MERGING", (400, 6))
+    monkeypatch.setattr(build_plan, "_MERGING", (400, 6))
     monkeypatch.setattr(build, "merged", merged)
     with pytest.raises(fs.InputError, match=r"chunk is 500; .* and memory is 1 MiB") as refused:
         fs.build_store(files, tmp_path / "both.fss", **SMALL)

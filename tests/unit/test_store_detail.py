@@ -9,19 +9,19 @@ import pytest
 from test_store_drawing import splats
 
 import fidsplat as fs
-from fidsplat.accuracy import truth
+from fidsplat.accuracy.error import truth
+from fidsplat.accuracy.level_of_detail import SIZES, cameras_around, errors_of, measure_detail
+from fidsplat.accuracy.price_list import load as load_prices
+from fidsplat.accuracy.quality_within import Choice
+from fidsplat.backends.frustum_culling import sizes
 from fidsplat.backends.prepare import prepare
-from fidsplat.backends.seen import sizes
-from fidsplat.budget import Choice
-from fidsplat.budget.prices import load as load_prices
 from fidsplat.cli import main
-from fidsplat.detail import SIZES, cameras_around, errors_of, measure_detail
-from fidsplat.store import plan
-from fidsplat.store.city import PITCH, City, flight
+from fidsplat.store import build_plan
 from fidsplat.store.detail import MARGIN, Detail, load_details, pixels, save_details
 from fidsplat.store.sources import sample, splats_of
-from fidsplat.store.streamed import Streamed
+from fidsplat.streaming.selection import Streamed
 from fidsplat.vision import read_back
+from fidsplat.worlds.city import PITCH, City, flight
 
 QUALITY = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8)
 
@@ -29,7 +29,7 @@ QUALITY = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8)
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "_LEAST_MEMORY", 0)
+        patch.setattr(build_plan, "_LEAST_MEMORY", 0)
         city = City(6000, houses=2)
         return fs.Store(fs.build_store([city.source], tmp_path_factory.mktemp("city") / "c.fss", chunk=128))
 
@@ -311,7 +311,7 @@ def test_a_budget_of_time_alone_turns_detail_too(store, renderer, monkeypatch, t
         own = candidate.of(base)
         return Choice(own, errors[base.detail_error], 1.0, 1.0, "measured", "here", candidate.knobs)
 
-    monkeypatch.setattr(sys.modules["fidsplat.budget.choose"], "_measured", found)
+    monkeypatch.setattr(sys.modules["fidsplat.accuracy.quality_within"], "_measured", found)
     asked = {"scene": store, "capture": seen_from(1500.0), "device": renderer}
     asked["capture"] = fs.Capture(asked["capture"], quality="lowpass=pixel")
     for _ in range(2):  # the second is kept

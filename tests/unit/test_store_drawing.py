@@ -12,13 +12,14 @@ from small_stores import contents
 from store_views import COUNT, SIZE, TURNED, look, made_store, made_stores, splats
 
 import fidsplat as fs
+from fidsplat.backends.frustum_culling import seen
 from fidsplat.backends.prepare import prepare
-from fidsplat.backends.seen import seen
-from fidsplat.random_clouds import random_splats
-from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
-from fidsplat.store import plan, streamed
+from fidsplat.scenes.random_clouds import random_splats
+from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.store import build_plan
 from fidsplat.store.sources import source_of
-from fidsplat.store.streamed import Streamed
+from fidsplat.streaming import selection
+from fidsplat.streaming.selection import Streamed
 
 CAPTURES = {
     "pinhole": fs.Capture(look(turn=TURNED)),
@@ -68,7 +69,7 @@ def test_views_are_drawn_of_what_they_see(stores, reference, name):
         for output in ours:
             assert np.array_equal(ours[output], whole[output]), output
         assert whole["rgb"].any()
-        read, every = streamed.data.nodes, store.chunks
+        read, every = selection.data.nodes, store.chunks
         assert 0 < read <= every
         if name in ("pinhole", "distorted", "pixel"):
             assert read < 0.75 * every
@@ -315,12 +316,12 @@ def test_stores_with_origins_of_their_own_stand_where_they_were_built(tmp_path, 
 
 
 def test_a_scene_has_no_more_splats_than_indices(stores, monkeypatch):
-    monkeypatch.setattr(streamed, "MOST_SPLATS", 2 * COUNT - 1)
+    monkeypatch.setattr(selection, "MOST_SPLATS", 2 * COUNT - 1)
     with pytest.raises(fs.InputError, match="6,000 splats are too many"):
         Streamed([stores["disks"], stores["thick"]])
-    monkeypatch.setattr(plan, "MOST_SPLATS", COUNT - 1)
+    monkeypatch.setattr(build_plan, "MOST_SPLATS", COUNT - 1)
     with pytest.raises(fs.InputError, match="3,000 splats are too many for a store"):
-        plan.plan_of([source_of(splats(1), stores["disks"].path, "test")])
+        build_plan.plan_of([source_of(splats(1), stores["disks"].path, "test")])
 
 
 def test_planes_of_stores_are_always_whole(tmp_path, reference):
@@ -341,7 +342,7 @@ def test_planes_of_stores_are_always_whole(tmp_path, reference):
 
 
 def test_a_flight_over_a_store_goes_on_by_its_content(stores, tmp_path):
-    from fidsplat.flights import Flight
+    from fidsplat.render.flight import Flight
 
     path = fs.Trajectory([0.0, 1.0], [np.eye(4), rigid_matrix((0, 0, 1))])
 

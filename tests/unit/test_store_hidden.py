@@ -8,12 +8,12 @@ from agreement import ALL_OUTPUTS
 from store_views import TURNED, look, made_store, splats
 
 import fidsplat as fs
-from fidsplat.backends import ends
+from fidsplat.backends import termination_depth
 from fidsplat.backends.prepare import prepare
 from fidsplat.effects.select import with_tile_ends
-from fidsplat.rotations import rigid_matrix
-from fidsplat.store import hidden, pieces
-from fidsplat.store.streamed import Streamed
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.streaming import occlusion_culling, subchunks
+from fidsplat.streaming.selection import Streamed
 
 
 def walls():
@@ -49,19 +49,19 @@ def town(tmp_path_factory):
 @pytest.fixture
 def asked(monkeypatch):
     """Every view is asked for what is hidden; gives what each was drawn of, of how many splats."""
-    drawn, counts = hidden.Hidden.drawn, []
-    monkeypatch.setattr(hidden, "LEAST", 0)
-    monkeypatch.setattr(hidden, "_FIRST", 3000)
-    monkeypatch.setattr(hidden, "_SMALL", 1)
-    monkeypatch.setattr(hidden, "_RESTS", 0)
-    monkeypatch.setattr(pieces, "ROWS", 24)
+    drawn, counts = occlusion_culling.Hidden.drawn, []
+    monkeypatch.setattr(occlusion_culling, "LEAST", 0)
+    monkeypatch.setattr(occlusion_culling, "_FIRST", 3000)
+    monkeypatch.setattr(occlusion_culling, "_SMALL", 1)
+    monkeypatch.setattr(occlusion_culling, "_RESTS", 0)
+    monkeypatch.setattr(subchunks, "ROWS", 24)
 
     def noted(self, whole, *given):
         made = drawn(self, whole, *given)
         counts.append((whole.count if made is None else made[0][0].count, whole.count))
         return made
 
-    monkeypatch.setattr(hidden.Hidden, "drawn", noted)
+    monkeypatch.setattr(occlusion_culling.Hidden, "drawn", noted)
     return counts
 
 
@@ -131,8 +131,8 @@ def test_the_same_view_is_drawn_once(town, asked, monkeypatch):
 @pytest.mark.parametrize("way", ["centres", "pixels", "samples", "odd samples", "groups", "bands"])
 def test_what_is_missing_is_drawn_in_its_tiles_alone(town, asked, monkeypatch, way):
     """The last view's ends are taken too near, so that some of what shows is not drawn at first."""
-    monkeypatch.setattr(hidden, "_SLACK", -6.0)
-    monkeypatch.setattr(hidden, "_SOME", 1)
+    monkeypatch.setattr(occlusion_culling, "_SLACK", -6.0)
+    monkeypatch.setattr(occlusion_culling, "_SOME", 1)
     renderer, taken, path = fs.Renderer("opencl"), [], [view(), view(0.02, 0.1), view(0.03, 0.5)]
     backend = type(renderer.backend)
     take, outputs = backend.take_tiles, ALL_OUTPUTS if way != "groups" else ("rgb", "splat_id")
@@ -175,9 +175,9 @@ def test_views_of_about_as_many_splats_take_no_new_memory(town, asked, monkeypat
 
 
 def test_of_what_lets_light_through_nothing_is_hidden(tmp_path, asked, monkeypatch):
-    monkeypatch.setattr(hidden, "_RESTS", 2)
-    monkeypatch.setattr(hidden, "_SMALL", 4)
-    monkeypatch.setattr(hidden, "_FIRST", 500)
+    monkeypatch.setattr(occlusion_culling, "_RESTS", 2)
+    monkeypatch.setattr(occlusion_culling, "_SMALL", 4)
+    monkeypatch.setattr(occlusion_culling, "_FIRST", 500)
     cloud = splats(4)
     faint = fs.SplatCloud(
         cloud.means, cloud.quats, cloud.scales, np.full(len(cloud), 0.05, np.float32), colors=cloud.colors
@@ -204,9 +204,9 @@ def test_levels_of_detail_and_places_are_hidden_too(town, tmp_path, asked, monke
     )
     for camera in PATH[:3]:
         ours = renderer.render(resident, camera, outputs=("rgb", "depth", "splat_id"))
-        monkeypatch.setattr(hidden, "LEAST", 1 << 60)
+        monkeypatch.setattr(occlusion_culling, "LEAST", 1 << 60)
         every = renderer.render(renderer.upload(whole), camera, outputs=("rgb", "depth", "splat_id"))
-        monkeypatch.setattr(hidden, "LEAST", 0)
+        monkeypatch.setattr(occlusion_culling, "LEAST", 0)
         for output in every:
             assert np.array_equal(ours[output], every[output])
     assert all(count < 0.9 * of for count, of in asked)
@@ -255,8 +255,8 @@ def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(n
         return cloud.means - sigmas * largest[:, None], cloud.means + sigmas * largest[:, None]
 
     shown = np.flatnonzero(trace["keys"] < 0xFFFFFFFE)
-    keys = ends.TileEnds.of_keys(trace["keys"], (1, 1)).depths
-    least = ends.least_keys(view, features, boxes)
+    keys = termination_depth.TileEnds.of_keys(trace["keys"], (1, 1)).depths
+    least = termination_depth.least_keys(view, features, boxes)
     assert (least[shown] <= keys[shown]).all()
     # of one tile for each sample: what each splat touches ends behind all, the rest before all
     records, rectangles = trace["records"], np.full((len(cloud), 4), -1)
@@ -267,9 +267,9 @@ def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(n
         y0, y1, x0, x1 = rectangles[i]
         for row, column in ((y0, x0), (y0, x1 - 1), (y1 - 1, x0), (y1 - 1, x1 - 1)):
             depths[row, column] = np.inf
-            given = ends.TileEnds(depths, (1, 1))
+            given = termination_depth.TileEnds(depths, (1, 1))
             only = lambda sigmas, i=i: tuple(each[i : i + 1] for each in boxes(sigmas))  # noqa: E731
-            assert not ends.hidden(view, features, only, largest[i : i + 1], given).any()
+            assert not termination_depth.hidden(view, features, only, largest[i : i + 1], given).any()
             depths[row, column] = -np.inf
 
 
@@ -312,9 +312,9 @@ def test_ends_of_some_tiles():
         np.array([[1.0, np.inf], [3.0, 4.0]], np.float32),
         np.array([[True, True], [False, False]]),
     )
-    some = ends.TileEnds(depths, (16, 16))
+    some = termination_depth.TileEnds(depths, (16, 16))
     assert np.array_equal(some.within(tiles).depths, [[1.0, np.inf], [-np.inf, -np.inf]])
-    others = ends.TileEnds(np.full((2, 2), 7, np.float32), (16, 16))
+    others = termination_depth.TileEnds(np.full((2, 2), 7, np.float32), (16, 16))
     assert np.array_equal(some.replaced(tiles, others).depths, [[7.0, 7.0], [3.0, 4.0]])
 
 
@@ -323,7 +323,7 @@ def test_the_largest_in_rectangles():
     values = generator.normal(size=(13, 21))
     tops, lefts = generator.integers(0, 13, 300), generator.integers(0, 21, 300)
     bottoms, rights = generator.integers(0, 14, 300), generator.integers(0, 22, 300)
-    found = ends._Largest(values).within(tops, bottoms, lefts, rights)
+    found = termination_depth._Largest(values).within(tops, bottoms, lefts, rights)
     for k, (top, bottom, left, right) in enumerate(zip(tops, bottoms, lefts, rights, strict=True)):
         assert found[k] == values[top:bottom, left:right].max(initial=-np.inf)
 
@@ -334,7 +334,7 @@ def test_a_needle_that_ewa_draws_into_a_wide_picture_is_on_it():
     sigmas = np.array([[1e-3, 1e-3, 0.06]], np.float32)
     means = np.array([[-7.6, 0, 1]], np.float32)
     needle = fs.SplatCloud(means, [[1, 0, 0, 0]], sigmas, [0.99], colors=[[1, 1, 1]])
-    nowhere_finished = ends.TileEnds(np.full((1, 125), np.inf, np.float32), (16, 16))
+    nowhere_finished = termination_depth.TileEnds(np.full((1, 125), np.inf, np.float32), (16, 16))
     features, shot = prepare(needle, fs.Capture(camera, quality=fs.Quality(ellipsoid="ewa")))
     given = shot, features, lambda count: (means - count * sigmas, means + count * sigmas)
-    assert not ends.hidden(*given, sigmas.max(axis=1), nowhere_finished).any()
+    assert not termination_depth.hidden(*given, sigmas.max(axis=1), nowhere_finished).any()

@@ -14,9 +14,9 @@ from store_views import TURNED, look, made_stores
 import fidsplat as fs
 from fidsplat.backends.opencl import chunks, workspace
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
-from fidsplat.rotations import rigid_matrix
-from fidsplat.store import bands
-from fidsplat.store.streamed import Streamed
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.streaming import bands
+from fidsplat.streaming.selection import Streamed
 
 
 @pytest.fixture(scope="module")

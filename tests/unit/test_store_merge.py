@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.harmonics import C0
-from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats.harmonics import C0
+from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.store.merge import DENSEST, merged, quaternions_of
 from fidsplat.store.morton import Grid, grid_around
 

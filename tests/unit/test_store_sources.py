@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.random_clouds import random_splats
+from fidsplat.scenes.random_clouds import random_splats
 
 
 def test_a_file_that_lies_about_its_count_builds_nothing(tmp_path):

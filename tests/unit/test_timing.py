@@ -1,11 +1,11 @@
-"""One loop times everything (`fidsplat.timing`)."""
+"""One loop times everything (`fidsplat.util.timing`)."""
 
 import math
 
 import pytest
 
-from fidsplat.errors import DeviceError
-from fidsplat.timing import Clock, Timer, quartiles, ratios, take_turns
+from fidsplat.util.errors import DeviceError
+from fidsplat.util.timing import Clock, Timer, quartiles, ratios, take_turns
 
 
 def timers(order, *seconds):

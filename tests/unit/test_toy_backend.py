@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.accuracy import draws_float64
+from fidsplat.accuracy.error import draws_float64
 from fidsplat.backends import registry
 
 CAMERA = fs.Camera.pinhole(6, 4, 6.0, 6.0, 3.0, 2.0)
@@ -12,9 +12,9 @@ CLOUD = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.9], colors=[
 TOY = '''
 """Draws the background, and nothing else."""
 import numpy as np
-from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.interface import DeviceInfo
 from fidsplat.effects import OUTPUTS
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 INFO = DeviceInfo("toy", "Toy", "Toys", "1", "other", 1, 1, 1, False, True, "")
 

@@ -83,6 +83,6 @@ def test_a_run_that_is_interrupted_keeps_what_it_has_done(folder, tmp_path, caps
     assert main([*words, str(file)]) == 0
     assert file.read_bytes() == (tmp_path / "whole.ply").read_bytes()
     interrupts[0] = 2
-    monkeypatch.setattr("fidsplat.interrupts.REPEAT", 0.0)
+    monkeypatch.setattr("fidsplat.util.interrupts.REPEAT", 0.0)
     assert main([*words, str(tmp_path / "b.ply")]) == 130
     assert list(tmp_path.glob("b.*")) == []

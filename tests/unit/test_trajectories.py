@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.rotations import quaternion_to_matrix, rigid_matrix
+from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
 
 CAMERA = fs.Camera.pinhole(640, 480, 500.0, 510.0, 320.0, 240.0)
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.bop import DEPTH_SCALE, BopScene
 from fidsplat.vision.coco import CocoAnnotations, run_lengths
 from fidsplat.vision.images import read_image

@@ -9,8 +9,8 @@ import pytest
 from viewing import HERE, TAG, scene
 
 import fidsplat as fs
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.viewer import session as session_module
 from fidsplat.viewer.session import Session
 from fidsplat.viewer.settings import AT_REST, Settings

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.rotations import rigid_matrix
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.viewer.edits import SceneFile, placed
 
 FILE = """# a scene, with words of its own

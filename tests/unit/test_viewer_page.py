@@ -14,7 +14,7 @@ import pytest
 from viewing import HERE, Client, scene, until
 
 import fidsplat as fs
-from fidsplat.rotations import rigid_matrix
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.viewer.edits import Body
 from fidsplat.viewer.session import View
 from fidsplat.viewer.settings import Settings

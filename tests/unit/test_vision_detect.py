@@ -6,7 +6,7 @@ import pytest
 from ideal_picture import draw, photographed, pose, qr_bits, turned
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.detect import DEFAULT_FAMILIES, detect
 from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family, predefined

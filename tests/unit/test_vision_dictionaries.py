@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family
 
 

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fidsplat.errors import InputError
-from fidsplat.surroundings import Panorama
+from fidsplat.capture.environment import Panorama
+from fidsplat.util.errors import InputError
 from fidsplat.vision.images import read_bits, read_image, to_uint8, write_png
 
 

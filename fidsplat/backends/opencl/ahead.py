@@ -10,7 +10,7 @@ from contextlib import suppress
 import pyopencl as cl
 
 from fidsplat.backends.opencl.program import in_background
-from fidsplat.errors import FidsplatError
+from fidsplat.util.errors import FidsplatError
 
 
 class Ahead:

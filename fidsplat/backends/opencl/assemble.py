@@ -26,8 +26,8 @@ from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.layout import BOUNDS, KERNELS, SPLAT, VIEW
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet
-from fidsplat.errors import DeviceError
-from fidsplat.kernel_files import kernels_folder
+from fidsplat.util.errors import DeviceError
+from fidsplat.util.kernel_files import kernels_folder
 
 _LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",), "gathered": ("tiles", "gathered")}
 """stages of the program `lists`, by the way of listing"""

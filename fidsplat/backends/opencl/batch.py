@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.blank import blank
 from fidsplat.backends.opencl.images import Drawn
 from fidsplat.backends.opencl.workspace import Workspace
-from fidsplat.backends.stack import ViewBatch
 from fidsplat.effects.catalogue import Output
-from fidsplat.errors import DeviceError, bytes_words
+from fidsplat.util.errors import DeviceError, bytes_words
 
 _MOST = {"cpu": 1 << 28}
 """bytes that the views of a part take together, beside their images: more is no faster"""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.chunks import Chunk, WholeScene
+from fidsplat.backends.chunk_cache import Chunk, WholeScene
 from fidsplat.backends.opencl.assemble import kernel_text
 from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.workspace import Workspace

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import check_once
-from fidsplat.backends.chunks import WholeScene
-from fidsplat.backends.ends import TileEnds
+from fidsplat.backends.chunk_cache import WholeScene
+from fidsplat.backends.interface import DeviceInfo, Rates
 from fidsplat.backends.opencl.ahead import Ahead
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.chunks import OpenCLChunks
@@ -27,11 +26,12 @@ from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, o
 from fidsplat.backends.opencl.training import OpenCLTraining
 from fidsplat.backends.opencl.vendors import intel_among_them
 from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.termination_depth import TileEnds
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
-from fidsplat.errors import DeviceError, UnknownDeviceError
-from fidsplat.files import user_cache
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import DeviceError, UnknownDeviceError
+from fidsplat.util.files import user_cache
 
 _PYOPENCL_FILES = ("binary", "info", "source.cl")
 _NO_PATCH_NEEDED = (

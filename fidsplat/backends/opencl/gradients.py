@@ -37,7 +37,7 @@ from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
-from fidsplat.errors import DeviceError, InputError
+from fidsplat.util.errors import DeviceError, InputError
 
 _GROUP = 64  # RESERVED, POSED, ADDED and STEPPED of the kernels
 _F32 = np.dtype(np.float32)

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.ends import TileEnds
 from fidsplat.backends.opencl.counts import fullness_of, read_counts, stats_of
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.recording import Recording
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uint8 import read_uint8
 from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.termination_depth import TileEnds
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
 

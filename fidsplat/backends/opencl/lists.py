@@ -22,7 +22,7 @@ from fidsplat.backends.opencl.counts import COUNTS, counts_after, fullness_of, r
 from fidsplat.backends.opencl.memory_plan import BIG, KEYS, WINDOWS
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.workspace import Workspace
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 # words of the buffer `tallies`, as in prelude.cl
 _VISIBLE, _PAIRS, _BIG, _TALLIES = 0, 2, 6, 8

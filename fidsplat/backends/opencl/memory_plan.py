@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fidsplat.errors import DeviceError, bytes_words
+from fidsplat.util.errors import DeviceError, bytes_words
 
 CHUNK = 1 << 20
 """most splats that are projected at once where a cloud is taken in chunks; a power of two, so that pieces of

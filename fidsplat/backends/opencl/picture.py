@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.batched_views import ViewStack
 from fidsplat.backends.opencl.declare import Argument
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import Workspace
-from fidsplat.backends.stack import ViewStack
 from fidsplat.backends.view import View
 
 _GRID = (16, 4)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.batched_views import ViewBatch, ViewStack
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers, parts
 from fidsplat.backends.opencl.drawing import Slots, draw
@@ -31,11 +32,10 @@ from fidsplat.backends.opencl.recording import Recording
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import RayBuffers, Workspace
-from fidsplat.backends.stack import ViewBatch, ViewStack
 from fidsplat.backends.view import View
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 _OF_CAMERAS = ("ray", "vignette_center")
 """groups of uniforms that differ where cameras do"""

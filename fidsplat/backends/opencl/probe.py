@@ -15,7 +15,7 @@ from fidsplat.backends.opencl.assemble import section_text
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import build_options, check_kernels
 from fidsplat.backends.opencl.workspace import BufferPool, Workspace
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 
 def evaluate(

@@ -11,14 +11,14 @@ from typing import Any
 
 import pyopencl as cl
 
-from fidsplat import interrupts
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl
 from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_program
 from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import Workspace, token_of
-from fidsplat.errors import DeviceError
+from fidsplat.util import interrupts
+from fidsplat.util.errors import DeviceError
 
 in_background = threading.local()
 """`on` in threads whose starter has filtered warnings for them: filters are the whole process's"""

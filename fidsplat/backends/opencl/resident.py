@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
-from fidsplat.backends.planes import PlaneTable
-from fidsplat.errors import DeviceError
-from fidsplat.harmonics import color_range
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import color_range
+from fidsplat.util.errors import DeviceError
 
 _VECTOR = 16
 """bytes of the vectors that kernels read of arrays"""

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import Rates
+from fidsplat.backends.interface import Rates
 from fidsplat.backends.opencl.program import check_kernels
 from fidsplat.backends.opencl.workspace import Workspace
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 _CHAINS = 8  # as in roofline.cl
 _REPEATS = 7

@@ -25,7 +25,7 @@ from fidsplat.backends.opencl.training_source import (
 )
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras import Camera
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 _GROUP = 64
 _SUMS, _SUMMED = 512, 128

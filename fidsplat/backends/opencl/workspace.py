@@ -16,7 +16,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.interface import DeviceInfo
 from fidsplat.backends.opencl.host_memory import HostMemory
 from fidsplat.backends.opencl.memory_plan import PAIR
 from fidsplat.backends.opencl.pages import large_pages
@@ -24,7 +24,7 @@ from fidsplat.backends.opencl.pocl_workarounds import is_pocl
 from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_context
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.cameras.raster import RayRaster
-from fidsplat.errors import DeviceError, bytes_words
+from fidsplat.util.errors import DeviceError, bytes_words
 
 _LEAST = 16  # bytes; OpenCL has no empty buffers
 _LARGE = 1 << 22  # bytes from which large pages are asked for

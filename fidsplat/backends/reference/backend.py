@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat import interrupts
-from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.interface import DeviceInfo
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.culling import may_see
 from fidsplat.backends.reference.gradients import ReferenceGradients
@@ -20,9 +19,10 @@ from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES, FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
-from fidsplat.errors import InputError, UnknownDeviceError
-from fidsplat.harmonics import color_range
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import color_range
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError, UnknownDeviceError
 
 _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once: half a megabyte each, which caches hold
 _TILE = 16  # samples along a side of those for which splats are chosen together

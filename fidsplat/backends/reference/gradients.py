@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Images, Pipeline
 from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
+from fidsplat.backends.interface import Images, Pipeline
 from fidsplat.backends.reference.gradients_blend import Blend, Decisions, Samples, decide
 from fidsplat.backends.reference.gradients_scene import Parameters, Placed, place, place_backward
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
-from fidsplat.errors import InputError
+from fidsplat.util.errors import InputError
 
 _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from fidsplat.backends.view import View
-from fidsplat.splats import SplatCloud, sh_basis
+from fidsplat.splats.cloud import SplatCloud, sh_basis
 
 _SMALLEST = float(np.float32(1e-20))
 """metres: scales below it are drawn as that"""

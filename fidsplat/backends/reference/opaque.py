@@ -11,7 +11,7 @@ from fidsplat.backends.reference.fragments import Fragments
 from fidsplat.backends.reference.layers import Stack
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
-from fidsplat.surroundings import Layer
+from fidsplat.capture.environment import Layer
 
 
 @dataclass

@@ -6,7 +6,7 @@ import numpy as np
 
 from fidsplat.backends.reference.optics import rays_of
 from fidsplat.backends.view import View
-from fidsplat.surroundings import Gradient, Panorama
+from fidsplat.capture.environment import Gradient, Panorama
 
 _ROUND = 2e-6
 """what float32 may change in a value, per unit, before a step that may magnify it"""

@@ -7,11 +7,11 @@ from copy import copy
 
 import numpy as np
 
-from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.reference import ellipsoids, optics
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
-from fidsplat.splats import SplatCloud, sh_basis
+from fidsplat.splats.cloud import SplatCloud, sh_basis
 
 
 class Setup:

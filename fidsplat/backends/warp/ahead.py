@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from fidsplat.backends.stack import ViewStack
+from fidsplat.backends.batched_views import ViewStack
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.launch import Commands, Launcher

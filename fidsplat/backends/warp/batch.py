@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.blank import blank
-from fidsplat.backends.stack import ViewBatch
 from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.picture import Into
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import Output
-from fidsplat.errors import DeviceError, bytes_words
+from fidsplat.util.errors import DeviceError, bytes_words
 
 _MOST = {True: 1 << 31, False: 1 << 28}
 """bytes that the views of a part take together on CUDA, and on the CPU: more is no faster"""

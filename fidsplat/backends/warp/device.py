@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.interface import DeviceInfo
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.gradients import WarpGradients
 from fidsplat.backends.warp.launch import Commands
@@ -20,8 +20,8 @@ from fidsplat.backends.warp.shapes import WarpShape, other_shapes, shape_for
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
-from fidsplat.errors import DeviceError, UnknownDeviceError
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import DeviceError, UnknownDeviceError
 
 
 def devices() -> list[DeviceInfo]:

@@ -24,7 +24,7 @@ from fidsplat.backends.warp.program import GradientKernels
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.effects.differentiable import check_gradients
-from fidsplat.errors import DeviceError, InputError
+from fidsplat.util.errors import DeviceError, InputError
 
 _SHARES = 2048
 """threads that share a sum over the whole picture or cloud; the order of additions is theirs"""

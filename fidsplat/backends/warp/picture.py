@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fidsplat.backends.bands import cut
-from fidsplat.backends.stack import ViewStack
+from fidsplat.backends.batched_views import ViewStack
 from fidsplat.backends.view import Shot, View
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.program import Program
@@ -32,7 +32,7 @@ from fidsplat.backends.warp.structs import (
     uniforms,
 )
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace
-from fidsplat.errors import DeviceError, bytes_words
+from fidsplat.util.errors import DeviceError, bytes_words
 
 # bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
 # sort and lists; of a pair with the scratch of its sort

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fidsplat.backends.stack import ViewBatch, ViewStack
+from fidsplat.backends.batched_views import ViewBatch, ViewStack
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.ahead import Drawing
 from fidsplat.backends.warp.batch import WarpBatch, parts

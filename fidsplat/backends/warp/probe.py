@@ -13,7 +13,7 @@ import numpy as np
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 
 class WarpProbe:

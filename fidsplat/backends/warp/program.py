@@ -13,7 +13,7 @@ from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS
-from fidsplat.errors import DeviceError
+from fidsplat.util.errors import DeviceError
 
 SLOTS = frozenset(
     {"camera_pinhole", "camera_orthographic", "color_rgb", "color_sh"}

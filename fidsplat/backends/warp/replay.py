@@ -12,7 +12,7 @@ import warnings
 import weakref
 from typing import Any
 
-from fidsplat.backends.stack import ViewStack
+from fidsplat.backends.batched_views import ViewStack
 from fidsplat.backends.warp.launch import Launcher
 from fidsplat.backends.warp.picture import Picture
 from fidsplat.backends.warp.runtime import load

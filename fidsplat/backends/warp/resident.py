@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, nbytes
-from fidsplat.errors import DeviceError, InputError, bytes_words
-from fidsplat.harmonics import MAX_DEGREE, color_range
-from fidsplat.splats import SplatCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.harmonics import MAX_DEGREE, color_range
+from fidsplat.util.errors import DeviceError, InputError, bytes_words
 
 
 class Resident:

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.stack import ViewStack
+from fidsplat.backends.batched_views import ViewStack
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.cameras.raster import RayRaster
-from fidsplat.errors import DeviceError, bytes_words
-from fidsplat.surroundings import Gradient, Panorama
+from fidsplat.capture.environment import Gradient, Panorama
+from fidsplat.util.errors import DeviceError, bytes_words
 
 _DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
     "tile_w": lambda view, shape: shape.tile_width,

@@ -12,8 +12,8 @@ from weakref import WeakKeyDictionary, WeakSet
 
 from fidsplat.backends.warp.runtime import load
 from fidsplat.cameras.raster import RayRaster
-from fidsplat.errors import DeviceError, bytes_words
-from fidsplat.surroundings import Panorama
+from fidsplat.capture.environment import Panorama
+from fidsplat.util.errors import DeviceError, bytes_words
 
 
 class ArrayPool:

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory
-from fidsplat.errors import InputError, unknown
+from fidsplat.capture.quality import Quality
 from fidsplat.markers import marker
-from fidsplat.quality import Quality
-from fidsplat.random_clouds import SCENES, load_scene, standard_camera
-from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker, Scene
-from fidsplat.splats import SplatCloud
+from fidsplat.scenes.random_clouds import SCENES, load_scene, standard_camera
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.errors import InputError, unknown
 
 TIMED = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, arithmetic="precise")
 """how scenes are timed: with the cut-off and the stop that all peers share, so that the work is the same"""

@@ -10,20 +10,20 @@ from datetime import date
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo, Measurable, Rates
+from fidsplat.backends.interface import DeviceInfo, Measurable, Rates
 from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
-from fidsplat.capture import Capture
-from fidsplat.errors import FidsplatError
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.quality import Quality
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED, BenchScene
 from fidsplat.experiments.bench.model import Counts, roofline_ms
-from fidsplat.frame import Frame
-from fidsplat.quality import Quality
-from fidsplat.render import Renderer
-from fidsplat.resident import ResidentCloud
-from fidsplat.splats import SplatCloud
-from fidsplat.store.residency import Residency
-from fidsplat.timing import Timer, take_turns
+from fidsplat.render.frame import Frame
+from fidsplat.render.renderer import Renderer
+from fidsplat.render.resident import ResidentCloud
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.streaming.residency import Residency
+from fidsplat.util.errors import FidsplatError
+from fidsplat.util.timing import Timer, take_turns
 
 
 @dataclass

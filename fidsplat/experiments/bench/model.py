@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fidsplat.backends.base import Rates
+from fidsplat.backends.interface import Rates
 
 # bytes of one splat: position, scales and opacity decide whether it is seen; rotation and colour are needed
 # if it is

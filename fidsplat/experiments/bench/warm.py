@@ -11,11 +11,11 @@ from functools import partial
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.quality import Quality
-from fidsplat.random_clouds import random_splats
-from fidsplat.render import Renderer
-from fidsplat.splats import SplatCloud
-from fidsplat.timing import Timer
+from fidsplat.capture.quality import Quality
+from fidsplat.render.renderer import Renderer
+from fidsplat.scenes.random_clouds import random_splats
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.timing import Timer
 
 COUNTS = (2, 70_000)
 """Splats of the pictures that are drawn: launches of few and of many work-items."""

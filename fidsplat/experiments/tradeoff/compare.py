@@ -9,16 +9,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fidsplat.accuracy import errors
-from fidsplat.errors import FidsplatError
+from fidsplat.accuracy.error import errors
+from fidsplat.capture.quality import MarkerQuality, Quality
 from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.plane import plane_picture
 from fidsplat.experiments.setup import BACKGROUND
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window
 from fidsplat.experiments.tradeoff.scenes import GREY, HARD, PROTOCOL, SEED, TradeScene, made_marker
 from fidsplat.experiments.tradeoff.session import Session
-from fidsplat.hard_cases.agreement import Picture, truth_of
-from fidsplat.quality import MarkerQuality, Quality
+from fidsplat.selftest.agreement import Picture, truth_of
+from fidsplat.util.errors import FidsplatError
 from fidsplat.vision.images import to_uint8
 from fidsplat.vision.metrics import flip, has_flip, psnr
 from fidsplat.vision.readback import corner_error, own_code

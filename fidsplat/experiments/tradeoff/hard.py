@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.hard_cases.clouds import splats, turned
-from fidsplat.random_clouds import log_uniform
-from fidsplat.rotations import quaternion_multiply
-from fidsplat.splats import SplatCloud
+from fidsplat.scenes.random_clouds import log_uniform
+from fidsplat.selftest.clouds import splats, turned
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import quaternion_multiply
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
 COLUMNS, ROWS = 4, 2

@@ -8,9 +8,9 @@ import math
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.quality import Quality
-from fidsplat.render import Renderer
-from fidsplat.splats import SplatCloud
+from fidsplat.capture.quality import Quality
+from fidsplat.render.renderer import Renderer
+from fidsplat.splats.cloud import SplatCloud
 
 DISTANCES = (3, 5, 10, 30, 100)
 """standard deviations"""

@@ -8,9 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from fidsplat.errors import InputError, unknown
-from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.quality import (
+from fidsplat.capture.quality import (
     BY_FORMULA,
     ELLIPSOID,
     PRESETS,
@@ -18,6 +16,8 @@ from fidsplat.quality import (
     MarkerQuality,
     Quality,
 )
+from fidsplat.experiments.bench.catalogue import TIMED
+from fidsplat.util.errors import InputError, unknown
 
 BASE = TIMED.with_(marker=MarkerQuality("fitted"))
 """what every other setting is measured beside, turn by turn: the cut-off and the stop that other systems

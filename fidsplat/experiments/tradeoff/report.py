@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from fidsplat.errors import InputError
 from fidsplat.experiments.charts import Axes, chart, label_points, literal, plain_ticks
 from fidsplat.experiments.pages import fixed, number, percent, places, write_page
 from fidsplat.experiments.summary import Frame, Row, provenance
@@ -19,6 +18,7 @@ from fidsplat.experiments.tradeoff.points import ALONE, MARKER_KNOB, PRESETS_KNO
 from fidsplat.experiments.tradeoff.run import LINEAR
 from fidsplat.experiments.tradeoff.scenes import HARD, RANDOM, THICK
 from fidsplat.experiments.tradeoff.summary import TILT, Device, load
+from fidsplat.util.errors import InputError
 
 INVISIBLE = 1 / 512
 """half a step of 8 bits"""

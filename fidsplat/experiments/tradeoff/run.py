@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
-from fidsplat.accuracy import TRUTH_CUTOFF
-from fidsplat.errors import FidsplatError, InputError
+from fidsplat.accuracy.error import TRUTH_CUTOFF
 from fidsplat.experiments.sweep import Key, Results, Sweep
 from fidsplat.experiments.tradeoff import compare, linear, points, scenes
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Session, time_point
-from fidsplat.files import writable_folder
-from fidsplat.provenance import run_facts
-from fidsplat.render import Renderer
+from fidsplat.render.renderer import Renderer
+from fidsplat.util.errors import FidsplatError, InputError
+from fidsplat.util.files import writable_folder
+from fidsplat.util.provenance import run_facts
 from fidsplat.vision.metrics import metric_versions
 from fidsplat.vision.readers import reader_versions
 

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 from fidsplat.cameras import Camera
-from fidsplat.capture import Capture
-from fidsplat.errors import InputError, unknown
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.quality import MarkerQuality
 from fidsplat.experiments.bench.catalogue import BenchScene
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
 from fidsplat.experiments.tradeoff.hard import hard_scene
 from fidsplat.markers import Marker, marker
-from fidsplat.provenance import digest_of
-from fidsplat.quality import MarkerQuality
-from fidsplat.random_clouds import load_scene
-from fidsplat.splats import SplatCloud
+from fidsplat.scenes.random_clouds import load_scene
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.provenance import digest_of
 
 RANDOM = ("r100k_720p", "r1m_1080p")
 THICK = ("r100k_720p_3d", "r1m_1080p_3d")

@@ -8,16 +8,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from fidsplat.accuracy import full_precision, reference_for, truth
-from fidsplat.backends.base import Measurable
-from fidsplat.capture import Capture
+from fidsplat.accuracy.error import full_precision, reference_for, truth
+from fidsplat.backends.interface import Measurable
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.quality import MarkerQuality, Quality
 from fidsplat.experiments.tradeoff.points import BASE
 from fidsplat.experiments.tradeoff.scenes import Own, TradeScene, make
-from fidsplat.frame import Frame
-from fidsplat.quality import MarkerQuality, Quality
-from fidsplat.render import Renderer
-from fidsplat.resident import ResidentCloud
-from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
+from fidsplat.render.frame import Frame
+from fidsplat.render.renderer import Renderer
+from fidsplat.render.resident import ResidentCloud
+from fidsplat.util.timing import frame_timer, quartiles, ratios, take_turns
 
 _SCENES, _TRUTHS = 12, 6
 """kept at a time"""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from fidsplat.errors import InputError
+from fidsplat.capture.quality import PRESETS
 from fidsplat.experiments.angles import largest, parse_tilts
 from fidsplat.experiments.summary import Frame, Row, Summary, join, read_summary, records_of, summarise
 from fidsplat.experiments.sweep import Record
@@ -19,7 +19,7 @@ from fidsplat.experiments.tradeoff.points import KNOBS, PRESETS_KNOB, Point, pre
 from fidsplat.experiments.tradeoff.run import DECODE, LINEAR, NAME, POINT, TRUTH
 from fidsplat.experiments.tradeoff.scenes import NAMES, is_marker, views_of
 from fidsplat.experiments.tradeoff.session import DEFINITION
-from fidsplat.quality import PRESETS
+from fidsplat.util.errors import InputError
 
 ABOUT = ("what", "scene", "knob", "value")
 COLUMNS = (

@@ -1,5 +1,5 @@
 // rounding (h, w): upper bound of what float32 changes in rgb, per unit of colour. Of pictures without a transmittance stop alone: the
-// output `error` is made of it (fidsplat/ideal.py has the derivation). By intervals of each fragment's forms, as
+// output `error` is made of it (fidsplat/render/certified_error.py has the derivation). By intervals of each fragment's forms, as
 // fidsplat/backends/reference/error_bounds.py: the opacity lies between `low` and `high`, and the colour moves by no more than the
 // transmittance in front times the distance from the opacity that is blended to the further of them. Fragments that rounding may take
 // away (near plane, horizon, rim) count too, so that all that are listed are asked, not only those that are blended. Each that is

@@ -1,4 +1,4 @@
-// For stores (fidsplat/backends/ends.py), by centres: of each tile the sort key at which all of its pixels were finished; UINT_MAX
+// For stores (fidsplat/backends/termination_depth.py), by centres: of each tile the sort key at which all of its pixels were finished; UINT_MAX
 // where the list ended before. Whatever else the list may have behind that key, the tile has the same bits: it is not looked at.
 //@ lanes_start
     uint walked = UINT_MAX;     // the last place in `lists` that was looked at

@@ -1,4 +1,4 @@
-// For stores (fidsplat/backends/ends.py), by depth at each pixel: of each tile the furthest of the depths at which its pixels were
+// For stores (fidsplat/backends/termination_depth.py), by depth at each pixel: of each tile the furthest of the depths at which its pixels were
 // finished, as a sort key; that of infinity where one was not. Fragments behind that are composited behind it, whichever there are, and
 // change nothing. A layer is taken by a depth that is not quite its own (slot/compose_planes.cl).
 //@ state

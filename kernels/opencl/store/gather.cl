@@ -17,7 +17,7 @@ kernel void gather(global const uint *source, global const uint4 *pieces, uint w
 #if PLACES
 #define NOWHERE 0xffffffffu
 
-// As `moved` (fidsplat/store/part.py), sum by sum, so that both have the same bits. A pose: its rotation by rows, where
+// As `moved` (fidsplat/store/subset.py), sum by sum, so that both have the same bits. A pose: its rotation by rows, where
 // it puts the zero of the means, its quaternion.
 // Index space: (rows of the largest piece, pieces).
 kernel void gather_means(

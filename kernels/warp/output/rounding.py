@@ -1,5 +1,6 @@
 """Upper bound of what float32 changes in a pixel's colour, per unit of colour, of pictures without a
-transmittance stop: kernels/opencl/output/rounding.cl has the same, and fidsplat/ideal.py the derivation."""
+transmittance stop: kernels/opencl/output/rounding.cl has the same, and
+fidsplat/render/certified_error.py the derivation."""
 
 from typing import Any
 

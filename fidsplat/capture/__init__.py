@@ -1,0 +1,1 @@
+"""How an image is taken: camera, outputs, quality, sensor, environment; plain data."""

@@ -1,0 +1,184 @@
+"""What lies around and between the splats: fog, and what is seen behind everything; plain data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import LARGEST, PickledByFields, own_scalars
+
+MAX_PANORAMA = 16384
+"""pixels along a side"""
+
+
+@dataclass(frozen=True)
+class Fog:
+    """Fog of even density: of what is seen at distance r, exp(-density r) is left, the rest is the fog's
+    colour.
+
+    It is also all that is seen behind the splats. Raises InputError for a density that is no number of at
+    least 0, or a colour that is not three finite numbers.
+    """
+
+    density: float
+    """1 / metres"""
+    color: tuple[float, float, float] = (0.7, 0.7, 0.7)
+    """RGB"""
+
+    def __post_init__(self) -> None:
+        own_scalars(self)
+        ok = isinstance(self.density, (int, float)) and not isinstance(self.density, bool)
+        if not (ok and 0 <= self.density <= LARGEST):
+            raise InputError(
+                f"fog: density is {self.density!r}; it must be a number of at least 0 (1 / metres)"
+            )
+        object.__setattr__(self, "color", three_numbers("fog: color", self.color))
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """A background between two colours, by the sine of the ray's height above the horizon.
+
+    Raises InputError for a colour or direction that is not three finite numbers, or a direction of length 0.
+    """
+
+    top: tuple[float, float, float]
+    """RGB straight up"""
+    bottom: tuple[float, float, float]
+    """RGB straight down"""
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    """world direction, of any length"""
+
+    def __post_init__(self) -> None:
+        for name in ("top", "bottom", "up"):
+            object.__setattr__(self, name, three_numbers(f"background: {name}", getattr(self, name)))
+        if not 0 < np.linalg.norm(self.up) < math.inf:
+            raise InputError(f"background: up is {self.up!r}; it must be a direction, e.g. (0, -1, 0)")
+
+
+@dataclass(frozen=True, eq=False)
+class Panorama(PickledByFields):
+    """An equirectangular picture of the world as background: its middle column lies towards +z, to the right
+    of it is +x, its top row is -y.
+
+    Raises InputError for anything but an (h, w, 3) array of finite numbers with 2 to 16384 pixels a side.
+    """
+
+    image: np.ndarray
+    """(h, w, 3) float32 RGB, read-only; uint8 is taken as 255ths, uint16 as 65535ths"""
+    file: str | None = None
+    """where it came from"""
+
+    def __post_init__(self) -> None:
+        try:
+            given: np.ndarray = np.asarray(self.image)
+        except ValueError:  # rows that differ in length
+            given = np.empty(0)
+        if given.ndim != 3 or given.shape[2] != 3 or given.dtype.kind not in "fiu":
+            raise InputError(
+                f"background: a panorama must be (h, w, 3) numbers, not {given.shape} {given.dtype}"
+            )
+        if not 2 <= min(given.shape[:2]) <= max(given.shape[:2]) <= MAX_PANORAMA:
+            height, width = given.shape[:2]
+            raise InputError(
+                f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
+            )
+        whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
+        with np.errstate(over="ignore"):  # what float32 cannot hold is refused below
+            image = np.array(given, np.float32, order="C") / np.float32(whole)
+        if not np.isfinite(image).all():
+            which = f"the panorama {self.file}" if self.file else "the panorama"
+            raise InputError(f"background: {which} holds numbers that are not finite; replace them")
+        image.flags.writeable = False
+        object.__setattr__(self, "image", image)
+
+    @staticmethod
+    def load(path) -> Panorama:
+        """From a picture file, whole numbers of 8 or 16 bits or floats. Raises InputError when it cannot be
+        read."""
+        from fidsplat.vision.images import read_image
+
+        return Panorama(read_image(path, deep=True), str(path))
+
+
+@dataclass(frozen=True, eq=False)
+class Layer(PickledByFields):
+    """A picture with depths from another renderer, as an opaque surface among the splats: in each pixel it
+    hides what of them lies behind it, and what lies in front of it is composited over it.
+
+    Raises InputError for arrays of other shapes, colours that are not finite, or depths below 0.
+    """
+
+    rgb: np.ndarray
+    """(h, w, 3) float32 in display space, read-only; uint8 is taken as 255ths"""
+    depth: np.ndarray
+    """(h, w) float32 metres, as the camera's depths are (along z; along the ray for a fisheye or panorama);
+    infinite where there is nothing, also given as 0 or NaN"""
+    label: np.ndarray | int = 0
+    """(h, w) int32, or one for all"""
+
+    def __post_init__(self) -> None:
+        rgb, depth = (_array_of(name, getattr(self, name)) for name in ("rgb", "depth"))
+        if depth.ndim != 2 or rgb.shape != (*depth.shape, 3):
+            raise InputError(
+                f"a layer has rgb (h, w, 3) and depth (h, w), but their shapes are {rgb.shape}, {depth.shape}"
+            )
+        whole = 255 if rgb.dtype == np.uint8 else 1
+        if not np.isfinite(rgb).all() or (depth < 0).any():
+            raise InputError("a layer holds colours that are not finite, or depths below 0; replace them")
+        label = _array_of("label", self.label)
+        if label.dtype.kind not in "iu" or label.shape not in ((), depth.shape):
+            raise InputError(f"the label of a layer must be whole numbers {depth.shape}, or one for all")
+        here = np.isfinite(depth) & (depth > 0)
+        made = {
+            "rgb": np.array(rgb, np.float32, order="C") / np.float32(whole),
+            "depth": np.where(here, depth, np.inf).astype(np.float32),
+            "label": np.ascontiguousarray(np.broadcast_to(label, depth.shape), np.int32),
+        }
+        for name, array in made.items():
+            array = array.copy() if array is getattr(self, name) else array
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+
+def _array_of(name: str, value: Any) -> np.ndarray:
+    try:
+        array: np.ndarray = np.asarray(value)
+    except ValueError:  # rows that differ in length
+        array = np.empty(0, object)
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"the {name} of a layer must be an array of numbers, not {value!r}")
+    return array
+
+
+Background = tuple[float, float, float] | Gradient | Panorama
+
+
+def background_of(value: Any) -> Background:
+    """A background as it is, or three numbers as a colour, which a gradient between equal colours is too.
+    Raises InputError for anything else."""
+    if isinstance(value, Gradient) and value.top == value.bottom:
+        return value.top
+    if isinstance(value, (Gradient, Panorama)):
+        return value
+    if isinstance(value, np.ndarray) and value.ndim > 1:
+        raise InputError(
+            f"background is an array of shape {value.shape}; give three numbers, or a picture as "
+            "fs.Panorama(array)"
+        )
+    return three_numbers("background", value)
+
+
+def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
+    """Three finite floats. Raises InputError, with the name, for anything else."""
+    try:
+        numbers = tuple(float(number) for number in value)
+    except (TypeError, ValueError):
+        numbers = ()
+    if len(numbers) != 3 or not all(abs(number) <= LARGEST for number in numbers):
+        raise InputError(f"{name} must be three finite numbers, at most {LARGEST:g}, not {value!r}")
+    return numbers  # type: ignore[return-value]

@@ -1,0 +1,150 @@
+"""Sensor: what becomes of the light on its way to a file; plain data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from fidsplat.util.arguments import as_float
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import own_scalars
+
+RESPONSES = ("linear", "srgb")
+BITS = (8, 16)
+GAMMAS = 0.01, 100.0
+"""least and most"""
+LARGEST = 1e15
+"""of factors and of a curve's values: what is made of them stays within float32"""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A camera's sensor. The picture's values are taken as light; each step below is taken only if its value
+    does something, in this order.
+
+    Raises:
+        InputError: a value lies outside its range; the message names the range.
+    """
+
+    exposure: float = 1.0
+    """factor of the light that is gathered, 0 and above"""
+    vignetting: tuple[float, ...] = ()
+    """up to three numbers a, b, c: light times 1 + a r^2 + b r^4 + c r^6, with r the distance from the
+    principal point in halves of the picture's diagonal"""
+    full_well: float = math.inf
+    """electrons of the value 1, 1 or more: n electrons have a shot noise of sqrt(n); infinitely many have
+    none"""
+    read_noise: float = 0.0
+    """electrons, standard deviation of each read-out, 0 to full_well, which it needs"""
+    seed: int = 0
+    """which noise, 0 to 2^32 - 1; the same seed gives the same noise, so change it from picture to picture"""
+    gain: float = 1.0
+    """factor after the read-out, 0 and above"""
+    response: str | float | tuple[float, ...] = "linear"
+    """"linear"; "srgb", its transfer function; a gamma: v^(1 / gamma); or the curve's values at two or more
+    even steps of v from 0 to 1. All but "linear" clamp v to [0, 1]."""
+    bits: int | None = None
+    """8 or 16: values are rounded to as many whole steps of [0, 1], and rgb is written so; None: not
+    rounded"""
+
+    def __post_init__(self) -> None:
+        own_scalars(self)
+        if not (_is_number(self.full_well) and self.full_well >= 1):
+            raise InputError(
+                f"sensor: full_well is {self.full_well!r}; it must be a number of electrons, 1 or more"
+            )
+        for name, most in (("exposure", LARGEST), ("gain", LARGEST), ("read_noise", self.full_well)):
+            value = getattr(self, name)
+            if not (_is_number(value) and 0 <= value <= most and value < math.inf):
+                raise InputError(
+                    f"sensor: {name} is {value!r}; it must be a number of at least 0, at most {most:g}"
+                )
+        if self.read_noise > 0 and math.isinf(self.full_well):
+            raise InputError(
+                f"sensor: read_noise is {self.read_noise!r} electrons, which means nothing without full_well"
+            )
+        if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and 0 <= self.seed < 2**32):
+            raise InputError(f"sensor: seed is {self.seed!r}; it must be a whole number from 0 to 2^32 - 1")
+        if self.bits is not None and not (isinstance(self.bits, int) and self.bits in BITS):
+            raise InputError(f"sensor: bits is {self.bits!r}; known: 8, 16, or none")
+        object.__setattr__(self, "vignetting", _numbers("vignetting", self.vignetting, 0, 3))
+        if isinstance(self.response, str):
+            if self.response not in RESPONSES:
+                raise InputError(
+                    f"sensor: response is {self.response!r}; known: {', '.join(RESPONSES)}, a gamma above 0, "
+                    "or a table"
+                )
+        elif _is_number(self.response):
+            if not GAMMAS[0] <= self.response <= GAMMAS[1]:  # type: ignore[operator]
+                raise InputError(
+                    f"sensor: response is {self.response!r}; a gamma must lie between {GAMMAS[0]:g} and "
+                    f"{GAMMAS[1]:g}"
+                )
+        else:
+            object.__setattr__(self, "response", _numbers("response", self.response, 2, 65536))
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """Names of the effects that do something, in their order."""
+        found = [
+            ("exposure", self.exposure != 1),
+            ("vignetting", any(self.vignetting)),
+            ("noise", math.isfinite(self.full_well)),
+            ("gain", self.gain != 1),
+        ]
+        if not isinstance(self.response, (str, tuple)):
+            found.append(("response_gamma", self.response != 1))
+        elif self.response == "srgb":
+            found.append(("response_srgb", True))
+        elif isinstance(self.response, tuple):
+            # a straight line from 0 to 1 still clamps, but so does every output
+            line = np.linspace(0, 1, len(self.response))
+            found.append(("response_table", not np.array_equal(self.response, line)))
+        found.append(("quantise", self.bits is not None))
+        return tuple(name for name, does in found if does)
+
+    def uniform(self, name: str) -> tuple[Any, ...]:
+        """Numbers of a step, in the order of its kernel arguments."""
+        match name:
+            case "noise":
+                variance = 1 / self.full_well
+                return variance, (self.read_noise * variance) ** 2, np.uint32(self.seed)
+            case "vignetting":
+                return (*self.vignetting, 0.0, 0.0, 0.0)[:3]
+            case "inverse_gamma":
+                return (1 / self.response,)  # type: ignore[operator]
+            case "response_count":
+                return (np.int32(len(self.response)),)  # type: ignore[arg-type]
+            case "quantise_steps":
+                return (2.0**self.bits - 1,)  # type: ignore[operator]
+            case _:
+                return (getattr(self, name),)
+
+    def changes(self) -> dict[str, Any]:
+        """What differs from a sensor that does nothing, by name."""
+        plain = Sensor()
+        pairs = ((f.name, getattr(self, f.name)) for f in fields(self))
+        return {name: value for name, value in pairs if value != getattr(plain, name)}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not math.isnan(as_float(value))
+
+
+def _numbers(name: str, values: Any, least: int, most: int) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError):
+        numbers = None
+    if (
+        numbers is None
+        or not least <= len(numbers) <= most
+        or not all(abs(number) <= LARGEST for number in numbers)
+    ):
+        raise InputError(
+            f"sensor: {name} is {values!r}; it must be {least} to {most} finite numbers, at most {LARGEST:g}"
+        )
+    return numbers

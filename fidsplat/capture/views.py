@@ -1,0 +1,180 @@
+"""The views of a batch: captures of one size and the same effects, from poses of the camera and of groups of
+splats."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Motion
+from fidsplat.capture.capture import Capture
+from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import LARGEST, real_array
+
+
+@dataclass(frozen=True)
+class Views:
+    """What a batch is asked to draw: v views, each a capture, with poses that take the place of its own.
+
+    Raises InputError for numbers of views that differ, and for poses of what moves already.
+    """
+
+    captures: tuple[Capture, ...]
+    """one for each view, or one for all"""
+    poses: np.ndarray | None = None
+    """(v, 4, 4) float64 camera to world, rigid; None: each capture's camera stands where it is"""
+    groups: Mapping[int, np.ndarray] | None = None
+    """label: (v, 4, 4) float64, rigid, the motion of the world that its splats make"""
+    mask: np.ndarray | None = None
+    """(v,) bool: views that are drawn; None: all"""
+
+    def __post_init__(self) -> None:
+        counts = {"captures": len(self.captures)} if len(self.captures) != 1 else {}
+        counts |= {} if self.poses is None else {"poses": len(self.poses)}
+        counts |= {f"groups[{label}]": len(each) for label, each in (self.groups or {}).items()}
+        if not counts:
+            counts = {"captures": 1}
+        counts |= {} if self.mask is None else {"mask": len(self.mask)}
+        if len(set(counts.values())) > 1:
+            told = ", ".join(f"{name} has {count}" for name, count in counts.items())
+            raise InputError(f"a batch must have one number of views: {told}")
+        if not len(self):
+            raise InputError(f"a batch must have one view or more; {next(iter(counts))} is empty")
+        for number, capture in enumerate(self.captures):
+            self._refuse_two_motions(number, capture.motion)
+
+    def _refuse_two_motions(self, number: int, motion: Motion) -> None:
+        if self.poses is not None and motion.camera is not None:
+            raise InputError(
+                f"poses say where the camera of view {number} is, and its motion does too; leave one out"
+            )
+        for label in self.groups or ():
+            if label in motion.groups:
+                raise InputError(
+                    f"groups say how the splats of label {label} move, and the motion of view {number} does "
+                    "too; leave one out"
+                )
+
+    def __len__(self) -> int:
+        """Views, those that are not drawn among them."""
+        if len(self.captures) > 1:
+            return len(self.captures)
+        of_poses = () if self.poses is None else (self.poses,)
+        return next((len(each) for each in (*of_poses, *(self.groups or {}).values())), len(self.captures))
+
+    @property
+    def drawn(self) -> list[int]:
+        """Numbers of the views that are drawn."""
+        return list(range(len(self))) if self.mask is None else np.flatnonzero(self.mask).tolist()
+
+    def capture(self, number: int) -> Capture:
+        """The capture of one view: drawn alone it gives the same bits."""
+        base = self.captures[number if len(self.captures) > 1 else 0]
+        camera, motion = base.camera, base.motion
+        if self.poses is not None and camera is not None:
+            camera = camera_at(camera, self.poses[number])
+        if self.groups:
+            moved = {label: _standing(each[number]) for label, each in self.groups.items()}
+            motion = Motion(motion.camera, {**motion.groups, **moved})
+        return (
+            base
+            if camera is base.camera and motion is base.motion
+            else base.with_(camera=camera, motion=motion)
+        )
+
+    def refuse_other_sizes(self) -> None:
+        """Raises InputError where captures differ in size or in the names of their outputs."""
+        first = self.captures[0]
+        for number, capture in enumerate(self.captures[1:], 1):
+            for what, one, other in (
+                ("size", _size(first.camera), _size(capture.camera)),
+                ("outputs", first.outputs, capture.outputs),
+            ):
+                if one != other:
+                    raise InputError(
+                        f"the views of a batch must have the same {what}: view 0 has {one}, view {number} "
+                        f"has {other}; draw them in batches of their own"
+                    )
+
+
+def camera_at(camera: Camera, pose: np.ndarray) -> Camera:
+    """The camera at a pose (4, 4) camera to world, whose position it keeps as it is."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = pose[:3, :3].T
+    matrix[:3, 3] = -matrix[:3, :3] @ pose[:3, 3]
+    return replace(camera, world_to_camera=matrix, position=pose[:3, 3])
+
+
+def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None, mask: Any = None) -> Views:
+    """The views that `Renderer.render_batch` is asked for.
+
+    Raises:
+        InputError: arrays of another shape or with values that are no poses, numbers of views or sizes that
+            differ.
+    """
+    if groups is not None and not isinstance(groups, Mapping):
+        raise InputError(f"groups is {groups!r}; it must be {{label: poses (views, 7)}}")
+    for label in groups or ():
+        if isinstance(label, bool) or not isinstance(label, (int, np.integer)):
+            raise InputError(f"groups: the label {label!r} is no whole number; splats have such")
+    given = {int(label): pose_matrices(f"groups[{label}]", each) for label, each in (groups or {}).items()}
+    if mask is not None:
+        mask = _mask(mask)
+    turned = None if poses is None else pose_matrices("poses", poses)
+    views = Views(tuple(captures), turned, given or None, mask)
+    views.refuse_other_sizes()
+    return views
+
+
+def pose_matrices(name: str, poses: Any) -> np.ndarray:
+    """Rigid matrices (v, 4, 4) float64 of poses (v, 7): x y z in metres, quaternion w x y z of any length but
+    0.
+
+    Raises:
+        InputError: another shape, a value that is not finite, or a quaternion of length 0.
+    """
+    given = real_array(name, poses, "(views, 7) numbers: x y z, quaternion w x y z")
+    if given.ndim != 2 or given.shape[1] != 7:
+        raise InputError(
+            f"{name} must have the shape (views, 7), x y z and a quaternion w x y z, but the shape is "
+            f"{given.shape}"
+        )
+    with np.errstate(over="ignore"):  # what is too long for a float is infinitely long, and refused
+        lengths = np.linalg.norm(given[:, 3:], axis=1)
+        wrong = ~((np.abs(given[:, :3]) <= LARGEST).all(1) & (lengths > 0) & (lengths < np.inf))
+    if wrong.any():
+        view = int(np.argmax(wrong))
+        raise InputError(
+            f"{name}[{view}] is no pose: {given[view].tolist()}; it must be x y z, at most {LARGEST:g} "
+            "metres, and a finite quaternion w x y z that is not all 0"
+        )
+    matrices = np.zeros((len(given), 4, 4))
+    matrices[:, :3, :3] = quaternion_to_matrix(given[:, 3:])
+    matrices[:, :3, 3] = given[:, :3]
+    matrices[:, 3, 3] = 1
+    return matrices
+
+
+def _mask(given: Any) -> np.ndarray:
+    try:
+        mask = np.asarray(given)
+    except ValueError:  # rows that differ in length
+        mask = np.empty(0, object)
+    if mask.dtype != bool or mask.ndim != 1:
+        raise InputError(
+            f"mask must be (views,) bools, but it has the shape {mask.shape} and the type {mask.dtype}"
+        )
+    return mask
+
+
+def _standing(pose: np.ndarray):
+    """The same pose at every time."""
+    return lambda time: pose
+
+
+def _size(camera: Camera | None) -> str:
+    return "no camera" if camera is None else f"{camera.width} x {camera.height}"

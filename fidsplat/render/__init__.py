@@ -1,0 +1,1 @@
+"""Rendering scenes: the renderer, frames, batches, several devices."""

@@ -1,0 +1,193 @@
+"""FrameBatch: the finished pictures of many views."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.blank import blank
+from fidsplat.backends.interface import BatchImages, GivesArrays, Images, Waits
+from fidsplat.capture.views import Views
+from fidsplat.effects import OUTPUTS
+from fidsplat.render.frame import Frame, Ids, check_process, numbered, refuse_numbered
+from fidsplat.util.errors import InputError, MissingOutputError
+
+
+class FrameBatch(Mapping):
+    """Finished pictures of many views: a mapping from an output's name to a read-only NumPy array
+    (views, h, w) or (views, h, w, channels), copied from the device on first use.
+
+    Names, types and units are those of Frame. Views that were masked out hold -1 in `label` and `splat_id`
+    and 0 in all else. View i is bit-identical to `Renderer.render` alone, but for stores with
+    `detail_error` (`Renderer.render_batch`).
+    """
+
+    def __init__(self, images: BatchImages, views: Views, ids: Ids = None) -> None:
+        """ids: as those of a Frame."""
+        self._images, self._process, self._ids = images, os.getpid(), ids
+        self._views = views
+        self._arrays: dict[str, np.ndarray] = {}
+        self.outputs = views.captures[0].outputs
+        """Names of the images, in the order in which they were asked for."""
+
+    @property
+    def views(self) -> int:
+        """How many there are, those that were masked out among them."""
+        return self._images.views
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        self._check(name)
+        if name not in self._arrays:
+            check_process(self._process, "batch")
+            self._arrays[name] = images = numbered(name, self._images.read(name), self._ids)
+            images.flags.writeable = False  # what is kept is what was drawn
+        return self._arrays[name]
+
+    def device_array(self, name: str) -> Any:
+        """The images where they were drawn, without a copy, (views, h, w) or (views, h, w, channels): by
+        OpenCL a pyopencl.array.Array, on a Warp device a wp.array, from which DLPack makes a tensor.
+
+        They belong to this batch: the next is drawn into other arrays.
+
+        Raises:
+            InputError: an output that was not asked for, or the backend has no arrays to give.
+        """
+        self._check(name)
+        check_process(self._process, "batch")
+        refuse_numbered(name, self._ids)
+        if not isinstance(self._images, GivesArrays):
+            raise InputError(
+                f"this device keeps {name} of a batch in no array that others can use; take batch[{name!r}], "
+                "which is copied to the host"
+            )
+        return self._images.device_array(name)
+
+    def frame(self, number: int) -> Frame:
+        """One view as a Frame, of which only what is read is copied; without timings and stats.
+
+        Raises:
+            InputError: there is no such view.
+        """
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, (int, np.integer))
+            or not 0 <= number < self.views
+        ):
+            raise InputError(f"there is no view {number!r}; this batch has views 0 to {self.views - 1}")
+        return Frame(_OneOf(self._images, int(number)), self._views.capture(int(number)), self._ids)
+
+    def wait(self) -> FrameBatch:
+        """This batch, once the device has drawn it; nothing is copied."""
+        if isinstance(self._images, Waits):
+            self._images.wait()
+        return self
+
+    def _check(self, name: str) -> None:
+        if not isinstance(name, str) or name not in self.outputs:
+            raise MissingOutputError(
+                f"this batch has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+            )
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.outputs)
+
+    def __len__(self) -> int:
+        return len(self.outputs)
+
+    def __reduce__(self):
+        """Pickled and copied as NumPy arrays."""
+        views = replace(self._views, captures=tuple(one.picklable() for one in self._views.captures))
+        return _kept_batch, (dict(self), dict(self.timings), dict(self.stats), views)
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, of all views together."""
+        return self._images.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats (in the cloud), visible, pairs: of all views together."""
+        return self._images.stats
+
+
+class ViewByView:
+    """The images of a batch that was drawn one view after another."""
+
+    def __init__(self, images: Mapping[int, Images], views: int, size: tuple[int, int], splats: int) -> None:
+        """images: of the views that were drawn, by their number. splats: in the cloud."""
+        self._images, self.views, self._size, self._splats = images, views, size, splats
+
+    def read(self, name: str) -> np.ndarray:
+        """(views, h, w) or (views, h, w, channels)."""
+        output = OUTPUTS[name]
+        channels = () if output.channels == 1 else (output.channels,)
+        made = np.full((self.views, *self._size, *channels), blank(name), output.dtype)
+        for number, images in self._images.items():
+            made[number] = images.read(name)
+        return made
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        """(h, w) or (h, w, channels)."""
+        if number in self._images:
+            return self._images[number].read(name)
+        output = OUTPUTS[name]
+        channels = () if output.channels == 1 else (output.channels,)
+        return np.full((*self._size, *channels), blank(name), output.dtype)
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        return _added(images.timings for images in self._images.values())
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        none = {"splats": 0, "visible": 0, "pairs": 0}
+        counts = [images.stats for images in self._images.values()]
+        return _added([none, *counts]) | {"splats": self._splats}
+
+
+class _KeptBatch:
+    """Images of a batch that are no longer on a device."""
+
+    def __init__(
+        self, arrays: dict[str, np.ndarray], timings: Mapping[str, float], stats: Mapping[str, int]
+    ) -> None:
+        self._arrays, self.timings, self.stats = arrays, timings, stats
+        self.views = len(next(iter(arrays.values())))
+
+    def read(self, name: str) -> np.ndarray:
+        return self._arrays[name]
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        return self._arrays[name][number].copy()
+
+
+class _OneOf:
+    """The images of one view of a batch."""
+
+    timings: Mapping[str, float] = {}
+    stats: Mapping[str, int] = {}
+
+    def __init__(self, images: BatchImages, number: int) -> None:
+        self._images, self._number = images, number
+
+    def read(self, name: str) -> np.ndarray:
+        return self._images.read_one(name, self._number)
+
+
+def _kept_batch(
+    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], views: Views
+) -> FrameBatch:
+    return FrameBatch(_KeptBatch(arrays, timings, stats), views)
+
+
+def _added(counts) -> dict[str, Any]:
+    """The sums of mappings from names to numbers."""
+    sums: dict[str, Any] = {}
+    for each in counts:
+        for name, value in each.items():
+            sums[name] = sums.get(name, 0) + value
+    return sums

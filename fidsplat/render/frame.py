@@ -1,0 +1,327 @@
+"""Frame: one finished picture."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from fidsplat.backends.interface import GivesArrays, GivesUint8, Images, ReadsRows, Waits
+from fidsplat.capture.capture import Capture
+from fidsplat.util.arguments import invalid, whole_number
+from fidsplat.util.errors import InputError, MissingOutputError
+
+Ids = Callable[[], np.ndarray] | None
+"""gives the indices (n,) int32 of the splats that were drawn in the whole scene; None: these themselves"""
+
+
+class MadeImage(Protocol):
+    """An image that is made from others when it is read."""
+
+    def read(self) -> np.ndarray:
+        """The image, an array of its own."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, of what only this image takes."""
+        ...
+
+
+class Frame(Mapping):
+    """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
+    device on first use.
+
+    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
+    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
+    unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
+    (h, w) int32; `blended` (h, w) int32; `error` (h, w), an upper bound of |rgb - ideal|
+    (fidsplat/render/certified_error.py). Where less than 1/255 is covered, or of first hits less than
+    `Quality.first_hit`, labels and ids are -1, the others of these 0.
+    """
+
+    def __init__(
+        self, images: Images, capture: Capture, ids: Ids = None, error: MadeImage | None = None
+    ) -> None:
+        """ids: the indices that `splat_id` shows for the rendered splats. error: the output `error`, if it is
+        requested."""
+        self._error = error
+        self._images, self._process, self._ids = images, os.getpid(), ids
+        self._arrays: dict[str, np.ndarray] = {}
+        self.capture = capture
+        """The capture that made it. `read_back` and `truth_of` use its camera, shutter and motion."""
+        self.outputs = capture.outputs
+        """Names of the images, in the order in which they were asked for."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        self._check(name)
+        if name not in self._arrays:
+            check_process(self._process, "frame")
+            made = self._error if name == "error" else None
+            image = self._images.read(name) if made is None else made.read()
+            self._arrays[name] = image = numbered(name, image, self._ids)
+            image.flags.writeable = False  # what is kept is what was drawn
+        return self._arrays[name]
+
+    def device_array(self, name: str) -> Any:
+        """The image where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
+
+        It belongs to this frame: the next picture is drawn into another array. `wp.to_torch`, DLPack and
+        `__cuda_array_interface__` make a tensor of it on the same device.
+
+        Raises:
+            InputError: an output that was not asked for, or the backend has no arrays to give.
+        """
+        self._check(name)
+        check_process(self._process, "frame")
+        refuse_numbered(name, self._ids)
+        if name == "error":
+            raise InputError(
+                "the output 'error' must be read on the host, got device_array; take frame['error']"
+            )
+        if not isinstance(self._images, GivesArrays):
+            raise InputError(
+                f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
+                "'warp:cpu', or take frame[name], which is copied to the host"
+            )
+        return self._images.device_array(name)
+
+    def to_uint8(self) -> np.ndarray:
+        """`rgb` as files of 8 bits have it, (h, w, 3) uint8: clamped to [0, 1], times 255, rounded to the
+        nearest; 0 where it is no number. Made on the device where that can, so that a quarter of the bytes is
+        copied; the same bits on the host of `frame["rgb"]`, where that has been read.
+
+        Raises:
+            InputError: `rgb` was not asked for.
+        """
+        self._check("rgb")
+        if "rgb" not in self._arrays and isinstance(self._images, GivesUint8):
+            check_process(self._process, "frame")
+            return self._images.read_uint8("rgb")
+        from fidsplat.vision.images import to_uint8  # late: it brings OpenCV
+
+        return to_uint8(self["rgb"])
+
+    def to_torch(self, name: str = "rgb") -> Any:
+        """The image as a torch tensor: without a copy on the device that drew it where that has arrays to
+        give (`device_array`), else copied to the host.
+
+        Raises:
+            InputError: an output that was not asked for, or torch is not installed.
+        """
+        self._check(name)
+        try:
+            import torch  # type: ignore[import-not-found]
+        except ImportError:
+            raise InputError(
+                "to_torch makes tensors of torch, which is not installed; pip install torch"
+            ) from None
+        if self._stays(name):
+            return torch.from_dlpack(self.device_array(name))
+        return torch.from_numpy(self[name].copy())  # torch has no arrays that are read-only
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """The image of a frame with one output, as NumPy, PIL and OpenCV ask for it. Raises InputError where
+        there are several."""
+        image = self[self._only()]
+        return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
+
+    def __dlpack__(self, **words: Any) -> Any:
+        """The image of a frame with one output, for `from_dlpack` of torch, CuPy, JAX and NumPy: without a
+        copy where the device has arrays to give, else copied to the host. Raises InputError where there are
+        several."""
+        return self._exchanged().__dlpack__(**words)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        """Where that is, in DLPack's numbers."""
+        return self._exchanged().__dlpack_device__()
+
+    def _exchanged(self) -> Any:
+        name = self._only()
+        if self._stays(name):
+            return self.device_array(name)
+        return self[name].copy()  # what is read-only cannot be given away
+
+    def _stays(self, name: str) -> bool:
+        """Whether the device has an array of this image to give."""
+        made = name == "error" or (name == "splat_id" and self._ids is not None)
+        return isinstance(self._images, GivesArrays) and not made
+
+    def _only(self) -> str:
+        """The name of the one output."""
+        if len(self.outputs) != 1:
+            raise InputError(
+                f"this frame has {len(self.outputs)} images ({', '.join(self.outputs)}); take one by its "
+                "name, frame['rgb'] say"
+            )
+        return self.outputs[0]
+
+    def __repr__(self) -> str:
+        took = sum(self.timings.values())
+        splats = f", {self.stats['splats']:,} splats" if "splats" in self.stats else ""
+        return f"Frame({', '.join(self.outputs)}{splats}, {took:.1f} ms)"
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows: rgb, or else the first output, in colours."""
+        from fidsplat.vision.images import png_bytes  # late: it brings OpenCV
+        from fidsplat.vision.output_files import picture_of
+
+        name = "rgb" if "rgb" in self.outputs else self.outputs[0]
+        return png_bytes(picture_of(name, self[name]))
+
+    def _check(self, name: str) -> None:
+        if not isinstance(name, str) or name not in self.outputs:
+            raise MissingOutputError(
+                f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+            )
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.outputs)
+
+    def __len__(self) -> int:
+        return len(self.outputs)
+
+    def __reduce__(self):
+        """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
+        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats), self.capture.picklable())
+
+    def wait(self) -> Frame:
+        """This frame, once the device has drawn it; nothing is copied.
+
+        Raises:
+            DeviceError: the device has failed while it was drawing.
+        """
+        if isinstance(self._images, Waits):
+            self._images.wait()
+        return self
+
+    def read_rows(self, name: str, first: int, end: int, into: np.ndarray | None = None) -> np.ndarray:
+        """An array for an output, `into` or a new one, in which rows of pixels [first, end) are those of the
+        picture: they alone are copied where the device can do that.
+
+        Raises:
+            InputError: rows that the picture does not have, or an array of another shape or type.
+        """
+        self._check(name)
+        by_rows = self._images if isinstance(self._images, ReadsRows) and name != "error" else None
+        if into is None:
+            into = by_rows.empty(name) if by_rows is not None else np.empty_like(self[name])
+        elif not isinstance(into, np.ndarray) or not (by_rows is not None or into.shape == self[name].shape):
+            raise invalid("into", "an array of the shape of the output", into)
+        whole_number("the end of the rows", end, 0, len(into))
+        whole_number("the first row", first, 0, end)
+        if by_rows is None:
+            into[first:end] = self[name][first:end]
+            return into
+        by_rows.read_rows(name, first, end, into)
+        if name == "splat_id":
+            into[first:end] = numbered(name, into[first:end], self._ids)
+        return into
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage: project, sort, bin, blend, resolve; error: all that the output
+        `error` takes.
+
+        On a GPU a frame of a kind that was drawn before is drawn once more for that, since taking the time of
+        each launch would slow all frames down. Empty if its cloud is not on the device any more.
+        """
+        if self._error is None:
+            return self._images.timings
+        return {**self._images.timings, **self._error.timings}
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
+        return self._images.stats
+
+
+@dataclass(frozen=True)
+class _KeptImages:
+    """Images that are no longer on a device."""
+
+    arrays: dict[str, np.ndarray]
+    timings: Mapping[str, float]
+    stats: Mapping[str, int]
+
+    def read(self, name: str) -> np.ndarray:
+        return self.arrays[name]
+
+
+def _kept_frame(
+    arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], capture: Capture
+) -> Frame:
+    return Frame(_KeptImages(arrays, timings, stats), capture)
+
+
+class OfRows(Protocol):
+    """A part of a picture."""
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """Of pixels, [first, end)."""
+        ...
+
+
+P = TypeVar("P", bound=OfRows)
+
+
+def stacked(parts: Iterable[P], draw: Callable[[P], Frame]) -> Frame:
+    """The picture whose bands of rows these are: drawn one after the other, so that a device holds what one
+    is drawn of, and brought to the host, each while the next is drawn. A single one stays where it is."""
+    arrays: dict[str, np.ndarray] = {}
+    timings: dict[str, float] = {}
+    stats: dict[str, int] = {}
+    last: tuple[Frame, tuple[int, int]] | None = None
+
+    def finish(frame: Frame) -> None:
+        frame.wait()
+        for stage, spent in frame.timings.items():
+            timings[stage] = timings.get(stage, 0.0) + spent
+        for what, number in frame.stats.items():
+            stats[what] = stats.get(what, 0) + number
+
+    def take(frame: Frame, rows: tuple[int, int]) -> None:
+        for name in frame.outputs:
+            arrays[name] = frame.read_rows(name, *rows, arrays.get(name))
+
+    for part in parts:
+        if last is not None:
+            finish(last[0])
+        frame = draw(part)
+        if last is not None:
+            take(*last)
+        last = frame, part.rows
+    assert last is not None  # a picture has rows
+    if not arrays:
+        return last[0]
+    finish(last[0])
+    take(*last)
+    return _kept_frame(arrays, timings, stats, last[0].capture)
+
+
+def numbered(name: str, image: np.ndarray, ids: Ids) -> np.ndarray:
+    """An image with the whole scene's indices (n,) in the place of those of its part; -1 stays."""
+    if name != "splat_id" or ids is None:
+        return image
+    return np.append(ids(), np.int32(-1))[image]
+
+
+def refuse_numbered(name: str, ids: Ids) -> None:
+    """Raises InputError for indices of a part on a device, which the whole's are not."""
+    if name == "splat_id" and ids is not None:
+        raise InputError(
+            "splat_id of a store is numbered on the host; take frame['splat_id'], which is copied there"
+        )
+
+
+def check_process(opened_by: int, what: str) -> None:
+    """Raises InputError in a fork of the process that opened it, where its driver does not work."""
+    if opened_by != os.getpid():
+        raise InputError(
+            f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "
+            "each process, and read frames before the fork"
+        )

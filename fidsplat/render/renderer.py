@@ -1,0 +1,393 @@
+"""Renderer: the facade that people use."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any, Unpack
+
+import numpy as np
+
+from fidsplat.backends.interface import (
+    Adopts,
+    DeviceInfo,
+    DrawsBatches,
+    DrawsEvery,
+    Images,
+    Pipeline,
+)
+from fidsplat.backends.prepare import prepare, prepare_batch
+from fidsplat.backends.registry import FIRST, open_backend
+from fidsplat.backends.view import NO_CAMERA, View
+from fidsplat.cameras import Camera
+from fidsplat.capture.capture import Capture, CaptureParts, output_names
+from fidsplat.capture.environment import background_of
+from fidsplat.capture.quality import Quality
+from fidsplat.capture.views import Views, views_of
+from fidsplat.render.batch import FrameBatch, ViewByView
+from fidsplat.render.certified_error import ErrorImage, ideal_of
+from fidsplat.render.frame import Frame, check_process, stacked
+from fidsplat.render.resident import ResidentCloud
+from fidsplat.scenes import Scene
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.store.store import Store
+from fidsplat.streaming.bands import PartOfView
+from fidsplat.streaming.residency import Residency
+from fidsplat.util import interrupts
+from fidsplat.util.arguments import whole_number
+from fidsplat.util.errors import InputError, unknown
+
+_PLAIN = Capture()
+
+
+def default_device() -> str:
+    """The device that is used where none is named: FIDSPLAT_DEVICE, else auto."""
+    return os.environ.get("FIDSPLAT_DEVICE", "").strip() or FIRST
+
+
+class Renderer:
+    """Draws splats on one device. Compiled pipelines and scratch buffers are kept from picture to picture.
+
+    Threads may share one, whose pictures are then drawn one after another; a process that was forked opens
+    its own.
+
+    Args:
+        device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or a GPU's name, or
+            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), "reference" (NumPy, float64, slow), or "auto"
+            ("opencl", else "warp" with a warning). None: what FIDSPLAT_DEVICE says, else "auto".
+        memory_budget: bytes of the device that a picture and its cloud may take; by default nine tenths of
+            what the device says it has. What needs more is drawn in bands of the picture and, by OpenCL,
+            chunks of the cloud, which takes longer and gives the same bits.
+
+    Raises:
+        DeviceError: the device cannot be used; UnknownDeviceError: there is no such device.
+        InputError: the memory budget is no positive number, or the device has none.
+    """
+
+    def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
+        self.backend = open_backend(default_device() if device is None else device)
+        self._process, self._lock = os.getpid(), threading.Lock()
+        if memory_budget is not None:
+            if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
+                raise InputError(
+                    f"memory_budget is {memory_budget!r}; it must be a whole number of bytes, e.g. 2 * 2**30"
+                )
+            self.backend.limit_memory(memory_budget)
+
+    def __reduce__(self):
+        raise InputError(
+            "a Renderer holds a device and cannot be pickled or copied; open one where it is used, e.g. "
+            f"fs.Renderer({self.device.name!r}) in each worker"
+        )
+
+    @property
+    def device(self) -> DeviceInfo:
+        """The device that draws."""
+        return self.backend.info
+
+    def upload(self, scene: Scene | SplatCloud | Store) -> ResidentCloud:
+        """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept. Of stores
+        nothing is read before a view needs it."""
+        check_process(self._process, "Renderer")
+        capture = scene.capture if isinstance(scene, Scene) else _PLAIN
+        stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
+        streamed = stored.streamed if isinstance(stored, Scene) else None
+        if streamed is not None:
+            return ResidentCloud(self.backend, Residency(streamed, self.backend), capture)
+        cloud = scene.cloud() if isinstance(scene, Scene) else scene
+        if not isinstance(cloud, SplatCloud):
+            raise InputError(f"cannot render a {type(scene).__name__}; give a Scene, a SplatCloud or a Store")
+        with self._lock:
+            return ResidentCloud(self.backend, self.backend.upload(cloud), capture, cloud.labels)
+
+    def adopt(
+        self,
+        *,
+        means: Any,
+        quats: Any,
+        scales: Any,
+        opacities: Any,
+        colors: Any = None,
+        sh: Any = None,
+        labels: Any = None,
+        origin: Iterable[float] = (0.0, 0.0, 0.0),
+    ) -> ResidentCloud:
+        """Splats in arrays that are on the device already: drawn where they lie, without a copy.
+
+        Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack
+        (torch, CuPy, JAX); NumPy arrays are copied. With scales (n, 3) splats are 3D Gaussians, those whose
+        third is 0 disks. What is in the arrays when a picture is drawn is what it shows, so a simulation may
+        move the splats between pictures. Quaternions need no unit length; a splat that cannot be drawn (a
+        value that is not finite, a scale below 0) is left out of the picture without a word. `origin` (3,):
+        world position of the means' zero.
+
+        Raises:
+            InputError: the backend takes no arrays, or one has the wrong shape, type or device.
+        """
+        if not isinstance(self.backend, Adopts):
+            raise InputError(
+                f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud"
+            )
+        check_process(self._process, "Renderer")
+        if (colors is None) == (sh is None):
+            raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
+        given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+        given |= {"colors": colors} if sh is None else {"sh": sh}
+        given |= {} if labels is None else {"labels": labels}
+        with self._lock:
+            data = self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64))
+        return ResidentCloud(self.backend, data, _PLAIN)
+
+    def render(
+        self,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        **parts: Unpack[CaptureParts],
+    ) -> Frame:
+        """Draw one picture: `render(scene, Capture(camera, ...))`, or the parts of a capture as arguments.
+
+        Args:
+            scene: what to draw.
+            capture: how; or a camera alone. Without a Capture a Scene's own is taken, which its ResidentCloud
+                has too.
+            outputs, quality, and by name the other parts (`CaptureParts`): take the place of the capture's.
+
+        Raises:
+            InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
+                elsewhere.
+            DeviceError: the device fails or lacks memory.
+        """
+        asked = _asked(scene, capture, outputs=outputs, quality=quality, **parts)
+        return self._draw(self._resident(scene), asked)
+
+    def render_every(
+        self,
+        step: int,
+        scene: Scene | SplatCloud | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        tell: Callable[[float], object] | None = None,
+    ) -> Frame:
+        """Every step-th pixel of a picture, in both directions: what `render` gives those pixels, in a share
+        of the time. The reference alone draws so.
+
+        Args:
+            step: 1 or more.
+            scene, capture, outputs, quality: as `render`.
+            tell: called meanwhile with the share that is done, 0 to 1.
+
+        Raises:
+            InputError: as `render`; the device draws whole pictures only.
+        """
+        whole_number("step", step, 1, 2**31 - 1)
+        asked = _asked(scene, capture, outputs=outputs, quality=quality)
+
+        def draw(pipeline: Pipeline, data: Any, view: View) -> Images:
+            if not isinstance(pipeline, DrawsEvery):
+                raise InputError(
+                    f"{self.device.name} draws whole pictures only; device='reference' draws some of their "
+                    "pixels"
+                )
+            return pipeline.render_every(data, view, step, tell)
+
+        return self._draw(self._resident(scene), asked, draw)
+
+    def render_band(
+        self,
+        band: tuple[int, int],
+        scene: Scene | SplatCloud | Store | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+    ) -> Frame:
+        """A picture of which rows of pixels [first, end) alone are wanted: they have the bits of the whole
+        picture, and of the other rows nothing is promised. `fs.SeveralDevices` puts pictures together so.
+
+        Raises:
+            InputError: as `render`; rows that the picture does not have.
+        """
+        asked = _asked(scene, capture, outputs=outputs, quality=quality)
+        rows = asked.camera.height if asked.camera is not None else 0
+        try:
+            first, end = band
+        except (TypeError, ValueError):
+            raise InputError(f"band is {band!r}; it must be two rows, the first and the end") from None
+        whole_number("the first row of a band", first, 0, rows - 1)
+        whole_number("the end of a band", end, first + 1, rows)
+        return self._draw(self._resident(scene), asked, band=band)
+
+    def render_views(
+        self,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
+        captures: Iterable[Capture | Camera],
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        **parts: Unpack[CaptureParts],
+    ) -> Iterator[Frame]:
+        """Draw one cloud many times, one Frame for each capture or camera, in their order.
+
+        The cloud is uploaded once, kernels and buffers are used again, and on a device that works beside the
+        host the next picture is under way while the caller has the last. Arguments and errors: as `render`
+        (a motion of the camera takes the place of each camera's pose); an error comes after the pictures of
+        the captures before it.
+        """
+        outputs = None if outputs is None else output_names(outputs)  # an iterator would end with the first
+        background = parts.get("background")
+        if background is not None:
+            parts["background"] = background_of(background)
+        try:
+            rest = iter(captures)
+        except TypeError:
+            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
+        resident = self._resident(scene)
+        asked = (_asked(scene, one, outputs=outputs, quality=quality, **parts) for one in rest)
+        if isinstance(resident.data, Residency):
+            asked = resident.data.read_ahead(asked)
+        waiting: Frame | None = None
+        failure: Exception | None = None
+        while True:
+            try:
+                frame = self._draw(resident, next(asked))
+            except StopIteration:
+                break
+            except Exception as error:
+                failure = error
+                break
+            if waiting is not None:
+                yield waiting
+            waiting = frame
+        if waiting is not None:
+            yield waiting
+        if failure is not None:
+            raise failure
+
+    def render_batch(
+        self,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
+        captures: Iterable[Capture | Camera] | Capture | Camera,
+        *,
+        poses: Any = None,
+        groups: Mapping[int, Any] | None = None,
+        mask: Any = None,
+    ) -> FrameBatch:
+        """Render many views of one cloud at once. View i is bit-identical to `render` alone.
+
+        The exception are stores with `Quality.detail_error` above 0: the view with the highest demand
+        selects the levels of detail of all views.
+
+        Args:
+            scene: what to draw; a ResidentCloud transfers no splat.
+            captures: one Capture or Camera for each view, of one size and the same effects; or one for all
+                views. A Camera is taken with the scene's own capture, as in `render`.
+            poses: (views, 7) float64, camera to world: x y z in metres and a quaternion w x y z of any length
+                but 0. They take the place of the cameras' own poses.
+            groups: {label: (views, 7)}: the splats of that label make this motion of the world, from where
+                their cloud has them (`Motion.groups`).
+            mask: (views,) bool: a view that is False is not drawn, and costs nothing; its images hold 0, and
+                -1 in `label` and `splat_id`.
+
+        Raises:
+            InputError: as `render`; numbers of views, sizes, outputs or effects that differ; arrays of
+                another shape; what is no pose; a label that no splat has.
+            DeviceError: the device fails or lacks memory.
+        """
+        resident = self._resident(scene)
+        given = [captures] if isinstance(captures, (Capture, Camera)) else captures
+        try:
+            each = list(given)
+        except TypeError:
+            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
+        plain = [_asked(scene, one) for one in each]
+        if any("error" in one.outputs for one in plain):
+            raise InputError(
+                "the captures of a batch must not ask for the output 'error', got it; render each by itself"
+            )
+        views = views_of(plain, poses, groups, mask)
+        self._refuse_unknown_labels(resident, views)
+        return self._draw_batch(resident, views)
+
+    def _refuse_unknown_labels(self, resident: ResidentCloud, views: Views) -> None:
+        if views.groups and resident.labels is not None:
+            for label in views.groups:
+                if label not in resident.labels:
+                    raise InputError(
+                        unknown("label of splats", str(label), map(str, sorted(resident.labels)))
+                    )
+
+    def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
+        interrupts.check()
+        features, batch = prepare_batch(resident.whole, views)
+        with self._lock:
+            drawn = (batch.one(number) for number in range(len(batch.slots)))
+            data, ids = resident.seen(drawn, features, (capture.quality for capture in views.captures))
+            pipeline = self.backend.pipeline(features)
+            if isinstance(pipeline, DrawsBatches):
+                images = pipeline.render_batch(data, batch)
+            else:
+                each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
+                images = ViewByView(each, batch.total, batch.size, len(resident))
+        return FrameBatch(images, views, ids)
+
+    def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
+        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        check_process(self._process, "Renderer")
+        if resident.backend is not self.backend:
+            raise InputError(
+                "this cloud was uploaded by another Renderer; upload it with the one that draws it"
+            )
+        return resident
+
+    def _draw(
+        self,
+        resident: ResidentCloud,
+        capture: Capture,
+        draw: Callable[[Pipeline, Any, View], Images] = lambda pipeline, data, view: pipeline.render(
+            data, view
+        ),
+        band: tuple[int, int] | None = None,
+    ) -> Frame:
+        interrupts.check()
+        features, view = prepare(resident.whole, capture)
+        view = _banded(view, band)
+        plan = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None
+        with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
+            pipeline, data = self.backend.pipeline(features), resident.data
+            if not isinstance(data, Residency):
+                error = None
+                images = draw(pipeline, data, view)
+                if plan is not None:
+                    ideal = draw(self.backend.pipeline(plan.features), data, _banded(plan.view, band))
+                    error = ErrorImage(images, ideal, plan)
+                return Frame(images, capture, error=error)
+
+            def part(one: PartOfView) -> Frame:
+                images = one.images or draw(pipeline, one.data, one.view)
+                return Frame(images, capture, one.ids)
+
+            return stacked(data.parts(view, features, capture.quality, pipeline), part)
+
+
+def _banded(view: View, band: tuple[int, int] | None) -> View:
+    """The view of which only these rows of pixels are wanted."""
+    return view if band is None else replace(view, band=(band[0] * view.samples, band[1] * view.samples))
+
+
+def _asked(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
+    """The capture that is given or the scene's own, changed by the parts that are given beside it.
+
+    Raises:
+        InputError: an unknown part, one of the wrong kind, or no camera.
+    """
+    if not isinstance(capture, Capture):
+        if capture is not None:
+            parts["camera"] = capture
+        capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _PLAIN
+    asked = capture.with_(**parts)
+    if asked.camera is None:
+        raise InputError(NO_CAMERA)
+    return asked

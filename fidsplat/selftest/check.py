@@ -1,0 +1,212 @@
+"""The self-test of a device: all hard cases, its arithmetic, and a picture of the worst case."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from fidsplat.backends.interface import DeviceInfo
+from fidsplat.render.renderer import Renderer
+from fidsplat.selftest.agreement import TOLERANCE, Difference, Picture, compare, draw, truth_of
+from fidsplat.selftest.arithmetic import Arithmetic, measure
+from fidsplat.selftest.case import Case, Finding
+from fidsplat.util.errors import DeviceError
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The picture of the suite that is furthest from the reference."""
+
+    title: str
+    device: np.ndarray
+    """(h, w, 3) rgb"""
+    reference: np.ndarray
+    certificate: np.ndarray
+    """(h, w)"""
+    rank: tuple[bool, float]
+    """whether it fails, and its largest error"""
+
+
+@dataclass
+class CaseResult:
+    """One case on one device."""
+
+    case: Case
+    pictures: int = 0
+    uncertified: dict[str, float] = field(default_factory=dict)
+    """output -> largest error beyond the certificate"""
+    largest: dict[str, float] = field(default_factory=dict)
+    """output -> largest error, certified ones included"""
+    findings: list[Finding] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
+    """what does not hold, in words; empty when all of it does"""
+    seconds: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        """Whether all of it holds."""
+        return not self.wrong
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """What a device's self-test found."""
+
+    device: DeviceInfo
+    arithmetic: Arithmetic | None
+    cases: list[CaseResult]
+    worst: Worst | None
+    seconds: float
+
+    @property
+    def groups(self) -> dict[str, list[CaseResult]]:
+        """The cases by letter."""
+        letters = dict.fromkeys(result.case.name[0] for result in self.cases)
+        return {letter: [one for one in self.cases if one.case.name[0] == letter] for letter in letters}
+
+    @property
+    def failures(self) -> list[str]:
+        """What does not hold, in words."""
+        measured = self.arithmetic.findings if self.arithmetic else []
+        return [
+            *(f"arithmetic: {f.what} is {f.value:.3g}, above {f.bound:.3g}" for f in measured if not f.holds),
+            *(f"{case.case.name}: {words}" for case in self.cases for words in case.wrong),
+        ]
+
+    @property
+    def passed(self) -> bool:
+        """Whether everything holds."""
+        return not self.failures
+
+    def as_dict(self) -> dict:
+        """Everything but the pictures, for JSON."""
+        arithmetic = self.arithmetic
+        return {
+            "device": self.device.name,
+            "title": self.device.title,
+            "platform": self.device.platform,
+            "version": self.device.version,
+            "passed": self.passed,
+            "seconds": self.seconds,
+            "arithmetic": arithmetic
+            and {"float64": arithmetic.float64, "denormals": arithmetic.denormals, "ulp": arithmetic.ulp},
+            "tolerance": TOLERANCE,
+            "failures": self.failures,
+            "cases": [
+                {
+                    "name": result.case.name,
+                    "title": result.case.title,
+                    "trigger": result.case.trigger,
+                    "passed": result.passed,
+                    "pictures": result.pictures,
+                    "uncertified_error": result.uncertified,
+                    "largest_error": result.largest,
+                    "findings": [asdict(found) | {"holds": found.holds} for found in result.findings],
+                    "seconds": result.seconds,
+                }
+                for result in self.cases
+            ],
+        }
+
+
+def run_check(
+    renderer: Renderer, cases: Iterable[Case], tell: Callable[[str], None] = lambda doing: None
+) -> CheckResult:
+    """Run cases on a device. What the device cannot do at all fails its case; the others go on.
+
+    Args:
+        tell: called with what is being done, before each case.
+    """
+    begun = time.perf_counter()
+    tell("arithmetic")
+    arithmetic = measure(renderer)
+    results: list[CaseResult] = []
+    worst: Worst | None = None
+    for case in cases:
+        tell(f"{case.name}: {case.title}")
+        result, worst = run_case(renderer, case, worst)
+        results.append(result)
+    return CheckResult(renderer.device, arithmetic, results, worst, time.perf_counter() - begun)
+
+
+def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tuple[CaseResult, Worst | None]:
+    """Run one case on a device; returns what it found, and the worst of `worst` and its own pictures."""
+    begun = time.perf_counter()
+    result = CaseResult(case)
+    try:
+        for found in case.run(renderer):
+            if isinstance(found, Picture):
+                result.pictures += 1
+                worst = _compared(renderer, found, result, worst)
+            else:
+                result.findings.append(found)
+                if not found.holds:
+                    result.wrong.append(f"{found.what} is {found.value:.3g}, above {found.bound:.3g}")
+    except DeviceError as error:
+        result.wrong.append(str(error))
+    result.seconds = time.perf_counter() - begun
+    return result, worst
+
+
+def _compared(renderer: Renderer, picture: Picture, result: CaseResult, worst: Worst | None) -> Worst | None:
+    frame, truth = draw(renderer, picture), truth_of(picture)
+    for difference in compare(frame, truth, picture.outputs):
+        name = difference.output
+        raise_to(result.uncertified, name, difference.uncertified)
+        raise_to(result.largest, name, difference.error)
+        if not difference.agrees:
+            result.wrong.append(_in_words(result.pictures, difference))
+        rank = not difference.agrees, rank_of(difference.error)
+        # what agrees is shown if it can be seen
+        seen = "rgb" in picture.outputs and (name in ("rgb", "alpha") or rank[0])
+        if seen and (worst is None or rank > worst.rank):
+            words = f"{result.case.name}, picture {result.pictures}, {name}: wrong by {difference.error:.0e}"
+            words += f", uncertified {difference.uncertified:.0e}"
+            rgb = np.array(frame["rgb"], dtype=np.float64)
+            worst = Worst(words, rgb, truth["rgb"], truth["certificate"], rank)
+    return worst
+
+
+def worst_picture(worst: Worst) -> np.ndarray:
+    """Device, reference, difference and certificate side by side, (h, w, 3) uint8.
+
+    The difference and the certificate are multiplied by a power of ten, so that they can be seen.
+    """
+    from fidsplat.vision.images import to_uint8
+    from fidsplat.vision.paint import contact_sheet
+
+    difference = np.abs(worst.device - worst.reference)
+    certificate = np.repeat(worst.certificate[:, :, None], 3, axis=2)
+    panels = [(worst.title, worst.device), ("reference, float64", worst.reference)]
+    for name, plane in (("difference", difference), ("certificate", certificate)):
+        peak = float(np.nan_to_num(plane, posinf=1.0).max(initial=0.0))
+        factor = 10.0 ** np.clip(np.floor(-np.log10(peak)), 0, 9) if peak > 0 else 1.0
+        panels.append((f"{name} x {factor:.0e}, at most {peak:.1e}", plane * factor))
+    times = -(-400 // worst.device.shape[1])
+    shown = [(name, to_uint8(plane).repeat(times, axis=0).repeat(times, axis=1)) for name, plane in panels]
+    return contact_sheet([shown[:2], shown[2:]], width=times * worst.device.shape[1])
+
+
+def _in_words(number: int, difference: Difference) -> str:
+    image = f"picture {number}, {difference.output}"
+    if not difference.finite:
+        return f"{image} holds values that are not finite"
+    if difference.excess > 0:
+        return (
+            f"{image} is wrong by {difference.uncertified:.1e} beyond its certificate, above "
+            f"{TOLERANCE[difference.output]:.0e}"
+        )
+    return f"{image}: {difference.risky:.1%} of the pixels have certificates above 0.05"
+
+
+def raise_to(largest: dict[str, float], name: str, value: float) -> None:
+    """Keep the larger of what stands under a name and a value."""
+    largest[name] = max(largest.get(name, 0.0), value, key=rank_of)
+
+
+def rank_of(value: float) -> float:
+    """A NaN is worse than anything."""
+    return float("inf") if np.isnan(value) else value

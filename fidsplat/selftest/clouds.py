@@ -1,0 +1,60 @@
+"""Splats and cameras that the cases are made of: the camera at the origin looks down +z, x right, y down."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fidsplat.cameras import Camera
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import matrix_to_quaternion
+
+ORANGE = (0.9, 0.5, 0.2)
+
+
+def camera(width: int = 100, height: int = 80, focal: float = 80.0, **changes) -> Camera:
+    """A pinhole camera at the origin; `cx`, `cy`, `world_to_camera`, `near`, `far` may be given."""
+    center = {"cx": width / 2, "cy": height / 2}
+    return Camera.pinhole(width, height, focal, focal, **center | changes)
+
+
+def quaternion(tangent_u, tangent_v) -> np.ndarray:
+    """(4,) of the splat whose tangents point along u and v (each (3,), made orthonormal, u first)."""
+    u = np.asarray(tangent_u, float) / np.linalg.norm(tangent_u)
+    v = np.asarray(tangent_v, float) - np.dot(tangent_v, u) * u
+    v /= np.linalg.norm(v)
+    return matrix_to_quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
+
+
+def turned(axis, degrees: float) -> np.ndarray:
+    """Quaternion (4,) of a turn by an angle about an axis (3,)."""
+    half = math.radians(degrees) / 2
+    unit = np.asarray(axis, float) / np.linalg.norm(axis)
+    return np.array([math.cos(half), *(math.sin(half) * unit)])
+
+
+def splats(
+    means, quats, scales, opacities: ArrayLike = 1.0, colors: ArrayLike = ORANGE, **more
+) -> SplatCloud:
+    """A cloud of n splats: means (n, 3); the others (n, ...) or the value of them all; scales of three are
+    those of 3D Gaussians."""
+    n = len(means)
+
+    def each(value, *shape) -> np.ndarray:
+        return np.broadcast_to(np.asarray(value, float), (n, *shape))
+
+    more.setdefault("labels", np.arange(n) % 100)
+    sizes = each(scales, 3 if np.shape(scales)[-1:] == (3,) else 2)
+    return SplatCloud(means, each(quats, 4), sizes, each(opacities), colors=each(colors, 3), **more)
+
+
+def taken(cloud: SplatCloud, index) -> SplatCloud:
+    """The splats at an index array, in its order."""
+    names = ("means", "quats", "scales", "opacities", "colors", "sh", "labels")
+    arrays = {name: array[index] for name in names if (array := getattr(cloud, name)) is not None}
+    if cloud.thickness is not None:
+        arrays["scales"] = np.column_stack([arrays["scales"], cloud.thickness[index]])
+    chosen = SplatCloud(**arrays, origin=cloud.origin)
+    return chosen if cloud.planes is None else chosen.with_planes(cloud.planes[index])

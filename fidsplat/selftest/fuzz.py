@@ -1,0 +1,230 @@
+"""Random scenes that are hard on purpose, each from its seed alone, and their comparison with the reference,
+in runs that go on where they were stopped.
+
+The distribution is that of numerics.md, section 3: scales log-uniform from 1e-6 to 1e3 m, anisotropy to 1e6,
+depths from -5 to 1e5 m, every tenth splat edge-on within 1e-6 rad, every tenth across the near plane, every
+tenth in a coplanar group, half of those that are known as planes tilted, opacities on the thresholds.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.capture.quality import Quality
+from fidsplat.render.renderer import Renderer
+from fidsplat.scenes.random_clouds import log_uniform
+from fidsplat.selftest.agreement import ALL_OUTPUTS, RARE, RISKY, Picture, compare, draw, truth_of
+from fidsplat.selftest.clouds import quaternion
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import quaternion_multiply, quaternion_to_matrix
+from fidsplat.util.files import atomic_write, from_json, read_text
+from fidsplat.util.provenance import code_hash
+
+LARGEST_SCENE = 200
+CUT = 1.0 / 255.0
+OPACITIES = np.array([0.0, CUT * (1 - 1e-6), CUT * (1 + 1e-6), 0.5, 0.99, 1.0], np.float32)
+QUALITIES = (
+    Quality(),
+    Quality.named("reference"),
+    Quality(lowpass="none"),
+    Quality(samples=2),
+    Quality.named("gsplat"),
+)
+SHARES = (0.5, 0.15, 0.15, 0.1, 0.1)
+"""of the scenes that are drawn with each quality"""
+_SAVE_EVERY = 5.0  # seconds
+
+
+def scene_of(seed: int) -> Picture:
+    """The picture of a seed: 1 to 200 splats, at most 80 x 64 pixels, the camera anywhere."""
+    generator = np.random.default_rng(seed)
+    count = int(generator.integers(1, LARGEST_SCENE + 1))
+    width, height = (int(generator.integers(1, limit + 1)) for limit in (80, 64))
+    focal = max(width, height) * float(log_uniform(generator, 0.4, 4.0))
+    near = float(generator.choice([0.01, 0.01, 0.2, 1.0]))
+
+    kind = generator.choice(4, count, p=[0.7, 0.1, 0.1, 0.1])  # plain, edge-on, crossing near, coplanar
+    depth = np.where(
+        generator.random(count) < 0.4,
+        generator.uniform(-5, 5, count),
+        log_uniform(generator, near, 1e5, count),
+    )
+    span = np.array([width, height]) / 2 / focal
+    sideways = generator.uniform(-1.3, 1.3, (count, 2)) * span * np.maximum(np.abs(depth), 0.1)[:, None]
+    means = np.column_stack([sideways, depth])
+    quats = generator.normal(size=(count, 4))
+    large = log_uniform(generator, 1e-6, 1e3, count)
+    scales = np.column_stack([large, large / log_uniform(generator, 1, 1e6, count)])
+    swap = generator.random(count) < 0.5
+    scales[swap] = scales[swap, ::-1]
+
+    for k in np.flatnonzero(kind == 1):
+        quats[k] = _edge_on(generator, means[k])
+    for k in np.flatnonzero(kind == 2):
+        # the disk's reach along z is up to three standard deviations: the centre lies within it
+        axes = quaternion_to_matrix(quats[k])[2, :2] * scales[k]
+        means[k, 2] = near + generator.uniform(-3, 3) * np.linalg.norm(axes)
+    planes = _coplanar(generator, np.flatnonzero(kind == 3), means, quats)
+    _tilt(np.random.default_rng([seed, 1]), planes, means, quats)
+
+    pose = np.eye(4)
+    if generator.random() < 0.5:
+        if (planes >= 0).any():
+            _part(np.random.default_rng([seed, 3]), np.flatnonzero((kind == 3) & (planes < 0)), means)
+        turn = generator.normal(size=4)
+        turn /= np.linalg.norm(turn)
+        pose[:3, :3] = quaternion_to_matrix(turn)
+        means = means @ pose[:3, :3]
+        quats = quaternion_multiply(turn * [1, -1, -1, -1], quats)
+    cloud = SplatCloud(
+        means.astype(np.float32),
+        quats,
+        scales,
+        generator.choice(OPACITIES, count),
+        colors=generator.uniform(0, 1, (count, 3)),
+        labels=generator.integers(0, 9, count),
+    ).with_planes(planes)
+    cx, cy = generator.uniform(-0.2, 1.2, 2) * [width, height]
+    camera = Camera.pinhole(width, height, focal, focal, cx, cy, pose, near=near)
+    quality = QUALITIES[int(generator.choice(len(QUALITIES), p=SHARES))]
+    return Picture(cloud, camera, quality, ALL_OUTPUTS)
+
+
+def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:
+    """Quaternion (4,) of a splat at `mean` whose plane holds the camera within 1e-6 rad."""
+    ray = mean / np.linalg.norm(mean)
+    across = np.cross(ray, generator.normal(size=3))
+    across /= np.linalg.norm(across)
+    normal = across + generator.uniform(-1e-6, 1e-6) * ray
+    along = np.cross(normal, generator.normal(size=3))
+    return quaternion(along, np.cross(normal, along))
+
+
+def _coplanar(generator, chosen: np.ndarray, means: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """Puts the chosen splats on a few planes z = const, turned within them; returns ids of planes (n,)."""
+    planes = np.full(len(means), -1)
+    groups = generator.integers(0, 3, len(chosen))
+    for group in range(3):
+        members = chosen[groups == group]
+        depth = float(np.float32(log_uniform(generator, 0.3, 30.0)))
+        # half of the groups are known to be coplanar, the others only happen to be
+        known = generator.random() < 0.5
+        for k in members:
+            means[k, :2] *= depth / max(abs(means[k, 2]), 0.1)
+            means[k, 2] = depth
+            angle = generator.uniform(0, math.pi)
+            quats[k] = [math.cos(angle / 2), 0, 0, math.sin(angle / 2)]
+            planes[k] = group if known else -1
+    return planes
+
+
+def _tilt(generator: np.random.Generator, planes: np.ndarray, means: np.ndarray, quats: np.ndarray) -> None:
+    """Turns half of the planes about their middle, so that they cross one another and what lies around."""
+    for plane in np.unique(planes[planes >= 0]):
+        axis = generator.normal(size=3) * [1, 1, 0.3]
+        angle = generator.uniform(0, math.pi / 2)
+        if generator.random() < 0.5:
+            continue
+        own = np.flatnonzero(planes == plane)
+        turn = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis / np.linalg.norm(axis))])
+        middle = means[own].mean(axis=0)
+        means[own] = middle + (means[own] - middle) @ quaternion_to_matrix(turn).T
+        quats[own] = quaternion_multiply(turn, quats[own])
+
+
+def _part(generator: np.random.Generator, chosen: np.ndarray, means: np.ndarray) -> None:
+    """Moves the chosen splats, which lie in one plane, up to 1/1000 away from the camera. Where order is by
+    depth at each pixel and their plane is turned, rounding would say which is in front, all over the picture
+    (docs/order.md), and there would be nothing to compare."""
+    means[chosen] *= 1 + generator.uniform(0, 1e-3, (len(chosen), 1))
+
+
+@dataclass
+class FuzzState:
+    """Figures over all scenes from seed 0 to `scenes` - 1."""
+
+    key: str
+    """device, driver and sources that they hold for"""
+    scenes: int = 0
+    splats: int = 0
+    pixels: int = 0
+    risky: int = 0
+    """pixels whose certificate exceeds 0.05"""
+    uncertified: dict[str, tuple[float, int]] = field(default_factory=dict)
+    """output -> largest error beyond the certificate, and its seed"""
+    largest: dict[str, tuple[float, int]] = field(default_factory=dict)
+    """output -> largest error, certified ones included, and its seed"""
+    failing: list[int] = field(default_factory=list)
+    """seeds with an error above its tolerance beyond the certificate, or a value that is not finite"""
+    seconds: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        """Whether no seed fails and few pixels have large certificates."""
+        return not self.failing and self.risky <= RARE * self.pixels
+
+    def add(self, seed: int, renderer: Renderer) -> None:
+        """Draw the scene of the next seed and compare it."""
+        picture = scene_of(seed)
+        truth = truth_of(picture)
+        failed = False
+        for difference in compare(draw(renderer, picture), truth, ALL_OUTPUTS):
+            name = difference.output
+            failed |= not (difference.finite and difference.excess <= 0)
+            errors = (self.uncertified, difference.uncertified), (self.largest, difference.error)
+            for record, value in errors:
+                value = float("inf") if np.isnan(value) else value
+                if name not in record or value > record[name][0]:
+                    record[name] = value, seed
+        if failed:
+            self.failing.append(seed)
+        self.scenes, self.splats = seed + 1, self.splats + len(picture.cloud)
+        self.pixels += truth["certificate"].size
+        self.risky += int((truth["certificate"] > RISKY).sum())
+
+
+def fuzz_run(renderer: Renderer, splats: int, file: Path | None = None) -> Iterator[FuzzState]:
+    """Draw scenes until they hold `splats` splats; yields the state after each.
+
+    A run that was stopped, with the same device and kernels, goes on from `file`; one that has reached its
+    number starts again. Raises InputError when the file cannot be written.
+    """
+    state = _load(file, _key(renderer))
+    if state.splats >= splats:
+        state = FuzzState(state.key)
+    saved = began = time.monotonic()
+    before = state.seconds
+    while state.splats < splats:
+        state.add(state.scenes, renderer)
+        now = time.monotonic()
+        state.seconds = before + now - began
+        if file is not None and (now - saved > _SAVE_EVERY or state.splats >= splats):
+            with atomic_write(file) as stream:
+                stream.write(json.dumps(asdict(state), indent=1).encode())
+            saved = now
+        yield state
+
+
+def _key(renderer: Renderer) -> str:
+    device = renderer.device
+    return " | ".join((device.title, device.platform, device.version, code_hash()))
+
+
+def _load(file: Path | None, key: str) -> FuzzState:
+    try:
+        values = from_json(read_text(file)) if file is not None else {}
+        if values.get("key") != key:
+            return FuzzState(key)
+        for name in ("uncertified", "largest"):
+            values[name] = {output: (float(pair[0]), int(pair[1])) for output, pair in values[name].items()}
+        return FuzzState(**values)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):  # none yet, or not one of ours
+        return FuzzState(key)

@@ -1,0 +1,1 @@
+"""Splats as plain arrays: clouds, spherical harmonics, rotations."""

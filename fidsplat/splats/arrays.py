@@ -1,0 +1,220 @@
+"""What the arrays of a SplatCloud are made of: checks of what users give, splats that cannot be drawn, types,
+origins, quaternions, clouds in one."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fidsplat.splats.rotations import quaternion_multiply
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import LARGEST
+
+F32 = np.dtype(np.float32)
+
+
+def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
+    """Which rows hold a value that is not finite or beyond +-limit; None, at no cost in memory, if none."""
+    with np.errstate(invalid="ignore"):
+        if not array.size or (array.min() >= -limit and array.max() <= limit):  # false where there is a NaN
+            return None
+        good = array <= limit
+        good &= array >= -limit
+    return ~np.asarray(good.all(axis=tuple(range(1, array.ndim))))
+
+
+def find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, int]]:
+    """(mask of the rows to keep, or None for all; reason -> count), each row under its first reason."""
+    bad: np.ndarray | None = None
+    dropped: dict[str, int] = {}
+    s, o = arrays["scales"], arrays["opacities"]
+    finite = float(np.finfo(F32).max)
+    beyond = {n: rows_beyond(array, finite if n == "quats" else LARGEST) for n, array in arrays.items()}
+    beyond = {name: rows for name, rows in beyond.items() if rows is not None}
+    defects = [(f"{name} not finite", rows_beyond(arrays[name], finite)) for name in beyond]
+    defects += [(f"{name} beyond {LARGEST:g}", rows) for name, rows in beyond.items()]
+    with np.errstate(over="ignore", invalid="ignore"):
+        defects += [
+            ("zero quaternion", square_of(arrays["quats"]) < 1e-30),
+            ("scale not above 0", (s[:, :2] <= 0).any(axis=1) | (s[:, 2:] < 0).any(axis=1)),
+            ("opacity outside [0, 1]", (o < 0) | (o > 1)),
+        ]
+    for reason, rows in defects:
+        if rows is None or not rows.any():
+            continue
+        fresh = rows if bad is None else rows & ~bad
+        bad = rows if bad is None else rows | bad
+        if fresh.any():
+            dropped[reason] = int(fresh.sum())
+    return (None if bad is None else ~bad), dropped
+
+
+def drop_report(dropped: dict[str, int], n: int, source) -> str:
+    """What a warning says about splats that are left out."""
+    parts = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
+    start = "" if source is None else f"{source}: "
+    total = sum(dropped.values())
+    hints = [hint for reason, hint in _STORED.items() if 4 * dropped.get(reason, 0) > n]
+    return f"{start}{total} of {n} splats left out ({parts}){''.join(f'; {hint}' for hint in hints)}"
+
+
+_STORED = {
+    "scale not above 0": "scales are standard deviations in metres: take exp() of logarithms",
+    "opacity outside [0, 1]": "opacities are from 0 to 1: take the sigmoid of logits",
+}
+"""what trainers keep instead, as files do: said where more than a quarter of all are left out for it"""
+
+
+def square_of(quats: np.ndarray) -> np.ndarray:
+    """Squared lengths (n,) float64 of quaternions (n, 4)."""
+    return np.einsum("ij,ij->i", quats, quats, dtype=np.float64)
+
+
+# Turning the frame cyclically keeps it right-handed. Row i makes axis i the third: its new axes are
+# (y, z, x) for i = 0 and (z, x, y) for i = 1, a third of a turn about (1, 1, 1) and back.
+_TURNS = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])
+_CYCLES = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
+
+
+def real_numbers(name: str, value) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise InputError(f"{name} must be an array, but its rows differ in length") from None
+    if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
+        raise InputError(f"{name} must be an array of real numbers, not of {array.dtype}")
+    return array
+
+
+def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if array.shape == shape:
+        return
+    wanted = "(n, 3)" if name == "means" else str(shape)
+    if name == "scales":
+        wanted += f" or {(shape[0], 3)}"
+    raise InputError(f"{name} must have the shape {wanted}, but its shape is {array.shape}")
+
+
+def check_scale(colors: np.ndarray) -> np.ndarray:
+    """Colours, which are no bytes: white would be 255 times as light as the brightest paper."""
+    if colors.dtype == np.uint8 and colors.size and colors.max() > 1:
+        raise InputError("colors are bytes up to 255, but 1 is white: give colors / 255")
+    return colors
+
+
+def whole_numbers(labels, n: int, name: str = "labels") -> np.ndarray:
+    array = real_numbers(name, 0 if labels is None else labels)
+    if array.dtype.kind == "f" and array.size:
+        raise InputError(f"{name} must be ints, not {array.dtype}")
+    if array.shape not in ((), (n,)):
+        raise InputError(f"{name} must be one int or have the shape ({n},), but its shape is {array.shape}")
+    limits = np.iinfo(np.int32)
+    if array.size and (int(array.min()) < limits.min or int(array.max()) > limits.max):
+        raise InputError(f"{name} must lie in {limits.min} to {limits.max}")
+    return np.full(n, array, np.int32) if array.ndim == 0 else array.astype(np.int32)
+
+
+def check_origin(origin) -> np.ndarray:
+    array = real_numbers("origin", origin).astype(np.float64)
+    if array.shape != (3,) or rows_beyond(array, LARGEST) is not None:
+        raise InputError(f"origin must be three numbers, at most {LARGEST:g} metres, not {origin!r}")
+    return array
+
+
+def _is_frozen(array) -> bool:
+    while isinstance(array, np.ndarray):
+        if array.flags.writeable or isinstance(array, np.memmap):
+            return False
+        array = array.base
+    return array is None
+
+
+def as_single(array: np.ndarray) -> np.ndarray:
+    """As C-ordered float32 that nobody else can write to; what float32 cannot hold becomes inf."""
+    if array.dtype == F32 and array.flags.c_contiguous and _is_frozen(array):
+        return array
+    with np.errstate(over="ignore"):
+        return np.array(array, dtype=F32, order="C")
+
+
+def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(means (n, 3) float32 relative to the origin, origin (3,) float64) for finite means (n, 3) in the
+    world.
+
+    ``single`` is the means as float32. The origin is 0 unless the means are not all float32 numbers and lie
+    further from 0 than 64 times the cloud's reach, so that float32 would lose at least 6 of its 24 bits.
+    Then it is the centre of the bounding box, rounded to a power of two near the reach, which keeps it a
+    short number.
+    """
+    zero = np.zeros(3)
+    if means.dtype == F32 or not len(means) or np.array_equal(single, means):
+        return single, zero
+    low, high = means.min(axis=0), means.max(axis=0)
+    reach = max(float((high - low).max()) / 2, 3.0 * float(scales.max()))
+    if max(np.abs(low).max(), np.abs(high).max()) <= 64 * reach:
+        return single, zero
+    step = 2.0 ** np.floor(np.log2(reach))
+    origin = np.round((low / 2 + high / 2) / step) * step
+    return as_single(means - origin), origin
+
+
+def unit_quaternions(quats: np.ndarray) -> np.ndarray:
+    """Quaternions of length 1. Those that are so to float32 rounding keep their bits: twice is the same as
+    once."""
+    unit = quats  # only a cloud's own array can be written to
+    for start in range(0, len(quats), 4096):  # so that millions of them need no copy in float64
+        part = slice(start, start + 4096)
+        square = square_of(quats[part])
+        off = np.abs(square - 1.0) > 2.4e-7
+        if off.any():
+            unit = unit if unit.flags.writeable else unit.copy()
+            unit[part][off] = quats[part][off] / np.sqrt(square[off])[:, None]
+    return unit
+
+
+def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same 3D Gaussians in frames whose third axis is the thinnest; the third wins ties.
+
+    quats (n, 4) wxyz, scales (n, 3), none of them NaN -> both new.
+    """
+    thin = 2 - np.argmin(scales[:, ::-1], axis=1)
+    turned = thin != 2
+    if turned.any():
+        quats = quats.copy()
+        with np.errstate(over="ignore", invalid="ignore"):
+            quats[turned] = quaternion_multiply(quats[turned], _TURNS[thin[turned]])
+    return quats, np.take_along_axis(scales, _CYCLES[thin], axis=1)
+
+
+def check_one_footprint(planes: np.ndarray | None, boxes: np.ndarray | None) -> None:
+    """Raises InputError for a plane (n,) of both kinds."""
+    if planes is None or boxes is None:
+        return
+    both = np.intersect1d(planes[(planes >= 0) & boxes], planes[~boxes])
+    if len(both):
+        raise InputError(
+            f"plane {both[0]} has boxes and Gaussians, whose coverage follows different rules; "
+            "give each kind a plane"
+        )
+
+
+def joined_arrays(clouds: Sequence[Any], name: str, kind) -> np.ndarray | None:
+    """The arrays of this name of several clouds as one: 0 where a cloud has None; None if all have None."""
+    arrays = [getattr(cloud, name) for cloud in clouds]
+    if all(array is None for array in arrays):
+        return None
+    pairs = zip(arrays, clouds, strict=True)
+    return np.concatenate([np.zeros(len(cloud), kind) if a is None else a for a, cloud in pairs])
+
+
+def joined_planes(clouds: Sequence[Any]) -> np.ndarray | None:
+    """The same of `planes`, whose ids in different clouds are different planes; -1 where a cloud has None."""
+    given = [cloud.planes for cloud in clouds]
+    if all(ids is None for ids in given):
+        return None
+    joined, first_free = [], 0
+    for cloud, own in zip(clouds, given, strict=True):
+        ids = np.full(len(cloud), -1, np.int32) if own is None else own
+        joined.append(np.where(ids >= 0, ids + first_free, -1).astype(np.int32))
+        first_free = max(first_free, int(joined[-1].max()) + 1)
+    return np.concatenate(joined)

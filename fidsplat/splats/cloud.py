@@ -1,0 +1,404 @@
+"""SplatCloud: the Gaussian splats of a scene as a structure of arrays, checked once and then frozen."""
+
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fidsplat.splats.arrays import (
+    F32,
+    as_single,
+    check_one_footprint,
+    check_origin,
+    check_scale,
+    check_shape,
+    choose_origin,
+    drop_report,
+    find_defects,
+    joined_arrays,
+    joined_planes,
+    real_numbers,
+    rows_beyond,
+    unit_quaternions,
+    whole_numbers,
+    with_thinnest_last,
+)
+from fidsplat.splats.harmonics import C0, MAX_DEGREE, rotation_of_coefficients, sh_basis
+from fidsplat.splats.rotations import (
+    check_similarity,
+    matrix_to_quaternion,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from fidsplat.util.arguments import number
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import LARGEST, PickledByFields
+from fidsplat.util.summaries import Summarised, point
+
+__all__ = ["SplatCloud", "sh_basis"]
+
+
+@dataclass(frozen=True, init=False, eq=False, repr=False)
+class SplatCloud(PickledByFields, Summarised):
+    """2D Gaussian splats (disks), and 3D ones (ellipsoids) where they have a thickness. Every array is
+    read-only; make a new cloud to change one."""
+
+    means: np.ndarray
+    """(n, 3) float32, metres, centres relative to ``origin``"""
+    quats: np.ndarray
+    """(n, 4) float32, unit (w, x, y, z); the rotation's columns are tangent u, tangent v, normal"""
+    scales: np.ndarray
+    """(n, 2) float32, metres, standard deviations along the tangents, above 0"""
+    opacities: np.ndarray
+    """(n,) float32 in [0, 1]"""
+    colors: np.ndarray | None
+    """(n, 3) float32 RGB in display space, or None when ``sh`` is set"""
+    sh: np.ndarray | None
+    """(n, k, 3) float32, k = (degree + 1)^2, or None when ``colors`` is set; convention at ``sh_basis``"""
+    labels: np.ndarray
+    """(n,) int32"""
+    origin: np.ndarray
+    """(3,) float64, metres, world position of the means' zero"""
+    planes: np.ndarray | None = None
+    """(n,) int32, or None: splats with the same id >= 0 are printed on one plane, where their order means
+    nothing (`with_planes`); -1 for splats of no plane"""
+    boxes: np.ndarray | None = None
+    """(n,) bool, or None if all are False: True for a box, whose opacity is the same all over |u|, |v| <= 1
+    and whose ``scales`` are half sides (`with_boxes`); False for a Gaussian"""
+    thickness: np.ndarray | None = None
+    """(n,) float32, metres, or None if all are 0: standard deviation along the normal, above 0 for a 3D
+    Gaussian, 0 for a disk or a box"""
+    dropped: dict[str, int] = field(default_factory=dict)
+    """reason -> number of splats left out when this cloud was made; empty when nothing was"""
+
+    def __init__(
+        self, means, quats, scales, opacities, colors=None, sh=None, labels=None, origin=None, *, source=None
+    ):
+        """Check and freeze n splats.
+
+        means (n, 3) metres; quats (n, 4) wxyz of any length but 0; scales (n, 2) metres, or (n, 3), whose
+        third becomes ``thickness``: 0 is a disk; opacities (n,) in [0, 1]; exactly one of colors (n, 3) and
+        sh (n, 1 | 4 | 9 | 16, 3); labels: an int or (n,) ints, else 0.
+
+        origin None: means are world coordinates; float32 means keep their bits, with origin 0; float64
+        means get an origin when float32 would blur them. origin (3,): means are relative to it, as the
+        attribute is.
+
+        A splat that cannot be drawn (a value that is not finite or, quaternions apart, beyond 1e15,
+        |q|^2 < 1e-30, a scale <= 0 or a thickness < 0, an opacity outside [0, 1]) is left out and counted in
+        ``dropped`` under its first such reason; one warning reports the counts, naming ``source`` (a file,
+        say). Arrays are copied, except float32 arrays that are read-only down to the memory they stand on.
+        Raises InputError, naming the array, for a wrong shape or type.
+        """
+        given = real_numbers("means", means)
+        n = given.shape[0] if given.ndim else -1
+        check_shape("means", given, (n, 3))
+        arrays = {"quats": real_numbers("quats", quats), "scales": real_numbers("scales", scales)}
+        arrays["opacities"] = real_numbers("opacities", opacities)
+        thick = arrays["scales"].shape == (n, 3)
+        shapes: dict[str, tuple[int, ...]] = {"quats": (n, 4), "opacities": (n,)}
+        shapes["scales"] = (n, 3) if thick else (n, 2)
+        if (colors is None) == (sh is None):
+            raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
+        if colors is not None:
+            arrays["colors"] = check_scale(real_numbers("colors", colors))
+            shapes["colors"] = (n, 3)
+        else:
+            arrays["sh"] = real_numbers("sh", sh)
+            k = arrays["sh"].shape[1] if arrays["sh"].ndim == 3 else 0
+            if k not in [(d + 1) ** 2 for d in range(MAX_DEGREE + 1)]:
+                got = arrays["sh"].shape
+                raise InputError(
+                    f"sh must have the shape ({n}, k, 3), k = 1, 4, 9 or 16, but its shape is {got}"
+                )
+            shapes["sh"] = (n, k, 3)
+        for name, array in arrays.items():
+            check_shape(name, array, shapes[name])
+        new_labels = whole_numbers(labels, n)
+
+        single = {name: as_single(array) for name, array in {"means": given, **arrays}.items()}
+        keep, dropped = find_defects(single)
+        if keep is not None:
+            single = {name: array[keep] for name, array in single.items()}
+            given = single["means"] if given.dtype == F32 else given[keep]
+            new_labels = new_labels[keep]
+            warnings.warn(drop_report(dropped, n, source), stacklevel=2)
+        if thick:
+            single["thickness"] = as_single(single["scales"][:, 2])
+            single["scales"] = as_single(single["scales"][:, :2])
+        self._finish(given, single, new_labels, origin, dropped)
+
+    @classmethod
+    def of_checked(
+        cls,
+        means,
+        quats,
+        scales,
+        opacities,
+        sh=None,
+        labels=None,
+        thickness=None,
+        *,
+        colors=None,
+        origin,
+        dropped,
+    ) -> "SplatCloud":
+        """A cloud that takes over arrays of splats that can all be drawn, as their maker knows.
+
+        means (n, 3) float32 or float64, all else as the attributes are, but quats of any length above 0; one
+        of sh and colors is None. dropped: what a reader left out.
+        """
+        cloud = object.__new__(cls)
+        single = {"quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "sh": sh}
+        single["means"] = means if means.dtype == F32 else as_single(means)
+        if thickness is not None:
+            single["thickness"] = thickness
+        cloud._finish(
+            means, single, whole_numbers(None, len(means)) if labels is None else labels, origin, dropped
+        )
+        return cloud
+
+    def _finish(self, given, single: dict[str, np.ndarray], labels, origin, dropped: dict[str, int]) -> None:
+        """Freeze splats that can be drawn; given: the means in the type that they came in."""
+        single["quats"] = unit_quaternions(single["quats"])
+        if "thickness" in single and not single["thickness"].any():
+            del single["thickness"]
+        if origin is not None:
+            new_origin = check_origin(origin)
+        else:  # after the defects, so that a splat that is left out has no say in it
+            single["means"], new_origin = choose_origin(given, single["means"], single["scales"])
+        self._set(
+            **{"colors": None, "sh": None, "planes": None, "boxes": None, "thickness": None, **single},
+            labels=labels,
+            origin=new_origin,
+            dropped=dropped,
+        )
+
+    def _set(self, **values) -> None:
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    def _replaced(self, **values) -> "SplatCloud":
+        """A copy with some arrays exchanged; the values are known to be good."""
+        cloud = object.__new__(SplatCloud)
+        old = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        cloud._set(**old | {"dropped": dict(self.dropped)} | values)
+        return cloud
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __repr__(self) -> str:
+        color = "colors" if self.sh is None else f"SH degree {self.sh_degree}"
+        return f"SplatCloud({len(self)} splats, {color}, origin {tuple(self.origin.tolist())})"
+
+    def summary(self) -> dict[str, str]:
+        """What it holds, in words."""
+        kinds = {"none": "2D", "all": "3D", "some": "2D and 3D"}
+        rows = {"splats": f"{len(self):,}, {kinds[self.ellipsoids]}"}
+        rows["colours"] = "plain" if self.sh is None else f"SH of degree {self.sh_degree}"
+        if len(self):
+            rows["bounds"] = " to ".join(map(point, self.bounds())) + " m"
+            rows["labels"] = f"{len(np.unique(self.labels)):,} different"
+        return rows | {f"left out: {why}": f"{count:,}" for why, count in self.dropped.items()}
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree 0 to 3 of the SH colours, -1 for plain colours."""
+        return -1 if self.sh is None else int(np.sqrt(self.sh.shape[1])) - 1
+
+    @property
+    def plain_colors(self) -> np.ndarray | None:
+        """(n, 3) float32 colours that do not depend on the view: `colors`, or what SH of degree 0 means; None
+        for SH of a higher degree."""
+        if self.sh is None or self.sh_degree > 0:
+            return self.colors
+        return np.maximum(np.float32(C0) * self.sh[:, 0, :] + np.float32(0.5), np.float32(0))
+
+    @property
+    def has_planes(self) -> bool:
+        """Whether some splats are printed on planes."""
+        return self.planes is not None
+
+    @property
+    def ellipsoids(self) -> str:
+        """Which splats are 3D Gaussians: `none`, `some` or `all`."""
+        if self.thickness is None:
+            return "none"
+        return "all" if (self.thickness > 0).all() else "some"
+
+    @property
+    def footprint(self) -> str:
+        """`gaussian`, `box`, or `mixed` where there are splats of both kinds."""
+        if self.boxes is None:
+            return "gaussian"
+        return "box" if self.boxes.all() else "mixed"
+
+    @staticmethod
+    def empty() -> "SplatCloud":
+        """A cloud of no splats, with plain colours and no origin of its own."""
+        zero = np.zeros
+        return SplatCloud(zero((0, 3)), zero((0, 4)), zero((0, 2)), zero(0), colors=zero((0, 3)))
+
+    def world_means(self) -> np.ndarray:
+        """Centres (n, 3) float64 in the world, metres."""
+        return self.means + self.origin
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest axis-aligned box (min (3,), max (3,)) float64, world, around all splats: the 3 sigma
+        ellipses or ellipsoids of Gaussians, the rectangles of boxes.
+
+        Raises InputError for an empty cloud.
+        """
+        if not len(self):
+            raise InputError("an empty cloud has no bounds")
+        reach = self.reach(3.0)
+        return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
+
+    def reach(self, sigmas: float) -> np.ndarray:
+        """Half extents (n, 3) float64 [m] of splats along the world's axes: of Gaussians to that many
+        standard deviations, of boxes to their corners."""
+        sigmas = number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
+        turns = quaternion_to_matrix(self.quats)
+        axes = turns[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]
+        squares = (axes * axes).sum(axis=2)
+        if self.thickness is not None:
+            squares += (turns[:, :, 2] * (sigmas * self.thickness.astype(np.float64))[:, None]) ** 2
+        if self.boxes is None:
+            return np.sqrt(squares)
+        corners = np.abs(turns[:, :, :2] * self.scales.astype(np.float64)[:, None, :]).sum(axis=2)
+        return np.where(self.boxes[:, None], corners, np.sqrt(squares))
+
+    def flattened(self) -> "SplatCloud":
+        """The cloud with disks in place of its 3D Gaussians: of each, the thinnest axis becomes the normal.
+
+        For renderers of disks alone. Captures of thick splats lose their haze (docs/experiments.md).
+        """
+        if self.thickness is None:
+            return self
+        quats, scales, rows = self.quats.copy(), self.scales.copy(), self.thickness > 0
+        three = np.column_stack([scales[rows], self.thickness[rows]])
+        turned, sorted_scales = with_thinnest_last(quats[rows], three)
+        quats[rows], scales[rows] = turned, sorted_scales[:, :2]
+        return self._replaced(quats=unit_quaternions(quats), scales=scales, thickness=None)
+
+    def with_labels(self, labels) -> "SplatCloud":
+        """The same splats with other labels, one int or (n,) ints. Raises InputError for anything else."""
+        return self._replaced(labels=whole_numbers(labels, len(self)))
+
+    def transformed(self, matrix) -> "SplatCloud":
+        """The cloud moved by a 4x4 rigid transform with uniform scale (world from world); SH colours turn
+        too.
+
+        A cloud with an origin keeps its relative means small: the origin moves. Raises InputError for any
+        other matrix, a reflection among them.
+        """
+        rotation, scale, translation = check_similarity(matrix, "the transform")
+        local = self.means @ (scale * rotation).T
+        if self.origin.any():
+            means, origin = as_single(local), scale * rotation @ self.origin + translation
+        else:
+            world = local + translation
+            means, origin = choose_origin(world, as_single(world), self.scales * scale)
+        quats = unit_quaternions(quaternion_multiply(matrix_to_quaternion(rotation), self.quats).astype(F32))
+        sh = self.sh
+        if sh is not None and sh.shape[1] > 1:
+            sh = rotation_of_coefficients(self.sh_degree, rotation).astype(F32) @ sh
+        scales = as_single(self.scales * scale)
+        thickness = None if self.thickness is None else as_single(self.thickness * scale)
+        within = all(rows_beyond(array, LARGEST) is None for array in (means, scales))
+        if not (within and (scales > 0).all()):
+            raise InputError(
+                f"the transform takes splats out of range (its scale is {scale:g}): means and scales may be "
+                f"at most {LARGEST:g}, and scales must stay above 0"
+            )
+        return self._replaced(
+            means=means, quats=quats, scales=scales, thickness=thickness, sh=sh, origin=origin
+        )
+
+    def with_planes(self, planes) -> "SplatCloud":
+        """The same splats, printed on planes: one id or (n,) ids, -1 for none.
+
+        A renderer draws the splats of one plane as one layer: where they meet in a pixel, the result does not
+        depend on their order. They must be coplanar, as those of a marker are. Raises InputError for anything
+        but ints of at least -1.
+        """
+        ids = whole_numbers(planes, len(self), "planes")
+        if (ids < -1).any():
+            raise InputError(f"planes must be ids of at least 0, or -1 for none, not {int(ids.min())}")
+        check_one_footprint(ids, self.boxes)
+        if self.thickness is not None and ((ids >= 0) & (self.thickness > 0)).any():
+            raise InputError("3D Gaussians lie in no plane; give their planes as -1, or a thickness of 0")
+        return self._replaced(planes=ids if (ids >= 0).any() else None)
+
+    def with_boxes(self, boxes: bool | np.ndarray = True) -> "SplatCloud":
+        """The same splats with box footprints where ``boxes``, one bool or (n,) bools, is True.
+
+        A box is a rectangle of even opacity: its scales are half sides in metres, its edges are filtered by
+        the pixel. On a plane (`with_planes`) boxes lie side by side: what they cover of a pixel adds up, so
+        those of a partition, their sides parallel, leave no seam. Raises InputError for anything but bools,
+        and for a plane of both kinds.
+        """
+        try:
+            mask = np.asarray(boxes)
+        except ValueError:  # rows that differ in length
+            mask = np.empty(0)
+        if mask.dtype != bool or mask.shape not in ((), (len(self),)):
+            raise InputError(f"boxes must be one bool or have the shape ({len(self)},) and the type bool")
+        mask = np.full(len(self), mask) if mask.ndim == 0 else mask.copy()
+        check_one_footprint(self.planes, mask)
+        if self.thickness is not None and (self.thickness[np.flatnonzero(mask)] > 0).any():
+            raise InputError("a box has no thickness, but some of these splats are 3D Gaussians")
+        return self._replaced(boxes=mask if mask.any() else None)
+
+    @staticmethod
+    def concatenate(clouds: Sequence["SplatCloud"]) -> "SplatCloud":
+        """All splats of several clouds, in order.
+
+        When any has SH, all get SH of the highest degree (colours become degree 0, missing bands 0). Clouds
+        that share an origin keep their bits; otherwise a common one is chosen as in the constructor.
+        Planes of different clouds stay different planes. ``dropped`` adds up.
+        """
+        try:
+            clouds = list(clouds)
+        except TypeError:
+            clouds = [None]  # type: ignore[list-item]
+        for cloud in clouds:
+            if not isinstance(cloud, SplatCloud):
+                raise InputError(f"concatenate takes a list of SplatCloud, not of {type(cloud).__name__}")
+        dropped = dict(sum((Counter(cloud.dropped) for cloud in clouds), Counter[str]()))
+        filled = [cloud for cloud in clouds if len(cloud)]
+        if not filled:
+            return (clouds[0] if clouds else SplatCloud.empty())._replaced(dropped=dropped)
+        first = filled[0]
+        if len(filled) == 1:
+            return first._replaced(dropped=dropped)
+        joined = {
+            name: np.concatenate([getattr(cloud, name) for cloud in filled])
+            for name in ("means", "quats", "scales", "opacities", "labels")
+        }
+        joined["origin"] = first.origin
+        if any(not np.array_equal(cloud.origin, first.origin) for cloud in filled):
+            world = np.concatenate([cloud.world_means() for cloud in filled])
+            joined["means"], joined["origin"] = choose_origin(world, as_single(world), joined["scales"])
+        degree = max(cloud.sh_degree for cloud in filled)
+        if degree < 0:
+            colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None
+        else:
+            colors, sh = None, np.concatenate([_sh_of_degree(cloud, degree) for cloud in filled])
+        joined |= {"planes": joined_planes(filled), "boxes": joined_arrays(filled, "boxes", bool)}
+        joined["thickness"] = joined_arrays(filled, "thickness", F32)
+        return first._replaced(**joined, colors=colors, sh=sh, dropped=dropped)
+
+
+def _sh_of_degree(cloud: SplatCloud, degree: int) -> np.ndarray:
+    sh = np.zeros((len(cloud), (degree + 1) ** 2, 3), F32)
+    if cloud.colors is not None:
+        sh[:, 0] = (cloud.colors.astype(np.float64) - 0.5) / C0
+    elif cloud.sh is not None:
+        sh[:, : cloud.sh.shape[1]] = cloud.sh
+    return sh

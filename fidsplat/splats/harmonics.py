@@ -1,0 +1,95 @@
+"""Real spherical harmonics of degree 0 to 3, with the signs, order and constants of 3DGS, gsplat and 2DGS."""
+
+import numpy as np
+
+from fidsplat.util.errors import InputError
+
+C0 = 0.28209479177387814
+"""Y_00; a colour c is the degree 0 coefficient (c - 0.5) / C0."""
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+_C3 = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
+MAX_DEGREE = 3
+
+
+def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
+    """Basis values (n, k) float64, k = (degree + 1)^2, for unit directions (n, 3).
+
+    Colour of a splat: max(0, 0.5 + sum_k basis[k] * sh[k]), where the direction runs from the camera's
+    position to the splat's centre, in the world frame. Raises InputError for a degree outside 0..3.
+    """
+    if degree not in range(MAX_DEGREE + 1):
+        raise InputError(f"SH degree must be 0 to {MAX_DEGREE}, not {degree}")
+    x, y, z = np.asarray(dirs, np.float64).T
+    columns = [np.full(x.shape, C0)]
+    if degree >= 1:
+        columns += [-_C1 * y, _C1 * z, -_C1 * x]
+    xx, yy, zz = x * x, y * y, z * z
+    if degree >= 2:
+        columns += [
+            _C2[0] * x * y,
+            _C2[1] * y * z,
+            _C2[2] * (2 * zz - xx - yy),
+            _C2[3] * x * z,
+            _C2[4] * (xx - yy),
+        ]
+    if degree >= 3:
+        columns += [
+            _C3[0] * y * (3 * xx - yy),
+            _C3[1] * x * y * z,
+            _C3[2] * y * (4 * zz - xx - yy),
+            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            _C3[4] * x * (4 * zz - xx - yy),
+            _C3[5] * z * (xx - yy),
+            _C3[6] * x * (xx - 3 * yy),
+        ]
+    return np.stack(columns, axis=1)
+
+
+def color_range(colors: np.ndarray | None, sh: np.ndarray | None) -> tuple[float, float]:
+    """Lower and upper bound of every channel of colours (n, 3), or of what harmonics (n, k, 3) show from any
+    direction; 0 is always within. What is not finite does not count.
+
+    The squares of a band's basis values add up to (2 l + 1) / (4 pi), so that the band is at most the root of
+    that times the length of its coefficients.
+    """
+    if sh is None:
+        values = np.zeros(0) if colors is None else colors[np.isfinite(colors)]
+        return float(values.min(initial=0.0)), float(values.max(initial=0.0))
+    most = np.full((len(sh), 3), 0.5)
+    for band in range(int(np.sqrt(sh.shape[1]))):
+        own = sh[:, band**2 : (band + 1) ** 2]
+        squares = np.einsum("nkc,nkc->nc", own, own, dtype=np.float64)
+        most += np.sqrt((2 * band + 1) / (4 * np.pi) * squares)
+    return 0.0, float(most[np.isfinite(most)].max(initial=0.0))
+
+
+def _sample_directions() -> np.ndarray:
+    """32 evenly spread unit directions (Fibonacci lattice), on which every band is well conditioned."""
+    i = np.arange(32)
+    z = 1 - (2 * i + 1) / 32
+    angle = i * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+
+
+def rotation_of_coefficients(degree: int, rotation: np.ndarray) -> np.ndarray:
+    """Matrix D (k, k) float64 that turns SH coefficients with a rotation (3, 3): basis(R d) D f = basis(d) f.
+
+    Bands do not mix, so D is block diagonal; each block is solved for on fixed directions.
+    """
+    dirs = _sample_directions()
+    before, after = sh_basis(degree, dirs), sh_basis(degree, dirs @ np.asarray(rotation, np.float64).T)
+    result = np.zeros((before.shape[1],) * 2)
+    for band in range(degree + 1):
+        part = slice(band * band, (band + 1) * (band + 1))
+        result[part, part] = np.linalg.lstsq(after[:, part], before[:, part], rcond=None)[0]
+    return result

@@ -1,0 +1,114 @@
+"""Quaternions (w, x, y, z) and 4x4 rigid transforms, in float64."""
+
+import numpy as np
+
+from fidsplat.util.errors import InputError
+from fidsplat.util.scalars import LARGEST, real_array
+
+
+def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product a b of (..., 4) quaternions: turning by it is turning by b, then by a."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a, np.float64), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b, np.float64), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) float64 of quaternions (..., 4) of any length but 0."""
+    q = np.asarray(quaternion, np.float64)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion (4,) float64, w >= 0, of one rotation matrix (3, 3).
+
+    The row of 4 q q^T with the largest diagonal entry is divided by its length, which is never small.
+    """
+    r = np.asarray(rotation, np.float64)
+    xx, yy, zz = r[0, 0], r[1, 1], r[2, 2]
+    outer = np.array(
+        [
+            [1 + xx + yy + zz, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], 1 + xx - yy - zz, r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 - xx + yy - zz, r[1, 2] + r[2, 1]],
+            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - xx - yy + zz],
+        ]
+    )
+    row = outer[np.argmax(np.diag(outer))]
+    row = row / np.linalg.norm(row)
+    return row if row[0] >= 0 else -row
+
+
+def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray, float, np.ndarray]:
+    """Split a 4x4 rigid transform with uniform scale into rotation (3, 3), scale, translation (3,), float64.
+
+    Raises InputError, naming ``name``, when the shape is not 4x4, a value is not finite, the last row is not
+    (0, 0, 0, 1), or the upper left 3x3 is not scale * rotation within 1e-6 (a reflection is not; with
+    ``rigid`` the scale must be 1).
+    """
+    m = real_array(name, matrix, "a 4x4 matrix of numbers")
+    if m.shape != (4, 4):
+        raise InputError(f"{name} must be a 4x4 matrix, but its shape is {m.shape}")
+    if not (np.isfinite(m).all() and (np.abs(m[:3, 3]) <= LARGEST).all()):
+        raise InputError(f"{name} holds a value that is not finite, or moves by more than {LARGEST:g} metres")
+    if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError(f"{name} must have the last row (0, 0, 0, 1), not {tuple(m[3].tolist())}")
+    linear = m[:3, :3]
+    with np.errstate(over="ignore"):  # as of a quaternion
+        scale = float(np.linalg.norm(linear)) / np.sqrt(3.0)
+    if not scale > 0 or not np.isfinite(scale):
+        raise InputError(f"{name} must be a rotation with a positive scale, but its scale is {scale:g}")
+    rotation = linear / scale
+    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if off > 1e-6:
+        rounded = "; give more digits" if off < 0.01 else ""
+        raise InputError(
+            f"{name} must be a rotation with one uniform scale; its columns are skew or of unequal length, "
+            f"by {off:.1g} where 1e-06 is allowed{rounded}"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"{name} holds a reflection (its determinant is negative); only rotations are possible"
+        )
+    if rigid:
+        if abs(scale - 1.0) > 1e-6:
+            raise InputError(f"{name} must be rigid (rotation and translation), but it scales by {scale:g}")
+        return linear, 1.0, m[:3, 3]
+    return rotation, scale, m[:3, 3]
+
+
+def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) -> np.ndarray:
+    """4x4 float64 matrix that scales, then turns by a quaternion (w, x, y, z) of any length, then moves.
+
+    Raises InputError when position is not three finite numbers, quaternion not four or all 0, or scale not
+    above 0.
+    """
+    move, turn = real_array("position", position), real_array("quaternion", quaternion)
+    if move.shape != (3,) or not np.isfinite(move).all():
+        raise InputError(f"position must be three finite numbers, not {position!r}")
+    with np.errstate(over="ignore"):  # what is too long for a float is infinitely long, and refused
+        length = np.linalg.norm(turn) if turn.shape == (4,) else np.nan
+    if not (0 < length < np.inf):
+        raise InputError(
+            f"quaternion must be four finite numbers (w, x, y, z), not all 0, but it is {quaternion!r}"
+        )
+    if not (0 < scale < np.inf):
+        raise InputError(f"scale must be above 0 and finite, not {scale!r}")
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * quaternion_to_matrix(turn)
+    matrix[:3, 3] = move
+    return matrix

@@ -1,0 +1,1 @@
+"""Rendering scenes larger than memory: culling, level of detail, residency."""

@@ -1,0 +1,72 @@
+"""Readers of NumPy's .npy and .npz files that trust nothing in them.
+
+`numpy.load` allocates what a header declares, may skip the checksums of a .npz file, and raises whatever
+Python's parser raises for a damaged header. These readers allocate no more than the file holds.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import os
+from collections.abc import Collection
+from pathlib import Path
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
+
+import numpy as np
+
+from fidsplat.util.files import open_input
+
+_MAGIC = b"\x93NUMPY\x01\x00"
+
+
+def load_npy(file: Path) -> np.ndarray:
+    """The array of a .npy file, read-only.
+
+    Raises:
+        InputError: the file is not a regular file, or cannot be read.
+        ValueError: its content is damaged, or its array holds Python objects.
+    """
+    with open_input(file) as stream:
+        return _array(stream.read())
+
+
+def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file that `numpy.savez` wrote, read-only, with their CRC-32 checked.
+
+    names: of the arrays to read; None: all.
+
+    Raises:
+        InputError: the file is not a regular file, or cannot be read.
+        ValueError: an array is missing, damaged or compressed, or holds Python objects.
+    """
+    with open_input(file) as stream:
+        try:
+            with ZipFile(stream) as members:
+                entries = members.infolist()
+                if any(entry.compress_type != ZIP_STORED for entry in entries):
+                    raise ValueError("it must not be compressed; write it with numpy.savez")
+                if sum(entry.file_size for entry in entries) > os.fstat(stream.fileno()).st_size:
+                    raise ValueError("its arrays must not be larger than the file")
+                found = {entry.filename.removesuffix(".npy"): entry for entry in entries}
+                return {name: _array(members.read(found[name])) for name in names or found}
+        except KeyError as error:
+            raise ValueError(f"the array {error} is missing") from None
+        except (BadZipFile, EOFError, RuntimeError, OverflowError) as error:  # RuntimeError: encrypted
+            raise ValueError(str(error)) from None
+
+
+def _array(content: bytes) -> np.ndarray:
+    length = int.from_bytes(content[8:10], "little")
+    if content[:8] != _MAGIC:
+        raise ValueError("it holds no NumPy array of format version 1.0")
+    try:
+        header = ast.literal_eval(content[10 : 10 + length].decode("latin-1").strip())
+        dtype, shape = np.lib.format.descr_to_dtype(header["descr"]), header["shape"]
+        order = "F" if header["fortran_order"] else "C"
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject or not dtype.itemsize or size != len(content) - 10 - length:
+            raise ValueError
+        return np.ndarray(shape, dtype, content, 10 + length, order=order)
+    except Exception:  # Python's parser and NumPy raise many: SyntaxError, MemoryError, RecursionError
+        raise ValueError("the header of an array is damaged, or does not fit its data") from None

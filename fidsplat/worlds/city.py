@@ -1,0 +1,175 @@
+"""A city of splats that nobody has to download: streets, and houses with windows, as many splats as asked
+for, made block by block so that none is in memory for long. y is down; streets lie at y = 0."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Trajectory, look_at_matrix
+from fidsplat.formats.collect import WINDOW, Rows
+from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.store.sources import Source
+from fidsplat.util.errors import InputError
+
+MOST = 2_000_000_000
+PITCH = 24.0
+"""metres from house to house"""
+SIDE = 14.0
+"""metres: edge of a house"""
+WINDOWS = 3.0
+"""metres from window to window"""
+BOARD, EYES = 0.1, 1.7
+"""metres: how far before their walls markers hang, and how high"""
+OPACITY = 0.95
+OVERLAP = 0.75
+"""standard deviations of a splat, in the mean distance of two"""
+
+
+@dataclass(frozen=True)
+class City:
+    """Houses on a square grid. The same for the same numbers on every machine. Raises InputError for numbers
+    that make none."""
+
+    splats: int
+    houses: int = 8
+    """along a side"""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, most in (("splats", MOST), ("houses", 100), ("seed", 2**32 - 1)):
+            value, least = getattr(self, name), int(name != "seed")
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise InputError(f"{name} of a city is {value!r}; it must be {least} to {most:,}")
+
+    @property
+    def side(self) -> float:
+        """Metres: edge of the whole; it reaches from 0 along x and z."""
+        return PITCH * self.houses
+
+    @property
+    def source(self) -> Source:
+        """Its splats, for `build_store`."""
+        columns: dict = {
+            "means": ((3,), np.float32),
+            "quats": ((4,), np.float32),
+            "scales": ((2,), np.float32),
+        }
+        columns |= {"opacities": ((), np.float32), "colors": ((3,), np.float32)}
+        rows = Rows(Path(f"city of {self.splats:,}"), self.splats, columns, self._fill)
+        return Source(rows, np.zeros(3), repr(self))
+
+    @cached_property
+    def _walls(self) -> dict[str, np.ndarray]:
+        """Rectangles: corner (w, 3), edges (w, 3) each [m], colour (w, 3), storeys' windows (w,) bool."""
+        generator = np.random.default_rng(self.seed)
+        corners, across, up, colors, windows = (
+            [[0.0, 0, 0]],
+            [[self.side, 0, 0]],
+            [[0, 0, self.side]],
+            [],
+            [False],
+        )
+        colors.append([0.32, 0.31, 0.3])
+        for i in range(self.houses):
+            for j in range(self.houses):
+                height = float(generator.uniform(6, 24))
+                color = generator.uniform(0.35, 0.8, 3) * [1.0, 0.9, 0.8]
+                x, z = PITCH * i + (PITCH - SIDE) / 2, PITCH * j + (PITCH - SIDE) / 2
+                for at, edge in (
+                    ([x, 0, z], [SIDE, 0, 0]),
+                    ([x + SIDE, 0, z], [0, 0, SIDE]),
+                    ([x + SIDE, 0, z + SIDE], [-SIDE, 0, 0]),
+                    ([x, 0, z + SIDE], [0, 0, -SIDE]),
+                ):
+                    corners.append(at)
+                    across.append(edge)
+                    up.append([0, -height, 0])
+                    colors.append(color)
+                    windows.append(True)
+                corners.append([x, -height, z])
+                across.append([SIDE, 0, 0])
+                up.append([0, 0, SIDE])
+                colors.append(color * 0.5)
+                windows.append(False)
+        made = {"corner": corners, "across": across, "up": up, "color": colors}
+        return {name: np.array(rows, np.float64) for name, rows in made.items()} | {
+            "windows": np.array(windows)
+        }
+
+    def marker_poses(self, count: int) -> np.ndarray:
+        """(count, 4, 4) world from marker, of boards on the houses' walls at the height of a camera, evenly
+        spread and turned to the streets."""
+        walls, houses = self._walls, np.flatnonzero(self._walls["windows"])
+        poses, rows = np.tile(np.eye(4), (count, 1, 1)), -(-count // len(houses))
+        for number, pose in enumerate(poses):
+            row, wall = divmod(number, len(houses))
+            across = walls["across"][houses[wall]]
+            along, down = across / np.linalg.norm(across), np.array([0.0, 1.0, 0.0])
+            into = np.cross(along, down)
+            pose[:3, :3] = np.stack([along, down, into], axis=1)
+            pose[:3, 3] = walls["corner"][houses[wall]] + (row + 0.5) / rows * across - BOARD * into
+            pose[1, 3] -= EYES
+        return poses
+
+    @cached_property
+    def _frames(self) -> np.ndarray:
+        """(w, 4) quaternions: tangents along the edges."""
+        walls = self._walls
+        u = walls["across"] / np.linalg.norm(walls["across"], axis=1, keepdims=True)
+        v = walls["up"] / np.linalg.norm(walls["up"], axis=1, keepdims=True)
+        turns = np.stack([u, v, np.cross(u, v)], axis=2)
+        return np.array([matrix_to_quaternion(turn) for turn in turns])
+
+    def _fill(self, first: int, arrays: dict[str, np.ndarray]) -> None:
+        """Splats from `first` on; those of a block of `WINDOW` are made together."""
+        done, count = 0, len(arrays["means"])
+        while done < count:
+            block, start = divmod(first + done, WINDOW)
+            take = min(WINDOW - start, count - done)
+            for name, made in self._block(block).items():
+                arrays[name][done : done + take] = made[start : start + take]
+            done += take
+
+    def _block(self, number: int) -> dict[str, np.ndarray]:
+        generator, walls = np.random.default_rng([self.seed, number]), self._walls
+        widths, heights = (np.linalg.norm(walls[edge], axis=1) for edge in ("across", "up"))
+        areas = widths * heights
+        spacing = math.sqrt(areas.sum() / self.splats)
+        wall = np.searchsorted(np.cumsum(areas / areas.sum())[:-1], generator.random(WINDOW))
+        a, b = generator.random((2, WINDOW))
+        means = walls["corner"][wall] + a[:, None] * walls["across"][wall] + b[:, None] * walls["up"][wall]
+        x, y = a * widths[wall], b * heights[wall]
+        stains = 0.06 * (np.sin(0.7 * x + 1.3 * y) + np.sin(2.1 * x - 0.4 * y + wall))
+        colors = walls["color"][wall] * (1 + stains + generator.normal(0, 0.03, WINDOW))[:, None]
+        pane = (np.abs(x % WINDOWS - WINDOWS / 2) < 0.6) & (np.abs(y % WINDOWS - WINDOWS / 2) < 0.8)
+        pane &= walls["windows"][wall]
+        colors[pane] = [0.1, 0.14, 0.2]
+        line = ~walls["windows"][wall] & (wall == 0) & (np.abs(x % PITCH) < 0.15) & (y % 4 < 2)
+        colors[line] = 0.85
+        scales = OVERLAP * spacing * np.exp(generator.normal(0, 0.2, (WINDOW, 2)))
+        made = {
+            "means": means,
+            "quats": self._frames[wall],
+            "scales": scales,
+            "colors": np.clip(colors, 0, 1),
+        }
+        return made | {"opacities": np.full(WINDOW, OPACITY, np.float32)}
+
+
+def flight(city: City) -> tuple[Camera, Trajectory]:
+    """A camera of 1280 x 720, and its way (world to camera) through a street and up over the roofs, 8 s."""
+    street, side = PITCH * (city.houses // 2), city.side
+    ways = [
+        (0.0, (street, -1.7, -4.0), (street, -2.0, 40.0)),
+        (3.0, (street, -2.5, side * 0.4), (street, -4.0, side)),
+        (5.0, (street - 6.0, -32.0, side * 0.4), (street, -4.0, side)),
+        (8.0, (-0.3 * side, -0.6 * side, -0.4 * side), (side / 2, 0.0, side / 2)),
+    ]
+    poses = [look_at_matrix(position, target) for _, position, target in ways]
+    camera = Camera.look_at(1280, 720, math.radians(70.0), ways[0][1], ways[0][2])
+    return camera, Trajectory([time for time, _, _ in ways], np.stack(poses))

@@ -1,0 +1,234 @@
+"""Plants as meshes, grown from a seed: z up, the foot at the origin, metres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.worlds.plants import disks
+
+LEAF, STALK, TOMATO, CUCUMBER = (0.2, 0.46, 0.13), (0.38, 0.5, 0.2), (0.85, 0.13, 0.07), (0.16, 0.4, 0.1)
+LETTUCE = (0.38, 0.62, 0.16)
+GOLDEN = 2.39996
+"""radians from leaf to leaf"""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Quadrilaterals with a colour at each vertex."""
+
+    vertices: np.ndarray
+    """(n, 3) metres"""
+    quads: np.ndarray
+    """(m, 4) numbers of vertices, around each face"""
+    colors: np.ndarray
+    """(n, 3) display values of the surface, without light"""
+
+    def splats(self, count: int, seed: int = 0) -> SplatCloud:
+        """Disks spread evenly over the surface: `count` of them."""
+        rng = np.random.default_rng(seed)
+        # each quadrilateral as two triangles
+        corners = np.concatenate([self.quads[:, [0, 1, 2]], self.quads[:, [0, 2, 3]]])
+        at, colour = self.vertices[corners], self.colors[corners]
+        normals = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+        area = np.linalg.norm(normals, axis=1) / 2
+        # at even steps through the area, which leaves no holes as independent draws would
+        steps = (np.arange(count) + rng.uniform()) / count * area.sum()
+        face = np.minimum(np.searchsorted(np.cumsum(area), steps), len(area) - 1)
+        share = rng.uniform(size=(count, 2))
+        share = np.where(share.sum(1, keepdims=True) > 1, 1 - share, share)
+        weights = np.column_stack([1 - share.sum(1), share])[:, :, None]
+        size = 0.7 * math.sqrt(area.sum() / count)
+        return disks(
+            (at[face] * weights).sum(1),
+            at[face, 1] - at[face, 0],
+            normals[face],
+            np.full((count, 2), size),
+            (colour[face] * weights).sum(1),
+        )
+
+
+def tomato(rng: np.random.Generator) -> Mesh:
+    """A stem of 1.1 to 1.4 m, leaves of seven leaflets, trusses of fruits."""
+    height = rng.uniform(1.1, 1.4)
+    stem = _stem(rng, height)
+    parts = [_tube(stem, 0.008, STALK)]
+    for at, turn, share in _nodes(rng, stem, 18):
+        length = rng.uniform(0.26, 0.34) * (1.15 - 0.5 * share)
+        rachis = _placed(_arc(length, rng.uniform(0.2, 0.5), 1.3), at, turn)
+        parts.append(_tube(rachis, 0.003, STALK))
+        shade = _shade(rng, LEAF)
+        for where, side in ((0.4, 1.1), (0.65, 1.0), (0.85, 0.9)):
+            foot = rachis[round(where * (len(rachis) - 1))]
+            for sign in (-1, 1):
+                parts.append(
+                    _blade(rng, foot, turn + sign * side, 0.45 * length * (1.2 - 0.5 * where), 0.55, shade)
+                )
+        parts.append(_blade(rng, rachis[-1], turn, 0.45 * length, 0.6, shade))
+    for at, turn, _ in _nodes(rng, stem, 4, 0.25, 0.7):
+        truss = _placed(_arc(0.13, 0.3, 2.2), at, turn)
+        parts.append(_tube(truss, 0.003, STALK))
+        for foot in truss[2::2]:
+            radius = rng.uniform(0.02, 0.032)
+            parts.append(
+                _ball(foot - [0, 0, radius], (radius, radius, 0.9 * radius), _shade(rng, TOMATO, 0.1))
+            )
+    return _joined(parts)
+
+
+def cucumber(rng: np.random.Generator) -> Mesh:
+    """A stem of 1.3 to 1.7 m, broad leaves on stalks, long hanging fruits."""
+    height = rng.uniform(1.3, 1.7)
+    stem = _stem(rng, height)
+    parts = [_tube(stem, 0.007, STALK)]
+    for at, turn, share in _nodes(rng, stem, 20):
+        stalk = _placed(_arc(rng.uniform(0.1, 0.16) * (1.15 - 0.4 * share), 0.6, 0.6), at, turn)
+        parts.append(_tube(stalk, 0.004, STALK))
+        size = rng.uniform(0.18, 0.26) * (1.15 - 0.5 * share)
+        parts.append(_blade(rng, stalk[-1], turn, size, 1.05, _shade(rng, LEAF), lobes=0.18, droop=0.9))
+    for at, turn, _ in _nodes(rng, stem, 5, 0.3, 0.75):
+        stalk = _placed(_arc(0.07, 0.2, 2.0), at, turn)
+        half = rng.uniform(0.08, 0.13)
+        parts.append(_tube(stalk, 0.003, STALK))
+        parts.append(_ball(stalk[-1] - [0, 0, half], (0.02, 0.02, half), _shade(rng, CUCUMBER, 0.1)))
+    return _joined(parts)
+
+
+def lettuce(rng: np.random.Generator) -> Mesh:
+    """A rosette 0.3 m across: wavy leaves, upright inside."""
+    parts, count = [], 26
+    for k in range(count):
+        rise = 0.15 + 1.2 * k / count + rng.normal(0, 0.05)
+        length = rng.uniform(0.15, 0.19) * (1.0 - 0.35 * k / count)
+        parts.append(
+            _blade(
+                rng,
+                np.array([0, 0, 0.01]),
+                GOLDEN * k,
+                length,
+                0.9,
+                _shade(rng, LETTUCE),
+                rise=rise,
+                droop=0.5,
+                waves=0.2,
+            )
+        )
+    return _joined(parts)
+
+
+MESHES: dict[str, Callable[[np.random.Generator], Mesh]] = {
+    "tomato": tomato,
+    "cucumber": cucumber,
+    "lettuce": lettuce,
+}
+"""what grows a mesh, by kind"""
+
+
+def _shade(rng: np.random.Generator, colour: Sequence[float], spread: float = 0.2) -> np.ndarray:
+    return np.clip(np.asarray(colour) * (1 + rng.uniform(-spread, spread)), 0, 1)
+
+
+def _stem(rng: np.random.Generator, height: float) -> np.ndarray:
+    """(24, 3) the line of a stem that sways."""
+    z = np.linspace(0, height, 24)
+    phase, pace = rng.uniform(0, 2 * math.pi, 2), rng.uniform(3, 6, 2)
+    sway = 0.02 * (np.sin(pace * z[:, None] + phase) - np.sin(phase))
+    return np.column_stack([sway, z])
+
+
+def _nodes(
+    rng: np.random.Generator, stem: np.ndarray, count: int, low: float = 0.12, high: float = 0.98
+) -> list[tuple[np.ndarray, float, float]]:
+    """Where leaves leave a stem: place, direction, and share of its height."""
+    shares = np.linspace(low, high, count) + rng.normal(0, 0.01, count)
+    turns = GOLDEN * np.arange(count) + rng.uniform(0, 2 * math.pi) + rng.normal(0, 0.25, count)
+    line = [np.interp(shares, np.linspace(0, 1, len(stem)), axis) for axis in stem.T]
+    return list(zip(np.column_stack(line), turns.tolist(), shares.tolist(), strict=True))
+
+
+def _arc(length: float, rise: float, bend: float, points: int = 8) -> np.ndarray:
+    """(points, 3) a line from the origin along x that rises first and bends down by `bend` radians."""
+    angles = rise - bend * np.linspace(0, 1, points - 1) ** 1.5
+    steps = length / (points - 1) * np.column_stack([np.cos(angles), 0 * angles, np.sin(angles)])
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def _placed(points: np.ndarray, at: np.ndarray, turn: float) -> np.ndarray:
+    """Points (..., 3) turned about z, and moved."""
+    c, s = math.cos(turn), math.sin(turn)
+    return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + at
+
+
+def _tube(line: np.ndarray, radius: float, colour: Sequence[float], sides: int = 6) -> Mesh:
+    """A round stalk along a line (n, 3) that gets thinner."""
+    along = np.gradient(line, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(along, [0.35, 0.9, 0.25])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    around = np.arange(sides) * 2 * math.pi / sides
+    thick = radius * np.linspace(1, 0.6, len(line))
+    ring = (
+        np.cos(around)[:, None] * across[:, None] + np.sin(around)[:, None] * np.cross(along, across)[:, None]
+    )
+    return _grid(line[:, None] + thick[:, None, None] * ring, np.asarray(colour), closed=True)
+
+
+def _blade(
+    rng: np.random.Generator,
+    foot: np.ndarray,
+    turn: float,
+    length: float,
+    wide: float,
+    colour: np.ndarray,
+    rise: float = 0.35,
+    droop: float = 1.0,
+    lobes: float = 0.08,
+    waves: float = 0.05,
+) -> Mesh:
+    """A leaf from its foot towards `turn`: `wide` times as wide as long, folded at its middle, darker
+    there."""
+    rows, columns = 11, 9
+    u, v = np.linspace(0, 1, rows)[:, None], np.linspace(-1, 1, columns)
+    half = wide / 2 * length * np.sin(math.pi * np.clip(u, 0.02, 0.99) ** 0.75) ** 0.8
+    half = half * (1 + lobes * np.cos(6 * math.pi * u))
+    middle = _arc(length, rise, droop, rows)[:, None]
+    phase = rng.uniform(0, 2 * math.pi)
+    lift = half * (0.25 * np.abs(v) + waves * np.abs(v) ** 2 * np.sin(4 * math.pi * u + 3 * v + phase))
+    points = middle + np.stack([0 * lift, half * v, lift], axis=-1)
+    light = 1 + 0.18 * np.abs(v) - 0.08 * np.cos(8 * math.pi * (u - 0.3 * np.abs(v)))
+    return _grid(_placed(points, foot, turn), np.clip(colour * light[..., None], 0, 1))
+
+
+def _ball(middle: np.ndarray, radii: Sequence[float], colour: np.ndarray) -> Mesh:
+    """An ellipsoid."""
+    rows, columns = 9, 12
+    down = np.linspace(0.02, math.pi - 0.02, rows)[:, None]
+    around = np.arange(columns) * 2 * math.pi / columns
+    rays = np.stack(
+        [np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down) + 0 * around], -1
+    )
+    return _grid(middle + rays * radii, colour, closed=True)
+
+
+def _grid(points: np.ndarray, colour: np.ndarray, closed: bool = False) -> Mesh:
+    """Points (rows, columns, 3) as a surface; closed: the last column is joined to the first."""
+    rows, columns = points.shape[:2]
+    number = np.arange(rows * columns).reshape(rows, columns)
+    if closed:
+        number = np.column_stack([number, number[:, 0]])
+    quads = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], -1).reshape(-1, 4)
+    return Mesh(points.reshape(-1, 3), quads, np.broadcast_to(colour, points.shape).reshape(-1, 3))
+
+
+def _joined(parts: Sequence[Mesh]) -> Mesh:
+    firsts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    quads = [part.quads + first for part, first in zip(parts, firsts, strict=True)]
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate(quads),
+        np.concatenate([part.colors for part in parts]),
+    )

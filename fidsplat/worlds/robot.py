@@ -1,0 +1,181 @@
+"""A small robot with two driven wheels in MuJoCo: what it does along a path, and what its sensors say."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Trajectory
+from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.util.errors import InputError
+
+try:
+    import mujoco as _mujoco  # type: ignore[import-not-found]
+except ImportError as error:
+    raise InputError(f"MuJoCo is not here ({error}); pip install 'fidsplat[sim]'") from None
+
+mujoco: Any = _mujoco  # whose names its types do not tell
+
+WHEEL, TRACK = 0.08, 0.3
+"""metres: radius of a wheel, and from wheel to wheel"""
+CAMERA_AT = (0.1, 0.0, 0.32)
+"""metres from the middle of the axle on the floor; the camera looks ahead"""
+CONTROL = 0.02
+"""seconds between commands, and between readings of the sensors"""
+ACCELERATION = 0.5
+"""metres a second squared, at most"""
+TURNING = 1.2
+"""radians a second, at most"""
+
+# Spheres that do not rub carry the rest: friction between two bodies is the larger of theirs, so that they
+# need condim 1. Wheels are ellipsoids, since flat ones scrub when they turn.
+BODY = f"""    <body name="robot" pos="0 0 {WHEEL}">
+      <freejoint/>
+      <geom type="box" size="0.16 0.1 0.05" pos="0 0 0.06" mass="4"/>
+      <geom type="sphere" size="0.04" pos="-0.13 0 {0.04 - WHEEL}" condim="1" priority="1" mass="0.2"/>
+      <geom type="sphere" size="0.04" pos="0.13 0 {0.04 - WHEEL}" condim="1" priority="1" mass="0.2"/>
+      <site name="imu"/>
+      <body name="left" pos="0 {TRACK / 2} 0">
+        <joint name="left" type="hinge" axis="0 1 0" armature="0.01"/>
+        <geom type="ellipsoid" size="{WHEEL} 0.015 {WHEEL}" mass="0.3" friction="1.2"/></body>
+      <body name="right" pos="0 {-TRACK / 2} 0">
+        <joint name="right" type="hinge" axis="0 1 0" armature="0.01"/>
+        <geom type="ellipsoid" size="{WHEEL} 0.015 {WHEEL}" mass="0.3" friction="1.2"/></body>
+    </body>
+"""
+_DRIVES = """  <actuator><velocity joint="left" kv="5"/><velocity joint="right" kv="5"/></actuator>
+  <sensor><gyro site="imu"/></sensor>
+</mujoco>
+"""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What wheels and gyroscope get wrong."""
+
+    wheels: float = 0.01
+    """standard deviation of each wheel's scale, drawn once for a run"""
+    slip: float = 0.002
+    """metres, standard deviation of a wheel's distance after one metre"""
+    gyro_bias: float = 0.003
+    """radians a second, standard deviation, drawn once for a run"""
+    gyro_noise: float = 0.002
+    """radians a second, standard deviation of each reading"""
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A drive: what happened, and what was measured, every `CONTROL` seconds."""
+
+    times: np.ndarray
+    """(n,) seconds"""
+    poses: np.ndarray
+    """(n, 4, 4) world from the middle of the axle on the floor: x ahead, z up"""
+    wheels: np.ndarray
+    """(n, 2) metres that the left and the right wheel have rolled since the last, as measured"""
+    gyro: np.ndarray
+    """(n,) radians a second about z, as measured"""
+
+    @property
+    def length(self) -> float:
+        """Metres that were driven."""
+        return float(np.linalg.norm(np.diff(self.poses[:, :2, 3], axis=0), axis=1).sum())
+
+    @property
+    def camera(self) -> Trajectory:
+        """World from camera, OpenCV axes."""
+        return Trajectory(self.times, self.poses @ mount())
+
+
+def mount() -> np.ndarray:
+    """(4, 4) robot from camera, OpenCV axes."""
+    return rigid_matrix(CAMERA_AT, (0.5, -0.5, 0.5, -0.5))
+
+
+def camera_at(camera: Camera, robot: np.ndarray) -> Camera:
+    """A camera where it stands when the robot stands there."""
+    return replace(camera, world_to_camera=np.linalg.inv(robot @ mount()), position=None)
+
+
+def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None = None) -> Run:
+    """Drive along a path on the floor of a model that has `BODY`: turning at its corners, straight between.
+
+    Args:
+        mjcf: the model's text, as `Greenhouse.mjcf(BODY)` gives it.
+        path: (k, 2) metres, corners of the path; the robot starts at the first and faces the second.
+        speed: metres a second.
+
+    Raises:
+        InputError: a path of less than two corners, or the robot does not get on, as against an obstacle.
+    """
+    corners = np.asarray(path, np.float64)
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 2:
+        raise InputError(f"a path has two or more corners (k, 2), not {corners.shape}")
+    model = mujoco.MjModel.from_xml_string(mjcf.replace("</mujoco>\n", _DRIVES))
+    data = mujoco.MjData(model)
+    first = corners[1] - corners[0]
+    turn = math.atan2(first[1], first[0])
+    data.qpos[:7] = [*corners[0], WHEEL, math.cos(turn / 2), 0, 0, math.sin(turn / 2)]
+    steps = round(CONTROL / model.opt.timestep)
+    address = [model.joint(name).qposadr[0] for name in ("left", "right")]
+    times, poses, rolled, turned = [], [], [], []
+
+    def record() -> None:
+        # lower by the wheel's radius is the floor
+        pose = np.eye(4)
+        pose[:3, :3] = data.body("robot").xmat.reshape(3, 3)
+        pose[:3, 3] = data.body("robot").xpos - WHEEL * pose[:3, 2]
+        times.append(data.time)
+        poses.append(pose)
+        rolled.append(WHEEL * data.qpos[address])
+        turned.append(float(data.sensordata[2]))
+
+    mujoco.mj_forward(model, data)
+    record()
+    forward = 0.0
+    for start, goal in itertools.pairwise(corners):
+        limit = len(times) + round((np.linalg.norm(goal - start) / speed + 20) / CONTROL)
+        while (command := _command(poses[-1], start, goal, speed)) is not None:
+            # a robot that starts at once tips over
+            forward = min(command[0], forward + ACCELERATION * CONTROL)
+            around = command[1]
+            data.ctrl[:] = (forward + np.array([-1, 1]) * around * TRACK / 2) / WHEEL
+            mujoco.mj_step(model, data, steps)
+            record()
+            if len(times) > limit:
+                at = tuple(np.round(poses[-1][:2, 3], 2).tolist())
+                raise InputError(f"the robot does not get on at {at}; is there something in its path?")
+    return _measured(np.array(times), np.array(poses), np.array(rolled), np.array(turned), errors or Errors())
+
+
+def _command(
+    pose: np.ndarray, start: np.ndarray, goal: np.ndarray, speed: float
+) -> tuple[float, float] | None:
+    """Speed and turning towards a corner; None once it is reached."""
+    along = (goal - start) / np.linalg.norm(goal - start)
+    here = pose[:2, 3]
+    left = float((goal - here) @ along)
+    if left < 0.01:
+        return None
+    aside = float(along[0] * (here - start)[1] - along[1] * (here - start)[0])
+    heading = math.atan2(along[1], along[0]) - math.atan(2 * aside)
+    off = heading - math.atan2(pose[1, 0], pose[0, 0])
+    off = (off + math.pi) % (2 * math.pi) - math.pi
+    around = max(-TURNING, min(TURNING, 3 * off))
+    return (speed * min(1.0, left / 0.2 + 0.1) if abs(off) < 0.3 else 0.0), around
+
+
+def _measured(
+    times: np.ndarray, poses: np.ndarray, rolled: np.ndarray, turned: np.ndarray, errors: Errors
+) -> Run:
+    rng = np.random.default_rng(errors.seed)
+    steps = np.diff(rolled, axis=0, prepend=rolled[:1])
+    wheels = steps * (1 + rng.normal(0, errors.wheels, 2))
+    wheels = wheels + errors.slip * np.sqrt(np.abs(steps)) * rng.normal(size=steps.shape)
+    gyro = turned + rng.normal(0, errors.gyro_bias) + rng.normal(0, errors.gyro_noise, len(turned))
+    return Run(times, poses, wheels, gyro)

@@ -1,0 +1,37 @@
+"""Every entry of the catalogue (numerics.md) on every device, and that none is missing."""
+
+import pytest
+from agreement import truth_of
+
+from fidsplat.selftest import check
+from fidsplat.selftest.catalogue import GROUPS, all_cases
+from fidsplat.selftest.homography import QUALITY, grazing_errors
+
+SIZES = {"A": 7, "B": 8, "C": 4, "D": 5, "E": 5, "F": 6, "G": 5}
+
+
+@pytest.mark.parametrize("case", all_cases(), ids=lambda case: case.name)
+def test_case(renderer, case, monkeypatch):
+    """All its pictures agree with the reference, and all its findings hold."""
+    monkeypatch.setattr(check, "truth_of", truth_of)  # each drawn once for all devices
+    result, _ = check.run_case(renderer, case)
+    assert result.wrong == []
+
+
+def test_the_catalogue_is_whole():
+    """A1 to G5, each once."""
+    cases = all_cases()
+    names = [f"{letter}{n}" for letter, count in SIZES.items() for n in range(1, count + 1)]
+    assert [case.name for case in cases] == names
+    assert [case.name for case in all_cases("CA")] == [name for name in names if name[0] in "AC"]
+    assert list(GROUPS) == list(SIZES)
+    assert all(case.title and case.trigger for case in cases)
+
+
+def test_float32_setup_shows_why_float64_is_used(renderer):
+    """The measure of B1 does see a set-up in single precision: ten times and more (numerics B1, table)."""
+    single = QUALITY.with_(setup_precision="float32")
+    error = grazing_errors(renderer, 85.0, 3, single).max()
+    assert error > 1e-4
+    if renderer.device.float64:
+        assert grazing_errors(renderer, 85.0, 3).max() < error / 10

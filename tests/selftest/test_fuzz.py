@@ -1,0 +1,120 @@
+"""Random hard scenes: what they hold, a short run, and a long one that is stopped and goes on."""
+
+import json
+
+import numpy as np
+import pytest
+from sampling import in_turn
+
+from fidsplat.selftest import fuzz
+from fidsplat.splats.rotations import quaternion_to_matrix
+
+
+@pytest.mark.parametrize("splats", [2000, pytest.param(50_000, marks=pytest.mark.exhaustive)])
+def test_so_many_splats(renderer, splats):
+    *_, state = fuzz.fuzz_run(renderer, splats)
+    assert state.failing == []
+    assert state.passed
+    assert state.splats >= splats
+    assert set(state.largest) == {"rgb", "alpha", "depth", "depth_median", "normal", "label"}
+    assert state.uncertified["rgb"][0] <= 2e-5
+
+
+@pytest.mark.parametrize("seed", [12, 45, 68, 94, 174, 194, 223, 229, 248])
+def test_seeds_that_failed_once(renderer, seed):
+    """Tiny splats called edge-on; opacities at the cut-off in depth and labels; optical depth near 1."""
+    state = fuzz.FuzzState("")
+    state.add(seed, renderer)
+    assert state.failing == []
+
+
+@pytest.mark.parametrize("seed", [56, 107, 739])
+def test_seeds_with_ties(renderer, seed):
+    """Of splats of one plane: cut off by the stop in one order; turned; face to face with the camera."""
+    state = fuzz.FuzzState("")
+    state.add(seed, renderer)
+    assert state.passed
+
+
+def test_a_scene_is_its_seed():
+    one, other = fuzz.scene_of(7), fuzz.scene_of(7)
+    assert np.array_equal(one.cloud.means, other.cloud.means)
+    assert one.quality == other.quality
+    assert not np.array_equal(one.camera.matrix, fuzz.scene_of(8).camera.matrix)
+
+
+def test_the_scenes_are_hard():
+    """The distribution of numerics.md, section 3, in what the splats turn out to be."""
+    edge_on = near = total = grouped = tilted = 0
+    largest, smallest, counts, flat, opacities = 0.0, np.inf, [], 1.0, set()
+    for seed in range(150):
+        picture = fuzz.scene_of(seed)
+        cloud, view = picture.cloud, picture.camera
+        turn = view.world_to_camera[:3, :3]
+        p = cloud.means @ turn.T
+        axes = turn @ quaternion_to_matrix(cloud.quats)
+        sine = np.einsum("nk,nk->n", axes[:, :, 2], p) / np.linalg.norm(p, axis=1)
+        reach = 3.33 * np.hypot(*(axes[:, 2, :2] * cloud.scales).T)
+        edge_on += (np.abs(sine) < 1.5e-6).sum()
+        near += (np.abs(p[:, 2] - view.near) < reach).sum()
+        total, grouped = total + len(cloud), grouped + cloud.has_planes
+        tilted += (np.abs(axes[:, 2, 2])[cloud.planes >= 0] < 0.9).any() if cloud.has_planes else 0
+        largest, smallest = max(largest, cloud.scales.max()), min(smallest, cloud.scales.min())
+        flat = max(flat, float((cloud.scales.max(1) / cloud.scales.min(1)).max()))
+        counts.append(len(cloud))
+        opacities |= set(cloud.opacities.tolist())
+        assert p[:, 2].min() > -5000
+    assert 0.07 < edge_on / total < 0.13
+    assert near / total > 0.1
+    assert grouped > 50
+    assert tilted > 30
+    assert largest > 500
+    assert smallest < 1e-10
+    assert flat > 5e5
+    assert min(counts) <= 5
+    assert max(counts) >= 195
+    assert opacities == set(fuzz.OPACITIES.tolist())
+
+
+@in_turn()
+def test_a_stopped_run_goes_on(renderer, tmp_path, monkeypatch):
+    monkeypatch.setattr(fuzz, "_SAVE_EVERY", 0.0)
+    file = tmp_path / "fuzz.json"
+    whole = list(fuzz.fuzz_run(renderer, 300))[-1]
+    run = fuzz.fuzz_run(renderer, 300, file)
+    first = next(run)
+    run.close()
+    saved = json.loads(file.read_text())
+    assert (saved["scenes"], saved["splats"]) == (1, first.splats)
+    *_, state = fuzz.fuzz_run(renderer, 300, file)
+    assert (state.scenes, state.pixels, state.largest) == (whole.scenes, whole.pixels, whole.largest)
+    # more splats go on from there; the same number starts again
+    *_, more = fuzz.fuzz_run(renderer, 450, file)
+    assert more.scenes > state.scenes
+    assert next(fuzz.fuzz_run(renderer, 300, file)).scenes == 1
+
+
+@in_turn()
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 3}', '{"key": "%s", "scenes": "a", "new": 1}'])
+def test_a_file_of_something_else_is_no_hindrance(renderer, tmp_path, content):
+    file = tmp_path / "fuzz.json"
+    file.write_text(content.replace("%s", fuzz._key(renderer)))
+    assert next(fuzz.fuzz_run(renderer, 50, file)).scenes == 1
+
+
+@in_turn(1)
+def test_a_failing_seed_is_named(renderer, monkeypatch):
+    class Wrong(dict):
+        """Images of a device that is off by a little where it is sure."""
+
+    def wrong(one, picture):
+        frame = draw(one, picture)
+        return Wrong({name: frame[name] + (1e-3 if name == "alpha" else 0) for name in frame})
+
+    draw = fuzz.draw
+    monkeypatch.setattr(fuzz, "draw", wrong)
+    state = fuzz.FuzzState("")
+    state.add(3, renderer)
+    assert state.failing == [3]
+    assert not state.passed
+    assert state.uncertified["alpha"][1] == 3

@@ -1,0 +1,80 @@
+"""Group E: inputs, sizes, integers."""
+
+import numpy as np
+import pytest
+from agreement import random_splats
+
+import fidsplat as fs
+from fidsplat.selftest import inputs
+from fidsplat.selftest.agreement import COLOR_TOLERANCE, Picture, draw, truth_of
+
+
+@pytest.mark.parametrize(("width", "height"), [(32767, 3), (3, 32767), (4001, 1003)])
+def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
+    """E4: tens of thousands of tiles; compared with the reference in 200 pixels."""
+    cloud = random_splats(60, seed=45, depth=(1.0, 4.0), scale=(0.01, 0.3))
+    camera = inputs.sized(width, height)
+    generator = np.random.default_rng(0)
+    pixels = generator.integers(0, height, 200), generator.integers(0, width, 200)
+    picture = Picture(cloud, camera)
+    truth, frame = truth_of(picture, pixels), draw(renderer, picture)
+    for name in ("rgb", "alpha"):
+        error = np.abs(frame[name][pixels] - truth[name])
+        error = error.max(-1) if error.ndim > 1 else error
+        assert (error <= COLOR_TOLERANCE + truth["certificate"]).all(), name
+
+
+def opencl(renderer):
+    if not renderer.device.name.startswith("opencl"):
+        pytest.skip("buffers of the OpenCL backend")
+    return renderer.backend
+
+
+@pytest.mark.parametrize("budget", [None, 40])
+def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, budget):
+    """E3: a picture of more than 2^32 pairs keeps its places modulo 2^32. The places of a small one are moved
+    up until they wrap amid its tiles.
+    """
+    from fidsplat.backends.opencl import probe
+    from fidsplat.backends.opencl.lists import LISTS
+
+    backend = opencl(renderer)
+    cloud = random_splats(60, seed=46, depth=(1.0, 4.0), scale=(0.05, 0.4))
+    wanted = renderer.render(cloud, inputs.VIEW, ("rgb", "depth"))
+    method = {"ordered": "_tally", "tiled": "_starts"}[backend.shape.lists]
+    original = getattr(LISTS[backend.shape.lists], method)
+
+    def moved(own, *args):
+        result, run = original(own, *args), own.picture
+        starts = run.read("starts", np.uint32, (run.tiles + 1,))
+        starts += np.uint32(-(int(starts[-1]) // 2) % 2**32)
+        run.held["starts"], run.held["cursors"] = (probe.buffer_of(backend, s) for s in (starts, starts[:-1]))
+        return result
+
+    monkeypatch.setattr(LISTS[backend.shape.lists], method, moved)
+    monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
+    frame = renderer.render(cloud, inputs.VIEW, ("rgb", "depth"))
+    assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+
+
+def test_a_buffer_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer):
+    """E3: nothing is allocated beyond the device's limit, and the message says what to do."""
+    backend = opencl(renderer)
+    limit = renderer.device.largest_allocation_bytes
+    with pytest.raises(fs.DeviceError, match=r"lists needs \d+ MiB .* use fewer splats or a smaller picture"):
+        backend.pool.fresh("lists", limit + 1)
+
+
+def test_poison_reaches_every_buffer(renderer):
+    """E5 would prove nothing if the buffers were clean."""
+    from fidsplat.backends.opencl import probe
+
+    backend = opencl(renderer)
+    taken = []
+    with backend.probe().poisoned():
+        filled = backend.pool._filled
+        backend.pool._filled = lambda buffer: taken.append(buffer) or filled(buffer)
+        renderer.render(random_splats(20, seed=1, depth=(1, 3)), inputs.VIEW, ("rgb", "depth"))
+        again = probe.contents(backend, filled(backend.pool.scratch("splats", 64)))
+    assert len(taken) > 15
+    assert (again == 0xFF).all()
