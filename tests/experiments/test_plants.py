@@ -12,6 +12,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments import blender, plants
 from fidsplat.experiments.plants import Plants, cameras_around, write_plants
+from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.vision.images import read_rgba
 from fidsplat.worlds.greenhouse import Greenhouse
 from fidsplat.worlds.plant_meshes import MESHES, Mesh
@@ -46,7 +47,7 @@ def test_splats_lie_in_the_faces_and_have_their_colours():
     assert (on >= 0).all()
     assert (on <= np.where(large, 3, 1)[:, None]).all()
     assert np.abs(cloud.means[:, 2]).max() < 1e-7
-    turned = fs.rotations.quaternion_to_matrix(cloud.quats.astype(float))[:, :, 2]
+    turned = quaternion_to_matrix(cloud.quats.astype(float))[:, :, 2]
     np.testing.assert_allclose(np.abs(turned[:, 2]), 1, atol=1e-6)
     # of the two triangles of a square: red falls along the farther of its sides
     red = 1 - np.max(cloud.means[large, :2], axis=1) / 3

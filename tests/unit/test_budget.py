@@ -8,14 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from brute_force import ideal
-from fidsplat.budget import Choice, certify, choose
 from random_scenes import HELD_OUT, random_scene
 from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.accuracy import cache, price_list, search
 from fidsplat.accuracy.error import errors, truth
-from fidsplat.accuracy.quality_within import _key
+from fidsplat.accuracy.quality_within import Choice, _key, certify, choose
 from fidsplat.util.errors import InputError
 from fidsplat.util.timing import Clock, Timer
 

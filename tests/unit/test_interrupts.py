@@ -31,7 +31,8 @@ sys.exit(main(["devices"]))
 """sends a signal when PyOpenCL calls Python while it is loaded"""
 WHERE_EXCEPTIONS_ARE_DROPPED = """
 import os, signal, sys, weakref
-from fidsplat import cli, interrupts
+from fidsplat import cli
+from fidsplat.util import interrupts
 from fidsplat.commands import COMMANDS
 
 class Finalised:

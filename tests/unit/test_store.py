@@ -9,6 +9,7 @@ import pytest
 from small_stores import COUNT, SMALL, contents, store_fixtures
 
 import fidsplat as fs
+from fidsplat.splats.harmonics import C0
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.store.layout import FAR, NODE, NPY_HEADER, header_crc
 from fidsplat.store.merge import REDUCTION
@@ -267,7 +268,7 @@ def test_colours_are_kept_as_asked(files, store, tmp_path):
     plain = fs.Store(fs.build_store(files, tmp_path / "plain.fss", sh_degree=0, levels=False, **SMALL))
     assert plain.sh_degree == -1
     assert (plain.nodes["level"] == 0).all()
-    kept = fs.harmonics.C0 * store.cloud().sh[:, 0] + 0.5
+    kept = C0 * store.cloud().sh[:, 0] + 0.5
     assert plain.cloud().colors == pytest.approx(np.maximum(kept, 0), abs=1e-6)
 
 

@@ -69,7 +69,7 @@ def test_views_are_drawn_of_what_they_see(stores, reference, name):
         for output in ours:
             assert np.array_equal(ours[output], whole[output]), output
         assert whole["rgb"].any()
-        read, every = selection.data.nodes, store.chunks
+        read, every = streamed.data.nodes, store.chunks
         assert 0 < read <= every
         if name in ("pinhole", "distorted", "pixel"):
             assert read < 0.75 * every

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.train import TrainSettings, densify, mcmc, neighbours
 from fidsplat.train.losses import C1, C2, blurred, normal_loss, picture_loss, window
 from fidsplat.train.neighbours import mean_square_distances
@@ -269,7 +270,7 @@ def test_densification_keeps_the_order_and_puts_new_splats_behind():
     away = made.values["means"][6:] - old.values["means"][[2, 5, 2, 5]]
     assert (np.abs(away[:2] - away[2:]).max(axis=1) > 1e-4).all()  # the parts of a splat are apart
     assert (np.abs(away).max(axis=1) > 0).all()
-    turns = fs.rotations.quaternion_to_matrix(old.values["quats"][[2, 5, 2, 5]])
+    turns = quaternion_to_matrix(old.values["quats"][[2, 5, 2, 5]])
     assert np.abs(np.einsum("ni,ni->n", away, turns[:, :, 2])).max() < 1e-6  # within their disks
     assert not made.gradients.any()
     assert not made.seen.any()
@@ -353,7 +354,7 @@ def test_mcmc_shakes_faint_splats_within_their_disks():
     mcmc.shake(splats, settings, 5, 1e-4)
     away = splats.values["means"] - before
     assert np.abs(away[:20]).max(axis=1).min() > 100 * np.abs(away[20:]).max()
-    turns = fs.rotations.quaternion_to_matrix(splats.values["quats"])
+    turns = quaternion_to_matrix(splats.values["quats"])
     assert np.abs(np.einsum("ni,ni->n", away, turns[:, :, 2])).max() < 1e-6
 
 
