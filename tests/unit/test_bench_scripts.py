@@ -3,10 +3,10 @@
 import json
 from pathlib import Path
 
+import compare_images
 import growth
 import performance_tables as tables
 import pytest
-import same_pictures
 from growth import Point
 
 from fidsplat.experiments.sweep import read_records
@@ -187,28 +187,28 @@ def test_growth_stops_where_it_takes_too_long(tmp_path, capsys):
     assert "splats ends at 20" in capsys.readouterr().err
 
 
-def test_pictures_of_two_trees_are_compared_by_their_bits(monkeypatch, capsys):
-    assert len(same_pictures.pictures()) == 144
-    drawn = [{"a": "1", "b": "2", "c": "refused: so"}, {"a": "1", "b": "refused: why", "c": "refused: other"}]
+def test_images_of_two_trees_are_compared_by_their_digests(monkeypatch, capsys):
+    assert len(compare_images.frames()) == 144
+    found = [{"a": "1", "b": "2", "c": "refused: so"}, {"a": "1", "b": "refused: why", "c": "refused: other"}]
     monkeypatch.chdir("/")  # not the tree of this script
-    monkeypatch.setattr(same_pictures, "drawn_by", lambda tree, device, only: drawn[tree != Path("/")])
-    monkeypatch.setattr("sys.argv", ["same_pictures.py", "."])
-    assert same_pictures.main() == 1
+    monkeypatch.setattr(compare_images, "digests_of_tree", lambda tree, *_: found[tree != Path("/")])
+    monkeypatch.setattr("sys.argv", ["compare_images.py", "."])
+    assert compare_images.main() == 1
     out = capsys.readouterr().out
     assert out.startswith("differs: b\n  refused: why\n")
-    assert out.endswith("3 pictures on opencl: 1 with the same bits, 1 that both refuse\n")
-    drawn[1]["b"] = "2"
-    assert same_pictures.main() == 0
-    drawn[:] = {}, {}
+    assert out.endswith("3 frames on opencl: 1 identical, 1 refused by both\n")
+    found[1]["b"] = "2"
+    assert compare_images.main() == 0
+    found[:] = {}, {}
     with pytest.raises(SystemExit):
-        same_pictures.main()
+        compare_images.main()
 
 
-def test_a_picture_of_a_tree_is_its_outputs(monkeypatch):
-    some = {name: given for name, given in same_pictures.pictures().items() if name.startswith("output ")}
-    monkeypatch.setattr(same_pictures, "pictures", lambda: some)
-    drawn = same_pictures.draw("opencl", "output depth")
-    assert set(drawn) == {"output depth", "output depth_first", "output depth_median"}
-    assert len(set(drawn.values())) == 3
-    monkeypatch.setattr(same_pictures, "cloud", lambda seed: same_pictures.fs.SplatCloud.empty())
-    assert not set(drawn.values()) & set(same_pictures.draw("opencl", "output depth").values())
+def test_the_digest_of_a_frame_depends_on_its_outputs(monkeypatch):
+    some = {name: given for name, given in compare_images.frames().items() if name.startswith("output ")}
+    monkeypatch.setattr(compare_images, "frames", lambda: some)
+    found = compare_images.digests("opencl", "output depth")
+    assert set(found) == {"output depth", "output depth_first", "output depth_median"}
+    assert len(set(found.values())) == 3
+    monkeypatch.setattr(compare_images, "cloud", lambda seed: compare_images.fs.SplatCloud.empty())
+    assert not set(found.values()) & set(compare_images.digests("opencl", "output depth").values())

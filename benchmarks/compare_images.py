@@ -1,10 +1,10 @@
-"""Whether two trees draw the same pictures, bit for bit: after a change that is to change none.
+"""Check that this tree and a commit render bit-identical images.
 
-    python benchmarks/same_pictures.py COMMIT [--device D] [--only WORDS]
+    python benchmarks/compare_images.py COMMIT [--device D] [--only WORDS]
 
-144 small frames, every lens, output, effect, preset and mixture, whole and in chunks and bands, by a commit
-and by this tree, each in a process of its own; printed are those that differ. Three minutes for a tree with
-cold caches, on two cores.
+Renders 144 small frames (every lens, output, effect, preset and mixture, some within small memory budgets)
+with both trees, each tree in its own process, and prints the names of the frames that differ. With cold
+caches on two cores this takes about three minutes for each tree.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ OUTPUTS = (
 WIDTH, HEIGHT = 93, 61
 MIB = 1 << 20
 REFUSED = "refused"
-# shutters were told their exposure time by a shorter name once
+# Earlier commits use other names: `Shutter.exposure`, `SplatCloud.with_planes`.
 _EXPOSURE_TIME = "exposure_time" if "exposure_time" in fs.Shutter.__dataclass_fields__ else "exposure"
 
 
-def cloud(seed: int, count: int = 1500, degree: int | None = None, most: float = 0.25) -> fs.SplatCloud:
-    """Random splats before the camera; of plain colours, or of SH of that degree."""
+def cloud(seed: int, count: int = 1500, degree: int | None = None, largest: float = 0.25) -> fs.SplatCloud:
+    """Random splats in front of the camera, with plain colours or with SH of a degree."""
     rng = np.random.default_rng(seed)
     means = np.stack(
         [rng.uniform(-1.6, 1.6, count), rng.uniform(-1.1, 1.1, count), rng.uniform(0.6, 5, count)], 1
     )
-    scales = np.exp(rng.uniform(math.log(most / 25), math.log(most), (count, 2)))
+    scales = np.exp(rng.uniform(math.log(largest / 25), math.log(largest), (count, 2)))
     terms = 1 if degree is None else (degree + 1) ** 2
     shades = rng.random((count, 3)) if degree is None else rng.normal(0, 0.4, (count, terms, 3))
     colours = {"colors" if degree is None else "sh": shades.astype(np.float32)}
@@ -49,13 +49,16 @@ def cloud(seed: int, count: int = 1500, degree: int | None = None, most: float =
     return fs.SplatCloud(means, rng.normal(size=(count, 4)), scales, opacities, labels=labels, **colours)
 
 
-def printed(given: fs.SplatCloud) -> fs.SplatCloud:
-    """Forty splats on each plane, the first forty on none."""
-    return given.with_planes(np.arange(len(given)) // 40 - 1)
+def in_coplanar_groups(splats: fs.SplatCloud) -> fs.SplatCloud:
+    """Splats in coplanar groups of forty; the first forty are in no group."""
+    groups = np.arange(len(splats)) // 40 - 1
+    if hasattr(splats, "with_coplanar_groups"):
+        return splats.with_coplanar_groups(groups)
+    return splats.with_planes(groups)
 
 
 def turning(time: float) -> np.ndarray:
-    """A camera that turns about its axis and moves aside."""
+    """Pose of a camera that turns about its optical axis and moves sideways."""
     pose, angle = np.eye(4), 0.5 * time
     pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     pose[0, 3] = -0.2 * time
@@ -63,14 +66,14 @@ def turning(time: float) -> np.ndarray:
 
 
 def sliding(time: float) -> np.ndarray:
-    """A group of splats that moves aside."""
+    """Pose of a group of splats that moves sideways."""
     pose = np.eye(4)
     pose[0, 3] = 0.4 * time
     return pose
 
 
 def cameras() -> dict[str, fs.Camera]:
-    """One of each lens."""
+    """A camera for each lens model."""
     focal = (70.0, 71.0, 46.0, 31.0)
     return {
         "pinhole": fs.Camera.pinhole(WIDTH, HEIGHT, *focal),
@@ -81,24 +84,32 @@ def cameras() -> dict[str, fs.Camera]:
     }
 
 
-def pictures() -> dict[str, dict[str, Any]]:
-    """Arguments of `Renderer.render` by the pictures' names; `budget` is the renderer's own."""
+def frames() -> dict[str, dict[str, Any]]:
+    """Arguments of `Renderer.render` by frame name; `budget` is the renderer's memory budget."""
     found: dict[str, dict[str, Any]] = {}
     for name, camera in cameras().items():
         found |= {
-            f"{name}: {words}": {"camera": camera, **given} for words, given in _through_a_lens().items()
+            f"{name}: {words}": {"camera": camera, **given} for words, given in _for_each_lens().items()
         }
     pinhole = cameras()["pinhole"]
     found |= {f"output {name}": {"camera": pinhole, "outputs": (name,)} for name in OUTPUTS}
+    grouped = in_coplanar_groups(cloud(8))
     for preset in ("standard", "fast", "reference", "gsplat", "surfel"):
         found[f"preset {preset}"] = {"camera": pinhole, "quality": preset}
-        found[f"preset {preset}, planes"] = {"camera": pinhole, "quality": preset, "scene": printed(cloud(8))}
+        found[f"preset {preset}, coplanar groups"] = {
+            "camera": pinhole,
+            "quality": preset,
+            "scene": grouped,
+        }
     for words in ("setup_precision=float32", "arithmetic=precise", "blend_precision=float64"):
         found[words] = {"camera": pinhole, "quality": words, "outputs": OUTPUTS}
     found |= {f"sensor {words}": {"camera": pinhole, "sensor": one} for words, one in _sensors().items()}
     for k in range(12):
-        most = 0.05 * (k + 1)
-        found[f"splats up to {most:.2f}"] = {"camera": pinhole, "scene": cloud(100 + k, 3000, most=most)}
+        largest = 0.05 * (k + 1)
+        found[f"splats up to {largest:.2f}"] = {
+            "camera": pinhole,
+            "scene": cloud(100 + k, 3000, largest=largest),
+        }
     for spec in ("apriltag:36h11:5", "aruco:4x4_50:7", "qr:hello world"):
         for mixture in ("fitted", "paper", "exact"):
             for tilt in (0, 55):
@@ -110,14 +121,14 @@ def pictures() -> dict[str, dict[str, Any]]:
                 }
     large = fs.Camera.pinhole(640, 480, 480.0, 480.0, 320.0, 240.0)
     for mib in (18, 24, 40, 80):
-        of = {"camera": large, "scene": cloud(11, 20000), "outputs": ("rgb", "alpha", "depth")}
-        found[f"within {mib} MiB"] = of | {"budget": mib * MIB}
+        arguments = {"camera": large, "scene": cloud(11, 20000), "outputs": ("rgb", "alpha", "depth")}
+        found[f"within {mib} MiB"] = arguments | {"budget": mib * MIB}
     return found
 
 
-def _through_a_lens() -> dict[str, dict[str, Any]]:
+def _for_each_lens() -> dict[str, dict[str, Any]]:
     panorama = fs.Panorama(np.random.default_rng(5).random((16, 32, 3)).astype(np.float32))
-    moving, of_group = fs.Motion(turning, {}), fs.Motion(None, {1: sliding})
+    camera_motion, group_motion = fs.Motion(turning, {}), fs.Motion(None, {1: sliding})
     some, boxes = cloud(6, 300), cloud(5, 300).with_boxes()
     mixed = some.with_boxes(np.arange(len(some)) // 40 % 2 == 0)
     exposed = fs.Shutter(**{_EXPOSURE_TIME: 0.3}, sub_poses=2)
@@ -126,17 +137,17 @@ def _through_a_lens() -> dict[str, dict[str, Any]]:
         "SH of degree 0": {"scene": cloud(4, degree=0), "outputs": OUTPUTS},
         "SH of degree 3": {"scene": cloud(3, 800, 3), "outputs": OUTPUTS},
         "boxes": {"scene": boxes, "outputs": OUTPUTS},
-        "planes": {"scene": printed(cloud(7)), "outputs": OUTPUTS},
-        "planes of both kinds": {"scene": printed(mixed), "outputs": OUTPUTS},
+        "coplanar groups": {"scene": in_coplanar_groups(cloud(7)), "outputs": OUTPUTS},
+        "coplanar groups and boxes": {"scene": in_coplanar_groups(mixed), "outputs": OUTPUTS},
         "lowpass=pixel": {"quality": "lowpass=pixel"},
         "lowpass=none": {"quality": "lowpass=none"},
         "samples=2": {"quality": "samples=2"},
         "fog": {"fog": fs.Fog(0.2, (0.6, 0.65, 0.7))},
         "gradient": {"background": fs.Gradient((0.2, 0.4, 0.9), (0.4, 0.3, 0.1))},
         "panorama": {"background": panorama},
-        "blur": {"motion": moving, "shutter": exposed, "outputs": OUTPUTS},
-        "rolling": {"motion": moving, "shutter": fs.Shutter(readout=0.4, rows_per_band=16)},
-        "group": {"motion": of_group, "shutter": fs.Shutter(time=0.7)},
+        "blur": {"motion": camera_motion, "shutter": exposed, "outputs": OUTPUTS},
+        "rolling": {"motion": camera_motion, "shutter": fs.Shutter(readout=0.4, rows_per_band=16)},
+        "group": {"motion": group_motion, "shutter": fs.Shutter(time=0.7)},
     }
 
 
@@ -162,10 +173,10 @@ def _placed(spec: str, mixture: str, tilt: float) -> fs.SplatCloud:
     return fs.marker(spec, size=0.5, mixture=mixture).cloud.transformed(pose)
 
 
-def draw(device: str, only: str) -> dict[str, str]:
-    """A hash of each picture, or what its error says, by their names."""
+def digests(device: str, only: str) -> dict[str, str]:
+    """SHA-256 of each frame, or its error message, by frame name."""
     found, main, plain = {}, fs.Renderer(device), cloud(1)
-    for name, given in pictures().items():
+    for name, given in frames().items():
         if only not in name:
             continue
         given = {
@@ -187,10 +198,10 @@ def draw(device: str, only: str) -> dict[str, str]:
     return found
 
 
-def drawn_by(tree: Path, device: str, only: str) -> dict[str, str]:
-    """`draw` with the package of a tree."""
+def digests_of_tree(tree: Path, device: str, only: str) -> dict[str, str]:
+    """Digests of the frames that the package of a tree renders, in a separate process."""
     path = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])
-    words = [sys.executable, __file__, "--drawn-here", "--device", device, "--only", only]
+    words = [sys.executable, __file__, "--this-process", "--device", device, "--only", only]
     done = subprocess.run(
         words, stdout=subprocess.PIPE, cwd=tree, env=os.environ | {"PYTHONPATH": path}, check=True
     )
@@ -203,31 +214,29 @@ def main() -> int:
     )
     parser.add_argument("commit", nargs="?", help="any name that git knows, or a folder with its files")
     parser.add_argument("--device", default="opencl")
-    parser.add_argument("--only", default="", help="pictures whose names have these words")
-    parser.add_argument("--drawn-here", action="store_true", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.drawn_here:
-        print(json.dumps(draw(asked.device, asked.only)))
+    parser.add_argument("--only", default="", help="only frames whose names contain this text")
+    parser.add_argument("--this-process", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.this_process:
+        print(json.dumps(digests(options.device, options.only)))
         return 0
-    if asked.commit is None:
+    if options.commit is None:
         parser.error("name a commit, or a folder with its files")
-    from before_after import ROOT, checked_out  # late: another tree's package need not have what it takes
+    from before_after import ROOT, checked_out  # late: the package of another tree may lack what it imports
 
     with tempfile.TemporaryDirectory() as folder:
-        given = Path(asked.commit).resolve()
-        other = given if given.is_dir() else checked_out(asked.commit, Path(folder))
-        before, now = (drawn_by(tree, asked.device, asked.only) for tree in (other, ROOT))
+        given = Path(options.commit).resolve()
+        other = given if given.is_dir() else checked_out(options.commit, Path(folder))
+        before, now = (digests_of_tree(tree, options.device, options.only) for tree in (other, ROOT))
     if not now:
-        parser.error(f"no picture has {asked.only!r} in its name")
-    refused = [name for name in now if REFUSED in before[name] and REFUSED in now[name]]
-    differ = [name for name in now if before[name] != now[name] and name not in refused]
+        parser.error(f"--only must be part of a frame name, got {options.only!r}")
+    both_refuse = [name for name in now if REFUSED in before[name] and REFUSED in now[name]]
+    differ = [name for name in now if before[name] != now[name] and name not in both_refuse]
     for name in differ:
-        said = [text for text in (before[name], now[name]) if REFUSED in text]
-        print(f"differs: {name}" + "".join(f"\n  {text}" for text in said))
-    same = len(now) - len(differ) - len(refused)
-    print(
-        f"{len(now)} pictures on {asked.device}: {same} with the same bits, {len(refused)} that both refuse"
-    )
+        errors = [text for text in (before[name], now[name]) if REFUSED in text]
+        print(f"differs: {name}" + "".join(f"\n  {text}" for text in errors))
+    same = len(now) - len(differ) - len(both_refuse)
+    print(f"{len(now)} frames on {options.device}: {same} identical, {len(both_refuse)} refused by both")
     return 1 if differ else 0
 
 
