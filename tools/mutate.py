@@ -3,7 +3,7 @@
     python tools/mutate.py --count 80 --seed 7                run a seeded sample, spread over the packages
     python tools/mutate.py --package kernels/opencl --count 10   only of packages with this in their path
     python tools/mutate.py --list                             print the sample without running it
-    python tools/mutate.py --survivors                        run the recorded survivors again
+    python tools/mutate.py --survivors                        run survivors and those out of time again
     python tools/mutate.py --report                           print the score per package and the survivors
     python tools/mutate.py --equivalent KEY 'reason'          mark a survivor that changes no behaviour
 
@@ -18,6 +18,7 @@ import ast
 import contextlib
 import hashlib
 import json
+import math
 import os
 import random
 import re
@@ -33,39 +34,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-CONTRACT = "tests/contract tests/stages tests/selftest"
-UNIT, EXPERIMENTS = "tests/unit", "tests/experiments"
-TESTS = {  # package or file: test files and folders, and an expression for -k; the longest prefix holds
-    "kernels/opencl": (f"{CONTRACT} tests/unit/test_store_hidden.py", "not warp"),
-    "kernels/opencl/train": ("tests/contract/test_training*.py tests/contract/test_refine.py", ""),
-    "kernels/opencl/store": ("tests/unit/test_store*.py", "not warp"),
-    "kernels/warp": (f"{CONTRACT} tests/unit/test_warp*.py", "warp"),
-    "fidsplat": (f"{UNIT} tests/contract", ""),
-    "fidsplat/backends": (f"{CONTRACT} {UNIT}", "not warp"),
-    "fidsplat/backends/opencl": (f"{CONTRACT} tests/unit/test_store*.py", "not warp"),
-    "fidsplat/backends/reference": (f"{UNIT}/test_*reference.py {CONTRACT}", "not warp"),
-    "fidsplat/backends/warp": (f"{CONTRACT} tests/unit/test_warp*.py", "warp"),
-    "fidsplat/accuracy": ("tests/unit/test_budget.py tests/unit/test_accuracy.py", ""),
-    "fidsplat/cameras": (f"{UNIT}/test_[clmt]*.py tests/contract/test_lens_pictures.py", "not warp"),
-    "fidsplat/commands": (f"{UNIT} {EXPERIMENTS}", ""),
-    "fidsplat/effects": (f"{UNIT} tests/compile tests/contract", "not warp"),
-    "fidsplat/experiments": (f"{EXPERIMENTS} {UNIT}", ""),
-    "fidsplat/formats": (f"{UNIT} {EXPERIMENTS}/test_dataset.py tests/selftest", "not warp"),
-    "fidsplat/selftest": ("tests/selftest tests/contract/test_certificates.py", "not warp"),
-    "fidsplat/logs": (f"{UNIT}/test_logs.py {UNIT}/test_flights.py", ""),
-    "fidsplat/markers": (f"{UNIT}/test_[mv]*.py tests/contract/test_facets.py", "not warp"),
-    "fidsplat/remote": (f"{UNIT}/test_remote*.py {UNIT}/test_flights.py", ""),
-    "fidsplat/scenes": (f"{UNIT}/test_[sci]*.py", ""),
-    "fidsplat/sim": (f"{UNIT} {EXPERIMENTS}/test_plants.py", ""),
-    "fidsplat/store": (f"{UNIT}/test_s*.py {UNIT}/test_l*.py tests/contract/test_denser_splats.py", ""),
-    "fidsplat/train": (f"{UNIT}/test_train*.py tests/contract/test_[tr]*.py", ""),
-    "fidsplat/viewer": (f"{UNIT}/test_viewer*.py", ""),
-    "fidsplat/vision": (f"{UNIT} {EXPERIMENTS}", ""),
-}  # fmt: skip
 MOST_FILES = 12
-"""of tests for one mutation, the most fitting of the map"""
+"""Test files for one mutation."""
 TEST_SECONDS = 20
-"""of CPU time, after which a test hangs"""
+"""CPU time after which a test hangs."""
 LIMIT = -signal.SIGXCPU
 INVALID = re.compile(
     r"BUILD_PROGRAM_FAILURE|clBuildProgram|Warp\w*Codegen\w*Error|Error while parsing function"
@@ -196,8 +168,9 @@ SWAPS = _swaps()
 
 
 def package_of(path: str) -> str:
-    """Longest prefix in `TESTS`."""
-    return max((name for name in TESTS if path.startswith(f"{name}/")), key=len, default="")
+    """Folder of a source file, at most two deep, three deep for backends and kernels."""
+    parts = path.split("/")[:-1]
+    return "/".join(parts[: 3 if parts[:2] in (["fidsplat", "backends"], ["kernels", "opencl"]) else 2])
 
 
 def mutations_of(file: Path) -> Iterator[Mutation]:
@@ -239,25 +212,45 @@ def _is_python(mutation: Mutation) -> bool:
 
 
 def tests_for(mutation: Mutation) -> list[str]:
-    """Arguments of pytest: the files of the map that mention most often the words of the file's name, its
-    public classes and functions."""
-    patterns, expression = TESTS[mutation.package]
-    first = 2 if mutation.path.startswith("kernels/") else 1
-    words = [word for word in re.split(r"[_/.]", mutation.path)[first:-1] if len(word) > 2]
-    words += re.findall(
-        r"^(?:class|def) ([A-Za-z]\w+)", (ROOT / mutation.path).read_text("utf-8"), re.MULTILINE
+    """Arguments of pytest: the test files most specific to the mutated place, the most specific first.
+
+    Similarity of word counts, weighted by how few test files contain a word. The words near the mutation, in
+    the file's name and in its public names count more; an import of the mutated module doubles it.
+    """
+    path, source = mutation.path, (ROOT / mutation.path).read_text("utf-8")
+    warp = path.startswith(("kernels/warp/", "fidsplat/backends/warp/"))
+    tests = {
+        file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in ROOT.glob("tests/*/test_*.py")
+    }
+    names = path.removesuffix(".py").split("/")
+    imported = re.compile(
+        rf"{'.'.join(names)}\b|from {'.'.join(names[:-1])} import [^\n]*\b{names[-1]}\b".replace(".", r"\.")
     )
-    places = [place for pattern in patterns.split() for place in sorted(ROOT.glob(pattern))]
-    files = [
-        file for place in places for file in sorted([place] if place.is_file() else place.rglob("test_*.py"))
-    ]
-    texts = {file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in files}
+    public = re.findall(r"^(?:class|def) ([A-Za-z]\w+)", source, re.MULTILINE)
+    around = source[max(0, mutation.start - 600) : mutation.end + 600]
+    texts = {name: Counter(_words_of(f"{name} {name} {text}")) for name, text in tests.items()}
+    rarity = Counter(word for words in texts.values() for word in words)
+    wanted = Counter(_words_of(source))
+    for weight, text in ((4, around), (20, " ".join(names[1:])), (8, " ".join(public))):
+        wanted.update({word: weight * count for word, count in Counter(_words_of(text)).items()})
 
-    def mentions(name: str) -> int:
-        return sum(min(texts[name].count(word), 8) + 9 * (word in name) for word in words)
+    def similarity(name: str) -> float:
+        words, weight = texts[name], lambda word: math.log(len(texts) / rarity[word])
+        vector = {word: math.log1p(count) * weight(word) for word, count in words.items()}
+        common = sum(
+            math.log1p(wanted[word]) * weight(word) * vector[word] for word in wanted if word in words
+        )
+        length = math.sqrt(sum(value * value for value in vector.values())) or 1.0
+        return common / length * (2 if imported.search(tests[name]) else 1)
 
-    order = sorted(texts, key=mentions, reverse=True)
-    return [*order[:MOST_FILES], *(["-k", expression] if expression else [])]
+    order = sorted(tests, key=similarity, reverse=True)
+    if path.startswith("kernels/") or "/backends/" in path:
+        order = [name for name in order if warp or "warp" not in name]
+    return [*order[:MOST_FILES], "-k", "warp or not opencl" if warp else "not warp"]
+
+
+def _words_of(text: str) -> list[str]:
+    return re.findall(r"[a-z]{3,}", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text).lower())
 
 
 class Tree:
@@ -273,7 +266,11 @@ class Tree:
                 shutil.copy2(ROOT / name, folder / name)
 
     def run(self, mutation: Mutation) -> tuple[str, str, str]:
-        """`caught`, `survived` or `invalid` (it does not compile), the test that caught it, how it ended."""
+        """Result, the test that caught the mutation, and how that test ended.
+
+        The result is `caught`, `survived`, `limit` (time is up and no test has failed) or `invalid` (it does
+        not compile).
+        """
         file, broken = self._folder / mutation.path, []
         text = file.read_text("utf-8")
         while True:
@@ -284,8 +281,10 @@ class Tree:
                 file.write_text(text, "utf-8")
             if mutation.path.startswith("kernels/") and INVALID.search(output):
                 return "invalid", test, ""
-            if status in (0, LIMIT) or not test:
-                return "survived", "", {0: "", LIMIT: "limit"}.get(status, f"pytest ended with {status}")
+            if status == LIMIT:
+                return "limit", test, f"{self._limit} s of CPU time"
+            if status == 0 or not test:
+                return "survived", "", f"pytest ended with {status}" if status else ""
             if self._passes.setdefault(test, self._alone(test)):
                 how = "fails" if status > 0 else "hangs" if status == -signal.SIGPROF else f"signal {-status}"
                 return "caught", test, how
@@ -298,7 +297,8 @@ class Tree:
     def _pytest(self, arguments: list[str]) -> tuple[int, str, str]:
         """Exit status, negative for a signal; the test that failed or was running; the output."""
         path = os.pathsep.join(str(self._folder / name) for name in (".", "tools"))
-        environment = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "999"}
+        cache = str(self._folder / ".pycache")  # kernels are cached where the user's are: most do not change
+        environment = os.environ | {"PYTHONPATH": path, "PYTHONPYCACHEPREFIX": cache, "COLUMNS": "999"}
         options = ["-n", "0", "-x", "-v", "-p", "mutate", "-p", "no:cacheprovider"]
         limits = resource.RLIMIT_CPU, (self._limit, self._limit + 5)
         with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as stream:
@@ -329,14 +329,19 @@ def pytest_runtest_logstart() -> None:
 
 
 def report(rows: dict[str, dict]) -> str:
-    """Markdown: the score per package, then survivors and equivalent mutations."""
-    lines = ["| package | caught | survived | equivalent | share |", "|---|---|---|---|---|"]
+    """Markdown: the score per package, then survivors, mutations out of time and equivalent ones.
+
+    The share is caught / (caught + survived).
+    """
+    lines = ["| package | caught | survived | limit | equivalent | share |", "|---|---|---|---|---|---|"]
     for package in (*sorted({row["package"] for row in rows.values()}), "all"):
         results = [row["result"] for row in rows.values() if package in ("all", row["package"])]
-        caught, survived, equivalent = (results.count(each) for each in ("caught", "survived", "equivalent"))
+        caught, survived, limit, equivalent = map(
+            results.count, ("caught", "survived", "limit", "equivalent")
+        )
         share = f"{100 * caught / (caught + survived):.0f} %" if caught + survived else "-"
-        lines.append(f"| {package} | {caught} | {survived} | {equivalent} | {share} |")
-    for result in ("survived", "equivalent"):
+        lines.append(f"| {package} | {caught} | {survived} | {limit} | {equivalent} | {share} |")
+    for result in ("survived", "limit", "equivalent"):
         lines += ["", f"{result}:", *(_words(row) for row in rows.values() if row["result"] == result)]
     return "\n".join(lines)
 
@@ -352,9 +357,9 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=80, help="mutations of the sample")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--package", default="", help="only packages with this in their path")
-    parser.add_argument("--limit", type=int, default=60, help="seconds of CPU time for a mutation's tests")
+    parser.add_argument("--limit", type=int, default=300, help="seconds of CPU time for a mutation's tests")
     parser.add_argument("--results", type=Path, default=Path("mutations.jsonl"))
-    parser.add_argument("--survivors", action="store_true", help="run the recorded survivors again")
+    parser.add_argument("--survivors", action="store_true", help="run survivors and those out of time again")
     parser.add_argument("--equivalent", nargs=2, metavar=("KEY", "REASON"))
     parser.add_argument("--list", action="store_true", help="print the sample without running it")
     parser.add_argument("--report", action="store_true", help="print the recorded results")
@@ -371,9 +376,8 @@ def main() -> int:
         key, reason = options.equivalent
         record(rows[key] | {"result": "equivalent", "how": reason})
     elif options.survivors:
-        paths = {row["path"]: row["key"] for row in rows.values() if row["result"] == "survived"}
-        left = {key for key, row in rows.items() if row["result"] == "survived"}
-        chosen = [one for path in paths for one in mutations_of(ROOT / path) if one.key in left]
+        left = {key: row["path"] for key, row in rows.items() if row["result"] in ("survived", "limit")}
+        chosen = [one for path in set(left.values()) for one in mutations_of(ROOT / path) if one.key in left]
         run({one.key: one for one in chosen}.values(), options.limit, record)
     elif not options.report:
         chosen = sample(options.count, options.seed, options.package)
