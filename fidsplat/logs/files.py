@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
+from fidsplat.logs.bags import bag_metadata
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of, printable, writable_folder
 
@@ -19,7 +21,6 @@ try:
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as BagWriter
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    from ruamel.yaml import YAML  # of rosbags, whose reader does not give a bag's own metadata
 except ImportError as error:
     raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
 
@@ -84,8 +85,7 @@ def _source_of(path: Path) -> str | None:
     """The source of a log that was written with one; None for anything else."""
     try:
         if path.is_dir():
-            found = YAML(typ="safe").load(path / "metadata.yaml")
-            return found["rosbag2_bagfile_information"]["custom_data"][_METADATA]
+            return bag_metadata(path)["custom_data"][_METADATA]
         if path.is_file():
             with path.open("rb") as stream:
                 found = make_reader(stream).iter_metadata()
@@ -143,8 +143,13 @@ class _Bag:
     def __init__(self, target: Path, store: Any, source: str) -> None:
         self._target, self._store = target, store
         self._folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
-        self._made = self._folder / printable(target.name)
-        self._writer = BagWriter(self._made, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        # rosbags takes "?", "#" and "%" in a path for those of a URI
+        self._link = tempfile.TemporaryDirectory()
+        link = Path(self._link.name, "link")
+        link.symlink_to(self._folder.absolute())
+        name = re.sub("[?#%]", "_", printable(target.name))
+        self._made = self._folder / name
+        self._writer = BagWriter(link / name, version=9, storage_plugin=StoragePlugin.SQLITE3)
         if source:
             self._writer.set_custom_data(_METADATA, source)
         self._writer.open()
@@ -169,6 +174,7 @@ class _Bag:
                     self._writer.close()
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
+            self._link.cleanup()
 
 
 @contextmanager

@@ -1,0 +1,162 @@
+"""rosbag2 folders: metadata, and messages of MCAP and SQLite files, compressed by zstd or not."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path, PurePath
+from typing import Any, BinaryIO
+from urllib.parse import quote
+
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import open_input, read_input, regular_file
+from fidsplat.util.input_limit import check_expansion, input_limit
+
+try:
+    import lz4.frame
+    import zstandard
+    from mcap.data_stream import ReadDataStream
+    from mcap.reader import make_reader
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+    from ruamel.yaml import YAML  # of rosbags, whose reader neither limits expansion nor quotes names
+except ImportError as error:
+    raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
+
+MOST_METADATA = 2**20
+"""Bytes of metadata.yaml, which are parsed in Python."""
+_STEP = 2**20
+
+Message = tuple[str, str, int, bytes]
+"""Topic, type, time in nanoseconds, CDR."""
+
+
+def bag_metadata(folder: Path) -> dict[str, Any]:
+    """Information of a bag's metadata.yaml. Raises InputError for a missing or unsuitable one, and errors of
+    the YAML package."""
+    path = folder / "metadata.yaml"
+    text = read_input(path, most=MOST_METADATA).decode("utf-8")
+    if "<<" in text:  # tables merged into one another take exponential time
+        raise InputError(f"{path} must not merge YAML tables, got '<<'; write the tables out")
+    return YAML(typ="safe", pure=True).load(text)["rosbag2_bagfile_information"]
+
+
+def log_messages(path: Path) -> Iterator[Message]:
+    """CDR messages of an MCAP file or a rosbag2 folder.
+
+    Raises InputError for files that are not regular, are missing or expand to more than `input_limit`, and
+    errors of the packages that decode.
+    """
+    if not path.is_dir():
+        yield from _mcap_messages(path)
+        return
+    metadata = bag_metadata(path)
+    compressed = (metadata.get("compression_mode") or "none").lower()
+    form = metadata.get("compression_format") or ""
+    if compressed not in ("none", "file", "message") or (compressed != "none" and form != "zstd"):
+        raise InputError(
+            f"the compression of {path} must be zstd by file or by message, got {compressed} {form}"
+        )
+    names = [PurePath(name).name for name in metadata["relative_file_paths"]]  # nothing outside of the folder
+    for file in (regular_file(path / name) for name in names):
+        with tempfile.TemporaryDirectory() as folder:
+            if compressed == "file":
+                whole, file = file, Path(folder, file.stem)
+                with open_input(whole) as source, file.open("wb") as target:
+                    _decompress(source, target, whole)
+            mcap = metadata.get("storage_identifier") == "mcap" or file.suffix == ".mcap"
+            for topic, kind, time, data in (_mcap_messages if mcap else _sqlite_messages)(file):
+                if compressed == "message":
+                    data = _decompressed(data, path)
+                yield topic, kind, time, data
+
+
+def _decompress(source: BinaryIO, target: BinaryIO, path: Path) -> None:
+    """Expand a zstd file of any number of frames. Raises InputError above the limit."""
+    size = 0
+    with zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True) as stream:
+        while part := stream.read(_STEP):
+            size += len(part)
+            check_expansion(path, size, "zstd data")
+            target.write(part)
+
+
+def _decompressed(data: bytes, path: Path) -> bytes:
+    """Expand a message. Raises InputError above the limit."""
+    limit = input_limit(len(data))
+    with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
+        parts, size = [], 0
+        while part := stream.read(_STEP):
+            size += len(part)
+            if size > limit:
+                check_expansion(f"a message of {path}", size, "zstd data", len(data))
+            parts.append(part)
+    return b"".join(parts)
+
+
+def _sqlite_messages(path: Path) -> Iterator[Message]:
+    name = quote(os.fsencode(path.absolute()))
+    connection = sqlite3.connect(f"file://{name}?immutable=1&mode=ro", uri=True)
+    try:
+        # the definition of a table may compute values that no file holds
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(input_limit(path.stat().st_size), 10**9))
+        connection.execute("PRAGMA trusted_schema = OFF")
+        # a view in a table's place may compute for ever
+        kinds = connection.execute("SELECT type FROM sqlite_master WHERE name IN ('messages', 'topics')")
+        if sorted(kind for (kind,) in kinds) != ["table", "table"]:
+            raise InputError(f"{path} must have the tables messages and topics; give a rosbag2 database")
+        cursor = connection.execute(
+            "SELECT name, type, timestamp, data FROM messages JOIN topics ON messages.topic_id = topics.id "
+            "WHERE serialization_format = 'cdr' ORDER BY timestamp"
+        )
+        for topic, kind, time, data in cursor:
+            if [type(value) for value in (topic, kind, time, data)] != [str, str, int, bytes]:
+                raise InputError(
+                    f"{path} must have messages of a topic, a type, a time and data, got {time!r}"
+                )
+            yield topic, kind, time, data
+    finally:
+        connection.close()
+
+
+def _mcap_messages(path: Path) -> Iterator[Message]:
+    with open_input(path) as stream:
+        _check_chunks(path, stream)
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if schema is not None and channel.message_encoding == "cdr":
+                yield channel.topic, schema.name, message.log_time, message.data
+
+
+def _check_chunks(file: Path, stream: BinaryIO) -> None:
+    """Check what the chunks of an MCAP file expand to: one by one, or without an index, which says in which
+    order to read them, all together. Raises InputError above the limit."""
+    summary, need = make_reader(stream).get_summary(), 0
+    if summary is not None and summary.chunk_indexes:
+        for index in summary.chunk_indexes:
+            stream.seek(index.chunk_start_offset + 9)  # behind its opcode and length
+            chunk = Chunk.read(ReadDataStream(stream))
+            check_expansion(file, _expanded(chunk), "a chunk", len(chunk.data))
+    else:
+        stream.seek(0)
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                need += _expanded(record)
+                check_expansion(file, need, "chunks without an index")
+    stream.seek(0)
+
+
+def _expanded(chunk: Chunk) -> int:
+    """Bytes that a chunk expands to, by itself or by its compressed data, whichever says more."""
+    said = 0
+    if chunk.compression == "zstd":
+        said = zstandard.frame_content_size(chunk.data)
+    elif chunk.compression == "lz4":
+        said = lz4.frame.get_frame_info(chunk.data)["content_size"]
+        if not said:
+            most = min(chunk.uncompressed_size, input_limit(len(chunk.data))) + 1
+            said = len(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
+            if said == most:
+                raise InputError(f"a chunk must expand to the {most - 1:,} bytes that it declares, got more")
+    return max(chunk.uncompressed_size, said)
