@@ -15,9 +15,9 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.experiments.localise import FAMILY, RATE, VARIANTS, Localise
+from fidsplat.images.files import write_png
+from fidsplat.images.visualize import outlined, shrunk
 from fidsplat.vision.detect import detect
-from fidsplat.vision.images import write_png
-from fidsplat.vision.paint import outlined, shrunk
 from fidsplat.worlds.greenhouse import BENCH
 from fidsplat.worlds.robot import Run
 

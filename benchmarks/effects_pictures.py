@@ -19,9 +19,8 @@ from rich.console import Console
 from rich.progress import track
 
 import fidsplat as fs
-from fidsplat.scenes import PlacedMarker
-from fidsplat.vision.images import to_uint8
-from fidsplat.vision.paint import (
+from fidsplat.images.files import to_uint8
+from fidsplat.images.visualize import (
     contact_sheet,
     count_key,
     count_picture,
@@ -32,6 +31,7 @@ from fidsplat.vision.paint import (
     normal_key,
     normal_picture,
 )
+from fidsplat.scenes import PlacedMarker
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "examples"))

@@ -17,8 +17,8 @@ import numpy as np
 from measuring import facts, keep, options, show
 
 import fidsplat as fs
-from fidsplat.vision.images import to_uint8, write_png
-from fidsplat.vision.paint import contact_sheet
+from fidsplat.images.files import to_uint8, write_png
+from fidsplat.images.visualize import contact_sheet
 
 SIZES = (1.0, 2.0, 4.571, 8.0)
 """pixels per module"""

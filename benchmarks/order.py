@@ -28,13 +28,13 @@ from real_scene import extent, views
 from rich.progress import track
 
 import fidsplat as fs
+from fidsplat.images.files import to_uint8, write_png
+from fidsplat.images.visualize import contact_sheet
 from fidsplat.scenes.random_clouds import load_scene, random_splats
 from fidsplat.selftest.agreement import Picture, draw, truth_of
 from fidsplat.selftest.clouds import taken
 from fidsplat.selftest.order import STEP, largest_jump, turning, wall
 from fidsplat.util.timing import frame_timer, quartiles, ratios, take_turns
-from fidsplat.vision.images import to_uint8, write_png
-from fidsplat.vision.paint import contact_sheet
 
 ORDERS = ("centre", "pixel")
 SIZE = {"width": 240, "height": 192}

@@ -20,12 +20,12 @@ from rich.console import Console
 from rich.table import Table
 
 import fidsplat as fs
+from fidsplat.images.files import to_uint8, write_png
+from fidsplat.images.visualize import contact_sheet, outlined
 from fidsplat.scenes import PlacedMarker
 from fidsplat.util.errors import FidsplatError
 from fidsplat.util.files import writable_folder
 from fidsplat.vision import read_back
-from fidsplat.vision.images import to_uint8, write_png
-from fidsplat.vision.paint import contact_sheet, outlined
 
 WIDTH, HEIGHT, FOV_X = 1280, 720, math.radians(60.0)
 BACKGROUND = (0.72, 0.74, 0.76)

@@ -19,10 +19,10 @@ from measuring import PROGRESS, facts, keep, options, show
 from rich.progress import track
 
 import fidsplat as fs
+from fidsplat.images.files import to_uint8
 from fidsplat.scenes.random_clouds import SCENES, load_scene
 from fidsplat.train import Dataset, Trainer, TrainingView
 from fidsplat.util.timing import quartiles
-from fidsplat.vision.images import to_uint8
 
 WARM = 10
 

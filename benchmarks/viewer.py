@@ -18,13 +18,13 @@ from dataclasses import replace
 import numpy as np
 
 import fidsplat as fs
+from fidsplat.images.files import encoded
 from fidsplat.scenes.random_clouds import SCENES, random_cloud, standard_camera
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.viewer.server import JPEG
 from fidsplat.viewer.session import Session
 from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
-from fidsplat.vision.images import encoded
 
 STEP, SWING = 0.01, 0.3
 """radians that the view turns from picture to picture, to and fro, and how far: the splats stay in view"""

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.vision.images import write_png
+from fidsplat.images.files import write_png
 
 
 def sky() -> np.ndarray:

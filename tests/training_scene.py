@@ -6,8 +6,8 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.formats.colmap import save_colmap
+from fidsplat.images.files import to_uint8, write_png
 from fidsplat.train import Dataset, Trainer, TrainingView
-from fidsplat.vision.images import to_uint8, write_png
 
 BACKGROUND = (0.2, 0.3, 0.4)
 QUICK = {

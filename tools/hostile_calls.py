@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 import fidsplat as fs
+from fidsplat.images import files as image_files
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.scenes import PlacedMarker
 from fidsplat.sim import Rig, RigCamera, read_description
 from fidsplat.train import Dataset, Trainer, TrainingView, TrainSettings, load_dataset, refine, splats_within
-from fidsplat.vision import images
 from fidsplat.vision.coco import CocoAnnotations
 from fidsplat.vision.detect import detect
 from fidsplat.vision.pose import marker_pose
@@ -93,7 +93,7 @@ def _pictures_of(folder: Path) -> Path:
     poses = np.stack([np.linalg.inv(view.camera.world_to_camera) for view in VIEWS])
     names = [f"{number}.png" for number in range(len(VIEWS))]
     for view, name in zip(VIEWS, names, strict=True):
-        images.write_png(folder / name, view.picture)
+        image_files.write_png(folder / name, view.picture)
     fs.save_trajectory(
         fs.Trajectory(range(len(VIEWS)), poses), folder / "transforms.json", VIEWS[0].camera, names
     )
@@ -422,8 +422,8 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "quality_within": lambda _: (fs.quality_within, {"error": 0.01, "ms": None, "scene": None, "capture": None}, None),
     "parse_spec": lambda _: (parse_spec, {"text": "charuco:3x3:4x4_50"}, None),
     "detect": lambda _: (detect, {"image": np.zeros((16, 24, 3), np.uint8), "families": ("36h11",), "qr": True}, None),
-    "to_uint8": lambda _: (images.to_uint8, {"image": np.zeros((4, 4, 3))}, None),
-    "write_png": lambda folder: (images.write_png, {"path": folder / "out.png", "image": np.zeros((4, 4, 3), np.uint8)}, None),
+    "to_uint8": lambda _: (image_files.to_uint8, {"image": np.zeros((4, 4, 3))}, None),
+    "write_png": lambda folder: (image_files.write_png, {"path": folder / "out.png", "image": np.zeros((4, 4, 3), np.uint8)}, None),
     "marker_pose": lambda _: (
         marker_pose, {"corners": np.array([[9, 6], [15, 6], [15, 12], [9, 12.0]]), "size": 0.1, "camera": CAMERA}, None
     ),

@@ -62,7 +62,7 @@ def scene_text(rng: Random) -> str:
 def ground(folder: Path) -> None:
     """Files that are good, for inputs to name and to spoil."""
     if not (folder / "good.ply").exists():
-        from fidsplat.vision.images import write_png
+        from fidsplat.images.files import write_png
 
         rng = np.random.default_rng(0)
         fs.save_ply(_cloud(12), folder / "good.ply")
@@ -198,8 +198,8 @@ def pictures(rng: Random, folder: Path) -> int | None:
     ])()  # fmt: skip
     path = folder / f"hostile{rng.choice(['.png', '.hdr', '.exr', '.jpg', '', '.tif'])}"
     path.write_bytes(_spoil(rng, data) if rng.random() < 0.5 and data else data)
+    from fidsplat.images.files import read_bits, read_image
     from fidsplat.vision.detect import detect
-    from fidsplat.vision.images import read_bits, read_image
 
     def seen() -> None:
         image = read_image(path)

@@ -31,10 +31,10 @@ import torch
 from gsplat.strategy.ops import reset_opa
 
 import fidsplat as fs
+from fidsplat.images.files import to_uint8
 from fidsplat.train import Dataset, Trainer, TrainSettings, load_dataset
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.parameters import Splats, first_splats
-from fidsplat.vision.images import to_uint8
 from fidsplat.vision.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))

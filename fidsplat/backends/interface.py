@@ -166,7 +166,7 @@ class GivesUint8(Protocol):
     """Images whose 8-bit values the device makes, so that a quarter of the bytes is copied."""
 
     def read_uint8(self, name: str) -> np.ndarray:
-        """An image of floats in [0, 1] as `to_uint8` (fidsplat/vision/images.py) makes it of what `read`
+        """An image of floats in [0, 1] as `to_uint8` (fidsplat/images/files.py) makes it of what `read`
         gives, bit for bit: a NumPy array of its own, (h, w) or (h, w, channels) uint8."""
         ...
 

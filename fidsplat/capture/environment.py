@@ -100,7 +100,7 @@ class Panorama(PickledByFields):
     def load(path) -> Panorama:
         """From a picture file, whole numbers of 8 or 16 bits or floats. Raises InputError when it cannot be
         read."""
-        from fidsplat.vision.images import read_image
+        from fidsplat.images.files import read_image
 
         return Panorama(read_image(path, deep=True), str(path))
 

@@ -61,9 +61,9 @@ class Check:
             renderer = fs.Renderer(self.device)
         if self.fuzz is not None:
             return self._fuzz(renderer, folder, where)
+        from fidsplat.images.files import write_png
         from fidsplat.selftest.catalogue import all_cases
         from fidsplat.selftest.check import run_check, worst_picture
-        from fidsplat.vision.images import write_png
 
         with where.status("starting") as status:
             result = run_check(renderer, all_cases(), status.update)

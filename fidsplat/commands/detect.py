@@ -59,7 +59,7 @@ class Detect:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.vision.dictionaries import parse_family
+        from fidsplat.images.tag_dictionaries import parse_family
         from fidsplat.vision.readback import means
 
         if not self.images:
@@ -111,8 +111,8 @@ class Detect:
 
     def _pictures(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
         """Names, pictures, and the scene as it was in each."""
+        from fidsplat.images.files import is_video, pictures
         from fidsplat.render.flight import RECORD, seen_in_flight
-        from fidsplat.vision.images import is_video, pictures
 
         if path.endswith(".mcap") or (Path(path) / "metadata.yaml").is_file():
             yield from self._logged(path, scene)

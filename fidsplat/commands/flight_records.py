@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from fidsplat.images.files import read_image
+from fidsplat.images.output_files import load_output, suffixes_of
 from fidsplat.render.flight import FlightFolder
 from fidsplat.vision.coco import CocoAnnotations
-from fidsplat.vision.images import read_image
-from fidsplat.vision.output_files import load_output, suffixes_of
 from fidsplat.vision.truth import truth_of
 
 CAMERA = "camera"

@@ -106,8 +106,8 @@ class Fly:
         import fidsplat as fs
         from fidsplat.cameras.trajectory import check_rate
         from fidsplat.commands.flight_records import write_log, write_truth
+        from fidsplat.images.video import check_video
         from fidsplat.render.flight import Flight, FlightFolder
-        from fidsplat.vision.video import check_video
 
         names = names_of(self.outputs)
         check_words(names, self.quality)

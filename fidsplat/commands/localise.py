@@ -54,8 +54,8 @@ class Localise:
         from fidsplat.commands.sweeps import need_reports
         from fidsplat.experiments.localise import VARIANTS
         from fidsplat.experiments.localise import Localise as Asked
+        from fidsplat.images.video import check_video
         from fidsplat.util.provenance import digest_of
-        from fidsplat.vision.video import check_video
 
         need_reports()
         from fidsplat.experiments.localise_sweep import drive_sweep, found_of, table_of, write_report
@@ -98,7 +98,7 @@ class Localise:
     def _record(self, asked: Asked, renderer: Renderer, source: str | None) -> None:
         """Write the log and the video. source: of the log; None: a run that was stopped has written it."""
         from fidsplat.experiments.localise import RATE, VARIANTS, write_log
-        from fidsplat.vision.video import write_video
+        from fidsplat.images.video import write_video
 
         if (self.log is None or source is None) and self.video is None:
             return

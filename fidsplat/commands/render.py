@@ -100,7 +100,7 @@ class Render:
     def run(self) -> int:
         import fidsplat as fs
         from fidsplat.accuracy.quality_within import check_bounds
-        from fidsplat.vision.output_files import save_output
+        from fidsplat.images.output_files import save_output
 
         names = names_of(self.outputs)
         check_words(names, self.quality)

@@ -14,9 +14,9 @@ import numpy as np
 
 from fidsplat.experiments.methods import IDEAL, Painter, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, Category
+from fidsplat.images.files import to_uint8
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
-from fidsplat.vision.images import to_uint8
 from fidsplat.vision.readers import Target, attempt, readers
 
 NAME = "angles"

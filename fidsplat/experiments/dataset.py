@@ -30,9 +30,9 @@ from fidsplat.experiments.setup import (
 )
 from fidsplat.experiments.views import exact_view
 from fidsplat.formats.colmap import save_colmap
+from fidsplat.images.files import read_image, write_png
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
-from fidsplat.vision.images import read_image, write_png
 
 POINTS = 1000
 """3D points for a trainer to start from: random places on the plane, coloured as it is there"""

@@ -11,12 +11,9 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.experiments.demo_scene import OUTPUTS, demo_scene, demo_views
 from fidsplat.formats import save_ply
-from fidsplat.render.renderer import Renderer
-from fidsplat.scenes import Scene
-from fidsplat.util.files import atomic_write, writable_folder
-from fidsplat.vision.images import to_uint8, write_png
-from fidsplat.vision.output_files import save_output
-from fidsplat.vision.paint import (
+from fidsplat.images.files import to_uint8, write_png
+from fidsplat.images.output_files import save_output
+from fidsplat.images.visualize import (
     contact_sheet,
     depth_key,
     depth_picture,
@@ -25,6 +22,9 @@ from fidsplat.vision.paint import (
     normal_picture,
     outlined,
 )
+from fidsplat.render.renderer import Renderer
+from fidsplat.scenes import Scene
+from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.vision.readback import Reading, read_back
 
 # a marker counts as wholly visible from this share of its area on; the rest is the soft edge of its quiet

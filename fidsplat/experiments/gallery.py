@@ -10,13 +10,13 @@ from pathlib import Path
 from urllib.parse import quote
 
 from fidsplat import __version__
+from fidsplat.images.files import write_png
+from fidsplat.images.output_files import picture_of
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.files import atomic_write, printable, read_text, writable_folder
 from fidsplat.util.provenance import digest_of
-from fidsplat.vision.images import write_png
-from fidsplat.vision.output_files import picture_of
 
 PAGE = "index.html"
 _POLICY = "script-src 'none'; object-src 'none'; frame-src 'none'; base-uri 'none'; form-action 'none'"

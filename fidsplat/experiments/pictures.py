@@ -9,9 +9,9 @@ import numpy as np
 
 from fidsplat.experiments.methods import Painter, plain_marker
 from fidsplat.experiments.setup import PROTOCOLS, Category
+from fidsplat.images.files import to_uint8, write_png
+from fidsplat.images.visualize import contact_sheet
 from fidsplat.util.files import writable_folder
-from fidsplat.vision.images import to_uint8, write_png
-from fidsplat.vision.paint import contact_sheet
 
 TILTS = (0.0, 45.0, 70.0)
 _PIXELS = 160  # of the cut-out in the middle of each picture, at most

@@ -12,9 +12,9 @@ import pandas as pd
 
 from fidsplat.experiments.charts import COLOURS, chart
 from fidsplat.experiments.pages import fixed, places, write_page
+from fidsplat.images.files import write_png
 from fidsplat.train import Trainer, TrainingView, ViewScore
 from fidsplat.util.provenance import run_facts
-from fidsplat.vision.images import write_png
 
 PICTURES = 4
 """views that are shown at most"""

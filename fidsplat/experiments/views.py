@@ -22,9 +22,9 @@ from fidsplat.experiments.methods import (
 )
 from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS, TEST_VIEWS, Category, novel_cameras
+from fidsplat.images.files import read_image, to_uint8
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
-from fidsplat.vision.images import read_image, to_uint8
 from fidsplat.vision.metrics import flip, has_flip, psnr, ssim
 
 NAME = "views"

@@ -89,7 +89,7 @@ def _part(path: Path, archive: zipfile.ZipFile, name: str, most: int = MAX_PART)
 
 def _picture(path: Path, archive: zipfile.ZipFile, name: str, count: int) -> np.ndarray:
     """(h, w, 4) uint8 RGBA of so many pixels that are meant: a small file can hold a huge picture."""
-    from fidsplat.vision.images import declared_pixels, rgba_pixels  # late: it brings OpenCV
+    from fidsplat.images.files import declared_pixels, rgba_pixels  # late: it brings OpenCV
 
     data = _part(path, archive, name)
     pixels = declared_pixels(data)

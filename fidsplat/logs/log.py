@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
+from fidsplat.images.files import encoded, pixels_of, to_uint8
 from fidsplat.logs.files import log_file, typestore
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.util.arguments import instance, invalid, items, number, text
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.scalars import real_array
 from fidsplat.vision.detect import Detection
-from fidsplat.vision.images import encoded, pixels_of, to_uint8
 
 _ENCODINGS = {"rgb": "rgb8", "label": "32SC1", "splat_id": "32SC1", "blended": "32SC1"}
 """of outputs; the others are 32FC1 or 32FC3"""

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.images.files import decoded
 from fidsplat.logs.bags import log_messages
 from fidsplat.logs.files import typestore
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
-from fidsplat.vision.images import decoded
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"

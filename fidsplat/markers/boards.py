@@ -58,7 +58,7 @@ def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
 def _bits(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
     """A board's modules: its tags, over dark squares in turn with white ones (the top left one dark), none,
     or one at each corner of a tag."""
-    from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family
+    from fidsplat.images.tag_dictionaries import dictionary_bits, families, parse_family
 
     kind, family = parse_family(spec.family or "")
     if kind != "apriltag" and spec.kind == "aprilgrid":

@@ -17,7 +17,7 @@ def _parse(text: str, head: str, rest: str) -> Spec:
 
 
 def _bits(spec: Spec) -> tuple[Spec, np.ndarray]:
-    from fidsplat.vision.images import read_bits
+    from fidsplat.images.files import read_bits
 
     return spec, np.ascontiguousarray(read_bits(Path(spec.payload or "")), np.uint8)
 

@@ -21,7 +21,7 @@ def _parse(text: str, head: str, rest: str) -> Spec:
 
 
 def _bits(spec: Spec) -> tuple[Spec, np.ndarray]:
-    from fidsplat.vision.dictionaries import dictionary_bits
+    from fidsplat.images.tag_dictionaries import dictionary_bits
 
     return spec, dictionary_bits(spec.kind, spec.family or "", spec.id or 0)
 

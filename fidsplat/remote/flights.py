@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from fidsplat.images.output_files import save_output
 from fidsplat.remote.queue import Engine, drain
 from fidsplat.render.flight import Flight, FlightFolder
 from fidsplat.render.renderer import Renderer
 from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
-from fidsplat.vision.output_files import save_output
 
 Files = dict[tuple[str, str], bytes]
 """content of a picture's files by output and suffix"""

@@ -17,16 +17,16 @@ from fidsplat import __version__
 from fidsplat.cameras import Motion, Shutter, Trajectory
 from fidsplat.capture.capture import Capture
 from fidsplat.formats import load_trajectory, save_trajectory
+from fidsplat.images.files import read_image, write_png
+from fidsplat.images.output_files import save_output, suffixes_of
+from fidsplat.images.video import write_video
+from fidsplat.images.visualize import contact_sheet
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, path_of, read_text, writable_folder
 from fidsplat.util.provenance import digest_of
 from fidsplat.util.scalars import real_array
-from fidsplat.vision.images import read_image, write_png
-from fidsplat.vision.output_files import save_output, suffixes_of
-from fidsplat.vision.paint import contact_sheet
-from fidsplat.vision.video import write_video
 
 RECORD = "flight.json"
 SHEET = "contact-sheet.png"

@@ -101,7 +101,7 @@ class Frame(Mapping):
         if "rgb" not in self._arrays and isinstance(self._images, GivesUint8):
             check_process(self._process, "frame")
             return self._images.read_uint8("rgb")
-        from fidsplat.vision.images import to_uint8  # late: it brings OpenCV
+        from fidsplat.images.files import to_uint8  # late: it brings OpenCV
 
         return to_uint8(self["rgb"])
 
@@ -166,8 +166,8 @@ class Frame(Mapping):
 
     def _repr_png_(self) -> bytes:
         """What a notebook shows: rgb, or else the first output, in colours."""
-        from fidsplat.vision.images import png_bytes  # late: it brings OpenCV
-        from fidsplat.vision.output_files import picture_of
+        from fidsplat.images.files import png_bytes  # late: it brings OpenCV
+        from fidsplat.images.output_files import picture_of
 
         name = "rgb" if "rgb" in self.outputs else self.outputs[0]
         return png_bytes(picture_of(name, self[name]))

@@ -175,8 +175,8 @@ def worst_picture(worst: Worst) -> np.ndarray:
 
     The difference and the certificate are multiplied by a power of ten, so that they can be seen.
     """
-    from fidsplat.vision.images import to_uint8
-    from fidsplat.vision.paint import contact_sheet
+    from fidsplat.images.files import to_uint8
+    from fidsplat.images.visualize import contact_sheet
 
     difference = np.abs(worst.device - worst.reference)
     certificate = np.repeat(worst.certificate[:, :, None], 3, axis=2)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.images.files import to_uint8
 from fidsplat.sim.rig import Rig
 from fidsplat.util.errors import InputError
-from fidsplat.vision.images import to_uint8
 
 try:
     import gymnasium as _gymnasium  # type: ignore[import-not-found]

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
+from fidsplat.images.files import read_image, read_over
 from fidsplat.train.dataset import MOST_POINTS, Dataset, TrainingView
 from fidsplat.train.flat import flat_view
 from fidsplat.train.transforms import Found, has_transforms, load_transforms
 from fidsplat.util.arguments import callback, whole_number
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
-from fidsplat.vision.images import read_image, read_over
 
 NOTES = ("dataset.json", "marker.json")
 """files beside a data set of ours that may say its `background`: one display value, or three"""

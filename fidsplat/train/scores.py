@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fidsplat.images.files import to_uint8
 from fidsplat.train.dataset import TrainingView
-from fidsplat.vision.images import to_uint8
 from fidsplat.vision.metrics import psnr, ssim
 
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, focal_length
 from fidsplat.formats.ply_header import read_header
+from fidsplat.images.files import read_image, read_over
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.flat import flat_view
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, read_text
-from fidsplat.vision.images import read_image, read_over
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")

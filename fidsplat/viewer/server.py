@@ -19,6 +19,7 @@ import numpy as np
 from fidsplat.backends import devices
 from fidsplat.cameras import Trajectory
 from fidsplat.formats import save_trajectory
+from fidsplat.images.files import png_bytes
 from fidsplat.scenes import Scene
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.markdown import escaped
@@ -30,7 +31,6 @@ from fidsplat.viewer.nodes import Nodes
 from fidsplat.viewer.session import Session, View
 from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
-from fidsplat.vision.images import png_bytes
 from fidsplat.vision.readback import read_back
 
 LOOK = 1.0

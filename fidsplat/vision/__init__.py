@@ -1,10 +1,6 @@
-"""Reading pictures: image files, tag dictionaries, detectors, poses; alone in importing cv2, zxingcpp."""
+"""Detection of markers in images, their poses, ground truth, and comparison of the two."""
 
-import os
-
-# OpenCV takes its limit when it is loaded, and its own of 2^30 lets a file of a megabyte become 12 GB. Twice
-# the largest panorama is enough for any camera.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
+import fidsplat.images  # noqa: F401  sets OpenCV's limits before cv2 is loaded
 
 
 def __getattr__(name: str):

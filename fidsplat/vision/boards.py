@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.images.tag_dictionaries import families, parse_family, predefined
 from fidsplat.markers.boards import GAP, BoardSpec, tag_places
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.scenes import PlacedMarker
 from fidsplat.vision.detect import Detection
-from fidsplat.vision.dictionaries import families, parse_family, predefined
 from fidsplat.vision.pose import plane_pose
 
 BOARDS = ("charuco", "gridboard", "aprilgrid")

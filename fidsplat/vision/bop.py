@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.images.files import write_png
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
-from fidsplat.vision.images import write_png
 from fidsplat.vision.truth import Box, MarkerTruth, Truth
 from fidsplat.vision.visible import outline
 

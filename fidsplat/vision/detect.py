@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import zxingcpp
 
+from fidsplat.images.files import pixels_of
+from fidsplat.images.tag_dictionaries import dictionary_bits, parse_family, predefined
 from fidsplat.util.arguments import invalid, items
 from fidsplat.util.errors import InputError
 from fidsplat.vision.align import align, fit
-from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefined
-from fidsplat.vision.images import pixels_of
 
 # One family for every grid that people print; with each, a random dark square reads as a tag less than once
 # in 300 times. 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or more false tags: searched

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.images.files import pixels_of, to_uint8
+from fidsplat.images.tag_dictionaries import parse_family
 from fidsplat.markers import Marker
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.util.arguments import invalid
 from fidsplat.vision.boards import BOARDS, board_pose
 from fidsplat.vision.detect import Detection, detect
-from fidsplat.vision.dictionaries import parse_family
-from fidsplat.vision.images import pixels_of, to_uint8
 from fidsplat.vision.pose import marker_pose, pose_error
 from fidsplat.vision.truth import MarkerTruth, marker_truth, standing
 

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import zxingcpp
 
+from fidsplat.images.tag_dictionaries import predefined
 from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import QR_ONLY, corners_of
-from fidsplat.vision.dictionaries import predefined
 
 # how much larger the picture is made, and how much taller beside that, until zxing-cpp reads the code: all
 # heights at the picture's own size first, then twice as large

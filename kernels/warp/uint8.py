@@ -1,4 +1,4 @@
-"""An image as 8 bits, when somebody reads it so: bit for bit `to_uint8` of fidsplat/vision/images.py."""
+"""An image as 8 bits, when somebody reads it so: bit for bit `to_uint8` of fidsplat/images/files.py."""
 
 import warp as wp
 

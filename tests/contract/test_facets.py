@@ -7,9 +7,9 @@ import pytest
 from agreement import ALL_OUTPUTS
 
 import fidsplat as fs
+from fidsplat.images.files import to_uint8
 from fidsplat.markers.facets import DISH
 from fidsplat.vision.detect import detect
-from fidsplat.vision.images import to_uint8
 
 GREY = (0.5, 0.5, 0.5)
 

@@ -232,8 +232,8 @@ def test_the_sensor_leaves_the_other_outputs_alone(renderer):
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
     """Position error under 1 % of the distance, as the ideal plane's: the pictures are for robots."""
+    from fidsplat.images.files import to_uint8
     from fidsplat.vision.detect import detect
-    from fidsplat.vision.images import to_uint8
     from fidsplat.vision.pose import marker_pose, pose_error
 
     pose = np.eye(4)

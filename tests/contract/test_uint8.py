@@ -9,8 +9,8 @@ from agreement import random_splats
 import fidsplat as fs
 from fidsplat.backends.interface import GivesUint8
 from fidsplat.backends.opencl.shapes import gpu_shape
+from fidsplat.images.files import to_uint8
 from fidsplat.util.errors import MissingOutputError
-from fidsplat.vision.images import to_uint8
 
 CLOUD = random_splats(60, seed=2)
 STEPS = np.arange(256, dtype=np.float32)

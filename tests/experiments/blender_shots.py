@@ -18,7 +18,7 @@ from fidsplat.experiments import blender
 from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES
-from fidsplat.vision.images import read_image
+from fidsplat.images.files import read_image
 from fidsplat.vision.metrics import psnr
 
 DATA = Path(__file__).parent / "data"

@@ -13,7 +13,7 @@ from fidsplat.experiments import run as run_module
 from fidsplat.experiments.blender import check_pictures, note_pictures
 from fidsplat.experiments.run import Options
 from fidsplat.experiments.sweep import read_records
-from fidsplat.vision.images import write_png
+from fidsplat.images.files import write_png
 
 pytestmark = pytest.mark.usefixtures("optimised")
 SMALL = ["--category", "apriltag", "--markers", "1"]

@@ -15,7 +15,7 @@ from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import CATEGORIES, novel_cameras, training_cameras
 from fidsplat.experiments.views import exact_view
 from fidsplat.formats.colmap import save_colmap
-from fidsplat.vision.images import read_image, to_uint8, write_png
+from fidsplat.images.files import read_image, to_uint8, write_png
 
 # pycolmap and OpenCV bring two libraries of one name and cannot live in one process
 READ = """

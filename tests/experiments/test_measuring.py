@@ -10,7 +10,7 @@ import fidsplat as fs
 from fidsplat.experiments import angles, counts, localisation, plane, views
 from fidsplat.experiments.methods import IDEAL, Painter, method_names, mixtures, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, novel_cameras
-from fidsplat.vision.images import to_uint8, write_png
+from fidsplat.images.files import to_uint8, write_png
 from fidsplat.vision.metrics import psnr
 
 pytestmark = pytest.mark.usefixtures("optimised")

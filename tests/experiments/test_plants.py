@@ -12,8 +12,8 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments import blender, plants
 from fidsplat.experiments.plants import Plants, cameras_around, write_plants
+from fidsplat.images.files import read_rgba
 from fidsplat.splats.rotations import quaternion_to_matrix
-from fidsplat.vision.images import read_rgba
 from fidsplat.worlds.greenhouse import Greenhouse
 from fidsplat.worlds.plant_meshes import MESHES, Mesh
 from fidsplat.worlds.plants import load_plants

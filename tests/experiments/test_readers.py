@@ -11,7 +11,7 @@ import fidsplat as fs
 from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.plane import plane_picture
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
-from fidsplat.vision.images import to_uint8
+from fidsplat.images.files import to_uint8
 from fidsplat.vision.readers import Attempt, Target, attempt, overlap, reader_versions, readers
 
 ALL = [("apriltag", name) for name in readers("apriltag")] + [("qr", name) for name in readers("qr")]

@@ -18,8 +18,8 @@ from fidsplat.experiments.results import load
 from fidsplat.experiments.summary import Summary, join, read_summary
 from fidsplat.experiments.sweep import Results
 from fidsplat.experiments.targets import targets
+from fidsplat.images.files import write_png
 from fidsplat.util.provenance import run_facts
-from fidsplat.vision.images import write_png
 
 TILTS = "0:80:20,81:84:1"  # 0 20 40 60 80 81 82 83 84
 

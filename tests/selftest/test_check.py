@@ -8,6 +8,7 @@ from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.cli import main
+from fidsplat.images.files import read_image
 from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.selftest import catalogue, check, inputs
 from fidsplat.selftest.agreement import ALL_OUTPUTS, Picture
@@ -15,7 +16,6 @@ from fidsplat.selftest.arithmetic import BOUNDS, measure
 from fidsplat.selftest.case import Case, Finding
 from fidsplat.selftest.clouds import camera, splats, turned
 from fidsplat.util.errors import DeviceError
-from fidsplat.vision.images import read_image
 
 CLOUD = random_splats(40, seed=41, depth=(1.0, 4.0), scale=(0.02, 0.5))
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.images.files import to_uint8
 from fidsplat.scenes import PlacedMarker
-from fidsplat.vision.images import to_uint8
 
 CAMERA = fs.Camera.look_at(24, 16, 1.0, (0, 0, -1), (0, 0, 0))
 TAG = fs.marker("aruco:4x4_50:7", size=0.4)

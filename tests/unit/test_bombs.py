@@ -13,9 +13,9 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.formats import load_splats, save_splats, usd
+from fidsplat.images.files import decoded, read_bits, read_image
 from fidsplat.sim import read_description
 from fidsplat.util.input_limit import FLOOR, RATIO, VARIABLE, input_limit
-from fidsplat.vision.images import decoded, read_bits, read_image
 
 ONE = fs.SplatCloud([[0, 0, 1.0]], [[1.0, 0, 0, 0]], [[0.1, 0.1]], [0.5], colors=[[1.0, 0, 0]])
 

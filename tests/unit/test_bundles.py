@@ -8,11 +8,11 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
+from fidsplat.images.files import write_png
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.bundles import read_bundles
 from fidsplat.vision.detect import Detection
-from fidsplat.vision.images import write_png
 from fidsplat.vision.pose import marker_pose, pose_error
 from fidsplat.vision.readback import Reading
 from fidsplat.vision.truth import marker_truth

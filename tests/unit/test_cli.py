@@ -18,8 +18,8 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands import COMMANDS
 from fidsplat.commands.output import late_progress
-from fidsplat.vision.dictionaries import dictionary_bits
-from fidsplat.vision.images import read_image, write_png
+from fidsplat.images.files import read_image, write_png
+from fidsplat.images.tag_dictionaries import dictionary_bits
 
 CAMERA = fs.Camera.pinhole(320, 240, 400, 400, 160, 120)
 

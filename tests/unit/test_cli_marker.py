@@ -8,7 +8,7 @@ from command_line import fails, prints_json
 import fidsplat as fs
 from fidsplat.capture.quality import LADDER
 from fidsplat.cli import main
-from fidsplat.vision.images import write_png
+from fidsplat.images.files import write_png
 
 
 def test_marker_says_what_it_is_made_of(capsys, tmp_path):

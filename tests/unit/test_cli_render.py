@@ -9,7 +9,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands.framing import framing_camera
-from fidsplat.vision.images import read_image, to_uint8
+from fidsplat.images.files import read_image, to_uint8
 
 SCENE = """
 [camera]
@@ -243,7 +243,7 @@ def test_a_scene_needs_a_camera(scene, tmp_path, capsys):
 
 
 def test_detect_wants_the_picture_of_that_scene(scene, tmp_path, capsys):
-    from fidsplat.vision.images import write_png
+    from fidsplat.images.files import write_png
 
     write_png("other.png", np.zeros((50, 60)))
     assert main(["detect", "other.png", "--scene", scene]) == 2

@@ -9,7 +9,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments import demo
 from fidsplat.experiments.demo_scene import demo_scene
-from fidsplat.vision.images import read_image
+from fidsplat.images.files import read_image
 
 pytestmark = pytest.mark.usefixtures("optimised")
 

@@ -18,7 +18,7 @@ from sybil.parsers.markdown import CodeBlockParser, PythonCodeBlockParser, SkipP
 
 import fidsplat as fs
 from fidsplat.cli import _parse, main
-from fidsplat.vision.images import read_image
+from fidsplat.images.files import read_image
 
 TREE = Path(__file__).resolve().parents[2]
 README = TREE / "README.md"

@@ -16,6 +16,7 @@ from fidsplat.experiments.summary import read_summary
 from fidsplat.experiments.sweep import read_records
 from fidsplat.formats import load_splats, save_splats
 from fidsplat.formats.colmap import save_colmap
+from fidsplat.images.files import pictures, read_image, write_png
 from fidsplat.sim import read_description
 from fidsplat.store.build import build_store
 from fidsplat.store.store import Store
@@ -24,7 +25,6 @@ from fidsplat.train.read import load_dataset
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.util.npy import load_npy
-from fidsplat.vision.images import pictures, read_image, write_png
 from fidsplat.vision.metrics import load_lpips
 
 

@@ -9,11 +9,11 @@ from full_disk import small_files
 
 import fidsplat as fs
 from fidsplat.cli import main
+from fidsplat.images.files import read_image
+from fidsplat.images.video import write_video
 from fidsplat.render.flight import Flight, FlightFolder
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.vision.images import read_image
-from fidsplat.vision.video import write_video
 
 SCENE = """
 [camera]

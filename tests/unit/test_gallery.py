@@ -8,7 +8,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.vision.images import read_image, to_uint8
+from fidsplat.images.files import read_image, to_uint8
 
 SCENE = (
     "# A tag <b>, alone. fidsplat render a.toml\n"

@@ -10,7 +10,7 @@ from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.vision.images import write_png
+from fidsplat.images.files import write_png
 
 BACKEND = "opencl"
 

@@ -19,30 +19,32 @@ MAY_IMPORT = {
     "util": set(),
     "splats": set(),
     "cameras": {"splats"},
-    "capture": {"splats", "cameras", "vision.images"},
-    "vision": {"splats", "cameras", "scenes", "markers"},
-    "formats": {"splats", "cameras", "vision.images"},
-    "markers": {"splats", "capture", "vision.dictionaries", "vision.images"},
+    "images": set(),
+    "capture": {"splats", "cameras", "images"},
+    "vision": {"splats", "cameras", "images", "scenes", "markers"},
+    "formats": {"splats", "cameras", "images"},
+    "markers": {"splats", "capture", "images"},
     "store": DATA | {"formats"},
     "scenes": DATA | {"markers", "formats", "store", "streaming"},
     "effects": DATA,
     "backends": DATA | {"effects"},
     "streaming": DATA | {"store", "effects", "backends"},
-    "render": DATA | {"store", "scenes", "streaming", "effects", "backends", "vision", "formats"},
-    "selftest": DATA | {"scenes", "effects", "backends", "render", "vision"},
+    "render": DATA | {"store", "scenes", "streaming", "effects", "backends", "images", "formats"},
+    "selftest": DATA | {"scenes", "effects", "backends", "render", "images", "vision"},
     "accuracy": DATA | {"store", "scenes", "streaming", "effects", "backends", "render"},
-    "viewer": DATA | {"store", "scenes", "effects", "backends", "render", "streaming", "vision", "formats"},
-    "remote": {"render", "vision", "experiments", "store"},
-    "sim": DATA | {"scenes", "markers", "render", "vision", "formats", "worlds"},
-    "worlds": DATA | {"scenes", "markers", "render", "vision", "formats", "store", "sim"},
-    "logs": {"splats", "cameras", "vision"},
-    "train": DATA | {"formats", "markers", "vision", "render", "backends", "effects"},
+    "viewer": DATA
+    | {"store", "scenes", "effects", "backends", "render", "streaming", "images", "vision", "formats"},
+    "remote": {"render", "images", "experiments", "store"},
+    "sim": DATA | {"scenes", "images", "render"},
+    "worlds": DATA | {"scenes", "markers", "formats", "store", "sim"},
+    "logs": {"splats", "cameras", "images", "vision"},
+    "train": DATA | {"formats", "markers", "images", "vision", "render", "backends", "effects"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 
 # third-party module: the places that alone may import it
 HOME_OF = {
-    "cv2": ("vision",),
+    "cv2": ("images", "vision"),
     "zxingcpp": ("vision",),
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
@@ -52,7 +54,7 @@ HOME_OF = {
     "torch": ("render.frame", "train.torch_bridge"),
     "ray": ("remote.ray_engine",),
     "pxr": ("formats.usd",),
-    "imageio_ffmpeg": ("vision.video",),
+    "imageio_ffmpeg": ("images.video",),
     "bpy": ("experiments.blender_worker", "experiments.blender_plants"),
     "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),
@@ -153,6 +155,19 @@ def test_no_module_imports_itself_by_way_of_others():
     assert len(edges) > len(modules)
     circles = [sorted(circle) for circle in strongly_connected_components(DiGraph(edges)) if len(circle) > 1]
     assert circles == []
+
+
+def test_no_package_imports_its_importer():
+    modules = {f"fidsplat.{name}".removesuffix(".__init__"): path for name, path in MODULES.items()}
+    package_of = {name: name.split(".")[1] for name in modules if "." in name}
+    edges = {
+        (package_of[name], package_of[other])
+        for name in package_of
+        for other in needed(modules[name], modules)
+        if other in package_of
+    }
+    cycles = [sorted(cycle) for cycle in strongly_connected_components(DiGraph(edges)) if len(cycle) > 1]
+    assert cycles == []
 
 
 @pytest.mark.parametrize("package", sorted(HOME_OF))

@@ -9,9 +9,9 @@ from full_disk import small_files
 
 import fidsplat as fs
 from fidsplat.cli import main
+from fidsplat.images.files import to_uint8
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.detect import Detection, detect
-from fidsplat.vision.images import to_uint8
 
 rosbags = pytest.importorskip("rosbags.highlevel", reason="pip install 'fidsplat[logs]'")
 mcap_reader = pytest.importorskip("mcap.reader", reason="pip install 'fidsplat[logs]'")

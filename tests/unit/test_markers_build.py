@@ -10,8 +10,8 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.capture.quality import NESTED
+from fidsplat.images.files import write_png
 from fidsplat.markers import Marker, Rectangle, marker
-from fidsplat.vision.images import write_png
 
 
 def text_of(length: int) -> str:

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.images.tag_dictionaries import predefined
 from fidsplat.markers import Kind, Spec, marker, register, with_file
 from fidsplat.markers.kinds import bits_of, parse_spec
 from fidsplat.scenes import PlacedMarker
-from fidsplat.vision.dictionaries import predefined
 
 PIXELS = 10
 

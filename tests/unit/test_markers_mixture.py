@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fidsplat.capture.quality import TEMPLATE_SIZES
+from fidsplat.images.tag_dictionaries import dictionary_bits, families
 from fidsplat.markers.kinds import bits_of, parse_spec
 from fidsplat.markers.mixture import (
     OVERLAP,
@@ -23,7 +24,6 @@ from fidsplat.markers.mixture import (
 from fidsplat.markers.partition import partition
 from fidsplat.markers.seams import LONG, grow
 from fidsplat.util.errors import InputError
-from fidsplat.vision.dictionaries import dictionary_bits, families
 
 
 @pytest.mark.parametrize("levels", range(1, 9))

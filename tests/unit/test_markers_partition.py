@@ -12,6 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from fidsplat.images.tag_dictionaries import dictionary_bits
 from fidsplat.markers import marker
 from fidsplat.markers.partition import (
     chords,
@@ -21,7 +22,6 @@ from fidsplat.markers.partition import (
     partition,
 )
 from fidsplat.markers.regions import label_components
-from fidsplat.vision.dictionaries import dictionary_bits
 
 SMALL = arrays(np.uint8, st.tuples(st.integers(1, 8), st.integers(1, 8)), elements=st.integers(0, 1))
 CHECKERBOARD = np.indices((6, 6)).sum(0).astype(np.uint8) % 2

@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from fidsplat.images.tag_dictionaries import dictionary_bits, families
 from fidsplat.markers import marker, parse_spec
 from fidsplat.markers.kinds import bits_of
 from fidsplat.markers.qr import qr_capacity
 from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import detect
-from fidsplat.vision.dictionaries import dictionary_bits, families
 
 
 def printed(bits: np.ndarray, pixels: int = 8) -> np.ndarray:

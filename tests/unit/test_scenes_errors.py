@@ -214,7 +214,7 @@ def test_dots_that_join_no_keys_are_read(tmp_path):
 
 @pytest.mark.parametrize("path", [5, None, b"a.toml", "\ud800", [], "a\0b", "a" * 256, "a/" * 2048 + "b"])
 def test_what_is_no_path(path):
-    from fidsplat.vision.images import read_image
+    from fidsplat.images.files import read_image
 
     cloud = fs.SplatCloud.empty()
     for use in (

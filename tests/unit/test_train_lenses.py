@@ -8,9 +8,9 @@ import pytest
 from training_scene import scene, write
 
 import fidsplat as fs
+from fidsplat.images.files import write_png
 from fidsplat.train import load_dataset
 from fidsplat.train.flat import flat_view
-from fidsplat.vision.images import write_png
 
 
 @pytest.fixture

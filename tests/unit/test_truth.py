@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.images.files import read_image
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.bop import DEPTH_SCALE, BopScene
 from fidsplat.vision.coco import CocoAnnotations, run_lengths
-from fidsplat.vision.images import read_image
 from fidsplat.vision.truth import groups_of, optical_flow, points_of, truth_of
 
 SIZE = 160, 120

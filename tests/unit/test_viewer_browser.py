@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.vision.images import to_uint8
+from fidsplat.images.files import to_uint8
 
 pytestmark = pytest.mark.skipif(chromium.program() is None, reason="no Chromium here")
 WIDTH, HEIGHT = 700, 400

@@ -6,10 +6,10 @@ import pytest
 from ideal_picture import draw, photographed, pose, qr_bits, turned
 
 from fidsplat.cameras import Camera
+from fidsplat.images.tag_dictionaries import dictionary_bits, families, parse_family, predefined
 from fidsplat.util.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.detect import DEFAULT_FAMILIES, detect
-from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family, predefined
 from fidsplat.vision.pose import marker_pose, plane_pose, pose_error
 
 CAMERA = Camera.pinhole(480, 400, 700, 700, 240, 200)

@@ -17,9 +17,9 @@ from fidsplat.experiments.setup import BACKGROUND
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window
 from fidsplat.experiments.tradeoff.scenes import GREY, HARD, PROTOCOL, SEED, TradeScene, made_marker
 from fidsplat.experiments.tradeoff.session import Session
+from fidsplat.images.files import to_uint8
 from fidsplat.selftest.agreement import Picture, truth_of
 from fidsplat.util.errors import FidsplatError
-from fidsplat.vision.images import to_uint8
 from fidsplat.vision.metrics import flip, has_flip, psnr
 from fidsplat.vision.readback import corner_error, own_code
 from fidsplat.vision.readers import Target, attempt

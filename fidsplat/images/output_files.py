@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.util.errors import InputError
-from fidsplat.util.files import atomic_write
-from fidsplat.util.npy import load_npy
-from fidsplat.vision.images import write_png
-from fidsplat.vision.paint import (
+from fidsplat.images.files import write_png
+from fidsplat.images.visualize import (
     count_picture,
     depth_millimetres,
     depth_picture,
     label_picture,
     normal_picture,
 )
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
+from fidsplat.util.npy import load_npy
 
 _WHOLE = ("label", "splat_id", "blended")
 """outputs of whole numbers"""

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from fidsplat.capture.environment import Panorama
+from fidsplat.images.files import read_bits, read_image, to_uint8, write_png
 from fidsplat.util.errors import InputError
-from fidsplat.vision.images import read_bits, read_image, to_uint8, write_png
 
 
 def test_colours_survive_a_round_trip(tmp_path):

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fidsplat.vision.output_files import save_output
-from fidsplat.vision.paint import (
+from fidsplat.images.output_files import save_output
+from fidsplat.images.visualize import (
     KEY_WIDTH,
     contact_sheet,
     count_key,

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from fidsplat.images.tag_dictionaries import dictionary_bits, families, parse_family
 from fidsplat.util.errors import InputError
-from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family
 
 
 def test_every_predefined_dictionary_of_opencv_is_known():
