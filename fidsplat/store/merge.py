@@ -18,7 +18,7 @@ from fidsplat.store.morton import BITS, Grid
 
 REDUCTION = 4
 """how many splats become one, in the mean: what halving the resolution leaves of a surface"""
-DENSEST = 4.0
+MAX_OPACITY = 4.0
 """most opacity of a splat that stands for others; where they lie closer on top of each other several do"""
 EDGE = 0.06
 """standard deviation of the brightness of a cell's splats from which on bright and dark ones stay apart"""
@@ -127,7 +127,7 @@ def _by_moments(
     turns = vectors[:, :, ::-1].copy()
     turns[:, :, 2] = np.cross(turns[:, :, 0], turns[:, :, 1])
     opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
-    copies = np.maximum(np.ceil(opacities / DENSEST), 1).astype(np.int64)
+    copies = np.maximum(np.ceil(opacities / MAX_OPACITY), 1).astype(np.int64)
     made = {"means": (base + middle).T, "quats": quaternions_of(turns), "scales": sigma[:, :2]}
     made["opacities"] = opacities / copies
     for name in {"colors", "sh"} & set(splats):

@@ -10,11 +10,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from fidsplat.backends.frustum_culling import seen
 from fidsplat.backends.interface import Images, ResidentData
-from fidsplat.backends.termination_depth import TileEnds, hidden, shown
+from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
+from fidsplat.streaming.frustum_culling import in_frustum
+from fidsplat.streaming.occlusion_test import contributing_tiles, occluded
 from fidsplat.streaming.selection import Nodes, Pixels, Selection, Streamed
 from fidsplat.streaming.subchunks import Pieces
 
@@ -74,36 +75,36 @@ class Band:
             made.__dict__["seen"] = self.seen  # a cached property
         return made
 
-    def cut_to(self, ends: TileEnds) -> Band:
+    def cut_to(self, ends: TerminationDepths) -> Band:
         """It, drawn of those pieces alone that may show where its tiles end there."""
         pieces = self.scene.pieces(self.nodes)
         return self._kept(replace(self, pieces=tuple((each, self._needed(each, ends)) for each in pieces)))
 
-    def lacking(self, ends: TileEnds, missing: Nodes) -> list[Pieces]:
+    def lacking(self, ends: TerminationDepths, missing: Nodes) -> list[Pieces]:
         """The pieces that may show where tiles end there and that it was not drawn of: of its nodes, and of
         some that are missing."""
         own = [each.only(self._needed(each, ends) & ~drawn) for each, drawn in self.pieces or ()]
         others = (each.only(self._needed(each, ends)) for each in self.scene.pieces(missing))
         return [each for each in (*own, *others) if len(each.nodes)]
 
-    def shown(self, pieces: Sequence[Pieces], ends: TileEnds) -> np.ndarray:
+    def shown(self, pieces: Sequence[Pieces], ends: TerminationDepths) -> np.ndarray:
         """(rows, columns) bool: the tiles that end there in which pieces may show."""
         made = np.zeros(ends.depths.shape, bool)
         for each in pieces:
-            made |= shown(self.view, self.features, each.boxes, each.reach, ends)
+            made |= contributing_tiles(self.view, self.features, each.boxes, each.reach, ends)
         return made
 
-    def ended(self, ends: TileEnds) -> Band:
+    def ended(self, ends: TerminationDepths) -> Band:
         """It, drawn of what may show where its tiles end there."""
         hidden = self.hidden(ends)
         return self.drawn_of(tuple(a & ~b for a, b in zip(self.nodes, hidden, strict=True))).cut_to(ends)
 
-    def _needed(self, pieces: Pieces, ends: TileEnds) -> np.ndarray:
+    def _needed(self, pieces: Pieces, ends: TerminationDepths) -> np.ndarray:
         """(k,) bool: which pieces may show where tiles end there."""
         if not len(pieces.nodes):
             return np.zeros(0, bool)
-        shows = seen(self.view, self.features, pieces.boxes, pieces.reach)
-        shows &= ~hidden(self.view, self.features, pieces.boxes, pieces.reach, ends)
+        shows = in_frustum(self.view, self.features, pieces.boxes, pieces.reach)
+        shows &= ~occluded(self.view, self.features, pieces.boxes, pieces.reach, ends)
         return shows | pieces.always
 
     @cached_property
@@ -129,7 +130,7 @@ class Band:
         """Those that it may see and is not drawn of."""
         return tuple(each & ~own for each, own in zip(self.seen, self.nodes, strict=True))
 
-    def hidden(self, ends: TileEnds) -> Nodes:
+    def hidden(self, ends: TerminationDepths) -> Nodes:
         """The nodes of which it shows nothing where its tiles end there."""
         return self.scene.hidden(self.view, self.features, ends)
 

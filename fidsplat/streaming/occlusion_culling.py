@@ -16,7 +16,7 @@ from itertools import product
 import numpy as np
 
 from fidsplat.backends.interface import Images
-from fidsplat.backends.termination_depth import TileEnds
+from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.streaming.bands import Band
 from fidsplat.streaming.selection import Nodes
@@ -47,7 +47,7 @@ class Hidden:
     """What the last view has taught about what hides what."""
 
     def __init__(self) -> None:
-        self._last: tuple[View, TileEnds] | None = None
+        self._last: tuple[View, TerminationDepths] | None = None
         self._rest = 0
         """views that are yet to be drawn without asking"""
 
@@ -69,7 +69,7 @@ class Hidden:
         self,
         whole: Band,
         fits: Callable[[Band, int], bool],
-        draw: Callable[[Band, int], tuple[Images, TileEnds]],
+        draw: Callable[[Band, int], tuple[Images, TerminationDepths]],
         take: Callable[[Images, Images, np.ndarray], None],
     ) -> tuple[list[Band], Images] | None:
         """A view drawn of what is not hidden: what it was drawn of, and its picture. None where it is to be
@@ -115,13 +115,13 @@ class Hidden:
         return None
 
 
-def _rows(tiles: np.ndarray, whole: Band, ends: TileEnds) -> tuple[int, int]:
+def _rows(tiles: np.ndarray, whole: Band, ends: TerminationDepths) -> tuple[int, int]:
     """The rows of pixels [first, end) of a view in which some tiles lie."""
     rows, height = np.flatnonzero(tiles.any(axis=1)), ends.tile[0] // whole.view.samples
     return max(int(rows[0]) * height, whole.rows[0]), min((int(rows[-1]) + 1) * height, whole.rows[1])
 
 
-def _whole_pixels(view: View, ends: TileEnds) -> bool:
+def _whole_pixels(view: View, ends: TerminationDepths) -> bool:
     """Whether every pixel has its samples in one tile."""
     return not any(side % view.samples for side in ends.tile)
 
@@ -147,7 +147,7 @@ def _nearest(whole: Band, nodes: Nodes, most: int) -> Nodes:
     return tuple(made)
 
 
-def _carried(last: View, ends: TileEnds, view: View) -> TileEnds | None:
+def _carried(last: View, ends: TerminationDepths, view: View) -> TerminationDepths | None:
     """What the ends of a view's tiles may be, by those of the view before; None where the two have little in
     common. Only a guess: of what lay in the same directions, and further by what the camera has moved."""
     if (last.width, last.height, last.parallel) != (view.width, view.height, view.parallel):

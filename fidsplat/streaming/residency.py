@@ -13,7 +13,7 @@ import numpy as np
 from fidsplat.backends.chunk_cache import KeepsChunks, KnowsRoom
 from fidsplat.backends.interface import Backend, Images, Pipeline, ResidentData
 from fidsplat.backends.prepare import prepare
-from fidsplat.backends.termination_depth import GivesTileEnds, TileEnds, can_hide
+from fidsplat.backends.termination_depth import GivesTileEnds, TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
@@ -21,6 +21,7 @@ from fidsplat.effects import FeatureSet
 from fidsplat.effects.select import with_tile_ends
 from fidsplat.streaming.bands import Band, Bands, PartOfView
 from fidsplat.streaming.occlusion_culling import Hidden
+from fidsplat.streaming.occlusion_test import is_supported
 from fidsplat.streaming.selection import Selection, Streamed
 from fidsplat.util.errors import FidsplatError
 
@@ -75,7 +76,7 @@ class Residency:
         elif self._asks(view, features) and isinstance(backend, GivesTileEnds):
             asking = backend.pipeline(with_tile_ends(features))
 
-            def draw(band: Band, first_id: int) -> tuple[Images, TileEnds]:
+            def draw(band: Band, first_id: int) -> tuple[Images, TerminationDepths]:
                 images = asking.render(self._data(band.selection, first_id), band.view)
                 return images, backend.tile_ends_of(images)
 
@@ -115,7 +116,7 @@ class Residency:
     def _asks(self, view: View, features: FeatureSet) -> bool:
         """Whether it can be told what is hidden."""
         tells = isinstance(self._backend, GivesTileEnds) and isinstance(self._backend, KeepsChunks)
-        return tells and can_hide(view, features)
+        return tells and is_supported(view, features)
 
     def read_ahead(self, captures: Iterator[Capture]) -> Iterator[Capture]:
         """The captures, each when what the next needs is being brought."""

@@ -13,8 +13,7 @@ import numpy as np
 
 from fidsplat.backends.chunk_cache import Chunk
 from fidsplat.backends.coplanar_groups import PlaneTable
-from fidsplat.backends.frustum_culling import Boxes, seen, sizes
-from fidsplat.backends.termination_depth import TileEnds, hidden, least_keys
+from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
@@ -22,6 +21,8 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.layout import MOST_SPLATS
 from fidsplat.store.store import Store
 from fidsplat.store.subset import StorePart, colors_of, joined
+from fidsplat.streaming.frustum_culling import Boxes, in_frustum, projected_sizes
+from fidsplat.streaming.occlusion_test import minimum_keys, occluded
 from fidsplat.streaming.subchunks import Pieces, PiecesOf
 from fidsplat.util.errors import InputError
 
@@ -145,15 +146,15 @@ class Streamed:
 
     def least_keys(self, view: View, features: FeatureSet) -> Nodes:
         """Of each store's nodes (n,) metres: below the depths at which a view sorts their splats."""
-        return tuple(least_keys(view, features, self._boxes(k)) for k in range(len(self.stores)))
+        return tuple(minimum_keys(view, features, self._boxes(k)) for k in range(len(self.stores)))
 
-    def hidden(self, view: View, features: FeatureSet, ends: TileEnds) -> Nodes:
+    def hidden(self, view: View, features: FeatureSet, ends: TerminationDepths) -> Nodes:
         """The nodes of which nothing can show in a picture whose tiles end there."""
         made = []
         for number, store in enumerate(self.stores):
             reach = np.tile(store.nodes["reach"].astype(np.float64), store.places)
             # what stands on planes is in every picture
-            made.append(hidden(view, features, self._boxes(number), reach, ends) & ~_pinned(store))
+            made.append(occluded(view, features, self._boxes(number), reach, ends) & ~_pinned(store))
         return tuple(made)
 
     def pieces(self, nodes: Nodes) -> list[Pieces]:
@@ -380,7 +381,7 @@ def _chosen(
     reach = np.tile(nodes["reach"].astype(np.float64), places)
     visible = np.zeros(len(level), bool)
     for view in views:
-        visible |= seen(view, features, boxes, reach)
+        visible |= in_frustum(view, features, boxes, reach)
     pinned = _pinned(store)
     if not pixels.any():
         return (visible | pinned) & (level == 0)
@@ -389,7 +390,7 @@ def _chosen(
     edges = np.tile(nodes["size"].astype(np.float64), places)
     refined = np.zeros(len(level), bool)
     for view in views:
-        refined |= sizes(view, boxes, edges) > pixels[level]
+        refined |= projected_sizes(view, boxes, edges) > pixels[level]
     reached = parents < 0
     for above in range(int(level.max()), 0, -1):
         children = np.flatnonzero((level == above - 1) & (parents >= 0))

@@ -196,7 +196,6 @@ SHARED = (
     "gradients",
     "chunk_cache",
     "termination_depth",
-    "frustum_culling",
     "derivatives",
     "probing",
 )

@@ -13,12 +13,12 @@ from fidsplat.accuracy.error import truth
 from fidsplat.accuracy.level_of_detail import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.accuracy.price_list import load as load_prices
 from fidsplat.accuracy.quality_within import Choice
-from fidsplat.backends.frustum_culling import sizes
 from fidsplat.backends.prepare import prepare
 from fidsplat.cli import main
 from fidsplat.store import build_plan
 from fidsplat.store.detail import MARGIN, Detail, load_details, pixels, save_details
 from fidsplat.store.sources import sample, splats_of
+from fidsplat.streaming.frustum_culling import projected_sizes
 from fidsplat.streaming.selection import Streamed
 from fidsplat.vision import read_back
 from fidsplat.worlds.city import PITCH, City, flight
@@ -89,7 +89,7 @@ def test_cells_above_a_panorama_are_as_wide_as_it_shows_them(store):
     _, view = prepare(store, fs.Capture(camera))
     corners = np.array([[0.1, -5.0, 0.0], [5.0, 0.1, 0.0], [-1.0, -5.0, -1.0]])
     high = corners + np.array([[0.01], [0.01], [2.0]])
-    above, beside, around = sizes(view, lambda sigmas: (corners, high), np.full(3, 0.05))
+    above, beside, around = projected_sizes(view, lambda sigmas: (corners, high), np.full(3, 0.05))
     # by the longitudes from which they are seen
     assert above > 0.9 * 80 / math.tau * 0.05 / 0.11
     assert beside < 0.2
@@ -104,7 +104,7 @@ def test_cells_through_a_distorting_lens_have_the_sizes_of_a_pinhole(store):
     for own in (None, fs.BrownConrady(k1=-0.1)):
         camera = fs.Camera.pinhole(80, 60, 50.0, 50.0, 40.0, 30.0, lens=own)
         _, view = prepare(store, fs.Capture(camera))
-        found.append(sizes(view, lambda sigmas: (corners, high), np.full(2, 0.05)))
+        found.append(projected_sizes(view, lambda sigmas: (corners, high), np.full(2, 0.05)))
     assert 0.5 <= found[0][0] < 0.5001
     assert np.array_equal(*found)
 

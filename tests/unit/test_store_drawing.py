@@ -12,13 +12,13 @@ from small_stores import contents
 from store_views import COUNT, SIZE, TURNED, look, made_store, made_stores, splats
 
 import fidsplat as fs
-from fidsplat.backends.frustum_culling import seen
 from fidsplat.backends.prepare import prepare
 from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.store import build_plan
 from fidsplat.store.sources import source_of
 from fidsplat.streaming import selection
+from fidsplat.streaming.frustum_culling import in_frustum
 from fidsplat.streaming.selection import Streamed
 
 CAPTURES = {
@@ -86,7 +86,7 @@ def test_a_box_around_each_splat_is_seen_where_the_splat_is(stores, reference):
         def boxes(sigmas, largest=largest):
             return cloud.means - sigmas * largest[:, None], cloud.means + sigmas * largest[:, None]
 
-        left_out = ~seen(view, features, boxes, largest)
+        left_out = ~in_frustum(view, features, boxes, largest)
         assert left_out.mean() > 0.2
         rest = np.flatnonzero(left_out)
         arrays = {n: getattr(cloud, n)[rest] for n in ("means", "quats", "opacities", "colors")}
@@ -126,7 +126,7 @@ def test_what_the_low_pass_pixel_draws_into_the_picture_is_seen(reference, name)
         around = sigmas * np.hypot(along * sizes[:, :1], beside * sizes[:, 1:])
         return means - around, means + around
 
-    shown = seen(view, features, boxes, sizes.max(axis=1))
+    shown = in_frustum(view, features, boxes, sizes.max(axis=1))
     assert 0.05 < shown.mean() < 0.95
 
     def alpha(chosen):
@@ -141,7 +141,7 @@ def test_what_the_low_pass_pixel_draws_into_the_picture_is_seen(reference, name)
 def test_where_a_footprint_has_no_bound_all_ahead_is_read(name):
     cloud = fs.SplatCloud([(50.0, 0, 1)], [(1, 0, 0, 0)], [(0.1, 0.1)], [0.9], colors=[(1, 1, 1)])
     features, view = prepare(cloud, CAPTURES[name])
-    assert seen(view, features, lambda sigmas: (cloud.means, cloud.means), np.array([0.1])).all()
+    assert in_frustum(view, features, lambda sigmas: (cloud.means, cloud.means), np.array([0.1])).all()
 
 
 @pytest.mark.parametrize("lens", [None, fs.Fisheye(k1=0.02), fs.BrownConrady(k1=-0.1)], ids=str)
@@ -186,9 +186,9 @@ def test_a_needle_that_ewa_draws_into_a_wide_picture_is_seen(reference):
     def boxes(count):
         return means.astype(np.float64) - count * sigmas, means.astype(np.float64) + count * sigmas
 
-    assert seen(view, features, boxes, sigmas.max(axis=1).astype(np.float64)).all()
+    assert in_frustum(view, features, boxes, sigmas.max(axis=1).astype(np.float64)).all()
     exact, _ = prepare(needle, capture.with_(quality=fs.Quality(ellipsoid="exact")))
-    assert not seen(view, exact, boxes, sigmas.max(axis=1).astype(np.float64)).any()
+    assert not in_frustum(view, exact, boxes, sigmas.max(axis=1).astype(np.float64)).any()
 
 
 def test_what_moves_into_the_picture_by_itself_is_read(tmp_path, reference):

@@ -8,11 +8,11 @@ from agreement import ALL_OUTPUTS
 from store_views import TURNED, look, made_store, splats
 
 import fidsplat as fs
-from fidsplat.backends import termination_depth
 from fidsplat.backends.prepare import prepare
+from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.effects.select import with_tile_ends
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.streaming import occlusion_culling, subchunks
+from fidsplat.streaming import occlusion_culling, occlusion_test, subchunks
 from fidsplat.streaming.selection import Streamed
 
 
@@ -255,8 +255,8 @@ def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(n
         return cloud.means - sigmas * largest[:, None], cloud.means + sigmas * largest[:, None]
 
     shown = np.flatnonzero(trace["keys"] < 0xFFFFFFFE)
-    keys = termination_depth.TileEnds.of_keys(trace["keys"], (1, 1)).depths
-    least = termination_depth.least_keys(view, features, boxes)
+    keys = TerminationDepths.of_keys(trace["keys"], (1, 1)).depths
+    least = occlusion_test.minimum_keys(view, features, boxes)
     assert (least[shown] <= keys[shown]).all()
     # of one tile for each sample: what each splat touches ends behind all, the rest before all
     records, rectangles = trace["records"], np.full((len(cloud), 4), -1)
@@ -267,9 +267,9 @@ def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(n
         y0, y1, x0, x1 = rectangles[i]
         for row, column in ((y0, x0), (y0, x1 - 1), (y1 - 1, x0), (y1 - 1, x1 - 1)):
             depths[row, column] = np.inf
-            given = termination_depth.TileEnds(depths, (1, 1))
+            given = TerminationDepths(depths, (1, 1))
             only = lambda sigmas, i=i: tuple(each[i : i + 1] for each in boxes(sigmas))  # noqa: E731
-            assert not termination_depth.hidden(view, features, only, largest[i : i + 1], given).any()
+            assert not occlusion_test.occluded(view, features, only, largest[i : i + 1], given).any()
             depths[row, column] = -np.inf
 
 
@@ -312,9 +312,9 @@ def test_ends_of_some_tiles():
         np.array([[1.0, np.inf], [3.0, 4.0]], np.float32),
         np.array([[True, True], [False, False]]),
     )
-    some = termination_depth.TileEnds(depths, (16, 16))
+    some = TerminationDepths(depths, (16, 16))
     assert np.array_equal(some.within(tiles).depths, [[1.0, np.inf], [-np.inf, -np.inf]])
-    others = termination_depth.TileEnds(np.full((2, 2), 7, np.float32), (16, 16))
+    others = TerminationDepths(np.full((2, 2), 7, np.float32), (16, 16))
     assert np.array_equal(some.replaced(tiles, others).depths, [[7.0, 7.0], [3.0, 4.0]])
 
 
@@ -323,7 +323,7 @@ def test_the_largest_in_rectangles():
     values = generator.normal(size=(13, 21))
     tops, lefts = generator.integers(0, 13, 300), generator.integers(0, 21, 300)
     bottoms, rights = generator.integers(0, 14, 300), generator.integers(0, 22, 300)
-    found = termination_depth._Largest(values).within(tops, bottoms, lefts, rights)
+    found = occlusion_test._RangeMaximum(values).within(tops, bottoms, lefts, rights)
     for k, (top, bottom, left, right) in enumerate(zip(tops, bottoms, lefts, rights, strict=True)):
         assert found[k] == values[top:bottom, left:right].max(initial=-np.inf)
 
@@ -334,7 +334,7 @@ def test_a_needle_that_ewa_draws_into_a_wide_picture_is_on_it():
     sigmas = np.array([[1e-3, 1e-3, 0.06]], np.float32)
     means = np.array([[-7.6, 0, 1]], np.float32)
     needle = fs.SplatCloud(means, [[1, 0, 0, 0]], sigmas, [0.99], colors=[[1, 1, 1]])
-    nowhere_finished = termination_depth.TileEnds(np.full((1, 125), np.inf, np.float32), (16, 16))
+    nowhere_finished = TerminationDepths(np.full((1, 125), np.inf, np.float32), (16, 16))
     features, shot = prepare(needle, fs.Capture(camera, quality=fs.Quality(ellipsoid="ewa")))
     given = shot, features, lambda count: (means - count * sigmas, means + count * sigmas)
-    assert not termination_depth.hidden(*given, sigmas.max(axis=1), nowhere_finished).any()
+    assert not occlusion_test.occluded(*given, sigmas.max(axis=1), nowhere_finished).any()

@@ -6,7 +6,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.splats.harmonics import C0
 from fidsplat.splats.rotations import quaternion_to_matrix
-from fidsplat.store.merge import DENSEST, merged, quaternions_of
+from fidsplat.store.merge import MAX_OPACITY, merged, quaternions_of
 from fidsplat.store.morton import Grid, grid_around
 
 
@@ -79,8 +79,8 @@ def test_splats_on_top_of_each_other_become_several():
     made, _ = merged(splats, Grid((-1.0, -1.0, -1.0), 2.0))
     light = made["opacities"] * made["scales"].prod(axis=1)
     assert light.sum() == pytest.approx(count * 0.9 * 4e-4, rel=1e-5)
-    assert 0.9 * count / DENSEST - 1 < len(light) < 0.9 * count
-    assert 1 < made["opacities"].max() <= DENSEST
+    assert 0.9 * count / MAX_OPACITY - 1 < len(light) < 0.9 * count
+    assert 1 < made["opacities"].max() <= MAX_OPACITY
     assert made["scales"].max() < 0.02 * 1.4
 
 

@@ -26,7 +26,7 @@ from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, o
 from fidsplat.backends.opencl.training import OpenCLTraining
 from fidsplat.backends.opencl.vendors import intel_among_them
 from fidsplat.backends.opencl.workspace import Workspace
-from fidsplat.backends.termination_depth import TileEnds
+from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.splats.cloud import SplatCloud
@@ -105,7 +105,7 @@ class OpenCLBackend(Workspace):
         """As `KeepsChunks`."""
         return OpenCLChunks(self, whole, rows)
 
-    def tile_ends_of(self, images: OpenCLImages) -> TileEnds:
+    def tile_ends_of(self, images: OpenCLImages) -> TerminationDepths:
         """As `GivesTileEnds`."""
         return images.tile_ends()
 

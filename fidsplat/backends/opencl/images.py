@@ -16,7 +16,7 @@ from fidsplat.backends.opencl.recording import Recording
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uint8 import read_uint8
 from fidsplat.backends.opencl.workspace import Workspace
-from fidsplat.backends.termination_depth import TileEnds
+from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
 
@@ -166,14 +166,14 @@ class OpenCLImages:
             image = drawn.buffer(f"{name}_out")
             return read_uint8(self._workspace, image, self._shape(name), drawn.done())
 
-    def tile_ends(self) -> TileEnds:
+    def tile_ends(self) -> TerminationDepths:
         """As `GivesTileEnds`, of pictures whose features have the effect. Raises DeviceError as `read`."""
         with self._workspace.failing("drawing"):
             drawn, (grid, tile) = self.settle(), self._tiles
             keys = np.empty(grid, np.uint32)
             queue = self._workspace.read_queue
             cl.enqueue_copy(queue, keys, drawn.buffer("tile_ends"), wait_for=drawn.done())
-        return TileEnds.of_keys(keys, tile)
+        return TerminationDepths.of_keys(keys, tile)
 
     def take_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
         """As `GivesTileEnds`. Raises DeviceError as `read`."""

@@ -1,5 +1,5 @@
 // As beside.cl, under the low-pass `pixel`, which widens a disk by what a sample sees of its plane, in depth too: the disk and the margin
-// larger by 1 / sqrt(1 - (R k)^2), R the cut-off's radius and k = 1/8, hold all of it (fidsplat/backends/frustum_culling.py has the proof). Of a band of
+// larger by 1 / sqrt(1 - (R k)^2), R the cut-off's radius and k = 1/8, hold all of it (fidsplat/streaming/frustum_culling.py has the proof). Of a band of
 // rows, what lies beside those is told as well.
 //@ beside
 #ifndef BOX_HERE

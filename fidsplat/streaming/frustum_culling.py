@@ -1,8 +1,8 @@
-"""Which boxes of splats a view may see: boxes that it cannot see need not be on the device.
+"""Frustum culling of boxes of splats, and their size on the image.
 
-A box that is left out must not have a splat that the picture shows, whatever camera, low-pass or shutter:
-what the kernels ask of each splat (`project.cl`) is asked here of all that a box may hold. Where that cannot
-be answered for a box as a whole, the box counts as seen.
+The test is conservative for every camera model, low-pass and shutter: a culled box contains no splat that
+contributes to the frame. It applies the criteria of `project.cl` to all splats that a box can contain, and
+keeps a box where it cannot decide.
 """
 
 from __future__ import annotations
@@ -18,74 +18,76 @@ from fidsplat.backends.view import View
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
+from fidsplat.store.merge import MAX_OPACITY
 
 Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
-"""corners (n, 3) float64 [m], lowest and highest, of boxes around splats to so many standard deviations"""
+"""(standard deviations) -> lowest, highest corners (n, 3) float64 [m] of boxes around splats"""
 
-ROOM = 1.01
-"""how much further splats are taken to reach: for rounding, and what bounds are padded with"""
-BRIGHTEST = 4.0
-"""most opacity, of splats that stand for others (fidsplat/store/merge.py)"""
+PADDING = 1.01
+"""factor on the extent of splats, for rounding"""
 _ACROSS, _ALONG = 0.5, 1 / 8
-"""standard deviations of what a sample sees under the low-pass `pixel`: across its ray in samples, and along
+"""standard deviations of a sample's footprint under the low-pass `pixel`: across its ray in samples, along
 it as a share of the depth (kernels/opencl/slot/lowpass_pixel.cl)"""
 _ROUNDING = 1e-5
-"""of a coordinate: what a set-up in float32 may be off"""
+"""relative error of a coordinate that projection in float32 computes"""
 
 
-def seen(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
-    """(n,) bool: the boxes whose splats may show in the picture, or in one of the poses of which it is made.
+def in_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
+    """(n,) bool: boxes whose splats can contribute to the frame, at any pose of the shutter.
 
     Args:
-        boxes: of the splats that move with the camera's view and of those that move by themselves alike.
+        boxes: tested with the motion of the camera and with that of each moving group.
         reach: (n,) metres: largest standard deviation of a box's splats.
     """
     if view.shots:
         made = np.zeros(len(reach), bool)
         for shot in view.shots:
-            made |= seen(shot.view, features, boxes, reach)
+            made |= in_frustum(shot.view, features, boxes, reach)
         return made
-    made = _seen_by(view, features, boxes, reach)
+    made = _in_pose_frustum(view, features, boxes, reach)
     for _, own in view.groups:
-        made |= _seen_by(own, features, boxes, reach)
+        made |= _in_pose_frustum(own, features, boxes, reach)
     return made
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How far splats show around their centres p, as the camera sees them.
+    """Bound on the extent of splats around their centres p, in the camera's frame.
 
-    The low-pass `pixel` adds to a disk, of R standard deviations, an ellipse of its plane: points e that are
-    by the derivative at p at most R s samples to the side and R k z further or nearer, z the depth of p, s
-    and k `_ACROSS` and `_ALONG`. A side of the picture is a plane through the camera's centre, from which p
-    is n . p / z samples away, and with p moved by e these samples times 1 + e_z / z, and those to the side.
-    Covariances add: p beyond a side, d = -n . p, reaches over it only if d^2 <= R^2 (E^2 + (k d)^2 + (s z)^2)
-    with E the disk's standard deviation along n. That is not so of a disk and a margin larger by
-    1 / sqrt(1 - (R k)^2) that lie beyond it. Of depths, z - R k z less the disk's, the bound is the sum's.
-    The low-pass leaves splats whose centre lies before the near plane as they are.
+    The low-pass `pixel` adds an ellipse in the disk's plane to a disk of R standard deviations: by the
+    derivative at p, its points e are at most R s samples to the side and R k z in depth, with z the depth
+    of p, s = `_ACROSS` and k = `_ALONG`. A side of the image is a plane through the camera's centre, at a
+    distance of n . p / z samples from p; a displacement e scales this distance by 1 + e_z / z and adds the
+    samples to the side. Covariances add: a point p beyond a side, d = -n . p, reaches over the side only if
+    d^2 <= R^2 (E^2 + (k d)^2 + (s z)^2), with E the disk's standard deviation along n. A disk and a margin
+    enlarged by 1 / sqrt(1 - (R k)^2) that are beyond the side do not. The bound on depths is the sum:
+    z - R k z, less the disk's own extent. The low-pass does not change splats whose centre is in front of
+    the near plane.
     """
 
     radius: float
-    """standard deviations to which disks are taken, to the sides"""
+    """extent of disks to the sides, in standard deviations"""
     margin: float
-    """samples beside their picture"""
+    """samples around their projection"""
     depths: float
-    """standard deviations to which disks are taken, in depth"""
+    """extent of disks in depth, in standard deviations"""
     nearer: float = 1.0
-    """by which depths are multiplied then"""
+    """factor on depths"""
 
     @staticmethod
     def of(view: View, features: FeatureSet, least: float = 0.0) -> Extent | None:
-        """That of a view's splats, to `least` standard deviations at least; None where nothing bounds it:
-        under the low-pass `pixel` behind distorted lenses, which stretch without limit at their fold, to
-        parallel rays, whose footprint has no end, and at cut-offs as low as 1e-13."""
-        radius = max(drawn_to(view), least)
-        # a dot of the low-pass, or what EWA widens a splat by
+        """The extent of a view's splats, of at least `least` standard deviations; None if unbounded.
+
+        The low-pass `pixel` has no bound for distorted lenses (a fold stretches without limit), for parallel
+        rays (an unbounded footprint) and for cut-offs as low as 1e-13.
+        """
+        radius = max(cutoff_radius(view), least)
+        # the dot of the low-pass, or the widening by EWA
         plain = Extent(radius, radius * view.samples + 2.0, radius)
         if not _widened(features):
             return plain
-        # depths along the ray are bounded by spheres around disks, in which their parts to the side are too
-        aside = _ACROSS * _turned_by(view) if view.along_ray else 0.0
+        # depths along the ray are bounded by spheres around disks, which include their extent to the side
+        aside = _ACROSS * _max_ray_rotation(view) if view.along_ray else 0.0
         nearer = 1.0 - radius * math.hypot(_ALONG, aside)
         if nearer <= 0 or view.parallel or isinstance(view.lens, BrownConrady):
             return None
@@ -93,10 +95,10 @@ class Extent:
         margin = max(plain.margin, larger * radius * _ACROSS + 2.0)
         return Extent(larger * radius, margin, radius / nearer, nearer)
 
-    def nearest(self, view: View, turned: Turned) -> np.ndarray:
-        """(n,) metres: below the depths of all that splats in boxes to `depths` standard deviations show, and
-        of their sort keys."""
-        nearest = turned.nearest(view)
+    def nearest(self, view: View, boxes: CameraBoxes) -> np.ndarray:
+        """(n,) metres: lower bound on the depths and sort keys of splats, by boxes to `depths` standard
+        deviations."""
+        nearest = boxes.nearest(view)
         return np.minimum(self.nearer * nearest, nearest)
 
 
@@ -104,32 +106,34 @@ def _widened(features: FeatureSet) -> bool:
     return "lowpass_pixel" in features.names
 
 
-def drawn_to(view: View) -> float:
-    """Standard deviations to which splats are drawn, with room: those that stand for others reach further."""
-    return ROOM * math.sqrt(2.0 * (math.log(BRIGHTEST) - view.log_cut))
+def cutoff_radius(view: View) -> float:
+    """Radius [standard deviations] at which splats of the highest opacity reach the cut-off, padded."""
+    return PADDING * math.sqrt(2.0 * (math.log(MAX_OPACITY) - view.log_cut))
 
 
 def ewa_reach(view: View, features: FeatureSet, radius: float, reach: np.ndarray) -> np.ndarray | None:
-    """(n,) samples, times the depth [m] where rays meet: how far beside their centres splats are drawn by the
-    derivative there, which may be further than they reach, to `radius` of their standard deviations, the
-    largest `reach` (n,) [m]; None where splats are not drawn so."""
+    """Extent of EWA footprints around projected centres, (n,) samples times the depth [m] (perspective).
+
+    EWA projects by the derivative at the centre, so a footprint can reach further than the splat. radius:
+    standard deviations; reach: (n,) metres, largest standard deviation. None without EWA.
+    """
     if not {"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names:
         return None
     slope = 1.0 if view.parallel else math.hypot(1.0, max(map(abs, view.slopes)))
     return max(view.focal_x, view.focal_y) * slope * radius * reach
 
 
-def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
+def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
     extent = Extent.of(view, features)
     if extent is None:
-        # nothing of a splat whose centre lies behind the near plane is widened
-        whole = Turned(view, *boxes(drawn_to(view)))
+        # splats whose centre is behind the near plane are not widened
+        whole = CameraBoxes(view, *boxes(cutoff_radius(view)))
         return whole.furthest(view) >= view.near * (1 - _ROUNDING)
     radius, margin = extent.radius, extent.margin
-    centers = Turned(view, *boxes(0.0))
-    whole = Turned(view, *boxes(radius))
+    centers = CameraBoxes(view, *boxes(0.0))
+    whole = CameraBoxes(view, *boxes(radius))
     made = whole.furthest(view) >= view.near * (1 - _ROUNDING)
-    deep = whole if extent.depths == radius else Turned(view, *boxes(extent.depths))
+    deep = whole if extent.depths == radius else CameraBoxes(view, *boxes(extent.depths))
     made &= extent.nearest(view, deep) <= view.far * (1 + _ROUNDING)
     if view.raster is None:
         wide = ewa_reach(view, features, radius, reach)
@@ -144,10 +148,10 @@ def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) 
         return made
     step = view.raster.step * margin
     if isinstance(lens, Fisheye):
-        if _widened(features):  # to the side at most that, and at least `nearer` times as far away
-            step = _turned_by(view) * max(margin, extent.depths * _ACROSS + 2.0)
-            return made & centers.within(_widest(view.raster), step, extent.depths * reach)
-        return made & whole.within(_widest(view.raster) + step)
+        if _widened(features):
+            step = _max_ray_rotation(view) * max(margin, extent.depths * _ACROSS + 2.0)
+            return made & centers.within(_max_ray_angle(view.raster), step, extent.depths * reach)
+        return made & whole.within(_max_ray_angle(view.raster) + step)
     low, high = _slopes(view.raster)
     for axis in (0, 1):
         for sign, side in ((1.0, low[axis] - step), (-1.0, high[axis] + step)):
@@ -157,7 +161,7 @@ def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) 
     return made
 
 
-class Turned:
+class CameraBoxes:
     """Boxes in the camera's frame."""
 
     def __init__(self, view: View, low: np.ndarray, high: np.ndarray) -> None:
@@ -165,38 +169,40 @@ class Turned:
         self.middle = middle @ view.rotation.T + view.translation
         self.half = half @ np.abs(view.rotation.T)
         self._low, self._high, self._view = low, high, view
-        # of the sums that make a coordinate
-        self.room = _ROUNDING * (np.abs(middle).sum(1) + half.sum(1) + np.abs(view.translation).sum())
+        # rounding error of the sums that yield a coordinate
+        self.rounding = _ROUNDING * (np.abs(middle).sum(1) + half.sum(1) + np.abs(view.translation).sum())
         self._half = half
 
     def beyond(self, normal: np.ndarray) -> np.ndarray:
-        """(n,) the largest product of a box's points with a vector (3,) of the camera's frame."""
+        """(n,) largest dot product of a box's points with a vector (3,) of the camera's frame."""
         reach = self._half @ np.abs(self._view.rotation.T @ normal)
-        return self.middle @ normal + reach + self.room * np.abs(normal).sum()
+        return self.middle @ normal + reach + self.rounding * np.abs(normal).sum()
 
     def nearest(self, view: View) -> np.ndarray:
-        """(n,) metres: the least depth of a box, as the view means depth."""
+        """(n,) metres: lowest depth of each box, by the view's definition of depth."""
         if view.along_ray:
             return np.maximum(np.linalg.norm(self.middle, axis=1) - self._radius, 0.0)
         return -self.beyond(np.array([0.0, 0.0, -1.0]))
 
     def furthest(self, view: View) -> np.ndarray:
-        """(n,) metres: the largest."""
+        """(n,) metres: highest depth of each box."""
         if view.along_ray:
             return np.linalg.norm(self.middle, axis=1) + self._radius
         return self.beyond(np.array([0.0, 0.0, 1.0]))
 
     def off_axis(self) -> np.ndarray:
-        """(n,) metres: the least distance from the vertical axis, around which panoramas are stretched."""
+        """(n,) metres: lowest distance from the vertical axis, around which panoramas are stretched."""
         return np.maximum(np.hypot(self.middle[:, 0], self.middle[:, 2]) - self._radius, 0.0)
 
     @property
     def _radius(self) -> np.ndarray:
-        return np.linalg.norm(self._half, axis=1) + self.room
+        return np.linalg.norm(self._half, axis=1) + self.rounding
 
     def within(self, angle: float, step: float = 0.0, further: np.ndarray | None = None) -> np.ndarray:
-        """(n,) bool: which may have points at most so far [rad] from the optical axis; or points as far from
-        those in the box as a share `step` of their distance from the camera, and `further` (n,) metres."""
+        """(n,) bool: boxes that can have points within an angle [rad] of the optical axis.
+
+        Points may be displaced by a share `step` of their distance to the camera, and `further` (n,) metres.
+        """
         distance = np.linalg.norm(self.middle, axis=1)
         around = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
         off = np.arctan2(np.hypot(self.middle[:, 0], self.middle[:, 1]), self.middle[:, 2])
@@ -207,14 +213,13 @@ class Turned:
 
 
 def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
-    """The sides of the picture as half spaces of the camera's frame, normal . p + offset >= 0 within, wider
-    by `margin` samples."""
+    """Half spaces normal . p + offset >= 0 of the frustum's sides, `margin` samples wider."""
     sides = []
     rows = (0, view.height) if view.band is None else view.band
     grid = ((0, view.focal_x, view.center_x, (0, view.width)), (1, view.focal_y, view.center_y, rows))
     for axis, focal, center, (first, end) in grid:
         for sign, side in ((1.0, first - margin), (-1.0, end + margin)):
-            # sign (focal x / z + center - side) >= 0, times z where rays meet
+            # sign (focal x / z + center - side) >= 0, times z for perspective
             normal = np.zeros(3)
             normal[axis] = sign * focal
             if view.parallel:
@@ -225,48 +230,51 @@ def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
     return sides
 
 
-def _turned_by(view: View) -> float:
-    """The largest angle [rad] by which rays of a fisheye or a panorama turn in a sample, wherever it sees;
-    infinite for a fisheye that folds."""
+def _max_ray_rotation(view: View) -> float:
+    """Largest angle [rad] between rays one sample apart, of a fisheye or a panorama; infinite for a fisheye
+    that folds."""
     lens = view.lens
     if not isinstance(lens, Fisheye):
         return 1.0 / min(view.focal_x, view.focal_y)
     angles = np.linspace(1e-6, lens.limit, 4096)
     slopes = lens.distance(angles + 1e-6) - lens.distance(angles - 1e-6)
     least = min(float(slopes.min()) / 2e-6, float((lens.distance(angles) / np.sin(angles)).min()))
-    # between these angles it changes less than that
+    # 5 % for the change between sampled angles
     return math.inf if least < 0.05 else 1.05 / (least * min(view.focal_x, view.focal_y))
 
 
 @lru_cache(maxsize=8)
-def _widest(raster: RayRaster) -> float:
-    """The largest angle [rad] of a sample's ray from the optical axis."""
+def _max_ray_angle(raster: RayRaster) -> float:
+    """Largest angle [rad] between a sample's ray and the optical axis."""
     rays = raster.rays.astype(np.float64)
     return float(np.nanmax(np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])))
 
 
 @lru_cache(maxsize=8)
 def _slopes(raster: RayRaster) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the largest x / z and y / z, (2,) each, of the samples' rays."""
+    """Minimum and maximum (x / z, y / z) of the samples' rays, (2,) each."""
     rays = raster.rays.astype(np.float64)
     slopes = rays[..., :2] / rays[..., 2:]
     return np.nanmin(slopes, axis=(0, 1)), np.nanmax(slopes, axis=(0, 1))
 
 
-def sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
-    """(n,) samples: how large lengths (n,) [m] are at most on the picture where a box is nearest. Shutters
-    and splats that move by themselves count, and infinity where a box reaches to the camera."""
+def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
+    """(n,) samples: upper bound on the projected size of lengths (n,) [m] anywhere in each box.
+
+    The bound is over all poses of the shutter and all moving groups; it is infinite where a box reaches the
+    camera.
+    """
     if view.shots:
-        return np.max([sizes(shot.view, boxes, edges) for shot in view.shots], axis=0)
+        return np.max([projected_sizes(shot.view, boxes, edges) for shot in view.shots], axis=0)
     made = np.zeros(len(edges))
     for one in (view, *(own for _, own in view.groups)):
         focal = max(one.focal_x, one.focal_y)
         if one.parallel:
             made = np.maximum(made, edges * focal)
             continue
-        turned = Turned(one, *boxes(0.0))
+        placed = CameraBoxes(one, *boxes(0.0))
         panorama = one.raster is not None and isinstance(one.raster.lens, Equirectangular)
-        nearest = turned.off_axis() if panorama else turned.nearest(one)
+        nearest = placed.off_axis() if panorama else placed.nearest(one)
         with np.errstate(divide="ignore", invalid="ignore"):
             size = np.where(nearest > 0, edges * focal / np.maximum(nearest, 1e-300), np.inf)
         made = np.maximum(made, np.where(edges > 0, size, 0.0))

@@ -1,0 +1,151 @@
+"""Occlusion test of boxes of splats against the termination depths of a frame's tiles.
+
+A box is occluded if its lowest sort key is above the termination depth of every tile that it can touch
+(fidsplat/backends/termination_depth.py says why the frame is then bit-identical).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fidsplat.backends.termination_depth import TerminationDepths
+from fidsplat.backends.view import View
+from fidsplat.effects import FeatureSet
+from fidsplat.streaming.frustum_culling import PADDING, Boxes, CameraBoxes, Extent, ewa_reach
+
+_RANGE = 3.33
+"""standard deviations: splats have their own depth within sqrt(2 ln 255) (slot/compose_pixel.cl)"""
+
+
+def is_supported(view: View, features: FeatureSet) -> bool:
+    """Whether occlusion can be tested: one pose, no moving groups, and splats of bounded extent."""
+    return not (view.shots or view.groups) and _extent(view, features) is not None
+
+
+def minimum_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
+    """(n,) metres: lower bound on the sort keys of the splats in each box."""
+    extent = _extent(view, features)
+    assert extent is not None  # `is_supported`
+    if "compose_ordered" in features.names:
+        return CameraBoxes(view, *boxes(0.0)).nearest(view)
+    return extent.nearest(view, CameraBoxes(view, *boxes(extent.depths)))
+
+
+def occluded(
+    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TerminationDepths
+) -> np.ndarray:
+    """(n,) bool: boxes none of whose splats can contribute to a frame with these termination depths.
+
+    boxes, reach: those of `in_frustum`.
+    """
+    least, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, ends)
+    return least > _RangeMaximum(ends.depths).within(*spans)
+
+
+def contributing_tiles(
+    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TerminationDepths
+) -> np.ndarray:
+    """(rows, columns) bool: tiles to which splats of the boxes can contribute, given termination depths.
+
+    boxes, reach: those of `in_frustum`.
+    """
+    made = np.zeros(ends.depths.shape, bool)
+    least, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, ends)
+    for depth, top, bottom, left, right in zip(least, *spans, strict=True):
+        made[top:bottom, left:right] |= ends.depths[top:bottom, left:right] >= depth
+    return made
+
+
+def _tile_spans(
+    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TerminationDepths
+) -> tuple[np.ndarray, ...]:
+    """Rows [top, bottom) and columns [left, right) of the tiles that boxes can touch, (n,) int64 each."""
+    columns = ends.depths.shape[1]
+    first, end = (0, view.height) if view.band is None else view.band
+    band = first // ends.tile[0], -(-end // ends.tile[0])
+    if view.raster is not None:
+        return tuple(np.full(len(reach), side, np.int64) for side in (*band, 0, columns))
+    low, high = _projected_extent(view, features, boxes, reach)
+    with np.errstate(invalid="ignore"):
+        left = np.clip(np.floor((low[:, 0] - 1) / ends.tile[1]), 0, columns)
+        right = np.clip(np.floor(high[:, 0] / ends.tile[1]) + 1, 0, columns)
+        top = np.clip(np.floor((low[:, 1] - 1) / ends.tile[0]), *band)
+        bottom = np.clip(np.floor(high[:, 1] / ends.tile[0]) + 1, *band)
+    return tuple(each.astype(np.int64) for each in (top, bottom, left, right))
+
+
+def _extent(view: View, features: FeatureSet) -> Extent | None:
+    """Extent within which splats contribute or have their own depth."""
+    return Extent.of(view, features, _RANGE * PADDING)
+
+
+def _projected_extent(
+    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds on x, y of the splats of each box on the image, (n, 2) samples each, by a pinhole or parallel
+    rays; infinite where a box reaches the camera."""
+    extent = _extent(view, features)
+    assert extent is not None  # `is_supported`
+    radius, margin = extent.radius, extent.margin
+    low, high = _projected(view, *boxes(radius))
+    wide = ewa_reach(view, features, radius, reach[:, None])
+    if wide is not None:
+        least, most = _projected(view, *boxes(0.0))
+        if not view.parallel:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                nearest = CameraBoxes(view, *boxes(0.0)).nearest(view)[:, None]
+                wide = np.where(nearest > 0, wide / nearest, np.inf)
+        low, high = np.minimum(low, least - wide), np.maximum(high, most + wide)
+    return low - margin, high + margin
+
+
+def _projected(view: View, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the projected corners of boxes, (n, 2) samples each."""
+    rounding = CameraBoxes(view, low, high).rounding[:, None] * math.sqrt(3.0)
+    low, high = low - rounding, high + rounding
+    least = np.full((len(low), 2), np.inf)
+    most, nearest = -least, np.full(len(low), np.inf)
+    focal, center = np.array([view.focal_x, view.focal_y]), np.array([view.center_x, view.center_y])
+    for corner in range(8):
+        which = np.array([corner & 1, corner >> 1 & 1, corner >> 2], bool)
+        at = np.where(which, high, low) @ view.rotation.T + view.translation
+        nearest = np.minimum(nearest, at[:, 2])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            on = focal * (at[:, :2] if view.parallel else at[:, :2] / at[:, 2:]) + center
+        least, most = np.minimum(least, on), np.maximum(most, on)
+    if not view.parallel:
+        least[~(nearest > 0)], most[~(nearest > 0)] = -np.inf, np.inf
+    return least, most
+
+
+class _RangeMaximum:
+    """Sparse table for the maximum over rectangles of a grid."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self._tables: dict[tuple[int, int], np.ndarray] = {(0, 0): values}
+        """by powers of two (rows, columns): the maximum of the rectangle of that size from each cell on"""
+
+    def _table(self, down: int, across: int) -> np.ndarray:
+        if (down, across) not in self._tables:
+            if across:
+                table, step = self._table(down, across - 1), 1 << (across - 1)
+                made = np.maximum(table[:, :-step], table[:, step:])
+            else:
+                table, step = self._table(down - 1, 0), 1 << (down - 1)
+                made = np.maximum(table[:-step], table[step:])
+            self._tables[down, across] = made
+        return self._tables[down, across]
+
+    def within(self, top: np.ndarray, bottom: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """(n,) maximum over rows [top, bottom) and columns [left, right); -inf for an empty rectangle."""
+        made = np.full(len(top), -np.inf)
+        some = np.flatnonzero((bottom > top) & (right > left))
+        tall, wide = (np.frexp(size[some])[1] - 1 for size in (bottom - top, right - left))
+        for down, across in {*zip(tall.tolist(), wide.tolist(), strict=True)}:
+            at = some[(tall == down) & (wide == across)]
+            table, low, far = self._table(down, across), bottom[at] - (1 << down), right[at] - (1 << across)
+            first = np.maximum(table[top[at], left[at]], table[top[at], far])
+            made[at] = np.maximum(first, np.maximum(table[low, left[at]], table[low, far]))
+        return made
