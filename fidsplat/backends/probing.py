@@ -94,8 +94,8 @@ class Reshapes(Backend, Protocol):
         agree but for rounding; `listing`, the ways of listing splats per tile, under the schedule of a GPU
         where the device has several; `sorting`, the device's own and others for listing and sorting;
         `arithmetic`, the ways of compiling the functions of `Probe.arithmetic`, fused or not, in vectors or
-        one by one, the device's own among them; `waiting`, less room for fragments that wait for nearer ones,
-        whose pictures have the same bits; `tape`, fewer fragments that are kept for the way back, if the
+        one by one, the device's own among them; `k_buffer`, smaller k-buffers, whose images are
+        bit-identical; `tape`, fewer fragments that are kept for the way back, if the
         device keeps any, whose derivatives have the same bits."""
         ...
 

@@ -1,7 +1,7 @@
 """Termination depths: the depth at which blending of each tile stopped, for occlusion culling.
 
 Blending walks a tile's list of splats by sort key until all pixels of the tile are opaque. The device
-stores that key (kernels/opencl/part/tile_ends_*.cl). A splat with a larger key cannot change the tile, since
+stores that key (part/termination_depth_*.cl). A splat with a larger key cannot change the tile, since
 the list up to that key is the same with or without it. A frame of some of the splats is therefore
 bit-identical to that of all, if the key of each other splat is larger than the termination depths of all
 tiles that it can touch. This holds for every output and order.

@@ -41,7 +41,7 @@ _PLAIN = (
     *("camera_orthographic", "color_rgb", "color_sh", "lowpass_none", "lowpass_pixel", "lowpass_screen"),
     *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_pixel", "compose_planes"),
     *("footprint_gaussian", "footprint_box", "footprint_mixed"),
-    *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_alone"),
+    *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
     *("background_constant", "background_gradient", "background_panorama"),
     *("arithmetic_precise", "arithmetic_fast"),
     # where a picture needs them

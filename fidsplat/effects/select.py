@@ -119,7 +119,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             f"camera_{lens.kind if lens else 'pinhole'}",
             "color_sh" if sh_degree else "color_rgb",
             *((f"ellipsoid_{ellipsoid}",) if ellipsoid else ()),
-            *(("ellipsoids_alone",) if alone else ()),
+            *(("ellipsoids_only",) if alone else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
             # before what composites, whose fragments it hides

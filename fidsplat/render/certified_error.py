@@ -57,7 +57,7 @@ _BOUNDED = frozenset(
     (
         *("camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"),
         *("compose_ordered", "footprint_gaussian", "background_constant", "motion_groups"),
-        *("ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_alone"),
+        *("ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
         *("arithmetic_precise", "arithmetic_fast"),
     )
 )

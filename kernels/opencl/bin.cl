@@ -2,7 +2,7 @@
 // Index space of both kernels: one work-item per chunk of the depth-sorted splats of each view, which have `count` places.
 
 // The next splats' windows are fetched ahead: their places in memory follow no order.
-#define AHEAD 16
+#define PREFETCH_DISTANCE 16
 
 typedef struct {
     int tiles_x, tiles_y, width, height;
@@ -45,7 +45,7 @@ static inline void bin_splats(global const uint *restrict order, global const ui
                               uint big_capacity, global const Bounds *restrict big_bounds, const Chunk *c,
                               const Emission *e) {
     for (uint k = c->from; k < c->to; k++) {
-        FETCH_AHEAD(windows + order[min(k + AHEAD, c->to - 1)]);
+        PREFETCH(windows + order[min(k + PREFETCH_DISTANCE, c->to - 1)]);
         uint index = order[k];
         uint2 window = windows[index];
         if (window.y == 0 && window.x < big_capacity) {

@@ -3,8 +3,8 @@
 
 typedef struct {            // what shows where something is drawn
     vfloat r, g, b;
-//@@ seen
-} Seen;
+//@@ attributes
+} Attributes;
 
 //@@ compose_types
 typedef struct {
@@ -29,43 +29,43 @@ static inline void pixel_start(Pixel *pixel) {
 //@@ fragment_half_rho
 
 // What a fragment shows.
-static inline Seen see(const Splat *s, Crossing c, vfloat inverse_d) {
-    Seen seen;
-    seen.r = s->r;
-    seen.g = s->g;
-    seen.b = s->b;
-//@@ see
-    return seen;
+static inline Attributes fragment_attributes(const Splat *s, Crossing c, vfloat inverse_d) {
+    Attributes attributes;
+    attributes.r = s->r;
+    attributes.g = s->g;
+    attributes.b = s->b;
+//@@ attribute_values
+    return attributes;
 }
 
 // Composites it over all that follows, where `mask` is set and the pixel still lets light through.
-static inline void composite(Pixel *pixel, const Seen *seen, vfloat opacity, vint mask, const BlendConstants *constants) {
+static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
 #if LANES == 1
     vfloat weight = pixel->t * VSELECT((vfloat)0.0f, opacity, live);
 #else
-    vfloat taken = pixel->t * opacity, weight = VSELECT((vfloat)0.0f, taken, live);
+    vfloat full_weight = pixel->t * opacity, weight = VSELECT((vfloat)0.0f, full_weight, live);
 #endif
-    pixel->r = FMA(weight, seen->r, pixel->r);
-    pixel->g = FMA(weight, seen->g, pixel->g);
-    pixel->b = FMA(weight, seen->b, pixel->b);
+    pixel->r = FMA(weight, attributes->r, pixel->r);
+    pixel->g = FMA(weight, attributes->g, pixel->g);
+    pixel->b = FMA(weight, attributes->b, pixel->b);
 //@@ composite
 #if LANES == 1
     pixel->t = pixel->t - weight;
 #else       // as fragment follows fragment: `live` is found meanwhile
-    pixel->t = VSELECT(pixel->t, pixel->t - taken, live);
+    pixel->t = VSELECT(pixel->t, pixel->t - full_weight, live);
 #endif
 }
 
 // Whether light comes through to what follows.
-static inline vint pixel_lit(const Pixel *pixel, const BlendConstants *constants) {
+static inline vint pixel_transmits(const Pixel *pixel, const BlendConstants *constants) {
     return VMASK(pixel->t > constants->stop);
 }
 
 // Whether anything that follows can still be seen.
 static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *constants) {
-    return pixel_lit(pixel, constants)
+    return pixel_transmits(pixel, constants)
 //@@ unfinished
         ;
 }
@@ -79,7 +79,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
     vfloat inverse_d = 1.0f / c.d;
     vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->ceiling);
 //@@ footprint_opacity
-    const Seen seen = see(s, c, inverse_d);
+    const Attributes attributes = fragment_attributes(s, c, inverse_d);
 //@@ compose
 }
 

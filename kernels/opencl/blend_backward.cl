@@ -17,16 +17,16 @@ typedef struct {
 //@@ state
 } Pixel;
 
-static inline void pixel_start(Pixel *pixel, vfloat light) {
-    pixel->t = light;
+static inline void pixel_start(Pixel *pixel, vfloat transmittance) {
+    pixel->t = transmittance;
 //@@ start
 }
 
 // What `pixel_start` has to be given to go on from here.
-static inline vfloat pixel_light(const Pixel *pixel) {
-    vfloat light = pixel->t;
-//@@ light
-    return light;
+static inline vfloat pixel_transmittance(const Pixel *pixel) {
+    vfloat transmittance = pixel->t;
+//@@ transmittance
+    return transmittance;
 }
 
 //@@ fragment_mask
@@ -34,19 +34,19 @@ static inline vfloat pixel_light(const Pixel *pixel) {
 //@@ fragment_branch
 
 // What is drawn of a fragment of this opacity; lets the light behind it go on.
-static inline vfloat take_light(Pixel *pixel, vfloat opacity, vint mask, const BlendConstants *constants) {
+static inline vfloat attenuate(Pixel *pixel, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
-    vfloat drawn = VSELECT((vfloat)0.0f, opacity, live);
-    pixel->t = pixel->t - pixel->t * drawn;
-    return drawn;
+    vfloat composited = VSELECT((vfloat)0.0f, opacity, live);
+    pixel->t = pixel->t - pixel->t * composited;
+    return composited;
 }
 
 typedef struct {            // of a pixel: the loss's derivatives
     vfloat r, g, b;         // by the light that it shows
     vfloat behind;          // B above
-//@@ loss
-} Loss;
+//@@ pixel_gradient
+} PixelGradient;
 
 // The pixels of a block at (x, y), of an image (h, w, channels); 0 outside of it.
 static inline vfloat pixels_of(global const float *image, int channels, int channel, int x, int y, int width, int height) {
@@ -92,25 +92,25 @@ static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vflo
 }
 
 // What a unit of the fragment's light is worth.
-static inline vfloat fragment_worth(const Splat *s, const Loss *loss, const Geometry *g) {
-    vfloat worth = FMA(loss->r, (vfloat)s->r, FMA(loss->g, (vfloat)s->g, loss->b * s->b));
-//@@ worth
-    return worth;
+static inline vfloat fragment_by_weight(const Splat *s, const PixelGradient *gradient, const Geometry *g) {
+    vfloat by_weight = FMA(gradient->r, (vfloat)s->r, FMA(gradient->g, (vfloat)s->g, gradient->b * s->b));
+//@@ by_weight
+    return by_weight;
 }
 
 // dL / d ln(opacity) of a fragment that takes `weight` of the light, where the ceiling does not hold it.
-static inline vfloat take_back(Loss *loss, vfloat worth, vfloat weight, vfloat opacity) {
-    vfloat gain = worth - loss->behind;
-    loss->behind = FMA(opacity, gain, loss->behind);
+static inline vfloat backward_opacity(PixelGradient *gradient, vfloat by_weight, vfloat weight, vfloat opacity) {
+    vfloat gain = by_weight - gradient->behind;
+    gradient->behind = FMA(opacity, gain, gradient->behind);
     return weight * gain;
 }
 
 // Adds a fragment's derivatives. by_log: by ln(opacity); (x, y): its place, relative to the anchor.
-static inline void add_fragment(Sums *sums, const Splat *s, const Loss *loss, const Geometry *g, vfloat weight, vfloat by_log,
+static inline void add_fragment(Sums *sums, const Splat *s, const PixelGradient *gradient, const Geometry *g, vfloat weight, vfloat by_log,
                                 vfloat screen, vfloat x, vfloat y, const BlendConstants *constants) {
-    sums->r = FMA(weight, loss->r, sums->r);
-    sums->g = FMA(weight, loss->g, sums->g);
-    sums->b = FMA(weight, loss->b, sums->b);
+    sums->r = FMA(weight, gradient->r, sums->r);
+    sums->g = FMA(weight, gradient->g, sums->g);
+    sums->b = FMA(weight, gradient->b, sums->b);
     vfloat half_rho = VSELECT(screen, g->half_rho, g->on_plane);
     by_log = VSELECT((vfloat)0.0f, by_log, VMASK(s->log_opacity - half_rho <= constants->log_ceiling));
     sums->log_opacity += by_log;
@@ -229,20 +229,20 @@ static inline void put_rows(global uint *rows, uint stride, const Bounds *b, int
 
 // Gives every splat that is drawn a slot for each of its tiles. Where they lie depends on the order of the groups, what they
 // hold and in which order it is added up does not.
-// Index space: one work-item per splat, in groups of RESERVED.
+// Index space: one work-item per splat, in groups of RESERVE_ITEMS.
 // Reads: keys, windows, big_bounds. Writes: splat_slots, big_rows; adds to reserved.
-#define RESERVED 64
-kernel __attribute__((reqd_work_group_size(RESERVED, 1, 1))) void reserve_slots(
+#define RESERVE_ITEMS 64
+kernel __attribute__((reqd_work_group_size(RESERVE_ITEMS, 1, 1))) void reserve_slots(
 //@@ arguments reserve_slots
 ) {
     local uint needed, first;
     uint i = get_global_id(0), offset = 0;
     if (get_local_id(0) == 0) needed = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (i < count && keys[i] < OUTSIDE)
+    if (i < count && keys[i] < OUT_OF_BAND)
         offset = atomic_add(&needed, tile_count(windows[i], big_capacity, big_bounds, width, height));
 #if LANES > 1
-    if (i < count && keys[i] < OUTSIDE && windows[i].y == 0 && windows[i].x < big_capacity) {
+    if (i < count && keys[i] < OUT_OF_BAND && windows[i].y == 0 && windows[i].x < big_capacity) {
         const Bounds b = big_bounds[windows[i].x];
         put_rows(big_rows + windows[i].x, big_capacity, &b, width, height);
     }

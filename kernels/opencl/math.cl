@@ -140,9 +140,9 @@ static inline int pixel_below(float x, int limit) { return (int)clamp(floor(x), 
 // A hint on CPUs whose compiler has one: they then wait less for what lies at an unforeseeable place.
 #if LANES > 1 && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)
-#define FETCH_AHEAD(p) __builtin_prefetch((const void *)(size_t)(p))
+#define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))
 #endif
 #endif
-#ifndef FETCH_AHEAD
-#define FETCH_AHEAD(p)
+#ifndef PREFETCH
+#define PREFETCH(p)
 #endif

@@ -9,13 +9,13 @@ kernel void pack_count(
     uint piece = get_global_id(0);
     if (piece >= CHUNKS) return;
     uint each = (count + CHUNKS - 1) / CHUNKS;
-    uint from = min(piece * each, count), to = min(from + each, count), kept = 0, seen = 0;
+    uint from = min(piece * each, count), to = min(from + each, count), packed = 0, visible = 0;
     for (uint k = from; k < to; k++) {
-        kept += keys[k] < OUTSIDE;
-        seen += keys[k] != CULLED;
+        packed += keys[k] < OUT_OF_BAND;
+        visible += keys[k] != CULLED;
     }
-    held[piece] = kept;
-    held[CHUNKS + piece] = seen;
+    held[piece] = packed;
+    held[CHUNKS + piece] = visible;
 }
 
 // Index space: one work-item per piece. Reads: places (where each piece goes), splats, keys, windows.
@@ -28,7 +28,7 @@ kernel void pack_move(
     uint each = (count + CHUNKS - 1) / CHUNKS;
     uint from = min(piece * each, count), to = min(from + each, count), place = places[piece];
     for (uint k = from; k < to; k++)
-        if (keys[k] < OUTSIDE) {
+        if (keys[k] < OUT_OF_BAND) {
             splats_out[place] = splats[k];
             keys_out[place] = keys[k];
             windows_out[place] = windows[k];

@@ -21,7 +21,7 @@ typedef float real;
 #endif
 
 #define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
-#define OUTSIDE 0xFFFFFFFEu  // of one that is drawn in another band of rows only
+#define OUT_OF_BAND 0xFFFFFFFEu  // of one that is drawn in another band of rows only
 
 // places in the buffer `tallies`: numbers of visible splats, of pairs (64 bits each) and of big splats; then one word per tile,
 // or the same of the next view

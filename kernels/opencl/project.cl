@@ -1,12 +1,12 @@
 // Index space: one work-item per splat and view. Of each view `view` has a record, `splats`, `keys` and `windows` have `count`.
 // Reads:  view, means, quats, scales, opacities, and what the colour slot and the outputs ask for.
-// Writes: splats[at] of visible splats; keys[at]: depth key, or CULLED or OUTSIDE; windows[at]
+// Writes: splats[at] of visible splats; keys[at]: depth key, or CULLED or OUT_OF_BAND; windows[at]
 //         of visible splats: the tiles that they touch; big, big_bounds and their number in tallies (numerics A5).
 //
 // The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
 
 // [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
-#define SMALLEST_SCALE 1e-20f
+#define MIN_SCALE 1e-20f
 
 // Regular polygon around the R-sigma circle, clipped against the near plane and projected: the bounds of a disk that
 // crosses it (numerics A1 iii). Returns false if nothing is left.
@@ -47,7 +47,7 @@ static inline real3_ rotate_to_camera(global const View *view, real3_ v) {
 typedef union {
     Splat splat;
     float4 words[sizeof(Splat) / 16];
-} Whole;
+} SplatWords;
 
 //@@ camera
 //@@ functions
@@ -70,7 +70,7 @@ kernel void project(
     float opacity = opacities[i];
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
-//@@ beside
+//@@ cull_frustum
     wide log_opacity = (wide)log((real)opacity);
     wide half_r2 = log_opacity - (wide)view->log_cut;
     if (!(half_r2 > 0.0f)) return;
@@ -89,7 +89,7 @@ kernel void project(
 //@@ camera_offset
     // before fmax, which would make a number of a NaN (numerics E1)
     if (!(scale_uv.x >= 0.0f && scale_uv.x < INFINITY && scale_uv.y >= 0.0f && scale_uv.y < INFINITY)) return;
-    real su = fmax(scale_uv.x, SMALLEST_SCALE), sv = fmax(scale_uv.y, SMALLEST_SCALE);
+    real su = fmax(scale_uv.x, MIN_SCALE), sv = fmax(scale_uv.y, MIN_SCALE);
     a.x *= su; a.y *= su; a.z *= su;
     b.x *= sv; b.y *= sv; b.z *= sv;
 //@@ lowpass_make
@@ -116,7 +116,7 @@ kernel void project(
     if (!(y0 < y1 && x0 <= x1 && first < width && last >= 0 && first <= last)) return;
 
     if (y1 <= (int)view->band || y0 >= (int)view->band_end) {
-        keys[at] = OUTSIDE;
+        keys[at] = OUT_OF_BAND;
         return;
     }
 
@@ -152,8 +152,8 @@ kernel void project(
 //@@ color
 //@@ project
     // in whole vectors
-    Whole whole = {record};
-    for (uint part = 0; part < sizeof(Splat) / 16; part++) ((global float4 *)(splats + at))[part] = whole.words[part];
+    SplatWords packed = {record};
+    for (uint part = 0; part < sizeof(Splat) / 16; part++) ((global float4 *)(splats + at))[part] = packed.words[part];
     uint corner, window = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &corner);
     if (window == 0) {
         // in any order: what is kept of them is looked up by its place or sorted

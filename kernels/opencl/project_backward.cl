@@ -1,16 +1,16 @@
 // The derivatives by the cloud's arrays, as set_up_backward.cl has them of a splat, and the camera's.
-// Index space: one work-item per splat, in groups of POSED.
+// Index space: one work-item per splat, in groups of POSE_ITEMS.
 // Reads:  view, the cloud, splats, keys, windows, big_bounds, splat_slots, moments.
 // Writes: derivatives by the cloud's arrays, 0 for splats that are not drawn; group_sums, those by the pose.
-#define POSED 64
-kernel __attribute__((reqd_work_group_size(POSED, 1, 1))) void project_backward(
+#define POSE_ITEMS 64
+kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_backward(
 //@@ arguments project_backward
 ) {
-    local real pose[6][POSED];
+    local real pose[6][POSE_ITEMS];
     uint i = get_global_id(0), item = get_local_id(0);
-    Slopes own = {{0}};
+    SplatGradient own = {{0}};
     if (i < count) {
-        own = slopes_of(
+        own = splat_gradient(
             i, view, means, quats, scales, opacities, CLOUD_TERMS, SH_TERMS, splats, keys, windows, big_capacity, big_bounds, width,
             height, splat_slots, moments
         );
@@ -23,37 +23,37 @@ kernel __attribute__((reqd_work_group_size(POSED, 1, 1))) void project_backward(
         for (int k = 0; k < SH_TERMS; k++)
             for (int c = 0; c < 3; c++) by_terms[3 * k + c] = own.basis[k] * own.color[c];
     }
-    pose[0][item] = own.turned.x;
-    pose[1][item] = own.turned.y;
-    pose[2][item] = own.turned.z;
-    pose[3][item] = own.moved.x;
-    pose[4][item] = own.moved.y;
-    pose[5][item] = own.moved.z;
+    pose[0][item] = own.by_rotation.x;
+    pose[1][item] = own.by_rotation.y;
+    pose[2][item] = own.by_rotation.z;
+    pose[3][item] = own.by_translation.x;
+    pose[4][item] = own.by_translation.y;
+    pose[5][item] = own.by_translation.z;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item < 6) {
         real sum = 0;
-        for (uint other = 0; other < POSED; other++) sum += pose[item][other];
+        for (uint other = 0; other < POSE_ITEMS; other++) sum += pose[item][other];
         group_sums[6 * get_group_id(0) + item] = sum;
     }
 }
 
 // Sums of rows, in a fixed order.
-// Index space: work-groups of ADDED, one per column: three of tile_sums, then six of group_sums. Writes: background, pose.
-#define ADDED 64
-kernel __attribute__((reqd_work_group_size(ADDED, 1, 1))) void add_up(
+// Index space: work-groups of SUM_ITEMS, one per column: three of tile_sums, then six of group_sums. Writes: background, pose.
+#define SUM_ITEMS 64
+kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void add_up(
 //@@ arguments add_up
 ) {
-    local real kept[ADDED];
+    local real partial[SUM_ITEMS];
     bool of_tiles = get_group_id(0) < 3;
     global const real *parts = of_tiles ? tile_sums : group_sums;
     uint item = get_local_id(0), column = get_group_id(0) - (of_tiles ? 0 : 3);
     uint rows = of_tiles ? tiles : groups, columns = of_tiles ? 3 : 6;
     real sum = 0;
-    for (uint row = item; row < rows; row += ADDED) sum += parts[(size_t)row * columns + column];
-    kept[item] = sum;
+    for (uint row = item; row < rows; row += SUM_ITEMS) sum += parts[(size_t)row * columns + column];
+    partial[item] = sum;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0) {
-        for (uint other = 1; other < ADDED; other++) sum += kept[other];
+        for (uint other = 1; other < SUM_ITEMS; other++) sum += partial[other];
         (of_tiles ? background : pose)[column] = (float)sum;
     }
 }

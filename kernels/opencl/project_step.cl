@@ -1,24 +1,24 @@
 // Adam's step by the derivatives of set_up_backward.cl, which are in no memory but a work-group's own: what a training does with them
 // in place of project_backward.
-// Index space: one work-item per splat, in groups of STEPPED.
+// Index space: one work-item per splat, in groups of STEP_ITEMS.
 // Reads:  view, splats, keys, windows, big_bounds, splat_slots, moments. Changes: where `counted` the sums of derivatives by places on
 // the screen; where splats `move` their values, Adam's running means, and what is drawn of them.
-#define STEPPED 64
+#define STEP_ITEMS 64
 #define VALUES (3 * SH_TERMS)       // of a splat's colour that are drawn
 #if LANES > 1 && !PLAIN
-#define TERMS_ROOM 16               // a whole vector
+#define TERMS_CAPACITY 16               // a whole vector
 #else
-#define TERMS_ROOM SH_TERMS
+#define TERMS_CAPACITY SH_TERMS
 #endif
-kernel __attribute__((reqd_work_group_size(STEPPED, 1, 1))) void project_step(
+kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step(
 //@@ arguments project_step
 ) {
-    local float by_means[3 * STEPPED], by_scales[2 * STEPPED], by_quats[4 * STEPPED], by_opacities[STEPPED];
-    local float by_colors[3 * STEPPED], basis[TERMS_ROOM * STEPPED];
-    local uchar rests[STEPPED];
-    uint i = get_global_id(0), item = get_local_id(0), first = get_group_id(0) * STEPPED;
+    local float by_means[3 * STEP_ITEMS], by_scales[2 * STEP_ITEMS], by_quats[4 * STEP_ITEMS], by_opacities[STEP_ITEMS];
+    local float by_colors[3 * STEP_ITEMS], basis[TERMS_CAPACITY * STEP_ITEMS];
+    local uchar skipped[STEP_ITEMS];
+    uint i = get_global_id(0), item = get_local_id(0), first = get_group_id(0) * STEP_ITEMS;
     if (i < count) {
-        const Slopes own = slopes_of(
+        const SplatGradient own = splat_gradient(
             i, view, means, drawn_quats, drawn_scales, drawn_opacities, sh, all, splats, keys, windows, big_capacity, big_bounds, width,
             height, splat_slots, moments
         );
@@ -28,19 +28,19 @@ kernel __attribute__((reqd_work_group_size(STEPPED, 1, 1))) void project_step(
         for (int k = 0; k < 4; k++) by_quats[4 * item + k] = own.quat[k];
         by_opacities[item] = own.opacity;
         for (int k = 0; k < 3; k++) by_colors[3 * item + k] = own.color[k];
-        for (int k = 0; k < SH_TERMS; k++) basis[TERMS_ROOM * item + k] = own.basis[k];
+        for (int k = 0; k < SH_TERMS; k++) basis[TERMS_CAPACITY * item + k] = own.basis[k];
         // what the picture does not depend on stays as it is, its running means too
         bool depends = own.opacity != 0.0f;
         for (int k = 0; k < 3; k++) depends |= own.mean[k] != 0.0f || own.basis[0] * own.color[k] != 0.0f;
-        rests[item] = sparse && !depends;
+        skipped[item] = sparse && !depends;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     if (!move) return;
 
 #if LANES > 1
     // of whole rows of 16 splats the first steps for all
-    bool together = !sparse && (i | 15) < count;
-    if (together && item % 16 == 0) {
+    bool vectorized = !sparse && (i | 15) < count;
+    if (vectorized && item % 16 == 0) {
         for (uint k = 3 * item, at = 3 * i; k < 3 * item + 48; k += 16, at += 16)
             vstore16(ADAM_16(means, at, vload16(0, by_means + k), (float16)size_means), 0, means + at);
         for (uint k = 2 * item, at = 2 * i; k < 2 * item + 32; k += 16, at += 16) {
@@ -64,9 +64,9 @@ kernel __attribute__((reqd_work_group_size(STEPPED, 1, 1))) void project_step(
         vstore16(sigmoids(value), 0, drawn_opacities + i);
     }
 #else
-    bool together = false;
+    bool vectorized = false;
 #endif
-    if (i < count && !together && !rests[item]) {
+    if (i < count && !vectorized && !skipped[item]) {
         for (uint k = 0; k < 3; k++) ADAM(means, 3 * i + k, by_means[3 * item + k], size_means);
         for (uint k = 0; k < 2; k++) {
             uint at = 2 * i + k;
@@ -88,12 +88,12 @@ kernel __attribute__((reqd_work_group_size(STEPPED, 1, 1))) void project_step(
     }
 
     // drawn colours are the values themselves where all of them are drawn and none is plain
-    const bool apart = PLAIN || SH_TERMS < all;
+    const bool separate = PLAIN || SH_TERMS < all;
 #if LANES > 1 && !PLAIN
-    if (i < count && !rests[item]) {
-        size_t row = i * (size_t)(3 * all), shown = i * (size_t)VALUES;
+    if (i < count && !skipped[item]) {
+        size_t row = i * (size_t)(3 * all), out = i * (size_t)VALUES;
         // value k is of term k / 3 and colour k % 3; places beyond the last term are multiplied too, and not used
-        float16 b = vload16(0, basis + TERMS_ROOM * item), c = 0.0f;
+        float16 b = vload16(0, basis + TERMS_CAPACITY * item), c = 0.0f;
         c.s012 = vload3(item, by_colors);
         const float16 by[3] = {
             b.s0001112223334445 * c.s0120120120120120,
@@ -106,25 +106,25 @@ kernel __attribute__((reqd_work_group_size(STEPPED, 1, 1))) void project_step(
             if (k == 0) size.s012 = size_sh;
             float16 value = ADAM_16(sh, row + k, by[k / 16], size);
             vstore16(value, 0, sh + row + k);
-            if (apart) vstore16(value, 0, drawn_sh + shown + k);
+            if (separate) vstore16(value, 0, drawn_sh + out + k);
         }
         float last[16];
         vstore16(by[k / 16 % 3], 0, last);
         for (; k < VALUES; k++) {
             float value = ADAM(sh, row + k, last[k % 16], k < 3 ? size_sh : size_rest);
-            if (apart) drawn_sh[shown + k] = value;
+            if (separate) drawn_sh[out + k] = value;
         }
     }
 #else
     // the group's coefficients one after the other, as they lie in memory
-    for (uint k = item; k < min(count - first, (uint)STEPPED) * VALUES; k += STEPPED) {
+    for (uint k = item; k < min(count - first, (uint)STEP_ITEMS) * VALUES; k += STEP_ITEMS) {
         uint which = k / VALUES, within = k % VALUES;
-        if (rests[which]) continue;
+        if (skipped[which]) continue;
         size_t at = (first + which) * (size_t)(3 * all) + within;
-        float gradient = basis[TERMS_ROOM * which + within / 3] * by_colors[3 * which + within % 3];
+        float gradient = basis[TERMS_CAPACITY * which + within / 3] * by_colors[3 * which + within % 3];
         if (PLAIN) gradient = SH_C0 * sh[at] + 0.5f > 0.0f ? SH_C0 * gradient : 0.0f;
         float value = ADAM(sh, at, gradient, within < 3 ? size_sh : size_rest);
-        if (apart) drawn_sh[(size_t)first * VALUES + k] = PLAIN ? plain_color(value) : value;
+        if (separate) drawn_sh[(size_t)first * VALUES + k] = PLAIN ? plain_color(value) : value;
     }
 #endif
 }

@@ -2,7 +2,7 @@
 // rotation, scales, opacity and colour, and by the camera's pose. What project.cl decides is taken as it was; the common factor
 // of a record's forms has no derivative, as nothing depends on it.
 
-#define SMALLEST_SCALE 1e-20f   // as in project.cl
+#define MIN_SCALE 1e-20f   // as in project.cl
 
 //@@ camera
 //@@ functions
@@ -38,18 +38,18 @@ typedef struct {            // derivatives by what the cloud has of a splat
     float mean[3], quat[4], scale[2], opacity;
     float color[3], basis[SH_TERMS];    // by a term of the colour: what the term is worth times one of `color`
     float screen;
-    real3_ turned, moved;               // its part of those by the pose
-} Slopes;
+    real3_ by_rotation, by_translation;               // its part of those by the pose
+} SplatGradient;
 
 // Of splat i; zeros where it is not drawn. terms: of colours that have some, in rows of so many.
-static inline Slopes slopes_of(
+static inline SplatGradient splat_gradient(
     uint i, global const View *view, global const float *means, global const float *quats, global const float *scales,
     global const float *opacities, global const float *terms, uint row, global const Splat *splats, global const uint *keys,
     global const uint2 *windows, uint big_capacity, global const Bounds *big_bounds, int width, int height,
     global const uint *splat_slots, global const float *moments
 ) {
-    Slopes own = {{0}};
-    if (keys[i] >= OUTSIDE) return own;
+    SplatGradient own = {{0}};
+    if (keys[i] >= OUT_OF_BAND) return own;
     Totals total = {0};
     global const float *slot = moments + (size_t)splat_slots[i] * FIELDS;
     uint tiles = tile_count(windows[i], big_capacity, big_bounds, width, height);
@@ -66,7 +66,7 @@ static inline Slopes slopes_of(
     real3_ unit_a = rotate_to_camera(view, tangent_u), unit_b = rotate_to_camera(view, tangent_v);
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
-    real pz = p.z, su = fmax(scales[2 * i], SMALLEST_SCALE), sv = fmax(scales[2 * i + 1], SMALLEST_SCALE);
+    real pz = p.z, su = fmax(scales[2 * i], MIN_SCALE), sv = fmax(scales[2 * i + 1], MIN_SCALE);
     real3_ a = scaled(su, unit_a), b = scaled(sv, unit_b);
     real offset = dot3(cross3(unit_a, unit_b), p);
 
@@ -94,12 +94,12 @@ static inline Slopes slopes_of(
     real across_x = by_tu.z * view->width, across_y = by_tv.z * view->height;
     own.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
 //@@ disk_backward
-    real by_su = scales[2 * i] >= SMALLEST_SCALE ? dot3(by_a, unit_a) : 0;
-    real by_sv = scales[2 * i + 1] >= SMALLEST_SCALE ? dot3(by_b, unit_b) : 0;
+    real by_su = scales[2 * i] >= MIN_SCALE ? dot3(by_a, unit_a) : 0;
+    real by_sv = scales[2 * i + 1] >= MIN_SCALE ? dot3(by_b, unit_b) : 0;
     real3_ by_unit_a = scaled(su, by_a), by_unit_b = scaled(sv, by_b);
 //@@ facet_backward
-    own.turned = add3(cross3(p, by_p), add3(cross3(unit_a, by_unit_a), cross3(unit_b, by_unit_b)));
-    own.moved = add3(by_p, rotate_to_camera(view, by_ray));
+    own.by_rotation = add3(cross3(p, by_p), add3(cross3(unit_a, by_unit_a), cross3(unit_b, by_unit_b)));
+    own.by_translation = add3(by_p, rotate_to_camera(view, by_ray));
     real3_ by_mean = add3(rotate_to_world(view, by_p), by_ray);
     real3_ by_u = rotate_to_world(view, by_unit_a);
     real3_ by_v = rotate_to_world(view, by_unit_b);

@@ -22,11 +22,21 @@ BACKEND = "opencl"
 SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
 FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
-DIGESTS = {
-    "none": ["4a05fbc4f021c556", "ff6638a23b9803fd"],
-    "screen": ["a4c83ecc4e0e8c9e", "969b2b79aead75f7"],
+SHARED_FILES = {
+    *("prelude", "math", "bounds", "project", "splat", "blend", "part/conic", "part/perspective"),
+    *("part/resolve_fused", "part/resolve_pixel", "slot/arithmetic_fast", "slot/camera_pinhole"),
+    *("slot/color_rgb", "slot/compose_ordered"),
 }
-"""of a scene that asks for nothing, by low-pass; `screen` is the default"""
+"""kernel files of a scene without effects, on all devices"""
+SCHEDULE_FILES = {
+    "lanes": {
+        *("scan", "sort", "bin", "pack", "part/tile_loop_lanes"),
+        "schedule/lanes",
+        "schedule/lanes_cells",
+    },
+    "group": {*("list/tiled", "tile_lists", "part/chord"), "schedule/group", "schedule/group_cells"},
+}
+LOWPASS_FILES = {"none": {"slot/lowpass_none"}, "screen": {"slot/lowpass_screen"}}
 
 
 COLORS = Traits()
@@ -43,9 +53,9 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "camera_pinhole",
         "conic",
         "perspective",
-        "resolve_at_once",
+        "resolve_fused",
         "resolve_pixel",
-        "walk_lanes",
+        "tile_loop_lanes",
         "color_rgb",
         "lowpass_none",
         "stop_inclusive",
@@ -54,8 +64,8 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "arithmetic_fast",
     }
     of_knobs = ("wide", "WIDE")
-    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "optical_depth")
-    of_order = (*of_layers, "waiting", "Waiting", "WAITING", "nearest")
+    of_layers = ("planes", "plane_keys", "layer", "Layer", "open_layer", "optical_depth")
+    of_order = (*of_layers, "k_buffer", "KBuffer", "K_BUFFER_SIZE", "nearest")
     for name in (*absent, *FURTHER, "sh", "finished", *of_order, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
@@ -85,7 +95,7 @@ def test_an_output_brings_its_text_and_nothing_else(output):
 @pytest.mark.parametrize("outputs", [("rgb",), tuple(FURTHER)])
 def test_only_splats_on_planes_bring_layers(outputs):
     """What an output says of layers stays out as well, and layers bring the depth that places them."""
-    words = ("Layer", "layer_close", "layer_gather", "plane_keys", "label_tau", "share")
+    words = ("Layer", "layer_close", "layer_add", "plane_keys", "label_tau", "share")
     plain = assemble(select(COLORS, fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
     layered = assemble(
         select(Traits(has_planes=True), fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE
@@ -129,7 +139,7 @@ def test_record_sizes_are_what_the_effects_declare():
 
 
 def test_scenes_without_3d_gaussians_have_the_text_that_they_have_without_such_a_thing():
-    """Whatever is asked of 3D Gaussians; `test_the_base_is_what_it_was` holds what that text is."""
+    """No option of 3D Gaussians changes the text of a scene without them."""
     words = ("thickness", "THICK_HERE", "bulge", "conjugate_disk", "slopes", "ellipsoid", "conic_facing")
     for outputs, shape in ((("rgb",), SHAPE), (tuple(FURTHER), GROUP)):
         plain = assemble(select(COLORS, fs.Capture(outputs=outputs)), shape)
@@ -171,16 +181,21 @@ def test_features_are_the_same_whatever_the_order_of_outputs():
     )
 
 
-def test_the_base_is_what_it_was():
-    """A change of the stages themselves records new digests here; an effect must not."""
-    digests = {
-        lowpass: [
-            assemble(select(COLORS, fs.Capture(quality=fs.Quality(lowpass=lowpass))), shape).digest[:16]
-            for shape in (SHAPE, GROUP)
-        ]
-        for lowpass in DIGESTS
-    }
-    assert digests == DIGESTS
+def kernel_files(source):
+    """Kernel files that have lines in a source text, without their ending."""
+    return set(re.findall(r'^#line \d+ "opencl/(.*)\.cl"$', source.listing, re.MULTILINE))
+
+
+@pytest.mark.parametrize("lowpass", LOWPASS_FILES)
+@pytest.mark.parametrize("schedule", SCHEDULE_FILES)
+def test_a_scene_without_effects_has_lines_of_these_files_only(schedule, lowpass):
+    source = assemble(
+        select(COLORS, fs.Capture(quality=fs.Quality(lowpass=lowpass))),
+        {"lanes": SHAPE, "group": GROUP}[schedule],
+    )
+    culling = {"part/cull_frustum"} if (schedule, lowpass) == ("lanes", "screen") else set()
+    wanted = SHARED_FILES | SCHEDULE_FILES[schedule] | LOWPASS_FILES[lowpass] | culling
+    assert kernel_files(source) == wanted
 
 
 # of each kernel of the base: arguments, those of them that are buffers, bytes of local memory

@@ -109,7 +109,7 @@ TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is dra
 //@ start
     pixel->nearest = INFINITY;
 //@ composite
-    pixel->nearest = fmin(pixel->nearest, VSELECT((vfloat)INFINITY, seen->z, live & VMASK(weight > 0.0f)));
+    pixel->nearest = fmin(pixel->nearest, VSELECT((vfloat)INFINITY, attributes->z, live & VMASK(weight > 0)));
 //@ store
         BLOCK_STORE(pixel->nearest, nearest_raw + at, stride);
 //@ resolve_start

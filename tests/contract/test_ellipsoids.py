@@ -64,7 +64,7 @@ ALONE = {
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 @pytest.mark.parametrize("place", ALONE)
 def test_alone_or_among_others_they_have_the_same_bits(renderer, place, order):
-    """Clouds of nothing else have kernels without what disks need (`ellipsoids_alone`), in either order the
+    """Clouds of nothing else have kernels without what disks need (`ellipsoids_only`), in either order the
     same: every fragment has its centre's depth."""
     alone, quality = ALONE[place](), fs.Quality(lowpass="none", order=order)
     behind = fs.SplatCloud([[0, 0, -5]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1.0], colors=[[1, 1, 1]])

@@ -73,7 +73,7 @@ def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):
     """Room for one fragment at a pixel, or a few: the list is gone through again until the picture is the
     same, bit for bit."""
     picture = Picture(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ALL_OUTPUTS)
-    shapes = renderer.backend.shapes("waiting")
+    shapes = renderer.backend.shapes("k_buffer")
     wanted = trace(renderer, picture)
     for name, shape in shapes.items():
         assert differing(trace(renderer, picture, shape), wanted, picture.outputs) == 0, name

@@ -165,7 +165,7 @@ def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
 
 
 def test_a_list_longer_than_local_memory_is_sorted(backend):
-    """tiles.cl sorts 2048 pairs at once in local memory, longer lists in global memory as well."""
+    """tile_lists.cl sorts 2048 pairs at once in local memory, longer lists in global memory as well."""
     cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
     trace, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
     visible = np.flatnonzero(trace["keys"] != CULLED)
@@ -199,7 +199,7 @@ DEPTHS = {
 
 @pytest.mark.parametrize("depths", DEPTHS)
 def test_a_list_is_sorted_however_its_depths_are_spread(backend, depths):
-    """tiles.cl spreads a list over ranges of depth, and sorts it by a network where one is crowded."""
+    """tile_lists.cl spreads a list over ranges of depth, and sorts it by a network where one is crowded."""
     n, generator = 1500, np.random.default_rng(4)
     cloud = random_splats(n, seed=4, scale=(0.05, 0.3))
     z = generator.permutation(DEPTHS[depths](n))

@@ -29,7 +29,11 @@ from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError
 from fidsplat.util.kernel_files import kernels_folder
 
-_LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",), "gathered": ("tiles", "gathered")}
+_LISTS = {
+    "ordered": ("scan", "sort", "bin"),
+    "tiled": ("tile_lists",),
+    "gathered": ("tile_lists", "tile_lists_local"),
+}
 """stages of the program `lists`, by the way of listing"""
 _DRAWN = (
     "prelude",
@@ -125,38 +129,38 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         DeviceError: an effect's file fills a hook that no file has.
     """
     layouts = layouts_of(features)
-    at_once = _at_once(features, layouts)
-    declared = Declarations(layouts, features, at_once)
+    fused = _resolves_fused(features, layouts)
+    declared = Declarations(layouts, features, fused)
     files = [layout.file for layout in layouts.values() if layout.file]
     files.append(LAYOUTS["resolve_pixel"].file)
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
         # disks and 3D Gaussians among each other are not asked: their images are bounded otherwise
         if "lowpass_screen" in layouts and "thickness" not in layouts:
-            files.append(LAYOUTS["beside"].file)
+            files.append(LAYOUTS["cull_frustum"].file)
         if "lowpass_pixel" in layouts and "thickness" not in layouts:
-            files.append(LAYOUTS["beside_pixel"].file)
-        if "ellipsoids_alone" in layouts:
-            files.append(LAYOUTS["beside_ewa"].file)
-    if at_once:
-        files.append(LAYOUTS["resolve_at_once"].file)
+            files.append(LAYOUTS["cull_frustum_pixel"].file)
+        if "ellipsoids_only" in layouts:
+            files.append(LAYOUTS["cull_frustum_ewa"].file)
+    if fused:
+        files.append(LAYOUTS["resolve_fused"].file)
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
     if "compose_pixel" in layouts:
-        files.append(LAYOUTS[f"waiting_{shape.schedule}"].file)
+        files.append(LAYOUTS[f"k_buffer_{shape.schedule}"].file)
     elif shape.schedule == "lanes":
-        files.append(LAYOUTS["walk_lanes"].file)
-    if "tile_ends" in layouts:  # behind what may go through lists again
+        files.append(LAYOUTS["tile_loop_lanes"].file)
+    if "tile_ends" in layouts:  # after the k-buffer, which may repeat the pass through a list
         way = "_pixel" if "compose_pixel" in layouts else ""
-        files += [LAYOUTS["tile_ends_pixel"].file] if way else []
-        files.append(LAYOUTS[f"tile_ends{way}_{shape.schedule}"].file)
-    if "opaque_layer" in layouts:  # behind what waits
+        files += [LAYOUTS["termination_depth_pixel"].file] if way else []
+        files.append(LAYOUTS[f"termination_depth{way}_{shape.schedule}"].file)
+    if "opaque_layer" in layouts:  # after the k-buffer is empty
         files.append(LAYOUTS["opaque_layer_end"].file)
     stages = {
         "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),
         "picture": [
             stage.format(shape.schedule)
             for stage in _DRAWN
-            if not (stage == "pack" and shape.lists != "ordered") and not (stage == "resolve" and at_once)
+            if not (stage == "pack" and shape.lists != "ordered") and not (stage == "resolve" and fused)
         ],
     }
     _refuse_unknown_hooks(files)
@@ -167,7 +171,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     return Source(programs, declared.records, arguments, declared.samples, declared.scalars)
 
 
-def _at_once(features: FeatureSet, layouts: Mapping[str, Layout]) -> bool:
+def _resolves_fused(features: FeatureSet, layouts: Mapping[str, Layout]) -> bool:
     """Whether who has drawn a pixel resolves it too, which saves a launch: where a pixel is one
     sample of one pose, and nothing but blending adds to it."""
     alone = features.samples == 1 and "background_constant" in layouts and "rays" not in layouts
@@ -187,7 +191,7 @@ def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
         "SH_DEGREE": features.sh_degree,
         "TILE_H": shape.tile_height,
         "TILE_W": shape.tile_width,
-        "WAITING": shape.waiting,
+        "K_BUFFER_SIZE": shape.k_buffer_size,
     }
     if shape.schedule == "group":
         numbers["ROWS"] = shape.rows
@@ -245,12 +249,12 @@ def kernels_in(text: Text) -> list[str]:
 class Declarations:
     """What layout.py declares, with what the chosen effects add to it."""
 
-    def __init__(self, layouts: dict[str, Layout], features: FeatureSet, at_once: bool = False) -> None:
-        """at_once: blending resolves, with the arguments of both."""
+    def __init__(self, layouts: dict[str, Layout], features: FeatureSet, fused: bool = False) -> None:
+        """fused: blending resolves, with the arguments of both."""
         real = "double" if features.setup_precision == "float64" else "float"
         self.scalars = Scalars(real, "double" if "blend_double" in layouts else "float")
         self.samples = tuple((one, layout.averaged) for layout in layouts.values() for one in layout.samples)
-        self._layouts, self._outputs, self._at_once = layouts, features.images, at_once
+        self._layouts, self._outputs, self._resolves_fused = layouts, features.images, fused
         every = layouts.values()
         self.constants = dict(one for layout in every for one in layout.constant)
         """fields of `Splat` that all splats share, and their values"""
@@ -279,7 +283,7 @@ class Declarations:
             added += (Argument(one.ctype, one.name, access, note=one.note) for one, _ in self.samples)
         if kernel == "resolve":
             added += map(output_argument, self._outputs)
-        if kernel == "blend" and self._at_once:
+        if kernel == "blend" and self._resolves_fused:
             own = {"stride", *(one.name for one in (*KERNELS[kernel], *added))}
             added += [one for one in self.arguments("resolve") if one.name not in own]
         return tuple({one.name: one for one in (*KERNELS[kernel], *added)}.values())

@@ -36,7 +36,7 @@ class Copies:
     """What copies rows of chunks that have slots."""
 
     pieces: cl.Buffer
-    """as `gather.cl` reads them"""
+    """as `gather_chunks.cl` reads them"""
     poses: cl.Buffer | None
     count: int
     """chunks"""
@@ -69,7 +69,7 @@ class OpenCLChunks:
         """for transfers, beside what is drawn"""
         self._last: cl.Event | None = None
         """the last copy out of slots"""
-        program = build(workspace, kernel_text("store/gather.cl"), f"-DPLACES={int(self.places)}")
+        program = build(workspace, kernel_text("store/gather_chunks.cl"), f"-DINSTANCED={int(self.places)}")
         self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
 
     @property

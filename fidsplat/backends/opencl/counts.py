@@ -9,7 +9,7 @@ import pyopencl as cl
 
 from fidsplat.backends.opencl.picture import Picture
 
-# words of the buffer `counts`, as in tiles.cl: big splats, pairs (two words), visible splats
+# words of the buffer `counts`, as in tile_lists.cl: big splats, pairs (two words), visible splats
 COUNTS = 4
 
 

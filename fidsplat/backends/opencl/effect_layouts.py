@@ -87,8 +87,8 @@ LAYOUTS: dict[str, Layout] = {
         view=(member("real slopes[4]", "of rays, -x, x, -y, y: where derivatives are taken at most"),),
     ),
     "ellipsoid_ewa_antialiased": Layout("slot/ellipsoid_ewa_antialiased.cl", parts=("ellipsoid_ewa",)),
-    "ellipsoids_alone": Layout(
-        "slot/ellipsoids_alone.cl",
+    "ellipsoids_only": Layout(
+        "slot/ellipsoids_only.cl",
         constant=(
             *(("nuy", "WIDE(0.0)"), ("d0", "WIDE(1.0)"), ("dx", "WIDE(0.0)"), ("dy", "WIDE(0.0)")),
             ("d_near", "INFINITY"),
@@ -131,11 +131,11 @@ LAYOUTS: dict[str, Layout] = {
         blend=takes("in uint keys", "out uint tile_ends  // of each tile: the key at which it was finished")
     ),
     # what several of them share
-    "beside": Layout("part/beside.cl"),
-    "beside_ewa": Layout("part/beside_ewa.cl"),
-    "beside_pixel": Layout("part/beside_pixel.cl"),
+    "cull_frustum": Layout("part/cull_frustum.cl"),
+    "cull_frustum_ewa": Layout("part/cull_frustum_ewa.cl"),
+    "cull_frustum_pixel": Layout("part/cull_frustum_pixel.cl"),
     "chord": Layout("part/chord.cl"),
-    "conic": Layout("part/conic.cl", behind=(("ellipsoids_alone", "conic_facing"),)),
+    "conic": Layout("part/conic.cl", behind=(("ellipsoids_only", "conic_facing"),)),
     "conic_facing": Layout("part/conic_facing.cl"),
     "perspective": Layout("part/perspective.cl"),
     "polygon": Layout("part/polygon.cl"),
@@ -179,22 +179,22 @@ LAYOUTS: dict[str, Layout] = {
     ),
     # how pixels are made of samples, and by whom
     "resolve_pixel": Layout("part/resolve_pixel.cl"),
-    "resolve_at_once": Layout("part/resolve_at_once.cl"),
-    # how CPUs go through a list where nothing waits
-    "walk_lanes": Layout("part/walk_lanes.cl"),
-    # where tiles are finished, by the schedule
-    "tile_ends_lanes": Layout("part/tile_ends_lanes.cl"),
-    "tile_ends_group": Layout("part/tile_ends_group.cl"),
-    "tile_ends_pixel": Layout("part/tile_ends_pixel.cl"),
-    "tile_ends_pixel_lanes": Layout("part/tile_ends_pixel_lanes.cl"),
-    "tile_ends_pixel_group": Layout("part/tile_ends_pixel_group.cl"),
-    # how fragments wait for nearer ones, by the schedule
-    "waiting_lanes": Layout("part/waiting_lanes.cl"),
-    "waiting_group": Layout("part/waiting_group.cl"),
+    "resolve_fused": Layout("part/resolve_fused.cl"),
+    # loop through a tile's list on CPUs, without a k-buffer
+    "tile_loop_lanes": Layout("part/tile_loop_lanes.cl"),
+    # termination depths of tiles, by the schedule
+    "termination_depth_lanes": Layout("part/termination_depth_lanes.cl"),
+    "termination_depth_group": Layout("part/termination_depth_group.cl"),
+    "termination_depth_pixel": Layout("part/termination_depth_pixel.cl"),
+    "termination_depth_pixel_lanes": Layout("part/termination_depth_pixel_lanes.cl"),
+    "termination_depth_pixel_group": Layout("part/termination_depth_pixel_group.cl"),
+    # fragments sorted by depth at each pixel, by the schedule
+    "k_buffer_lanes": Layout("part/k_buffer_lanes.cl"),
+    "k_buffer_group": Layout("part/k_buffer_group.cl"),
     "opaque_layer_end": Layout("part/opaque_layer_end.cl"),
-    "shown": Layout("part/shown.cl"),
+    "coverage": Layout("part/coverage.cl"),
     "ray": Layout(resolve=RAY_UNIFORMS),
-    "turn": Layout("part/turn.cl", resolve=takes("array float turns  // (h, 3, 3)")),
+    "row_rotation": Layout("part/row_rotation.cl", resolve=takes("array float turns  // (h, 3, 3)")),
     # rays of fisheyes and panoramas have a length of 1
     "ray_length": Layout("part/ray_length.cl", behind=(("camera_brown_conrady", "rays_length"),)),
     "rays_length": Layout("part/rays_length.cl"),
@@ -209,7 +209,7 @@ LAYOUTS: dict[str, Layout] = {
     "alpha": Layout("output/alpha.cl"),
     "depth": Layout(
         "output/depth.cl",
-        parts=("ray_depth", "shown"),
+        parts=("ray_depth", "coverage"),
         samples=(Samples("float", "depth_raw", 2, "sum w z, sum w"),),
     ),
     "distortion": Layout(
@@ -219,7 +219,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "depth_median": Layout(
         "output/depth_median.cl",
-        parts=("ray_depth", "shown"),
+        parts=("ray_depth", "coverage"),
         samples=(Samples("float", "depth_median_raw"),),
     ),
     "depth_first": Layout(
@@ -233,21 +233,21 @@ LAYOUTS: dict[str, Layout] = {
     "distance_first": Layout("output/distance_first.cl", parts=("depth_first", "sample_length")),
     "normal": Layout(
         "output/normal.cl",
-        parts=("shown",),
+        parts=("coverage",),
         splat=(member("wide nx ny nz"),),
         samples=(Samples("float", "normal_raw", 3),),
     ),
-    "normal_world": Layout("output/normal_world.cl", parts=("normal", "turn")),
+    "normal_world": Layout("output/normal_world.cl", parts=("normal", "row_rotation")),
     "label": Layout(
         "output/label.cl",
-        parts=("shown",),
+        parts=("coverage",),
         splat=(member("int label"),),
         project=takes("cloud int labels  // (n)"),
         samples=(Samples("float", "label_raw"), Samples("int", "label_id_raw")),
     ),
     "splat_id": Layout(
         "output/splat_id.cl",
-        parts=("shown",),
+        parts=("coverage",),
         splat=(member("int splat_id"),),
         project=takes("cloud int splat_ids  // (n)"),
         samples=(Samples("float", "splat_id_raw"), Samples("int", "splat_id_index_raw")),

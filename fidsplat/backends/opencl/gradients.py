@@ -39,7 +39,7 @@ from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
 from fidsplat.util.errors import DeviceError, InputError
 
-_GROUP = 64  # RESERVED, POSED, ADDED and STEPPED of the kernels
+_GROUP = 64  # RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_ITEMS of the kernels
 _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # of floats too
 

@@ -40,7 +40,7 @@ _STEP_STAGES = (
     "bounds",
     "moments",
     "set_up_backward",
-    "train/drawn",
+    "train/activation_functions",
     "train/adam",
     "project_step",
 )

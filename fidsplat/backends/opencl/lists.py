@@ -250,12 +250,13 @@ class ChunkedLists(OrderedLists):
 
 
 class TiledLists(Lists):
-    """Kernels tiles.cl. The buffers are as large as the last pictures needed, and all stages are launched
-    before the host knows whether that is enough; if it is not, the lists are empty and it is all done again:
-    at once, or, where one of its kind was drawn before, when somebody asks for it (`Repeat.settled`).
+    """Kernels tile_lists.cl. The buffers are as large as the last pictures needed, and all stages are
+    launched before the host knows whether that is enough; if it is not, the lists are empty and it is all
+    done again: at once, or, where one of its kind was drawn before, when it is
+    read (`Repeat.settled`).
     """
 
-    _ITEMS = 256  # WALK_ITEMS and SORT_ITEMS
+    _ITEMS = 256  # BIN_ITEMS and SORT_ITEMS
 
     def __init__(self, picture: Picture) -> None:
         super().__init__(picture)
@@ -355,9 +356,9 @@ class TiledLists(Lists):
 
 
 class GatheredLists(TiledLists):
-    """Kernels gathered.cl beside those of TiledLists: work-groups take many splats of a view each, and count
-    their pairs in local memory. For many views, of at most TILES tiles each, and for splats whose neighbours
-    lie near each other.
+    """Kernels tile_lists_local.cl with those of TiledLists: work-groups take many splats of a view each, and
+    count their pairs in local memory. For many views, of at most TILES tiles each, and for splats whose
+    neighbours lie near each other.
     """
 
     TILES = 4096  # GATHER_TILES
@@ -376,7 +377,7 @@ class GatheredLists(TiledLists):
         self._gather("emit_gathered", **band)
 
     def _gather(self, kernel: str, **given: Any) -> None:
-        """Launch of a kernel of gathered.cl."""
+        """Launch of a kernel of tile_lists_local.cl."""
         picture, count = self.picture, self.picture.resident.count
         if count == 0:
             return

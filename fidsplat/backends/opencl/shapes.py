@@ -26,9 +26,8 @@ class DeviceShape:
     """of the depth sort (`ordered`)"""
     scan_items: int
     fast_fma: bool
-    waiting: int
-    """fragments for which there is room where they are composited by their own depth, at most 254, or 31 in
-    `group`"""
+    k_buffer_size: int
+    """fragments of a pixel that are sorted by depth at once (k-buffer), at most 254, or 31 in `group`"""
     rows: int = 2
     """pixels of a column that a work-item draws (`group`)"""
     tape: int = 1024
@@ -55,9 +54,9 @@ def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
     """`shape` with the tiles and the schedule that these features ask for."""
     if "blend_double" in features.slots and shape.schedule == "lanes":
         # doubles are drawn one by one
-        shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, waiting=8)
+        shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
     if not {"compose_pixel", "compose_planes"}.isdisjoint(features.slots):
-        # what waits takes the registers of a second pixel
+        # the k-buffer takes the registers of a second pixel
         shape = replace(shape, rows=1)
     return shape
 
@@ -66,12 +65,12 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
     """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/probing.py."""
     if kind == "schedule":
         return {"groups": _groups(own, 16 if own.schedule == "lanes" else 8)}
-    if kind == "waiting":
-        # less than what groups keep in registers, and a little more
-        few = replace(_groups(own, 8), waiting=1), replace(_groups(own, 8), waiting=4)
+    if kind == "k_buffer":
+        # fewer fragments than groups keep in registers, and a little more
+        few = replace(_groups(own, 8), k_buffer_size=1), replace(_groups(own, 8), k_buffer_size=4)
         return {
-            **{f"own, room for {room}": replace(own, waiting=room) for room in (1, 3)},
-            **{f"groups, room for {shape.waiting}": shape for shape in few},
+            **{f"own, k-buffer of {size}": replace(own, k_buffer_size=size) for size in (1, 3)},
+            **{f"groups, k-buffer of {shape.k_buffer_size}": shape for shape in few},
         }
     if kind == "tape":
         return {"a short tape": replace(own, tape=40)} if own.schedule == "lanes" else {}
@@ -97,4 +96,4 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
 def _groups(own: DeviceShape, side: int) -> DeviceShape:
     """The schedule of a GPU in tiles of side x side."""
     groups = replace(own, schedule="group", tile_width=side, tile_height=side)
-    return replace(groups, lists="tiled", lanes=1, scan_items=64, waiting=8)
+    return replace(groups, lists="tiled", lanes=1, scan_items=64, k_buffer_size=8)

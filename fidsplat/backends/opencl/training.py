@@ -29,7 +29,7 @@ from fidsplat.util.errors import DeviceError
 
 _GROUP = 64
 _SUMS, _SUMMED = 512, 128
-"""work-groups that add up the loss, and their work-items (SUMMED of kernels/opencl/train/loss.cl)"""
+"""work-groups that add up the loss, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
 _EACH_ROWS = 4
 """that a work-item of its passes over columns takes (EACH_ROWS there)"""
 _REMEMBERED = ("first_", "second_")

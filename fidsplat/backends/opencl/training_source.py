@@ -12,7 +12,7 @@ MARGIN, MARGIN_ROWS = 16, 5
 """zeros around an image, floats of a row and rows"""
 PANEL, STRIP = 128, 64
 """values of a row and rows that a work-item takes, on CPUs (kernels/opencl/train/loss_strips.cl)"""
-_STEPS = ("surface", "drawn", "activate", "pick", "shake")
+_STEPS = ("surface", "activation_functions", "activate", "gather_rows", "position_noise")
 
 _PICTURE = takes(
     "int width height  // values of a row: three of a pixel; rows",

@@ -25,7 +25,7 @@ SLOTS = frozenset(
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure", "opaque_layer"}
     # they change no picture, and nothing here
-    | {"shutter_rows", "ellipsoids_alone"}
+    | {"shutter_rows", "ellipsoids_only"}
 )
 """effects of slots that the kernels have; outputs and steps after blending are those that have a file"""
 # what depends on an effect: a stage is compiled once for all feature sets that mean the same to it
@@ -145,7 +145,7 @@ class Program:
         """whether it reads a layer of another renderer"""
         grouped = self.shape.schedule == "group"
         self.blend, self.state, self.blend_block = kernels("blend").make_blend(
-            needs.among(_SAMPLE), blending, grouped, self.tile_area, self.shape.waiting
+            needs.among(_SAMPLE), blending, grouped, self.tile_area, self.shape.k_buffer_size
         )
         """its kernel, the struct of a sample, and the threads that draw a tile on a GPU"""
         self.sample_fields = buffers.sample_fields(blending)

@@ -15,8 +15,8 @@ class WarpShape:
     tile_width: int
     """samples: 8, 16 or 32, as its height"""
     tile_height: int
-    waiting: int = 8
-    """fragments for which there is room where they are composited by their own depth"""
+    k_buffer_size: int = 8
+    """fragments of a pixel that are sorted by depth at once (k-buffer)"""
 
 
 def shape_for(device: Any) -> WarpShape:
@@ -34,6 +34,6 @@ def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
         return {"own": own}
     if kind == "tape":
         return {}
-    if kind == "waiting":
-        return {f"own, room for {room}": replace(own, waiting=room) for room in (1, 3)}
+    if kind == "k_buffer":
+        return {f"own, k-buffer of {size}": replace(own, k_buffer_size=size) for size in (1, 3)}
     return {f"{side} x {side}": WarpShape(own.schedule, side, side) for side in (8, 32)}

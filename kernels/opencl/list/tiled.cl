@@ -1,4 +1,4 @@
-// For GPUs: the splat is added to the tallies of its tiles as soon as they are known (tiles.cl). The tallies are integers,
+// For GPUs: the splat is added to the tallies of its tiles as soon as they are known (tile_lists.cl). The tallies are integers,
 // so their sums do not depend on the order of the additions.
 //@ list
     int tiles_x = (width + TILE_W - 1) / TILE_W;

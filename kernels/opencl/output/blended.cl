@@ -3,14 +3,14 @@
     vint blended;
 //@ start
     pixel->blended = 0;
-//@ seen
+//@ attributes
     vint blended;
-//@ see
-    seen.blended = 1;
-//@ gather
+//@ attribute_values
+    attributes.blended = 1;
+//@ layer_accumulate
     layer->mean.blended += VSELECT((vint)0, (vint)1, VMASK(opacity > 0.0f));
 //@ composite
-    pixel->blended += live & seen->blended;
+    pixel->blended += live & attributes->blended;
 //@ store
         BLOCK_STORE(pixel->blended, blended_raw + at, stride);
 //@ resolve_start
@@ -19,5 +19,5 @@
             blended = max(blended, blended_raw[at]);
 //@ resolve_end
     blended_out[out] = blended;
-//@ layer_seen
-        seen.blended = 0;
+//@ external_attributes
+        attributes.blended = 0;

@@ -5,11 +5,11 @@
     pixel->depth = 0.0f;
     pixel->depth_weight = 0.0f;
 //@ composite
-    pixel->depth = FMA(weight, seen->z, pixel->depth);
+    pixel->depth = FMA(weight, attributes->z, pixel->depth);
     pixel->depth_weight += weight;
 //@ store
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth, pixel_shown(pixel)), depth_raw + at, stride);
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_shown(pixel)), depth_raw + channel_stride + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth, pixel_covered(pixel)), depth_raw + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_covered(pixel)), depth_raw + channel_stride + at, stride);
 //@ resolve_start
     float depth = 0, depth_weight = 0;
 //@ resolve_sample

@@ -7,7 +7,7 @@
 //@ pixels_start
     for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++) pixels[row].first_light = first_light;
 //@ composite
-    pixel->depth_first = VSELECT(pixel->depth_first, seen->z,
+    pixel->depth_first = VSELECT(pixel->depth_first, attributes->z,
                                  live & VMASK(pixel->depth_first == 0.0f) & VMASK(pixel->t - weight <= pixel->first_light));
 //@ store
         BLOCK_STORE(pixel->depth_first, depth_first_raw + at, stride);

@@ -9,8 +9,8 @@
     pixel->median_light = 1.0f;
 //@ composite
     vfloat behind = pixel->t - weight;
-    vint counts = live & VMASK(pixel->t > 0.5f) & VMASK(pixel->median_light - behind >= LEAST_ALPHA);
-    pixel->depth_median = VSELECT(pixel->depth_median, seen->z, counts);
+    vint counts = live & VMASK(pixel->t > 0.5f) & VMASK(pixel->median_light - behind >= MIN_ALPHA);
+    pixel->depth_median = VSELECT(pixel->depth_median, attributes->z, counts);
     pixel->median_light = VSELECT(pixel->median_light, behind, counts);
 //@ store
         BLOCK_STORE(pixel->depth_median, depth_median_raw + at, stride);

@@ -13,8 +13,8 @@
     pixel->spread_sum = 0.0f;
     pixel->spread_squares = 0.0f;
 //@ composite
-    vint spreads = VMASK(weight > 0.0f) & VMASK(seen->z > 0.0f);
-    vfloat spread_share = VSELECT((vfloat)0.0f, weight, spreads), inverse = INVERSE_DEPTH / max(seen->z, (vfloat)SPREAD_NEAR);
+    vint spreads = VMASK(weight > 0.0f) & VMASK(attributes->z > 0.0f);
+    vfloat spread_share = VSELECT((vfloat)0.0f, weight, spreads), inverse = INVERSE_DEPTH / max(attributes->z, (vfloat)SPREAD_NEAR);
     pixel->spread_first = VSELECT(pixel->spread_first, inverse, spreads & VMASK(pixel->spread_weight == 0.0f));
     vfloat nearer = inverse - pixel->spread_first;
     pixel->spread_weight += spread_share;

@@ -20,11 +20,11 @@
                 ;
         }
 //@ composite
-    vfloat hidden = weight * (1.0f - exp(pixel->fog_slope * seen->z));
-    pixel->r = FMA(-hidden, seen->r, pixel->r);
-    pixel->g = FMA(-hidden, seen->g, pixel->g);
-    pixel->b = FMA(-hidden, seen->b, pixel->b);
-    pixel->fogged += hidden;
+    vfloat absorbed = weight * (1.0f - exp(pixel->fog_slope * attributes->z));
+    pixel->r = FMA(-absorbed, attributes->r, pixel->r);
+    pixel->g = FMA(-absorbed, attributes->g, pixel->g);
+    pixel->b = FMA(-absorbed, attributes->b, pixel->b);
+    pixel->fogged += absorbed;
 //@ store
         BLOCK_STORE(pixel->fogged, fog_raw + at, stride);
 //@ resolve_start

@@ -8,21 +8,21 @@
 //@ start
     pixel->label_weight = 0.0f;
     pixel->label = -1;
-//@ seen
+//@ attributes
     vint label;
-//@ see
-    seen.label = s->label;
-//@ layer
+//@ attribute_values
+    attributes.label = s->label;
+//@ layer_fields
     vfloat label_tau;       // greatest optical depth of its fragments: that one's label is the layer's
-//@ gather
-    layer->mean.label = VSELECT(layer->mean.label, seen->label, VMASK(tau > layer->label_tau));
+//@ layer_accumulate
+    layer->mean.label = VSELECT(layer->mean.label, attributes->label, VMASK(tau > layer->label_tau));
     layer->label_tau = fmax(layer->label_tau, tau);
 //@ composite
     vint heavier = VMASK(weight > pixel->label_weight);
-    pixel->label = VSELECT(pixel->label, seen->label, heavier);
+    pixel->label = VSELECT(pixel->label, attributes->label, heavier);
     pixel->label_weight = fmax(pixel->label_weight, weight);
 //@ store
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->label_weight, pixel_shown(pixel)), label_raw + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->label_weight, pixel_covered(pixel)), label_raw + at, stride);
         BLOCK_STORE(pixel->label, label_id_raw + at, stride);
 //@ resolve_start
     float label_weight = 0;
@@ -34,5 +34,5 @@
             }
 //@ resolve_end
     label_out[out] = label;
-//@ layer_lane
-            OPAQUE(int, seen.label) = layer_label[at];
+//@ external_lane
+            OPAQUE(int, attributes.label) = layer_label[at];

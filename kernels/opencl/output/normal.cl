@@ -13,24 +13,24 @@
     pixel->normal_x = 0.0f;
     pixel->normal_y = 0.0f;
     pixel->normal_z = 0.0f;
-//@ seen
+//@ attributes
     vfloat nx, ny, nz;
-//@ see
-    seen.nx = s->nx;
-    seen.ny = s->ny;
-    seen.nz = s->nz;
-//@ gather
-    layer->mean.nx = FMA(share, seen->nx - layer->mean.nx, layer->mean.nx);
-    layer->mean.ny = FMA(share, seen->ny - layer->mean.ny, layer->mean.ny);
-    layer->mean.nz = FMA(share, seen->nz - layer->mean.nz, layer->mean.nz);
+//@ attribute_values
+    attributes.nx = s->nx;
+    attributes.ny = s->ny;
+    attributes.nz = s->nz;
+//@ layer_accumulate
+    layer->mean.nx = FMA(share, attributes->nx - layer->mean.nx, layer->mean.nx);
+    layer->mean.ny = FMA(share, attributes->ny - layer->mean.ny, layer->mean.ny);
+    layer->mean.nz = FMA(share, attributes->nz - layer->mean.nz, layer->mean.nz);
 //@ composite
-    pixel->normal_x = FMA(weight, seen->nx, pixel->normal_x);
-    pixel->normal_y = FMA(weight, seen->ny, pixel->normal_y);
-    pixel->normal_z = FMA(weight, seen->nz, pixel->normal_z);
+    pixel->normal_x = FMA(weight, attributes->nx, pixel->normal_x);
+    pixel->normal_y = FMA(weight, attributes->ny, pixel->normal_y);
+    pixel->normal_z = FMA(weight, attributes->nz, pixel->normal_z);
 //@ store
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_x, pixel_shown(pixel)), normal_raw + at, stride);
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_shown(pixel)), normal_raw + channel_stride + at, stride);
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_shown(pixel)), normal_raw + 2 * channel_stride + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_x, pixel_covered(pixel)), normal_raw + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_covered(pixel)), normal_raw + channel_stride + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_covered(pixel)), normal_raw + 2 * channel_stride + at, stride);
 //@ resolve_start
     float normal_x = 0, normal_y = 0, normal_z = 0;
 //@ resolve_sample
@@ -43,5 +43,5 @@
     normal_out[3 * out] = normal_x * normal_scale;
     normal_out[3 * out + 1] = normal_y * normal_scale;
     normal_out[3 * out + 2] = normal_z * normal_scale;
-//@ layer_seen
-        seen.nx = seen.ny = seen.nz = 0.0f;
+//@ external_attributes
+        attributes.nx = attributes.ny = attributes.nz = 0.0f;

@@ -1,7 +1,7 @@
 // normal: the direction of sum w n.
-//@ loss
+//@ pixel_gradient
     vfloat normal_x, normal_y, normal_z;
-//@ loss_start
+//@ pixel_gradient_start
         vfloat nx = BLOCK_LOAD(normal_raw + at, stride), ny = BLOCK_LOAD(normal_raw + channel_stride + at, stride);
         vfloat nz = BLOCK_LOAD(normal_raw + 2 * (size_t)channel_stride + at, stride);
         vfloat normal_length = sqrt(nx * nx + ny * ny + nz * nz);
@@ -10,19 +10,19 @@
         nx *= normal_scale; ny *= normal_scale; nz *= normal_scale;
         vfloat by_nx = pixels_of(by_normal, 3, 0, x, y, width, height), by_ny = pixels_of(by_normal, 3, 1, x, y, width, height);
         vfloat by_nz = pixels_of(by_normal, 3, 2, x, y, width, height), along = by_nx * nx + by_ny * ny + by_nz * nz;
-        loss->normal_x = (by_nx - along * nx) * normal_scale;
-        loss->normal_y = (by_ny - along * ny) * normal_scale;
-        loss->normal_z = (by_nz - along * nz) * normal_scale;
-//@ worth
-    worth = FMA(loss->normal_x, (vfloat)s->nx, worth);
-    worth = FMA(loss->normal_y, (vfloat)s->ny, worth);
-    worth = FMA(loss->normal_z, (vfloat)s->nz, worth);
+        gradient->normal_x = (by_nx - along * nx) * normal_scale;
+        gradient->normal_y = (by_ny - along * ny) * normal_scale;
+        gradient->normal_z = (by_nz - along * nz) * normal_scale;
+//@ by_weight
+    by_weight = FMA(gradient->normal_x, (vfloat)s->nx, by_weight);
+    by_weight = FMA(gradient->normal_y, (vfloat)s->ny, by_weight);
+    by_weight = FMA(gradient->normal_z, (vfloat)s->nz, by_weight);
 //@ sums
     vfloat nx, ny, nz;
 //@ fragment_backward
-    sums->nx = FMA(weight, loss->normal_x, sums->nx);
-    sums->ny = FMA(weight, loss->normal_y, sums->ny);
-    sums->nz = FMA(weight, loss->normal_z, sums->nz);
+    sums->nx = FMA(weight, gradient->normal_x, sums->nx);
+    sums->ny = FMA(weight, gradient->normal_y, sums->ny);
+    sums->nz = FMA(weight, gradient->normal_z, sums->nz);
 //@ moments
     MOMENT(nx, sums->nx);
     MOMENT(ny, sums->ny);

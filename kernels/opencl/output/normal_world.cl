@@ -2,4 +2,4 @@
 //@ resolve_end
     for (int axis = 0; axis < 3; axis++)
         normal_world_out[3 * out + axis] =
-            normal_scale * FMA(turn[axis], normal_x, FMA(turn[3 + axis], normal_y, turn[6 + axis] * normal_z));
+            normal_scale * FMA(row_rotation[axis], normal_x, FMA(row_rotation[3 + axis], normal_y, row_rotation[6 + axis] * normal_z));

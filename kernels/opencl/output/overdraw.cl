@@ -4,14 +4,14 @@
     vint overdraw;
 //@ start
     pixel->overdraw = 0;
-//@ seen
+//@ attributes
     vint fragments;         // that it is made of
-//@ see
-    seen.fragments = 1;
-//@ gather
+//@ attribute_values
+    attributes.fragments = 1;
+//@ layer_accumulate
     layer->mean.fragments -= mask;
 //@ composite
-    pixel->overdraw += seen->fragments & live;
+    pixel->overdraw += attributes->fragments & live;
 //@ store
         BLOCK_STORE(pixel->overdraw, overdraw_raw + at, stride);
 //@ resolve_start

@@ -10,7 +10,7 @@
     pixel->rounding = 0.0f;
 //@ compose_functions
 #define UNIT 0x1p-24f
-#define OF_FORM (4.0f * UNIT)        // of a form, relative to its terms: three coefficients, and its sums
+#define FORM_ROUNDING (4.0f * UNIT)        // of a form, relative to its terms: three coefficients, and its sums
 #define FORM_TERMS(n0, nx, ny) (fabs((vfloat)(n0)) + fabs((vfloat)(nx)) * across + fabs((vfloat)(ny)) * down)
 
 static inline vfloat squared(vfloat x) { return x * x; }
@@ -24,16 +24,16 @@ static inline vfloat opacity_rounding(const Splat *s, vfloat h) {
 static inline void add_rounding(Pixel *pixel, const Splat *s, Crossing c, vfloat x, vfloat y, vint mask, vfloat screen,
                                 const BlendConstants *constants) {
     vfloat across = fabs(x), down = fabs(y);
-    vfloat off = OF_FORM * (FORM_TERMS(s->nu0, s->nux, s->nuy) + FORM_TERMS(s->nv0, s->nvx, s->nvy));
-    vfloat off_d = OF_FORM * FORM_TERMS(s->d0, s->dx, s->dy), d_low = c.d - off_d, d_high = c.d + off_d, root = sqrt(c.q);
-    vint may = VMASK(d_high > 0.0f) & VMASK(d_low <= (1.0f + OF_FORM) * s->d_near);
-    vint must = VMASK(d_low > 0.0f) & VMASK(d_high <= (1.0f - OF_FORM) * s->d_near);
+    vfloat off = FORM_ROUNDING * (FORM_TERMS(s->nu0, s->nux, s->nuy) + FORM_TERMS(s->nv0, s->nvx, s->nvy));
+    vfloat off_d = FORM_ROUNDING * FORM_TERMS(s->d0, s->dx, s->dy), d_low = c.d - off_d, d_high = c.d + off_d, root = sqrt(c.q);
+    vint may = VMASK(d_high > 0.0f) & VMASK(d_low <= (1.0f + FORM_ROUNDING) * s->d_near);
+    vint must = VMASK(d_low > 0.0f) & VMASK(d_high <= (1.0f - FORM_ROUNDING) * s->d_near);
     vfloat nearest = VSELECT((vfloat)INFINITY, squared(fmax(root - off, (vfloat)0.0f) / d_high), may);
     vfloat furthest = VSELECT((vfloat)INFINITY, squared((root + off) / d_low), must);
 #ifdef HAS_DOT
     if (HAS_DOT(s)) {
         vfloat away = sqrt(screen);
-        vfloat off_dot = OF_FORM * (sqrt(constants->filter) * (1.0f + 2.0f * (across + down)) + 3.0f * away);
+        vfloat off_dot = FORM_ROUNDING * (sqrt(constants->filter) * (1.0f + 2.0f * (across + down)) + 3.0f * away);
         nearest = fmin(nearest, squared(fmax(away - off_dot, (vfloat)0.0f)));
         furthest = fmin(furthest, squared(away + off_dot));
     }

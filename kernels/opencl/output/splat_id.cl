@@ -8,21 +8,21 @@
 //@ start
     pixel->splat_id_weight = 0.0f;
     pixel->splat_id = -1;
-//@ seen
+//@ attributes
     vint splat_id;
-//@ see
-    seen.splat_id = s->splat_id;
-//@ layer
+//@ attribute_values
+    attributes.splat_id = s->splat_id;
+//@ layer_fields
     vfloat splat_id_tau;    // greatest optical depth of its fragments: that one stands for the layer
-//@ gather
-    layer->mean.splat_id = VSELECT(layer->mean.splat_id, seen->splat_id, VMASK(tau > layer->splat_id_tau));
+//@ layer_accumulate
+    layer->mean.splat_id = VSELECT(layer->mean.splat_id, attributes->splat_id, VMASK(tau > layer->splat_id_tau));
     layer->splat_id_tau = fmax(layer->splat_id_tau, tau);
 //@ composite
     vint heavier_id = VMASK(weight > pixel->splat_id_weight);
-    pixel->splat_id = VSELECT(pixel->splat_id, seen->splat_id, heavier_id);
+    pixel->splat_id = VSELECT(pixel->splat_id, attributes->splat_id, heavier_id);
     pixel->splat_id_weight = fmax(pixel->splat_id_weight, weight);
 //@ store
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->splat_id_weight, pixel_shown(pixel)), splat_id_raw + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->splat_id_weight, pixel_covered(pixel)), splat_id_raw + at, stride);
         BLOCK_STORE(pixel->splat_id, splat_id_index_raw + at, stride);
 //@ resolve_start
     float splat_id_weight = 0;
@@ -34,5 +34,5 @@
             }
 //@ resolve_end
     splat_id_out[out] = splat_id;
-//@ layer_seen
-        seen.splat_id = -1;
+//@ external_attributes
+        attributes.splat_id = -1;

@@ -27,5 +27,5 @@
 //@ footprint_tau
     // what lies side by side adds up: the optical depth of boxes is the area that they cover, and their colour its mean
     if (IS_BOX(s)) tau = opacity;
-//@ footprint_gather
+//@ footprint_layer
     if (IS_BOX(s)) layer->opacity = fmin(layer->optical_depth, (vfloat)1.0f);

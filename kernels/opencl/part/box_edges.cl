@@ -1,14 +1,14 @@
 // Edges of boxes (part/box_cover.cl) where forms are affine in the sample: straight lines, whose distances in samples need
 // one number for each edge of a splat.
 //@ footprint_functions
-static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
+static inline vfloat slab_coverage(vfloat d, vfloat n, wide edge_0, wide edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     vfloat below = clamp(FMA(FMA((vfloat)-SQRT_2, n, d), (vfloat)edge_1, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     return fmax(above + below - 1.0f, (vfloat)0.0f);
 }
 //@ footprint_cross
     if (IS_BOX(s)) {
-        c.cover = between(c.d, nu, s->edge_u0, s->edge_u1) * between(c.d, nv, s->edge_v0, s->edge_v1);
+        c.cover = slab_coverage(c.d, nu, s->edge_u0, s->edge_u1) * slab_coverage(c.d, nv, s->edge_v0, s->edge_v1);
         c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     }
 //@ footprint_conic
@@ -16,12 +16,12 @@ static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
 //@ functions
 #define BOX_SIDES 6
 #define BOX_CORNERS (4 + BOX_SIDES)
-static inline real box_edge(real3_ k0, real3_ kx, real3_ ky, real facing, real turn, bool along_v, real *line) {
+static inline real box_edge(real3_ k0, real3_ kx, real3_ ky, real facing, real sign, bool along_v, real *line) {
     real n0 = along_v ? k0.y : k0.x, nx = along_v ? kx.y : kx.x, ny = along_v ? ky.y : ky.x;
-    line[1] = facing * kx.z + turn * nx;
-    line[2] = facing * ky.z + turn * ny;
+    line[1] = facing * kx.z + sign * nx;
+    line[2] = facing * ky.z + sign * ny;
     real inverse = 1 / fmax(sqrt(line[1] * line[1] + line[2] * line[2]), REAL(1e-30));
-    line[0] = (facing * k0.z + turn * n0) * inverse + REAL(0.5);
+    line[0] = (facing * k0.z + sign * n0) * inverse + REAL(0.5);
     line[1] *= inverse;
     line[2] *= inverse;
     return inverse;
@@ -36,28 +36,28 @@ static inline bool box_touches(real3_ k0, real3_ kx, real3_ ky, real facing, rea
         if (side < 4) {
             box_edge(k0, kx, ky, facing, side & 1 ? -facing : facing, side >= 2, line);
         } else {
-            real turn = side == 4 ? facing : -facing;
-            line[0] = turn * k0.z + (side == 4 ? 0 : d_near);
-            line[1] = turn * kx.z;
-            line[2] = turn * ky.z;
+            real sign = side == 4 ? facing : -facing;
+            line[0] = sign * k0.z + (side == 4 ? 0 : d_near);
+            line[1] = sign * kx.z;
+            line[2] = sign * ky.z;
         }
-        real kept_x[BOX_CORNERS], kept_y[BOX_CORNERS];
-        int kept = 0;
+        real clipped_x[BOX_CORNERS], clipped_y[BOX_CORNERS];
+        int clipped = 0;
         for (int k = 0; k < count; k++) {
             int next = k + 1 < count ? k + 1 : 0;
             real here = line[0] + line[1] * x[k] + line[2] * y[k], there = line[0] + line[1] * x[next] + line[2] * y[next];
-            if (here >= 0 && kept < BOX_CORNERS) {
-                kept_x[kept] = x[k];
-                kept_y[kept++] = y[k];
+            if (here >= 0 && clipped < BOX_CORNERS) {
+                clipped_x[clipped] = x[k];
+                clipped_y[clipped++] = y[k];
             }
-            if ((here >= 0) != (there >= 0) && kept < BOX_CORNERS) {
+            if ((here >= 0) != (there >= 0) && clipped < BOX_CORNERS) {
                 real share = here / (here - there);
-                kept_x[kept] = x[k] + share * (x[next] - x[k]);
-                kept_y[kept++] = y[k] + share * (y[next] - y[k]);
+                clipped_x[clipped] = x[k] + share * (x[next] - x[k]);
+                clipped_y[clipped++] = y[k] + share * (y[next] - y[k]);
             }
         }
-        count = kept;
-        for (int k = 0; k < count; k++) x[k] = kept_x[k], y[k] = kept_y[k];
+        count = clipped;
+        for (int k = 0; k < count; k++) x[k] = clipped_x[k], y[k] = clipped_y[k];
     }
     box[0] = box[2] = INFINITY;
     box[1] = box[3] = -INFINITY;

@@ -3,7 +3,7 @@
 #define CONIC_SLACK 2e-5f
 
 typedef struct {                        // an ellipse, relative to the splat's anchor
-    bool is;                            // false: there is none, or the horizon is near, or rows or columns run along the splat
+    bool valid;                            // false: there is none, or the horizon is near, or rows or columns run along the splat
     float middle, slope;                // middles of chords: middle + slope y
     float y, half_height;
     float square, bend;                 // squares of half chords: square - bend (y - its y)^2
@@ -18,7 +18,7 @@ static inline float conic_half_chord(const Conic *c, float y) {
 
 // Of the rows from y0 to y1.
 static inline void conic_chord(const Conic *c, float y0, float y1, float *x0, float *x1) {
-    if (!c->is) return;
+    if (!c->valid) return;
     if (y0 - c->y > c->half_height || c->y - y1 > c->half_height) {
         *x0 = INFINITY;
         *x1 = -INFINITY;

@@ -23,10 +23,10 @@
         vfloat u = fmax(fabs(FMA((vfloat)s->nuy, y, FMA((vfloat)s->nux, x, (vfloat)s->nu0))) - around_u, (vfloat)0.0f);
         vfloat v = fmax(fabs(FMA((vfloat)s->nvy, y, FMA((vfloat)s->nvx, x, (vfloat)s->nv0))) - around_v, (vfloat)0.0f);
         vfloat d = FMA((vfloat)s->dy, y, FMA((vfloat)s->dx, x, (vfloat)s->d0)) + around_d;
-        vint away = VMASK(FMA(u, u, v * v) > conic_h * (1.0f + BLOCKS_SLACK) * (d * d)) | VMASK(d < 0.0f);
+        vint outside = VMASK(FMA(u, u, v * v) > conic_h * (1.0f + BLOCKS_SLACK) * (d * d)) | VMASK(d < 0.0f);
 //@@ blocks_dot
 //@@ blocks_nearest
-        touched &= ~(VBITS(away) << first);
+        touched &= ~(VBITS(outside) << first);
     }
 //@ cells_functions
 static inline Conic conic_of(local const Splat *s, float h, float far_x, float far_y) {
@@ -41,7 +41,7 @@ static inline Conic conic_of(local const Splat *s, float h, float far_x, float f
     float q1 = h * (ud * ud_y + vd * vd_y) - uv * uv_y, grows = h * (ud_y * ud_y + vd_y * vd_y), q2 = uv_y * uv_y - grows;
     float shrinks = 1.0f / q2;
     Conic c;
-    c.is = steep > 1e-12f && bent <= 0.5f * steep && uv_y * uv_y > 1e-12f * steep && grows <= 0.5f * uv_y * uv_y;
+    c.valid = steep > 1e-12f && bent <= 0.5f * steep && uv_y * uv_y > 1e-12f * steep && grows <= 0.5f * uv_y * uv_y;
     c.middle = (h * dx * d0 - ux * u0 - vx * v0) * inverse;
     c.slope = (h * dx * dy - ux * uy - vx * vy) * inverse;
     c.y = q1 * shrinks;

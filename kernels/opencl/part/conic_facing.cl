@@ -25,7 +25,7 @@ static inline Conic conic_of(local const Splat *s, float h, float far_x, float f
     float shrinks = 1.0f / uv_y, grown = h + CONIC_SLACK * (u * u + v * v + h);
     float square_height = grown * steep * shrinks * shrinks;
     Conic c;
-    c.is = steep > 1e-12f && uv_y * uv_y > 1e-12f * steep;
+    c.valid = steep > 1e-12f && uv_y * uv_y > 1e-12f * steep;
     c.middle = -(ux * u0 + vx * v0) * inverse;
     c.slope = -vx * vy * inverse;
     c.y = -uv * shrinks;

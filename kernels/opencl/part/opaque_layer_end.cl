@@ -6,8 +6,8 @@
         Pixel *pixel = &pixels[row];
         vint mask = VMASK(pixel->opaque_z < INFINITY);
         if (!VANY(mask)) continue;
-        Seen seen;
-        seen.z = VSELECT((vfloat)0.0f, pixel->opaque_z, mask);
+        Attributes attributes;
+        attributes.z = VSELECT((vfloat)0.0f, pixel->opaque_z, mask);
         for (int lane = 0; lane < LANES; lane++) {
 #if LANES == 1
             int opaque_x = min(px, width - 1), opaque_y = min(py + row, height - 1);
@@ -17,11 +17,11 @@
 #define OPAQUE(type, of) ((type *)&(of))[lane]
 #endif
             size_t at = (size_t)(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES;
-            OPAQUE(float, seen.r) = layer_rgb[3 * at];
-            OPAQUE(float, seen.g) = layer_rgb[3 * at + 1];
-            OPAQUE(float, seen.b) = layer_rgb[3 * at + 2];
-//@@ layer_lane
+            OPAQUE(float, attributes.r) = layer_rgb[3 * at];
+            OPAQUE(float, attributes.g) = layer_rgb[3 * at + 1];
+            OPAQUE(float, attributes.b) = layer_rgb[3 * at + 2];
+//@@ external_lane
         }
-//@@ layer_seen
-        composite(pixel, &seen, (vfloat)1.0f, mask, &unstopped);
+//@@ external_attributes
+        composite(pixel, &attributes, (vfloat)1.0f, mask, &unstopped);
     }

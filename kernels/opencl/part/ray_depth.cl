@@ -18,16 +18,16 @@
     record.z_center = (wide)depth_center;
     record.z_reach = (wide)depth_reach;
 //@@ depth_nearest
-//@ seen
+//@ attributes
     vfloat z;
-//@ see
+//@ attribute_values
     vfloat depth_d = s->z_numerator;        // depth times D
-//@@ camera_see_depth
+//@@ camera_attribute_depth
     vfloat depth = depth_d * inverse_d;
-    vint met = VMASK(c.d > 0.0f);
-//@@ dot_see_depth
-    seen.z = VSELECT((vfloat)s->z_center,
-                     VMIN(VMAX(depth, (vfloat)s->z_center - (vfloat)s->z_reach), (vfloat)s->z_center + (vfloat)s->z_reach), met);
-//@@ plane_see_depth
-//@ gather
-    layer->mean.z = FMA(share, seen->z - layer->mean.z, layer->mean.z);
+    vint hit = VMASK(c.d > 0.0f);
+//@@ dot_attribute_depth
+    attributes.z = VSELECT((vfloat)s->z_center,
+                     VMIN(VMAX(depth, (vfloat)s->z_center - (vfloat)s->z_reach), (vfloat)s->z_center + (vfloat)s->z_reach), hit);
+//@@ coplanar_attribute_depth
+//@ layer_accumulate
+    layer->mean.z = FMA(share, attributes->z - layer->mean.z, layer->mean.z);

@@ -2,14 +2,14 @@
 // the centre's derivative.
 //@ geometry
     vfloat d, z;
-    vint met;               // the depth is z_numerator / D
+    vint hit;               // the depth is z_numerator / D
 //@@ dot_geometry
 //@ geometry_make
     g.d = c.d;
     vfloat z_low = s->z_center - s->z_reach, z_high = s->z_center + s->z_reach, depth = s->z_numerator * g.inverse_d;
     vint flat = g.on_plane;                 // the depth is that on the plane, but for the range
 //@@ dot_geometry_make
-    g.met = flat & VMASK(depth >= z_low) & VMASK(depth <= z_high);
+    g.hit = flat & VMASK(depth >= z_low) & VMASK(depth <= z_high);
     g.z = clamp(depth, z_low, z_high);
 //@ sums
     vfloat z_numerator, z_center;
@@ -17,8 +17,8 @@
 // Adds the derivative by a fragment's depth, at (x, y) from the anchor; returns that by D.
 static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vfloat by_z, vfloat screen, vfloat x, vfloat y,
                                vfloat *by_nu, vfloat *by_nv) {
-    vfloat by_numerator = VSELECT((vfloat)0.0f, by_z * g->inverse_d, g->met), by_d = -by_numerator * g->z;
-    vfloat by_center = VSELECT(by_z, (vfloat)0.0f, g->met);
+    vfloat by_numerator = VSELECT((vfloat)0.0f, by_z * g->inverse_d, g->hit), by_d = -by_numerator * g->z;
+    vfloat by_center = VSELECT(by_z, (vfloat)0.0f, g->hit);
 //@@ dot_add_depth
     sums->z_numerator += by_numerator;
     sums->z_center += by_center;

@@ -8,24 +8,24 @@ static inline vfloat edge_ramp(vfloat form, vfloat by_x, vfloat by_y) {
     return clamp(form / steep + 0.5f, (vfloat)0.0f, (vfloat)1.0f);
 }
 
-static inline vfloat between(vfloat d, vfloat n, vfloat d_x, vfloat d_y, vfloat n_x, vfloat n_y) {
+static inline vfloat slab_coverage(vfloat d, vfloat n, vfloat d_x, vfloat d_y, vfloat n_x, vfloat n_y) {
     const vfloat root = SQRT_2;
     vfloat above = edge_ramp(FMA(root, n, d), FMA(root, n_x, d_x), FMA(root, n_y, d_y));
     vfloat below = edge_ramp(FMA(-root, n, d), FMA(-root, n_x, d_x), FMA(-root, n_y, d_y));
     return fmax(above + below - 1.0f, (vfloat)0.0f);
 }
 
-static inline vfloat along(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfloat to_z) {
+static inline vfloat along_ray(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfloat to_z) {
     return FMA((vfloat)z, to_z, FMA((vfloat)y, to_y, (vfloat)x * to_x));
 }
 //@ ray_cross_parameters
     , vfloat xx, vfloat yx, vfloat zx, vfloat xy, vfloat yy, vfloat zy   // the ray's derivatives along x, along y
 //@ ray_cross
     if (IS_BOX(s)) {
-        vfloat d_x = along(s->dx, s->dy, s->dz, xx, yx, zx), d_y = along(s->dx, s->dy, s->dz, xy, yy, zy);
-        vfloat u_x = along(s->nux, s->nuy, s->nuz, xx, yx, zx), u_y = along(s->nux, s->nuy, s->nuz, xy, yy, zy);
-        vfloat v_x = along(s->nvx, s->nvy, s->nvz, xx, yx, zx), v_y = along(s->nvx, s->nvy, s->nvz, xy, yy, zy);
-        c.cover = between(d, nu, d_x, d_y, u_x, u_y) * between(d, nv, d_x, d_y, v_x, v_y);
+        vfloat d_x = along_ray(s->dx, s->dy, s->dz, xx, yx, zx), d_y = along_ray(s->dx, s->dy, s->dz, xy, yy, zy);
+        vfloat u_x = along_ray(s->nux, s->nuy, s->nuz, xx, yx, zx), u_y = along_ray(s->nux, s->nuy, s->nuz, xy, yy, zy);
+        vfloat v_x = along_ray(s->nvx, s->nvy, s->nvz, xx, yx, zx), v_y = along_ray(s->nvx, s->nvy, s->nvz, xy, yy, zy);
+        c.cover = slab_coverage(d, nu, d_x, d_y, u_x, u_y) * slab_coverage(d, nv, d_x, d_y, v_x, v_y);
         c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     }
 //@ ray_cross_arguments
@@ -49,10 +49,10 @@ static inline vfloat along(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfl
         real half_step = REAL(0.5) * ray_step[0] / (su * sv * fabs(offset)), far_off = sqrt(dot3(p, p));
         real wider_u = half_step * (su * sv + sqrt(dot3(of_u, of_u))), wider_v = half_step * (su * sv + sqrt(dot3(of_v, of_v)));
         real share = wider_u * su + wider_v * sv;
-        bool ends = share < REAL(0.9);
-        real furthest = ends ? far_off + (su + sv + share * far_off) / (1 - share) : 0;
-        real to_u = ends ? 1 + wider_u * furthest : REAL(1e6) * (1 + (far_off + sv) / su);
-        real to_v = ends ? 1 + wider_v * furthest : REAL(1e6) * (1 + (far_off + su) / sv);
+        bool bounded = share < REAL(0.9);
+        real furthest = bounded ? far_off + (su + sv + share * far_off) / (1 - share) : 0;
+        real to_u = bounded ? 1 + wider_u * furthest : REAL(1e6) * (1 + (far_off + sv) / su);
+        real to_v = bounded ? 1 + wider_v * furthest : REAL(1e6) * (1 + (far_off + su) / sv);
         a.x *= to_u; a.y *= to_u; a.z *= to_u;
         b.x *= to_v; b.y *= to_v; b.z *= to_v;
         reach = radius * sqrt(a.z * a.z + b.z * b.z);

@@ -16,7 +16,7 @@ kernel void backdrop(
     float world_z = FMA(turn_02, ray_x, FMA(turn_12, ray_y, turn_22 * ray_z));
     float behind[3];
 //@@ backdrop
-    float let_through = raw[3 * (size_t)channel_stride + at];
+    float transmittance = raw[3 * (size_t)channel_stride + at];
     for (int channel = 0; channel < 3; channel++)
-        raw[channel * (size_t)channel_stride + at] = FMA(let_through, behind[channel], raw[channel * (size_t)channel_stride + at]);
+        raw[channel * (size_t)channel_stride + at] = FMA(transmittance, behind[channel], raw[channel * (size_t)channel_stride + at]);
 }

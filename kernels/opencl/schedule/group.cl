@@ -65,7 +65,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             wide x = (wide)(px - s.ax);
             wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
             for (int row = 0; row < ROWS; row++) {
-                if (!pixel_lit(&pixels[row], &constants)) continue;
+                if (!pixel_transmits(&pixels[row], &constants)) continue;
                 wide y = (wide)(py + row - s.ay);
                 Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ cross
@@ -87,6 +87,6 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         Pixel *pixel = &pixels[row];
         PIXEL_STORE_BASE(pixel, raw, channel_stride, at);
 //@@ store
-//@@ stored
+//@@ pixel_stored
     }
 }

@@ -5,8 +5,8 @@
 // Barriers stand where the whole group comes to them.
 #define PIXELS (TILE_W * TILE_H)
 #define PARTS (GROUP + 1)                    // of one field's sums: neighbours among the fields lie in other banks
-#define AHEAD_CHUNKS 8                       // that are fetched at once
-#define AT_ONCE 2                            // splats of a cell's list
+#define PREFETCH_CHUNKS 8                       // that are fetched at once
+#define UNROLL 2                            // splats of a cell's list
 
 static inline Splat copy_of(local const Staged *staged) {
     Staged copy;
@@ -25,28 +25,28 @@ static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConst
 }
 
 typedef struct {            // of a splat at a pixel, whether light comes there or not
-    wide opacity, worth;
+    wide opacity, by_weight;
     int mask;
-} Met;
+} FragmentTerms;
 
-static inline Met meet(const Splat *s, int px, int py, const Loss *loss, const BlendConstants *constants) {
+static inline FragmentTerms fragment_terms(const Splat *s, int px, int py, const PixelGradient *gradient, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, screen;
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
-    Met met;
-    met.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
-    met.opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
+    FragmentTerms terms;
+    terms.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
+    terms.opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
     const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
-    met.worth = fragment_worth(s, loss, &g);
-    return met;
+    terms.by_weight = fragment_by_weight(s, gradient, &g);
+    return terms;
 }
 
 // Lets the splat take its light at a pixel; returns its opacity there.
-static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
+static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, screen;
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
     if (!VANY(mask)) return 0.0f;
-    return take_light(pixel, fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling), mask, constants);
+    return attenuate(pixel, fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling), mask, constants);
 }
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
@@ -61,7 +61,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
     local uchar places[CELLS_X * CELLS_Y][STAGED];          // those that can touch a cell, in order
     local float parts[3 * PARTS];
     local int alive;
-    local uint most;
+    local uint max_reached;
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
     uint number = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W;
@@ -74,26 +74,26 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
     uint start = starts[number], end = starts[number + 1], first_chunk = start / CHUNK + number;
     for (uint k = first_chunk + item; k <= end / CHUNK + number; k += GROUP) chunk_tiles[k] = number;
 
-    Loss losses[ROWS];
+    PixelGradient gradients[ROWS];
     Pixel pixels[ROWS];
-    vfloat lights[ROWS], worths[ROWS];
+    vfloat transmittances[ROWS], by_weights[ROWS];
     for (int row = 0; row < ROWS; row++) {
-        Loss *loss = &losses[row];
+        PixelGradient *gradient = &gradients[row];
         int x = px, y = py + row;
         size_t at = y * (size_t)stride + x;
-        loss->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
-        loss->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
-        loss->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
-        loss->behind = FMA(loss->r, (vfloat)background_r, FMA(loss->g, (vfloat)background_g, loss->b * background_b));
-//@@ loss_start
+        gradient->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
+        gradient->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
+        gradient->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+        gradient->behind = FMA(gradient->r, (vfloat)background_r, FMA(gradient->g, (vfloat)background_g, gradient->b * background_b));
+//@@ pixel_gradient_start
         // outside of the picture nothing is drawn
         pixel_start(&pixels[row], x < width && y < height ? 1.0f : 0.0f);
-        lights[row] = pixels[row].t;
-        worths[row] = 0.0f;
+        transmittances[row] = pixels[row].t;
+        by_weights[row] = 0.0f;
     }
-    global float2 *kept = (global float2 *)checkpoints + (size_t)first_chunk * PIXELS + top * TILE_W + column;
-    uint chunk = 0, lit = 0;        // the chunk that is walked; those that light of this work-item's pixels comes to
-    if (item == 0) most = 0;
+    global float2 *checkpoint = (global float2 *)checkpoints + (size_t)first_chunk * PIXELS + top * TILE_W + column;
+    uint chunk = 0, reached_chunks = 0;        // the chunk that is walked; those that light of this work-item's pixels comes to
+    if (item == 0) max_reached = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
 
     for (uint batch = start; batch < end; batch += STAGED) {
@@ -117,58 +117,58 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
         uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
         if (!unfinished) listed = 0;
         uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // of the batch's chunks
-        for (uint k = 0; k <= listed; k += AT_ONCE) {
+        for (uint k = 0; k <= listed; k += UNROLL) {
             // what they are depends on no light: side by side, where light then goes from one to the next
-            uint which[AT_ONCE];
-            Met met[AT_ONCE][ROWS];
-            for (int next = 0; next < AT_ONCE; next++) {
+            uint which[UNROLL];
+            FragmentTerms terms[UNROLL][ROWS];
+            for (int next = 0; next < UNROLL; next++) {
                 which[next] = k + next < listed ? places[cell][k + next] : 0;
                 const Splat s = copy_of(&staged[which[next]]);
-                for (int row = 0; row < ROWS; row++) met[next][row] = meet(&s, px, py + row, &losses[row], &constants);
+                for (int row = 0; row < ROWS; row++) terms[next][row] = fragment_terms(&s, px, py + row, &gradients[row], &constants);
             }
-            for (int next = 0; next < AT_ONCE; next++) {
+            for (int next = 0; next < UNROLL; next++) {
                 // what the chunks hold that are over
                 for (uint to = k + next < listed ? (batch - start + which[next]) / CHUNK : beyond; chunk < to; chunk++)
                     for (int row = 0; row < ROWS; row++) {
-                        kept[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(lights[row], worths[row]);
-                        if (lights[row] > stop) lit = chunk + 1;
-                        lights[row] = pixel_light(&pixels[row]);
-                        worths[row] = 0.0f;
+                        checkpoint[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(transmittances[row], by_weights[row]);
+                        if (transmittances[row] > stop) reached_chunks = chunk + 1;
+                        transmittances[row] = pixel_transmittance(&pixels[row]);
+                        by_weights[row] = 0.0f;
                     }
                 if (k + next >= listed) break;
                 for (int row = 0; row < ROWS; row++) {
-                    wide light = pixels[row].t, drawn = take_light(&pixels[row], met[next][row].opacity, met[next][row].mask, &constants);
-                    worths[row] = FMA(light * drawn, met[next][row].worth, worths[row]);
+                    wide transmittance = pixels[row].t, composited = attenuate(&pixels[row], terms[next][row].opacity, terms[next][row].mask, &constants);
+                    by_weights[row] = FMA(transmittance * composited, terms[next][row].by_weight, by_weights[row]);
                 }
             }
         }
     }
-    atomic_max(&most, lit);
+    atomic_max(&max_reached, reached_chunks);
     barrier(CLK_LOCAL_MEM_FENCE);
     // what light is worth behind each chunk: where a pixel is finished, what there is behind all splats
     for (int row = 0; row < ROWS; row++) {
-        vfloat behind = losses[row].behind, shown = pixels[row].t * behind;
-        for (int last = (int)most - 1; last >= 0; last -= AHEAD_CHUNKS) {
-            float2 known[AHEAD_CHUNKS];
-            for (int k = 0; k < AHEAD_CHUNKS; k++) known[k] = kept[(size_t)max(last - k, 0) * PIXELS + row * TILE_W];
-            for (int k = 0; k < min(AHEAD_CHUNKS, last + 1); k++) {
-                kept[(size_t)(last - k) * PIXELS + row * TILE_W].y = behind;
-                shown += known[k].y;
-                behind = known[k].x > stop ? shown / known[k].x : losses[row].behind;
+        vfloat behind = gradients[row].behind, shown_behind = pixels[row].t * behind;
+        for (int last = (int)max_reached - 1; last >= 0; last -= PREFETCH_CHUNKS) {
+            float2 loaded[PREFETCH_CHUNKS];
+            for (int k = 0; k < PREFETCH_CHUNKS; k++) loaded[k] = checkpoint[(size_t)max(last - k, 0) * PIXELS + row * TILE_W];
+            for (int k = 0; k < min(PREFETCH_CHUNKS, last + 1); k++) {
+                checkpoint[(size_t)(last - k) * PIXELS + row * TILE_W].y = behind;
+                shown_behind += loaded[k].y;
+                behind = loaded[k].x > stop ? shown_behind / loaded[k].x : gradients[row].behind;
             }
         }
     }
     float behind_r = 0, behind_g = 0, behind_b = 0;
     for (int row = 0; row < ROWS; row++) {
-        behind_r = FMA((float)pixels[row].t, (float)losses[row].r, behind_r);
-        behind_g = FMA((float)pixels[row].t, (float)losses[row].g, behind_g);
-        behind_b = FMA((float)pixels[row].t, (float)losses[row].b, behind_b);
+        behind_r = FMA((float)pixels[row].t, (float)gradients[row].r, behind_r);
+        behind_g = FMA((float)pixels[row].t, (float)gradients[row].g, behind_g);
+        behind_b = FMA((float)pixels[row].t, (float)gradients[row].b, behind_b);
     }
     parts[item] = behind_r;
     parts[PARTS + item] = behind_g;
     parts[2 * PARTS + item] = behind_b;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) reached[number] = most;
+    if (item == 0) reached[number] = max_reached;
     if (item < 3) {
         real sum = 0;
         for (uint other = 0; other < GROUP; other++) sum += parts[item * PARTS + other];
@@ -198,7 +198,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     local Staged staged[CHUNK];
     local float scratch[SCRATCH];
     local float2 *fragments = (local float2 *)scratch;      // by splat and pixel: light and opacity, then weight and derivative
-    local Loss shared[PIXELS];
+    local PixelGradient shared[PIXELS];
     local uint slots[CHUNK], within[PATCHES];               // as bits, the splats whose bounds meet a patch
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
     uint id = get_group_id(0), item = get_local_id(0);
@@ -235,21 +235,21 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     uint patch = item / 32, in_patch = item % 32;
     int column = (int)(patch % PATCHES_X * PATCH_W + in_patch % PATCH_W), px = x0 + column;
     int top = (int)(patch / PATCHES_X * PATCH_H + in_patch / PATCH_W);
-    Loss losses[EACH];
+    PixelGradient gradients[EACH];
     Pixel pixels[EACH];
     for (int each = 0; each < EACH; each++) {
-        Loss *loss = &losses[each];
+        PixelGradient *gradient = &gradients[each];
         int x = px, y = y0 + top + 4 * each;
         size_t at = y * (size_t)stride + x, mine = (top + 4 * each) * TILE_W + column;
-        loss->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
-        loss->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
-        loss->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
-        loss->behind = FMA(loss->r, (vfloat)background_r, FMA(loss->g, (vfloat)background_g, loss->b * background_b));
-//@@ loss_start
-        float2 kept = ((global const float2 *)checkpoints)[(size_t)id * PIXELS + mine];
-        loss->behind = kept.y;
-        shared[mine] = *loss;
-        pixel_start(&pixels[each], kept.x);
+        gradient->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
+        gradient->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
+        gradient->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+        gradient->behind = FMA(gradient->r, (vfloat)background_r, FMA(gradient->g, (vfloat)background_g, gradient->b * background_b));
+//@@ pixel_gradient_start
+        float2 checkpoint = ((global const float2 *)checkpoints)[(size_t)id * PIXELS + mine];
+        gradient->behind = checkpoint.y;
+        shared[mine] = *gradient;
+        pixel_start(&pixels[each], checkpoint.x);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
@@ -259,12 +259,12 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         const Splat s = copy_of(&staged[which]);
         for (int each = 0; each < EACH; each++) {
             int y = y0 + top + 4 * each;
-            wide light = 0.0f, opacity = 0.0f;
+            wide transmittance = 0.0f, opacity = 0.0f;
             if (pixels[each].t > stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
-                light = pixels[each].t;
-                opacity = walk_fragment(&s, px, y, &pixels[each], &constants);
+                transmittance = pixels[each].t;
+                opacity = forward_fragment(&s, px, y, &pixels[each], &constants);
             }
-            fragments[which * STRIDE + (top + 4 * each) * TILE_W + column] = (float2)(light, opacity);
+            fragments[which * STRIDE + (top + 4 * each) * TILE_W + column] = (float2)(transmittance, opacity);
         }
     }
     // each work-item reads what it has written itself; yet without a barrier NVIDIA's compiler (driver 580) has read before it wrote
@@ -280,7 +280,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
                 Crossing c = cross_at(&s, px, y0 + top + 4 * each, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
                 fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
                 const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-                *at = (float2)(weight, take_back(&losses[each], fragment_worth(&s, &losses[each], &g), weight, here.y));
+                *at = (float2)(weight, backward_opacity(&gradients[each], fragment_by_weight(&s, &gradients[each], &g), weight, here.y));
             } else
                 (*at).x = 0.0f;
         }
@@ -293,9 +293,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     if (which < count) {
         const Splat s = copy_of(&staged[which]);
         int left = max(s.x0 - x0, 0), right = min(s.x1 - x0, TILE_W), below = min(s.y1 - y0, TILE_H), across = right - left;
-        int turns = across > SHARE_OF_SPLAT / 2 ? 1 : across > SHARE_OF_SPLAT / 4 ? 2 : 4, columns = SHARE_OF_SPLAT / turns;
+        int row_step = across > SHARE_OF_SPLAT / 2 ? 1 : across > SHARE_OF_SPLAT / 4 ? 2 : 4, columns = SHARE_OF_SPLAT / row_step;
         int share = item % SHARE_OF_SPLAT, column = left + share % columns;
-        for (int row = column < right ? max(s.y0 - y0, 0) + share / columns : below; row < below; row += turns) {
+        for (int row = column < right ? max(s.y0 - y0, 0) + share / columns : below; row < below; row += row_step) {
             uint at = row * TILE_W + column;
             float2 here = fragments[which * STRIDE + at];
             if (here.x == 0.0f) continue;
@@ -303,8 +303,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             Crossing c = cross_at(&s, x0 + column, y0 + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
             fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
             const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-            const Loss loss = shared[at];
-            add_fragment(&sums, &s, &loss, &g, here.x, here.y, screen, x, y, &constants);
+            const PixelGradient gradient = shared[at];
+            add_fragment(&sums, &s, &gradient, &g, here.x, here.y, screen, x, y, &constants);
         }
     }
     const Moments m = moments_of(&sums, &constants);

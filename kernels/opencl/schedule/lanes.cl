@@ -2,7 +2,7 @@
 // Index space: one work-item (and work-group) per tile of each view.
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles; images where it resolves.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
-#define AHEAD_SPLATS 8
+#define PREFETCH_SPLATS 8
 
 kernel void blend(
 //@@ arguments blend
@@ -26,7 +26,7 @@ kernel void blend(
     uint alive = on_picture;      // those that still let light through
 
 //@@ pass
-//@@ walk
+//@@ tile_loop
             vfloat x = (float)(x0 + LEFT(block)) + BLOCK_X - (vfloat)s.ax, y = (float)(y0 + TOP(block)) + BLOCK_Y - (vfloat)s.ay;
             vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
             vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
@@ -36,15 +36,15 @@ kernel void blend(
             vfloat screen;
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
-//@@ drawn
+//@@ skip_fragment
             pixel_blend(&pixel, &s, c, mask, screen, &constants
 //@@ blend_arguments
             );
-            if (RARELY(!VANY(pixel_unfinished(&pixel, &constants)))) {
+            if (UNLIKELY(!VANY(pixel_unfinished(&pixel, &constants)))) {
                 alive &= ~(1u << block);
                 break;
             }
-//@@ walk_end
+//@@ tile_loop_end
 //@@ pass_end
 
     size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)number * tiles_y * TILE_H;

@@ -4,17 +4,17 @@
 // Reads:  splats, lists, starts[tiles + 1], windows, big_rows, splat_slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints, tapes; reserved[1], tiles that are taken.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
-#define AHEAD_SPLATS 8
+#define PREFETCH_SPLATS 8
 
-// Of a tile's list as many splats are walked forward and then back as the tape has room for: CHUNK at least, MOST at most.
-#define MOST (8 * CHUNK)
-#define ROOM (CHUNK * BLOCKS)
-#define RECORD (TILE_W * TILE_H + LANES)        // of a checkpoint: the light of each pixel, and the first splat
+// Of a tile's list as many splats are walked forward and then back as the tape has room for: CHUNK at least, TAPE_SPLATS at most.
+#define TAPE_SPLATS (8 * CHUNK)
+#define TAPE_FRAGMENTS (CHUNK * BLOCKS)
+#define CHECKPOINT_FLOATS (TILE_W * TILE_H + LANES)        // of a checkpoint: the light of each pixel, and the first splat
 
 typedef struct {            // fragments in the order in which they were drawn, block by block
-    vfloat light[ROOM], opacity[ROOM];
-    uint blocks[MOST];      // of a splat, as bits: blocks where anything is drawn
-    uint slots[MOST];
+    vfloat transmittance[TAPE_FRAGMENTS], opacity[TAPE_FRAGMENTS];
+    uint blocks[TAPE_SPLATS];      // of a splat, as bits: blocks where anything is drawn
+    uint slots[TAPE_SPLATS];
     uint length;            // blocks
 } Tape;
 
@@ -26,7 +26,7 @@ typedef struct {
 
 typedef struct {            // of a tile's first block: where its pixels are, relative to a splat's anchor; whole numbers all
     vfloat x, y;
-} Place;
+} BlockOrigin;
 
 typedef struct {            // of a splat in a block: places relative to its anchor, and its forms
     vfloat x, y, nu_x, nv_x, screen;
@@ -34,12 +34,12 @@ typedef struct {            // of a splat in a block: places relative to its anc
     Crossing crossing;
 } Block;
 
-static inline Place place_of(const Splat *s, const Tile *tile) {
-    const Place place = {(float)(tile->x0 - s->ax) + BLOCK_X, (float)(tile->y0 - s->ay) + BLOCK_Y};
+static inline BlockOrigin block_origin(const Splat *s, const Tile *tile) {
+    const BlockOrigin place = {(float)(tile->x0 - s->ax) + BLOCK_X, (float)(tile->y0 - s->ay) + BLOCK_Y};
     return place;
 }
 
-static inline Block block_of(const Splat *s, const Tile *tile, const Place *place, int block) {
+static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin *place, int block) {
     Block b;
     wide half_r2 = s->log_opacity - tile->constants->log_cut;
     b.x = place->x + tile->left[block];
@@ -52,40 +52,40 @@ static inline Block block_of(const Splat *s, const Tile *tile, const Place *plac
 }
 
 // Lets the splat take its light in the blocks that are alive; keeps on the tape what it took there. Returns which stay alive.
-static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, global Tape *tape, uint place) {
+static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, global Tape *tape, uint place) {
     const BlendConstants *constants = tile->constants;
-    uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_cut, constants->filter), drawn_in = 0;
+    uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_cut, constants->filter), contributing = 0;
     uint length = tape->length;
-    const Place at = place_of(s, tile);
+    const BlockOrigin at = block_origin(s, tile);
     for (; touched != 0; touched &= touched - 1) {
         int block = 31 - clz((int)(touched & -touched));
         const Block b = block_of(s, tile, &at, block);
-        if (RARELY(!VANY(b.mask))) continue;
+        if (UNLIKELY(!VANY(b.mask))) continue;
         vfloat half_rho = fragment_half_rho(s, b.crossing, 1.0f / b.crossing.d, b.screen);
         vfloat opacity = fragment_opacity(s, half_rho, constants->ceiling);
-        tape->light[length] = pixels[block].t;
-        tape->opacity[length++] = take_light(&pixels[block], opacity, b.mask, constants);
-        drawn_in |= 1u << block;
-        if (RARELY(!VANY(VMASK(pixel_light(&pixels[block]) > constants->stop)))) alive &= ~(1u << block);
+        tape->transmittance[length] = pixels[block].t;
+        tape->opacity[length++] = attenuate(&pixels[block], opacity, b.mask, constants);
+        contributing |= 1u << block;
+        if (UNLIKELY(!VANY(VMASK(pixel_transmittance(&pixels[block]) > constants->stop)))) alive &= ~(1u << block);
     }
     tape->length = length;
-    tape->blocks[place] = drawn_in;
+    tape->blocks[place] = contributing;
     return alive;
 }
 
 // Takes the splat's fragments, the last ones on the tape, back and off it.
-static inline void back_splat(const Splat *s, const Tile *tile, global Tape *tape, uint place, Loss *losses, global float *slot) {
+static inline void backward_splat(const Splat *s, const Tile *tile, global Tape *tape, uint place, PixelGradient *gradients, global float *slot) {
     const BlendConstants *constants = tile->constants;
     Sums sums = {0};
     uint blocks = tape->blocks[place], at = tape->length -= popcount(blocks);
-    const Place corner = place_of(s, tile);
+    const BlockOrigin corner = block_origin(s, tile);
     for (; blocks != 0; blocks &= blocks - 1, at++) {
         int block = 31 - clz((int)(blocks & -blocks));
         const Block b = block_of(s, tile, &corner, block);
         const Geometry g = geometry_of(s, b.crossing, b.nu_x, b.nv_x, b.y, b.screen);
-        vfloat opacity = tape->opacity[at], weight = tape->light[at] * opacity;
-        vfloat by_log = take_back(&losses[block], fragment_worth(s, &losses[block], &g), weight, opacity);
-        add_fragment(&sums, s, &losses[block], &g, weight, by_log, b.screen, b.x, b.y, constants);
+        vfloat opacity = tape->opacity[at], weight = tape->transmittance[at] * opacity;
+        vfloat by_log = backward_opacity(&gradients[block], fragment_by_weight(s, &gradients[block], &g), weight, opacity);
+        add_fragment(&sums, s, &gradients[block], &g, weight, by_log, b.screen, b.x, b.y, constants);
     }
     const Parts m = moments_of(&sums, constants);
 #if LANES == 16
@@ -101,17 +101,17 @@ static inline void back_splat(const Splat *s, const Tile *tile, global Tape *tap
 #endif
 }
 
-static inline void leave_nothing(global float *moments, uint slot) {
+static inline void store_zero_moments(global float *moments, uint slot) {
     const Moments nothing = {0};
     ((global Moments *)moments)[slot] = nothing;
 }
 
 // All that is asked of the splat that the list has at `next`.
-#define FETCH_SPLAT(next)                                                          \
-    FETCH_AHEAD(splats + lists[next]);                                             \
-    FETCH_AHEAD((global const char *)(splats + lists[next]) + 64);                 \
-    FETCH_AHEAD(windows + lists[next]);                                            \
-    FETCH_AHEAD(splat_slots + lists[next])
+#define PREFETCH_SPLAT(next)                                                          \
+    PREFETCH(splats + lists[next]);                                             \
+    PREFETCH((global const char *)(splats + lists[next]) + 64);                 \
+    PREFETCH(windows + lists[next]);                                            \
+    PREFETCH(splat_slots + lists[next])
 
 kernel void blend_backward(
 //@@ arguments blend_backward
@@ -132,85 +132,85 @@ kernel void blend_backward(
         uint start = starts[number], end = starts[number + 1];
 
         // the derivatives of the tile's pixels; there is nothing outside of the picture
-        Loss losses[BLOCKS];
+        PixelGradient gradients[BLOCKS];
         for (int block = 0; block < BLOCKS; block++) {
-            Loss *loss = &losses[block];
+            PixelGradient *gradient = &gradients[block];
             int x = tile.x0 + LEFT(block), y = tile.y0 + TOP(block);
             size_t at = y * (size_t)stride + x;
-            loss->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
-            loss->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
-            loss->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
-            loss->behind = FMA(loss->r, (vfloat)background_r, FMA(loss->g, (vfloat)background_g, loss->b * background_b));
-//@@ loss_start
+            gradient->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
+            gradient->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
+            gradient->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+            gradient->behind = FMA(gradient->r, (vfloat)background_r, FMA(gradient->g, (vfloat)background_g, gradient->b * background_b));
+//@@ pixel_gradient_start
         }
 
         // forward: the light in front of each chunk; of the last one the fragments stay on the tape
         Pixel pixels[BLOCKS];
         for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block], (vfloat)1.0f);
         const uint on_picture = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
-        uint alive = on_picture, walked = start, first = start, chunk = 0;
-        global float *own = checkpoints + (size_t)(start / CHUNK + number) * RECORD;
+        uint alive = on_picture, position = start, first = start, chunk = 0;
+        global float *own = checkpoints + (size_t)(start / CHUNK + number) * CHECKPOINT_FLOATS;
         tape->length = 0;
-        for (; walked < end && alive; walked++) {
-            if (walked == start || tape->length + BLOCKS > ROOM || walked - first == MOST) {
-                chunk += walked != start;
-                first = walked;
+        for (; position < end && alive; position++) {
+            if (position == start || tape->length + BLOCKS > TAPE_FRAGMENTS || position - first == TAPE_SPLATS) {
+                chunk += position != start;
+                first = position;
                 tape->length = 0;
-                for (int block = 0; block < BLOCKS; block++) VSTORE(pixel_light(&pixels[block]), own + (size_t)chunk * RECORD + block * LANES);
-                ((global uint *)own)[(size_t)chunk * RECORD + TILE_W * TILE_H] = first;
+                for (int block = 0; block < BLOCKS; block++) VSTORE(pixel_transmittance(&pixels[block]), own + (size_t)chunk * CHECKPOINT_FLOATS + block * LANES);
+                ((global uint *)own)[(size_t)chunk * CHECKPOINT_FLOATS + TILE_W * TILE_H] = first;
             }
-            FETCH_SPLAT(min(walked + AHEAD_SPLATS, end - 1));
-            uint index = lists[walked], place = walked - first;
+            PREFETCH_SPLAT(min(position + PREFETCH_SPLATS, end - 1));
+            uint index = lists[position], place = position - first;
             tape->slots[place] = splat_slots[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
             const Splat s = splats[index];
-            alive = walk_splat(&s, &tile, pixels, alive, tape, place);
+            alive = forward_splat(&s, &tile, pixels, alive, tape, place);
         }
         vfloat behind_r = 0.0f, behind_g = 0.0f, behind_b = 0.0f;
         for (int block = 0; block < BLOCKS; block++) {
-            behind_r = FMA(pixels[block].t, losses[block].r, behind_r);
-            behind_g = FMA(pixels[block].t, losses[block].g, behind_g);
-            behind_b = FMA(pixels[block].t, losses[block].b, behind_b);
+            behind_r = FMA(pixels[block].t, gradients[block].r, behind_r);
+            behind_g = FMA(pixels[block].t, gradients[block].g, behind_g);
+            behind_b = FMA(pixels[block].t, gradients[block].b, behind_b);
         }
         tile_sums[3 * number] = lane_sum(behind_r);
         tile_sums[3 * number + 1] = lane_sum(behind_g);
         tile_sums[3 * number + 2] = lane_sum(behind_b);
 
         // splats behind the last that was walked have nothing to do with the picture
-        for (uint k = walked; k < end; k++) {
-            FETCH_AHEAD(windows + lists[min(k + AHEAD_SPLATS, end - 1)]);
-            FETCH_AHEAD(splat_slots + lists[min(k + AHEAD_SPLATS, end - 1)]);
+        for (uint k = position; k < end; k++) {
+            PREFETCH(windows + lists[min(k + PREFETCH_SPLATS, end - 1)]);
+            PREFETCH(splat_slots + lists[min(k + PREFETCH_SPLATS, end - 1)]);
             uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_capacity, big_rows, column, tile_row);
-            leave_nothing(moments, slot);
+            store_zero_moments(moments, slot);
         }
-        for (bool again = false; walked > start; again = true) {
-            if (again) {
+        for (bool revisits = false; position > start; revisits = true) {
+            if (revisits) {
                 chunk--;
-                first = ((global const uint *)own)[(size_t)chunk * RECORD + TILE_W * TILE_H];
+                first = ((global const uint *)own)[(size_t)chunk * CHECKPOINT_FLOATS + TILE_W * TILE_H];
                 tape->length = 0;
                 alive = on_picture;
                 for (int block = 0; block < BLOCKS; block++) {
-                    pixel_start(&pixels[block], VLOAD(own + (size_t)chunk * RECORD + block * LANES));
+                    pixel_start(&pixels[block], VLOAD(own + (size_t)chunk * CHECKPOINT_FLOATS + block * LANES));
                     if (!VANY(VMASK(pixels[block].t > constants.stop))) alive &= ~(1u << block);
                 }
-                for (uint k = first; k < walked; k++) {
-                    FETCH_SPLAT(min(k + AHEAD_SPLATS, end - 1));
+                for (uint k = first; k < position; k++) {
+                    PREFETCH_SPLAT(min(k + PREFETCH_SPLATS, end - 1));
                     uint index = lists[k];
                     tape->slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_capacity, big_rows, column, tile_row);
                     const Splat s = splats[index];
-                    alive = walk_splat(&s, &tile, pixels, alive, tape, k - first);
+                    alive = forward_splat(&s, &tile, pixels, alive, tape, k - first);
                 }
             }
-            for (; walked > first; walked--) {
-                uint place = walked - 1 - first, next = max(walked - 1, first + AHEAD_SPLATS) - AHEAD_SPLATS;
-                FETCH_AHEAD(splats + lists[next]);
-                FETCH_AHEAD((global const char *)(splats + lists[next]) + 64);
-                FETCH_AHEAD(moments + (size_t)tape->slots[next - first] * FIELDS);
+            for (; position > first; position--) {
+                uint place = position - 1 - first, next = max(position - 1, first + PREFETCH_SPLATS) - PREFETCH_SPLATS;
+                PREFETCH(splats + lists[next]);
+                PREFETCH((global const char *)(splats + lists[next]) + 64);
+                PREFETCH(moments + (size_t)tape->slots[next - first] * FIELDS);
                 if (tape->blocks[place] == 0) {
-                    leave_nothing(moments, tape->slots[place]);
+                    store_zero_moments(moments, tape->slots[place]);
                     continue;
                 }
-                const Splat s = splats[lists[walked - 1]];
-                back_splat(&s, &tile, tape, place, losses, moments + (size_t)tape->slots[place] * FIELDS);
+                const Splat s = splats[lists[position - 1]];
+                backward_splat(&s, &tile, tape, place, gradients, moments + (size_t)tape->slots[place] * FIELDS);
             }
         }
     }

@@ -12,11 +12,11 @@
 // select instead, it could not go on without.
 #ifdef __has_builtin
 #if __has_builtin(__builtin_expect)
-#define RARELY(condition) __builtin_expect(condition, 0)
+#define UNLIKELY(condition) __builtin_expect(condition, 0)
 #endif
 #endif
-#ifndef RARELY
-#define RARELY(condition) (condition)
+#ifndef UNLIKELY
+#define UNLIKELY(condition) (condition)
 #endif
 
 // A bit for each block that meets columns [x0, x1) and rows [y0, y1) of the tile.

@@ -7,10 +7,10 @@ static inline float panorama_at(global const float *restrict panorama, int width
     return panorama[((size_t)y * width + x) * 3 + channel];
 }
 //@ backdrop
-    float turn_share = FMA(atan2(world_x, world_z), 0.15915494309189535f, 0.5f);
-    float fall_share = FMA(atan2(world_y, sqrt(FMA(world_x, world_x, world_z * world_z))), 0.31830988618379067f, 0.5f);
-    float panorama_x = FMA(turn_share, (float)panorama_width, -0.5f);
-    float panorama_y = FMA(fall_share, (float)panorama_height, -0.5f);
+    float longitude_share = FMA(atan2(world_x, world_z), 0.15915494309189535f, 0.5f);
+    float latitude_share = FMA(atan2(world_y, sqrt(FMA(world_x, world_x, world_z * world_z))), 0.31830988618379067f, 0.5f);
+    float panorama_x = FMA(longitude_share, (float)panorama_width, -0.5f);
+    float panorama_y = FMA(latitude_share, (float)panorama_height, -0.5f);
     int left = (int)floor(panorama_x), top = (int)floor(panorama_y);
     float right_share = panorama_x - (float)left, bottom_share = panorama_y - (float)top;
     for (int channel = 0; channel < 3; channel++) {

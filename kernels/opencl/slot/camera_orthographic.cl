@@ -35,7 +35,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
 //@ cross
     c.z = FMA((vfloat)s.zy, (vfloat)y, FMA((vfloat)s.zx, x, (vfloat)s.z0));
     c.inside &= VMASK(c.z >= s.z_near * c.d);
-//@ camera_see_depth
+//@ camera_attribute_depth
     depth_d = c.z;
 //@ camera_dot_depth
         beyond_near = VMASK(c.z >= s->z_near * c.d);

@@ -6,18 +6,18 @@
     real determinant = view->focal_x * view->focal_y * su * sv * offset;   // of M: exact where tw . k0 cancels
 //@ camera_blocks_nearest
         // depth is z_numerator / D, within the splat's range, and D at most `d` here; not where D may be 0, nor of what is no disk
-        vint met = VMASK(d > 2.0f * around_d) & VMASK((vfloat)s->z_numerator > 0.0f) & VMASK((vfloat)conic_h == (vfloat)(float)half_r2);
+        vint hit = VMASK(d > 2.0f * around_d) & VMASK((vfloat)s->z_numerator > 0.0f) & VMASK((vfloat)conic_h == (vfloat)(float)half_r2);
         vfloat depth = fmin((1.0f - BLOCKS_SLACK) * s->z_numerator / d, (vfloat)(s->z_center + s->z_reach));
-        least = VSELECT(least, fmax(depth, least), met);
+        min_depth = VSELECT(min_depth, fmax(depth, min_depth), hit);
 //@ camera_dot
         // The dot is never the larger weight of a splat that is wider than it wherever the dot reaches: there D is at least
-        // `least`, in front of the near plane, and (n_u^2 + n_v^2) / D^2 at most the squared distance.
+        // `min_d`, in front of the near plane, and (n_u^2 + n_v^2) / D^2 at most the squared distance.
         real spread = sqrt((kx.z * kx.z + ky.z * ky.z) * (half_r2 / view->filter));
         real ahead = (k0.z + kx.z * (center_x - anchor_x) + ky.z * (center_y - anchor_y)) * (determinant < 0 ? -1 : 1);
-        real least = ahead - spread, steep = kx.x * kx.x + kx.y * kx.y + ky.x * ky.x + ky.y * ky.y;
+        real min_d = ahead - spread, steep = kx.x * kx.x + kx.y * kx.y + ky.x * ky.x + ky.y * ky.y;
         // a margin for the rounding of the record's float32
-        if (facing != 0 && least > 0 && (ahead + spread) * near < REAL(0.999) * fabs(determinant) &&
-            steep < REAL(1.99) * view->filter * least * least)
+        if (facing != 0 && min_d > 0 && (ahead + spread) * near < REAL(0.999) * fabs(determinant) &&
+            steep < REAL(1.99) * view->filter * min_d * min_d)
             record.dot_x = 1e18f;
 //@ camera_derivative
         real ahead = 1 / pz;

@@ -1,3 +1,3 @@
 // The paper's compositing formula: every fragment over what lies behind it, in depth order.
 //@ compose
-    composite(pixel, &seen, opacity, mask, constants);
+    composite(pixel, &attributes, opacity, mask, constants);

@@ -10,8 +10,8 @@
 //@@ camera_image
         const real spread = REAL(0.3) / view->filter;
         real xx = dot3(across, across), xy = dot3(across, down), yy = dot3(down, down);
-        real3_ turned = cross3(across, down);                        // so that the determinant does not cancel
-        real determinant2 = dot3(turned, turned), grown = determinant2 + spread * (xx + yy + spread);
+        real3_ crossed = cross3(across, down);                        // so that the determinant does not cancel
+        real determinant2 = dot3(crossed, crossed), grown = determinant2 + spread * (xx + yy + spread);
 //@@ ewa_opacity
         real l11 = sqrt(xx + spread), l21 = xy / l11, l22 = sqrt(grown) / l11;
         a.x = l11 / per_x; a.y = l21 / per_y; a.z = 0;
@@ -30,11 +30,11 @@
         bool parallel = false;
 //@@ camera_ellipsoid
         real3_ axes[3] = {first, second, cross3(first, second)};
-        const real lengths[3] = {fmax(scale_uv.x, SMALLEST_SCALE), fmax(scale_uv.y, SMALLEST_SCALE), THICKNESS_HERE};
-        real least = fmin(fmin(lengths[0], lengths[1]), lengths[2]);
+        const real lengths[3] = {fmax(scale_uv.x, MIN_SCALE), fmax(scale_uv.y, MIN_SCALE), THICKNESS_HERE};
+        real min_length = fmin(fmin(lengths[0], lengths[1]), lengths[2]);
         real3_ outward = {0, 0, 0};
         for (int k = 0; k < 3; k++) {
-            real share = least / lengths[k], along = dot3(axes[k], towards) * share * share;
+            real share = min_length / lengths[k], along = dot3(axes[k], towards) * share * share;
             outward.x += along * axes[k].x; outward.y += along * axes[k].y; outward.z += along * axes[k].z;
         }
         real length = sqrt(dot3(outward, outward));

@@ -14,8 +14,8 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     int i0 = lengths[0] >= lengths[1] && lengths[0] >= lengths[2] ? 0 : lengths[1] >= lengths[2] ? 1 : 2;
     int i1 = (i0 + 1) % 3, i2 = (i0 + 2) % 3;
     real3_ e0 = axes[i0], e1 = axes[i1], e2 = axes[i2];
-    real s0 = lengths[i0], s1 = lengths[i1], s2 = lengths[i2], least = fmin(s1, s2);
-    real w0 = least / s0, w1 = least / s1, w2 = least / s2;
+    real s0 = lengths[i0], s1 = lengths[i1], s2 = lengths[i2], min_length = fmin(s1, s2);
+    real w0 = min_length / s0, w1 = min_length / s1, w2 = min_length / s2;
     // `least` times W towards, so that it neither over- nor underflows
     real g0 = dot3(e0, towards) / s0 * w0, g1 = dot3(e1, towards) / s1 * w1, g2 = dot3(e2, towards) / s2 * w2;
     real h = hypot(g1, g2), m = hypot(g0, h);
@@ -32,7 +32,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     real length = sqrt(dot3(n, n));
     facet->x = n.x / length; facet->y = n.y / length; facet->z = n.z / length;
     *area = s0 * fmax(s1, s2) * m / dot3(*facet, towards);
-    return least / m;
+    return min_length / m;
 }
 //@ lowpass_make
     real inverse_m2 = 0;                                // 1 / m^2

@@ -37,7 +37,7 @@
         if (HAS_DOT(s)) {
             vfloat dot_x = fmax(fabs(x - s->dot_x) - half_x - BLOCKS_PAD, (vfloat)0.0f);
             vfloat dot_y = fmax(fabs(y - s->dot_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
-            away &= VMASK(FMA(dot_x, dot_x, dot_y * dot_y) * filter > half_r2);
+            outside &= VMASK(FMA(dot_x, dot_x, dot_y * dot_y) * filter > half_r2);
         }
 //@ fragment_mask
 // A splat without a dot has it far away, or at NaN where the lens does not see the centre. Vectors of pixels skip it; for single pixels the
@@ -67,7 +67,7 @@ static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat invers
     vfloat screen;              // rho / 2 of the dot
 //@ dot_mask
             c.screen = screen;
-//@ dot_see_depth
+//@ dot_attribute_depth
     // In the dot the ray may meet the plane far outside of the splat. What lies beyond the circle of rho = 2 ln 255, within which a splat is
     // 1/255 of its opacity or more, is mirrored at it: the way from the centre's depth is multiplied by 2 ln 255 / rho, and so goes to
     // 0 at the plane's horizon. Where the dot's rho is larger it is the circle, so that nothing jumps where the dot takes over (docs/order.md).
@@ -75,12 +75,12 @@ static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat invers
         vfloat circle = VMAX(c.screen, (vfloat)WIDE(5.5412635451584261));
         vint on_plane = VMASK((c.q * inverse_d) * inverse_d <= circle), beyond_near = VMASK(c.d <= s->d_near);
 //@@ camera_dot_depth
-//@@ plane_dot_depth
-        met &= beyond_near;
+//@@ coplanar_dot_depth
+        hit &= beyond_near;
         depth = VSELECT(FMA(circle * (depth_d - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center), depth, on_plane);
     }
 //@ dot_blocks_nearest
-        if (HAS_DOT(s)) least = fmin(least, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->nearest));
+        if (HAS_DOT(s)) min_depth = fmin(min_depth, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->nearest));
 //@ dot_depth_reach
 #ifndef BOX_HERE
 #define BOX_HERE false

@@ -18,5 +18,5 @@
 //@ empty
                        && false         // the surface is drawn everywhere
 //@ compose
-    mask &= VMASK(seen.z < pixel->opaque_z);
+    mask &= VMASK(attributes.z < pixel->opaque_z);
     if (!VANY(mask)) return;

@@ -9,5 +9,5 @@
     vint drop = live & VMASK(pixel->t * (1.0f - opacity) <= constants->stop);
     pixel->finished |= drop;
     live &= ~drop;
-//@ layer_seen
+//@ external_attributes
         pixel->finished = 0;

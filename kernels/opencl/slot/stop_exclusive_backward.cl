@@ -1,3 +1,3 @@
 // A pixel that is finished stays so from one chunk of a list to the next: no light goes on.
-//@ light
-    light = VSELECT(light, (vfloat)0.0f, pixel->finished);
+//@ transmittance
+    transmittance = VSELECT(transmittance, (vfloat)0.0f, pixel->finished);

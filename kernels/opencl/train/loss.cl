@@ -4,7 +4,7 @@
 #define EACH_ROWS 4
 
 // Where a work-item's values lie in an image, `rows` rows of them.
-#define HERE(rows) \
+#define LOCATE(rows) \
     int column = get_global_id(0) * LANES, row = get_global_id(1) * (rows); \
     if (column >= width || row >= height) return; \
     size_t at = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column
@@ -17,10 +17,10 @@ kernel void loss_take(
     int column = get_global_id(0), row = get_global_id(1);
     if (column >= width || row >= height) return;
     size_t from = (size_t)row * width + column, to = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column;
-    float wanted = truth[from] * (1.0f / 255);
+    float target = truth[from] * (1.0f / 255);
     bool counts = !masked || mask[(size_t)row * (width / 3) + column / 3];
-    images[to] = counts ? rgb[from] : wanted;
-    images[image_stride + to] = wanted;
+    images[to] = counts ? rgb[from] : target;
+    images[image_stride + to] = target;
 }
 
 // Index space: (LANES values, rows). Reads: images 0 and 1, of a and b. Writes: images 2 to 6, the means along rows of a, b, a a,
@@ -28,7 +28,7 @@ kernel void loss_take(
 kernel void loss_rows(
 //@@ arguments loss_rows
 ) {
-    HERE(1);
+    LOCATE(1);
     vfloat a = 0, b = 0, aa = 0, bb = 0, ab = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
         vfloat x = VLOAD(images + at + 3 * k), y = VLOAD(images + image_stride + at + 3 * k), w = WINDOW[k + RADIUS];
@@ -66,16 +66,16 @@ static inline void columns_of(global const float *from, int count, int stride, u
 kernel void loss_columns(
 //@@ arguments loss_columns
 ) {
-    HERE(EACH_ROWS);
-    vfloat found[EACH_ROWS][5];
-    columns_of(images + 2 * image_stride + at, 5, stride, image_stride, found);
+    LOCATE(EACH_ROWS);
+    vfloat sums_of_rows[EACH_ROWS][5];
+    columns_of(images + 2 * image_stride + at, 5, stride, image_stride, sums_of_rows);
     for (int each = 0; each < EACH_ROWS && row + each < height; each++, at += stride) {
-        vfloat a = found[each][0], b = found[each][1], aa = found[each][2], bb = found[each][3], ab = found[each][4];
-        const Similar here = similar_of(a, b, aa, bb, ab);
+        vfloat a = sums_of_rows[each][0], b = sums_of_rows[each][1], aa = sums_of_rows[each][2], bb = sums_of_rows[each][3], ab = sums_of_rows[each][4];
+        const Ssim here = ssim_of(a, b, aa, bb, ab);
         VSTORE(INSIDE(here.by_mean), images + 7 * image_stride + at);
         VSTORE(INSIDE(here.by_variance), images + 8 * image_stride + at);
         VSTORE(INSIDE(here.by_shared), images + 9 * image_stride + at);
-        VSTORE(INSIDE(here.similar), images + 10 * image_stride + at);
+        VSTORE(INSIDE(here.ssim), images + 10 * image_stride + at);
     }
 }
 
@@ -83,7 +83,7 @@ kernel void loss_columns(
 kernel void loss_rows_backward(
 //@@ arguments loss_rows_backward
 ) {
-    HERE(1);
+    LOCATE(1);
     vfloat by_mean = 0, by_variance = 0, by_shared = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
         global const float *from = images + 7 * image_stride + at + 3 * k;
@@ -101,11 +101,11 @@ kernel void loss_rows_backward(
 kernel void loss_columns_backward(
 //@@ arguments loss_columns_backward
 ) {
-    HERE(EACH_ROWS);
-    vfloat found[EACH_ROWS][5];
-    columns_of(images + 2 * image_stride + at, 3, stride, image_stride, found);
+    LOCATE(EACH_ROWS);
+    vfloat sums_of_rows[EACH_ROWS][5];
+    columns_of(images + 2 * image_stride + at, 3, stride, image_stride, sums_of_rows);
     for (int each = 0; each < EACH_ROWS && row < height; each++, row++, at += stride) {
-        vfloat by_mean = found[each][0], by_variance = found[each][1], by_shared = found[each][2];
+        vfloat by_mean = sums_of_rows[each][0], by_variance = sums_of_rows[each][1], by_shared = sums_of_rows[each][2];
         vfloat a = VLOAD(images + at), b = VLOAD(images + image_stride + at);
         vfloat slope = sign(a - b) * l1_share - (by_mean + 2.0f * a * by_variance + b * by_shared) * ssim_share;
         float values[LANES];
@@ -117,30 +117,30 @@ kernel void loss_columns_backward(
     }
 }
 
-// Index space: any number of work-groups of SUMMED. Reads: images 0, 1 and 10, margins of zeros too. Writes: each work-group's sums
+// Index space: any number of work-groups of SUM_ITEMS. Reads: images 0, 1 and 10, margins of zeros too. Writes: each work-group's sums
 // of |a - b|, (a - b)^2 and the SSIM, in a fixed order: the same on every run. A group has a piece of the images, so that a core that
 // takes one work-item after another stays in the same pages.
-#define SUMMED 128
-kernel __attribute__((reqd_work_group_size(SUMMED, 1, 1))) void loss_sums(
+#define SUM_ITEMS 128
+kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void loss_sums(
 //@@ arguments loss_sums
 ) {
-    local real kept[3][SUMMED];
+    local real partial[3][SUM_ITEMS];
     uint item = get_local_id(0);
-    real absolute = 0, squared = 0, similar = 0;
+    real absolute = 0, squared = 0, ssim = 0;
     size_t piece = (image_stride + get_num_groups(0) - 1) / get_num_groups(0), first = get_group_id(0) * piece;
-    for (size_t at = first + item; at < min(first + piece, (size_t)image_stride); at += SUMMED) {
+    for (size_t at = first + item; at < min(first + piece, (size_t)image_stride); at += SUM_ITEMS) {
         float difference = images[at] - images[image_stride + at];
         absolute += fabs(difference);
         squared += difference * difference;
-        similar += images[10 * image_stride + at];
+        ssim += images[10 * image_stride + at];
     }
-    kept[0][item] = absolute;
-    kept[1][item] = squared;
-    kept[2][item] = similar;
+    partial[0][item] = absolute;
+    partial[1][item] = squared;
+    partial[2][item] = ssim;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item < 3) {
         real sum = 0;
-        for (uint other = 0; other < SUMMED; other++) sum += kept[item][other];
+        for (uint other = 0; other < SUM_ITEMS; other++) sum += partial[item][other];
         sums[3 * get_group_id(0) + item] = (float)sum;
     }
 }

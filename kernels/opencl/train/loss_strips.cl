@@ -9,7 +9,7 @@
 
 // Of a row the picture's and the truth's values from `column` - MARGIN on, zeros beyond the picture. Where the mask is 0 the picture
 // is the truth.
-static inline void take_row(
+static inline void load_row(
     float *a, float *b, int column, int width, global const float *rgb, global const uchar *truth, int masked,
     global const uchar *mask
 ) {
@@ -23,9 +23,9 @@ static inline void take_row(
         for (int lane = 0; lane < LANES; lane++) {
             int at = from + lane;
             bool inside = at >= 0 && at < width;
-            float wanted = inside ? truth[at] * (1.0f / 255) : 0.0f;
-            b[k + lane] = wanted;
-            a[k + lane] = inside && (!masked || mask[at / 3]) ? rgb[at] : wanted;
+            float target = inside ? truth[at] * (1.0f / 255) : 0.0f;
+            b[k + lane] = target;
+            a[k + lane] = inside && (!masked || mask[at / 3]) ? rgb[at] : target;
         }
     }
 }
@@ -46,11 +46,11 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
     const int left = get_global_id(0) * PANEL, first = get_global_id(1) * STRIP, end = min(first + STRIP, height);
     float a[PANEL + 2 * MARGIN], b[PANEL + 2 * MARGIN];
     vfloat means[TAPS][5 * VECTORS];
-    real absolute = 0, squared = 0, similar = 0;
+    real absolute = 0, squared = 0, ssim = 0;
     for (int row = first - RADIUS; row < end + RADIUS; row++) {
         bool there = row >= 0 && row < height;
         size_t from = there ? (size_t)row * width : 0;
-        take_row(a, b, left, there ? width : 0, rgb + from, truth + from, masked, mask + from / 3);
+        load_row(a, b, left, there ? width : 0, rgb + from, truth + from, masked, mask + from / 3);
         vfloat differences = 0, squares = 0;
         for (int vector = 0; vector < VECTORS; vector++) {
             vfloat sum_a = 0, sum_b = 0, sum_aa = 0, sum_bb = 0, sum_ab = 0;
@@ -77,7 +77,7 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
 
         int y = row - RADIUS;
         if (y < first) continue;
-        vfloat alike = 0;
+        vfloat ssim_sum = 0;
         const vfloat *rows[TAPS];
         for (int k = 0; k < TAPS; k++) rows[k] = means[(y - RADIUS + k + TAPS) % TAPS];
         size_t to = (size_t)(y + MARGIN_ROWS) * stride + MARGIN + left;
@@ -93,18 +93,18 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
                 mean_bb = FMA(w, row_means[3], mean_bb);
                 mean_ab = FMA(w, row_means[4], mean_ab);
             }
-            const Similar of = similar_of(mean_a, mean_b, mean_aa, mean_bb, mean_ab);
-            VSTORE(INSIDE(of.by_mean), images + to);
-            VSTORE(INSIDE(of.by_variance), images + image_stride + to);
-            VSTORE(INSIDE(of.by_shared), images + 2 * image_stride + to);
-            alike += INSIDE(of.similar);
+            const Ssim terms = ssim_of(mean_a, mean_b, mean_aa, mean_bb, mean_ab);
+            VSTORE(INSIDE(terms.by_mean), images + to);
+            VSTORE(INSIDE(terms.by_variance), images + image_stride + to);
+            VSTORE(INSIDE(terms.by_shared), images + 2 * image_stride + to);
+            ssim_sum += INSIDE(terms.ssim);
         }
-        similar += sum_of(alike);
+        ssim += sum_of(ssim_sum);
     }
     size_t group = get_global_id(1) * get_global_size(0) + get_global_id(0);
     sums[3 * group] = (float)absolute;
     sums[3 * group + 1] = (float)squared;
-    sums[3 * group + 2] = (float)similar;
+    sums[3 * group + 2] = (float)ssim;
 }
 
 // Reads: images 0 to 2, the picture, the truth, the mask. Writes: the derivative of the loss, of the picture's shape.
@@ -133,19 +133,19 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips_backward(
         for (int k = 0; k < TAPS; k++) rows[k] = means[(y - RADIUS + k + TAPS) % TAPS];
         float a[PANEL + 2 * MARGIN], b[PANEL + 2 * MARGIN];
         size_t at = (size_t)y * width;
-        take_row(a, b, left, width, rgb + at, truth + at, masked, mask + at / 3);
+        load_row(a, b, left, width, rgb + at, truth + at, masked, mask + at / 3);
         for (int vector = 0, column = left; vector < VECTORS && column < width; vector++, column += LANES) {
             vfloat by_mean = 0, by_variance = 0, by_shared = 0;
 #pragma unroll
             for (int k = 0; k < TAPS; k++) {
-                const vfloat *of = rows[k] + 3 * vector;
+                const vfloat *terms = rows[k] + 3 * vector;
                 vfloat w = WINDOW[k];
-                by_mean = FMA(w, of[0], by_mean);
-                by_variance = FMA(w, of[1], by_variance);
-                by_shared = FMA(w, of[2], by_shared);
+                by_mean = FMA(w, terms[0], by_mean);
+                by_variance = FMA(w, terms[1], by_variance);
+                by_shared = FMA(w, terms[2], by_shared);
             }
-            vfloat x = VLOAD(a + MARGIN + vector * LANES), wanted = VLOAD(b + MARGIN + vector * LANES);
-            vfloat slope = sign(x - wanted) * l1_share - (by_mean + 2.0f * x * by_variance + wanted * by_shared) * ssim_share;
+            vfloat x = VLOAD(a + MARGIN + vector * LANES), target = VLOAD(b + MARGIN + vector * LANES);
+            vfloat slope = sign(x - target) * l1_share - (by_mean + 2.0f * x * by_variance + target * by_shared) * ssim_share;
             if (!masked && column + LANES <= width) {
                 VSTORE(slope, by_rgb + at + column);
                 continue;

@@ -20,17 +20,17 @@ constant float WINDOW[2 * RADIUS + 1] = {
 
 // Of means in a window: the SSIM, and its derivatives by that of a, by that of a a, by that of a b.
 typedef struct {
-    vfloat similar, by_mean, by_variance, by_shared;
-} Similar;
+    vfloat ssim, by_mean, by_variance, by_shared;
+} Ssim;
 
-static inline Similar similar_of(vfloat a, vfloat b, vfloat aa, vfloat bb, vfloat ab) {
-    Similar found;
+static inline Ssim ssim_of(vfloat a, vfloat b, vfloat aa, vfloat bb, vfloat ab) {
+    Ssim result;
     vfloat means = a * a + b * b + C1, variances = (aa - a * a) + (bb - b * b) + C2;
     vfloat top = 2.0f * a * b + C1, shared = 2.0f * (ab - a * b) + C2;
-    found.similar = top * shared / (means * variances);
-    found.by_shared = 2.0f * top / (means * variances);
-    found.by_variance = -found.similar / variances;
-    vfloat by_mean = 2.0f * (b * shared - a * found.similar * variances) / (means * variances);
-    found.by_mean = by_mean - (2.0f * a * found.by_variance + b * found.by_shared);
-    return found;
+    result.ssim = top * shared / (means * variances);
+    result.by_shared = 2.0f * top / (means * variances);
+    result.by_variance = -result.ssim / variances;
+    vfloat by_mean = 2.0f * (b * shared - a * result.ssim * variances) / (means * variances);
+    result.by_mean = by_mean - (2.0f * a * result.by_variance + b * result.by_shared);
+    return result;
 }

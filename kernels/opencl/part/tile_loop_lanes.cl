@@ -1,15 +1,15 @@
 // The way through a tile's list in chunks, for CPUs: of a chunk block after block, so that a block's pixels stay in registers.
 //@ compose_types
 #define CHUNK 64
-//@ walk
+//@ tile_loop
     for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base; chunk < end && alive; chunk += CHUNK) {
         const uint length = min(end - chunk, (uint)CHUNK);
-//@@ walked
+//@@ tile_loop_chunk
         int touched[CHUNK];                 // of each splat its blocks
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
-            FETCH_AHEAD(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]);
-            FETCH_AHEAD((global const char *)(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]) + 64);
+            PREFETCH(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]);
+            PREFETCH((global const char *)(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]) + 64);
             const Splat s = splats[lists[chunk + which]];
             touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter);
         }
@@ -23,7 +23,7 @@
                 const uint k = chunk + 63 - (uint)clz(own & -own);
                 const Splat s = splats[lists[k]];
                 wide half_r2 = s.log_opacity - constants.log_cut;
-//@ walk_end
+//@ tile_loop_end
             }
             pixels[block] = pixel;
         }

@@ -1,26 +1,26 @@
-// As beside.cl, under the low-pass `pixel`, which widens a disk by what a sample sees of its plane, in depth too: the disk and the margin
+// As cull_frustum.cl, under the low-pass `pixel`, which widens a disk by what a sample sees of its plane, in depth too: the disk and the margin
 // larger by 1 / sqrt(1 - (R k)^2), R the cut-off's radius and k = 1/8, hold all of it (fidsplat/streaming/frustum_culling.py has the proof). Of a band of
 // rows, what lies beside those is told as well.
-//@ beside
+//@ cull_frustum
 #ifndef BOX_HERE
 #define BOX_HERE false
 #endif
-    real widest = fmax(scales[2 * i], scales[2 * i + 1]), most = sqrt((float)(REAL(-2.0) * view->log_cut));
+    real max_scale = fmax(scales[2 * i], scales[2 * i + 1]), most = sqrt((float)(REAL(-2.0) * view->log_cut));
     real deep = REAL(0.126) * most, larger = deep < 1 ? most / sqrt(1 - deep * deep) : INFINITY;
-    real margin = REAL(0.5) * larger + 4, around = REAL(1.001) * larger * fmax(widest, (real)SMALLEST_SCALE);    // for rounding
+    real margin = REAL(0.5) * larger + 4, sphere = REAL(1.001) * larger * fmax(max_scale, (real)MIN_SCALE);    // for rounding
     real left = view->center_x + margin, right = view->center_x - view->width - margin;
     real above = view->center_y + margin, below = view->center_y - view->height - margin;
     real above_band = above - view->band, below_band = view->center_y - view->band_end - margin;
     real to_x = view->focal_x * p.x, to_y = view->focal_y * p.y;
     // |n_x| + |n_z| >= |n|, and what is not a number is not away
     if (!BOX_HERE && opacities[i] <= 1.0f) {
-        if (to_x + left * p.z < -around * (view->focal_x + fabs(left)) || to_x + right * p.z > around * (view->focal_x + fabs(right))
-            || to_y + above * p.z < -around * (view->focal_y + fabs(above))
-            || to_y + below * p.z > around * (view->focal_y + fabs(below))) return;
+        if (to_x + left * p.z < -sphere * (view->focal_x + fabs(left)) || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
+            || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))
+            || to_y + below * p.z > sphere * (view->focal_y + fabs(below))) return;
         // not of a picture that is whole: its splats are listed as they are, and its last rows of tiles may reach below it
-        if ((view->band > 0 && to_y + above_band * p.z < -around * (view->focal_y + fabs(above_band)))
-            || (view->band_end < view->height && to_y + below_band * p.z > around * (view->focal_y + fabs(below_band)))) {
-            keys[at] = OUTSIDE;
+        if ((view->band > 0 && to_y + above_band * p.z < -sphere * (view->focal_y + fabs(above_band)))
+            || (view->band_end < view->height && to_y + below_band * p.z > sphere * (view->focal_y + fabs(below_band)))) {
+            keys[at] = OUT_OF_BAND;
             return;
         }
     }

@@ -1,4 +1,4 @@
-// As part/tile_ends_lanes.cl, for GPUs: lists are looked at in whole batches. The last does not count, since no vote follows it.
+// As part/termination_depth_lanes.cl, for GPUs: lists are looked at in whole batches. The last does not count, since no vote follows it.
 //@ group_start
     if (item == 0) tile_ends[tile] = UINT_MAX;
 //@ voted

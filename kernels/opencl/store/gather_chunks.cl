@@ -1,12 +1,12 @@
 // Puts chunks of splats that lie on the device into the arrays that a picture is drawn of, in the order of the scene;
-// where a store stands at many places, they are moved on the way. PLACES: whether the device has float64 for that.
+// where a store stands at many places, they are moved on the way. INSTANCED: whether the device has float64 for that.
 #pragma OPENCL FP_CONTRACT OFF
-#if PLACES
+#if INSTANCED
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 #endif
 
 // Index space: (words of the largest piece, pieces). Reads: pieces (row that it is taken from, row where it goes, rows,
-// its pose or NOWHERE), source. Writes: target. words: of a row.
+// its pose or NOT_PLACED), source. Writes: target. words: of a row.
 kernel void gather(global const uint *source, global const uint4 *pieces, uint words, global uint *target) {
     uint4 piece = pieces[get_global_id(1)];
     ulong word = get_global_id(0);
@@ -14,8 +14,8 @@ kernel void gather(global const uint *source, global const uint4 *pieces, uint w
     target[(ulong)piece.y * words + word] = source[(ulong)piece.x * words + word];
 }
 
-#if PLACES
-#define NOWHERE 0xffffffffu
+#if INSTANCED
+#define NOT_PLACED 0xffffffffu
 
 // As `moved` (fidsplat/store/subset.py), sum by sum, so that both have the same bits. A pose: its rotation by rows, where
 // it puts the zero of the means, its quaternion.
@@ -27,7 +27,7 @@ kernel void gather_means(
     if (row >= piece.z) return;
     global const float *from = source + (ulong)3 * (piece.x + row);
     global float *to = target + (ulong)3 * (piece.y + row);
-    if (piece.w == NOWHERE) {
+    if (piece.w == NOT_PLACED) {
         for (int i = 0; i < 3; i++) to[i] = from[i];
         return;
     }
@@ -45,12 +45,12 @@ kernel void gather_quats(
     if (row >= piece.z) return;
     global const float *from = source + (ulong)4 * (piece.x + row);
     global float *to = target + (ulong)4 * (piece.y + row);
-    if (piece.w == NOWHERE) {
+    if (piece.w == NOT_PLACED) {
         for (int i = 0; i < 4; i++) to[i] = from[i];
         return;
     }
-    global const double *turn = poses + 16 * (ulong)piece.w + 12;
-    double p = turn[0], q = turn[1], r = turn[2], s = turn[3];
+    global const double *rotation = poses + 16 * (ulong)piece.w + 12;
+    double p = rotation[0], q = rotation[1], r = rotation[2], s = rotation[3];
     double w = from[0], a = from[1], b = from[2], c = from[3];
     to[0] = (float)(p * w - q * a - r * b - s * c);
     to[1] = (float)(p * a + q * w + r * c - s * b);

@@ -2,13 +2,13 @@
 // finished, as a sort key; that of infinity where one was not. Fragments behind that are composited behind it, whichever there are, and
 // change nothing. A layer is taken by a depth that is not quite its own (slot/compose_planes.cl).
 //@ state
-    vfloat ended;               // depth of what was composited last
+    vfloat termination_depth;               // depth of what was composited last
 //@ start
-    pixel->ended = -INFINITY;
+    pixel->termination_depth = -INFINITY;
 //@ composite
-    pixel->ended = VSELECT(pixel->ended, FMA(fabs(seen->z), (vfloat)0x1p-14f, seen->z), live);
+    pixel->termination_depth = VSELECT(pixel->termination_depth, FMA(fabs(attributes->z), (vfloat)0x1p-14f, attributes->z), live);
 //@ compose_functions
 // Behind all that can show of a pixel.
-static inline vfloat pixel_end(const Pixel *pixel, const BlendConstants *constants) {
-    return VSELECT(pixel->ended, (vfloat)INFINITY, pixel_lit(pixel, constants));
+static inline vfloat pixel_termination(const Pixel *pixel, const BlendConstants *constants) {
+    return VSELECT(pixel->termination_depth, (vfloat)INFINITY, pixel_transmits(pixel, constants));
 }

@@ -13,41 +13,41 @@
 // Neither changes the order of fragments, which is by depth and place in the list.
 //@ compose_types
 #define CHUNK 128                   // splats, a multiple of 64 and a power of two
-#define EARLY 2048                  // splats that are read and not yet drawn: of more the nearest are drawn sooner, and wait
-#define MANY (CHUNK / 4)            // splats of a chunk behind what follows, for which the rest of the list is put in order
-#define CROWD 4                     // fragments in a queue, from which on what follows is looked at
-#define FURTHER 4                   // times as many splats as must be, so that it is done once for several that leave
-#define NOTHING INFINITY            // the depth where nothing waits in the queue
-#define NONE (-INFINITY)            // and where nothing is held
+#define DEFERRED_CAPACITY 2048                  // splats that are read and not yet drawn: of more the nearest are drawn sooner, and wait
+#define DEFER_THRESHOLD (CHUNK / 4)            // splats of a chunk behind what follows, for which the rest of the list is put in order
+#define LOOKAHEAD_QUEUE 4                     // fragments in a queue, from which on what follows is looked at
+#define LOOKAHEAD_FACTOR 4                   // times as many splats as must be, so that it is done once for several that leave
+#define EMPTY_Z INFINITY            // the depth where nothing waits in the queue
+#define NO_FRAGMENT (-INFINITY)            // and where nothing is held
 typedef union {
-    Seen seen;
-    vfloat fields[sizeof(Seen) / sizeof(vfloat)];
-} Shown;
+    Attributes attributes;
+    vfloat fields[sizeof(Attributes) / sizeof(vfloat)];
+} AttributeFields;
 typedef struct {                    // a fragment in each lane, of any splat
     vfloat z, opacity;
     vint place;                     // of its splat in the list
-    Shown shown;
+    AttributeFields data;
 } Entry;
 typedef struct {                    // apart from what is to stay in registers
-    Entry entries[WAITING];         // of WAITING - 1
-    uchar order[WAITING];           // places in the above: `count` that are taken, the nearest first, then those that are free
+    Entry entries[K_BUFFER_SIZE];         // of K_BUFFER_SIZE - 1
+    uchar order[K_BUFFER_SIZE];           // places in the above: `count` that are taken, the nearest first, then those that are free
     int count;
     int bounded;                    // whether not all fragments are taken, but those between
     vfloat from, until;             // these depths: at the first from `from_place` in the list on, at the second those before
     vint from_place, until_place;
 } Queue;
 typedef struct {
-    Entry held;
+    Entry farthest;
     Queue *queue;
-} Waiting;
+} KBuffer;
 
-static inline void waiting_start(Waiting *waiting) {
-    const Entry none = {(vfloat)NONE};      // and the rest 0, which shows nothing
-    waiting->held = none;
+static inline void k_buffer_start(KBuffer *k_buffer) {
+    const Entry none = {(vfloat)NO_FRAGMENT};      // and the rest 0, which shows nothing
+    k_buffer->farthest = none;
 }
 
 static inline void queue_start(Queue *queue) {
-    for (int k = 0; k < WAITING; k++) queue->order[k] = (uchar)k;
+    for (int k = 0; k < K_BUFFER_SIZE; k++) queue->order[k] = (uchar)k;
     queue->count = queue->bounded = 0;
     queue->from = -INFINITY;
     queue->until = INFINITY;
@@ -62,14 +62,14 @@ static inline uint rounded_key(wide depth) { return sortable((float)depth) & -CH
 static inline wide depth_of_key(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
 
 // The same of a splat whose depths in blocks are `keys`: the least in `blocks`.
-static inline uint least_key(const int *keys, uint blocks) {
-    int least = 0x7FFFFFFF;
-    for (; blocks != 0; blocks &= blocks - 1) least = min(least, keys[31 - clz((int)(blocks & -blocks))]);
-    return ((uint)least & -CHUNK) ^ 0x80000000u;
+static inline uint min_key(const int *keys, uint blocks) {
+    int min_depth = 0x7FFFFFFF;
+    for (; blocks != 0; blocks &= blocks - 1) min_depth = min(min_depth, keys[31 - clz((int)(blocks & -blocks))]);
+    return ((uint)min_depth & -CHUNK) ^ 0x80000000u;
 }
 
 // Puts `taken` numbers, at most CHUNK and all different, among the `count` of `early`, the greatest first. Returns how many they are then.
-static inline int early_take(ulong *early, int count, const ulong *batch, int taken) {
+static inline int insert_deferred(ulong *deferred, int count, const ulong *batch, int taken) {
     ulong sorted[CHUNK];
     for (int k = 0; k < taken; k++) {
         int before = 0;
@@ -77,68 +77,68 @@ static inline int early_take(ulong *early, int count, const ulong *batch, int ta
         sorted[before] = batch[k];
     }
     int old = count - 1, own = taken - 1;
-    for (int to = count + taken - 1; own >= 0; to--) early[to] = old >= 0 && early[old] < sorted[own] ? early[old--] : sorted[own--];
+    for (int to = count + taken - 1; own >= 0; to--) deferred[to] = old >= 0 && deferred[old] < sorted[own] ? deferred[old--] : sorted[own--];
     return count + taken;
 }
 //@ lanes_start
     Queue queues[BLOCKS];
     for (int block = 0; block < (empty ? 1 : BLOCKS); block++) {
         queue_start(&queues[block]);
-        pixels[block].waiting.queue = &queues[block];
+        pixels[block].k_buffer.queue = &queues[block];
     }
 //@ blocks_parameters
                                    , int which, int *keys
 //@ blocks_nearest
-        vfloat least = s->nearest;
+        vfloat min_depth = s->nearest;
 //@@ camera_blocks_nearest
 //@@ dot_blocks_nearest
-//@@ plane_blocks_nearest
-        VSTORE((in_order(VAS_INT(least)) & -CHUNK) | which, keys + first);
-//@ walk
-    ulong early[EARLY];         // splats that are read and not drawn: their least depths in the tile and their places, the furthest first
-    int count_early = 0;
+//@@ coplanar_blocks_nearest
+        VSTORE((in_order(VAS_INT(min_depth)) & -CHUNK) | which, keys + first);
+//@ tile_loop
+    ulong deferred[DEFERRED_CAPACITY];         // splats that are read and not drawn: their least depths in the tile and their places, the furthest first
+    int deferred_count = 0;
     bool ordered = false;       // whether all go there first
-    for (uint read = starts[tile] - base, end = starts[tile + 1] - base; (read < end || count_early > 0) && alive;) {
+    for (uint read = starts[tile] - base, end = starts[tile + 1] - base; (read < end || deferred_count > 0) && alive;) {
         uint places[CHUNK], listed[CHUNK], length = 0;      // in the list, and which splats
         // until what is to come next is known: a chunk of splats before all that is not read
-        const bool reads = read < end && count_early <= EARLY - CHUNK
-                           && (count_early < CHUNK || early[count_early - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
+        const bool reads = read < end && deferred_count <= DEFERRED_CAPACITY - CHUNK
+                           && (deferred_count < CHUNK || deferred[deferred_count - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
         if (reads)
             for (; length < CHUNK && read < end; length++) places[length] = read++;
         else
-            for (; length < CHUNK && count_early > 0; length++) places[length] = (uint)early[--count_early];
+            for (; length < CHUNK && deferred_count > 0; length++) places[length] = (uint)deferred[--deferred_count];
 //@@ chunk_end
-        wide after = read < end ? splats[lists[read]].nearest : INFINITY;
-        if (!reads && count_early > 0) after = fmin(after, depth_of_key((uint)(early[count_early - 1] >> 32)));
+        wide rest_nearest = read < end ? splats[lists[read]].nearest : INFINITY;
+        if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, depth_of_key((uint)(deferred[deferred_count - 1] >> 32)));
         for (uint which = 0; which < length; which++) listed[which] = lists[places[which]];
         // of each splat its blocks, and its least depth in each of them, rounded down to have its place in the chunk as last bits
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
         uint behind = 0;
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
-            global const Splat *ahead = splats + listed[min(which + AHEAD_SPLATS, length - 1)];
-            FETCH_AHEAD(ahead);
-            FETCH_AHEAD((global const char *)ahead + 64);
+            global const Splat *lookahead = splats + listed[min(which + PREFETCH_SPLATS, length - 1)];
+            PREFETCH(lookahead);
+            PREFETCH((global const char *)lookahead + 64);
             const Splat s = splats[listed[which]];
-            behind += s.z_center >= after;
+            behind += s.z_center >= rest_nearest;
             const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
             touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which]);
         }
         // what lies behind by its centre is asked where it lies here
-        if (reads && (ordered || behind > MANY)) {
+        if (reads && (ordered || behind > DEFER_THRESHOLD)) {
             ulong batch[CHUNK];
             int taken = 0, far = 0;
             for (uint which = 0; which < length; which++) {
                 const uint blocks = (uint)touched[which] & alive;
                 if (blocks == 0) continue;
-                const uint least = least_key(keys[which], blocks);
-                far += least >= rounded_key(after);
-                batch[taken++] = (ulong)least << 32 | places[which];
+                const uint min_depth = min_key(keys[which], blocks);
+                far += min_depth >= rounded_key(rest_nearest);
+                batch[taken++] = (ulong)min_depth << 32 | places[which];
             }
-            if (ordered || far > MANY) {
+            if (ordered || far > DEFER_THRESHOLD) {
                 ordered = true;
-                count_early = early_take(early, count_early, batch, taken);
+                deferred_count = insert_deferred(deferred, deferred_count, batch, taken);
                 continue;
             }
         }
@@ -162,68 +162,68 @@ static inline int early_take(ulong *early, int count, const ulong *batch, int ta
             sorted[count] = 0x7F800000;         // infinity
             wide nearest[CHUNK + LANES];        // what follows comes no nearer
             for (int first = 0; first < count; first += LANES)
-                VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)after), nearest + first);
+                VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)rest_nearest), nearest + first);
             vfloat depths[CHUNK];               // the same at each pixel, of those before `known`
             Pixel pixel = pixels[block];
             // Where much waits, what follows is looked at first: from `ahead` back to the splat after `next`, until no splat beyond
             // comes before what may leave, which is no further than what is held.
-            int known = 0, crowded = 0;
-            for (int next = 0, ahead = 0; next < count;) {
-                const vfloat following = next < known ? depths[next] : (vfloat)nearest[next], held = pixel.waiting.held.z;
-                crowded |= pixel.waiting.queue->count >= CROWD;
-                if (RARELY(crowded) && ahead == next && VANY(VMASK(held >= following))) {
-                    const int first = max(known, next + 1);
+            int evaluated = 0, looks_ahead = 0;
+            for (int next = 0, lookahead = 0; next < count;) {
+                const vfloat next_nearest = next < evaluated ? depths[next] : (vfloat)nearest[next], farthest = pixel.k_buffer.farthest.z;
+                looks_ahead |= pixel.k_buffer.queue->count >= LOOKAHEAD_QUEUE;
+                if (UNLIKELY(looks_ahead) && lookahead == next && VANY(VMASK(farthest >= next_nearest))) {
+                    const int first = max(evaluated, next + 1);
                     int last = first;
-                    while (last < count && VANY(VMASK(held >= nearest[last - 1]))) last++;
+                    while (last < count && VANY(VMASK(farthest >= nearest[last - 1]))) last++;
                     if (last > first) {
-                        known = min(next + 1 + FURTHER * (last - next - 1), count);
-                        ahead = known - 1;
-                        depths[ahead] = nearest[ahead];
+                        evaluated = min(next + 1 + LOOKAHEAD_FACTOR * (last - next - 1), count);
+                        lookahead = evaluated - 1;
+                        depths[lookahead] = nearest[lookahead];
                     }
                 }
-                const int which = sorted[ahead] & (CHUNK - 1);
+                const int which = sorted[lookahead] & (CHUNK - 1);
                 const Splat s = splats[listed[which]];
                 wide half_r2 = s.log_opacity - constants.log_cut;
-//@ walk_end
-                ahead = ++next;
+//@ tile_loop_end
+                lookahead = ++next;
             }
             pixels[block] = pixel;
         }
     }
 //@ compose_functions
 // Composites what waits nearer than `nearest`, but what shares an entry with something further.
-static inline void waiting_leave(Pixel *pixel, vfloat nearest, const BlendConstants *constants) {
-    Queue *queue = pixel->waiting.queue;
+static inline void k_buffer_flush(Pixel *pixel, vfloat nearest, const BlendConstants *constants) {
+    Queue *queue = pixel->k_buffer.queue;
     int left = 0;
     for (; left < queue->count; left++) {
         const Entry *entry = &queue->entries[queue->order[left]];
-        vint waits = VMASK(entry->z < NOTHING), ready = waits & VMASK(entry->z < nearest);
+        vint waits = VMASK(entry->z < EMPTY_Z), ready = waits & VMASK(entry->z < nearest);
         if (VANY(waits & ~ready)) break;
-        composite(pixel, &entry->shown.seen, entry->opacity, ready, constants);
+        composite(pixel, &entry->data.attributes, entry->opacity, ready, constants);
     }
     if (left == 0) return;
-    uchar free[WAITING];
+    uchar free[K_BUFFER_SIZE];
     for (int k = 0; k < left; k++) free[k] = queue->order[k];
     queue->count -= left;
     for (int k = 0; k < queue->count; k++) queue->order[k] = queue->order[k + left];
     for (int k = 0; k < left; k++) queue->order[queue->count + k] = free[k];
 }
 
-static inline void waiting_exchange(vfloat *one, vfloat *other, vint mask) {
+static inline void swap_lanes(vfloat *one, vfloat *other, vint mask) {
     vfloat kept = *one;
     *one = VSELECT(kept, *other, mask);
     *other = VSELECT(*other, kept, mask);
 }
 
-static inline void entry_exchange(Entry *one, Entry *other, vint mask) {
-    waiting_exchange(&one->z, &other->z, mask);
-    waiting_exchange(&one->opacity, &other->opacity, mask);
+static inline void swap_entries(Entry *one, Entry *other, vint mask) {
+    swap_lanes(&one->z, &other->z, mask);
+    swap_lanes(&one->opacity, &other->opacity, mask);
     vint place = one->place;
     one->place = VSELECT(place, other->place, mask);
     other->place = VSELECT(other->place, place, mask);
 #pragma unroll
-    for (uint field = 0; field < sizeof(Seen) / sizeof(vfloat); field++)
-        waiting_exchange(&one->shown.fields[field], &other->shown.fields[field], mask);
+    for (uint field = 0; field < sizeof(Attributes) / sizeof(vfloat); field++)
+        swap_lanes(&one->data.fields[field], &other->data.fields[field], mask);
 }
 
 // Where one comes before the other: of equal depths the first in the list.
@@ -232,81 +232,81 @@ static inline vint entry_before(const Entry *one, const Entry *other) {
 }
 
 // Puts what leaves `held` into the queue. Where that is full, what is held is dropped for it: the furthest of all.
-static inline void waiting_queue(Waiting *waiting, Entry *own) {
-    Queue *queue = waiting->queue;
-    own->z = VSELECT(own->z, (vfloat)NOTHING, VMASK(own->z == NONE));
+static inline void k_buffer_enqueue(KBuffer *k_buffer, Entry *own) {
+    Queue *queue = k_buffer->queue;
+    own->z = VSELECT(own->z, (vfloat)EMPTY_Z, VMASK(own->z == NO_FRAGMENT));
     for (int k = 0; k < queue->count; k++) {
         Entry *other = &queue->entries[queue->order[k]];
         vint before = entry_before(own, other);
-        if (VANY(before)) entry_exchange(own, other, before);
-        if (!VANY(VMASK(own->z < NOTHING))) return;
+        if (VANY(before)) swap_entries(own, other, before);
+        if (!VANY(VMASK(own->z < EMPTY_Z))) return;
     }
-    if (queue->count < WAITING - 1) {
+    if (queue->count < K_BUFFER_SIZE - 1) {
         queue->entries[queue->order[queue->count++]] = *own;
         return;
     }
-    vint dropped = VMASK(own->z < NOTHING);
-    queue->until = VSELECT(queue->until, waiting->held.z, dropped);
-    queue->until_place = VSELECT(queue->until_place, waiting->held.place, dropped);
+    vint dropped = VMASK(own->z < EMPTY_Z);
+    queue->until = VSELECT(queue->until, k_buffer->farthest.z, dropped);
+    queue->until_place = VSELECT(queue->until_place, k_buffer->farthest.place, dropped);
     queue->bounded = 1;
-    entry_exchange(own, &waiting->held, dropped);
+    swap_entries(own, &k_buffer->farthest, dropped);
 }
 
 // Takes a fragment of the splat at `place` in the list, with nothing to come before `nearest`.
-static inline void waiting_take(Pixel *pixel, vfloat nearest, vfloat z, vfloat opacity, const Seen *seen, uint splat, uint place,
+static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloat opacity, const Attributes *attributes, uint splat, uint place,
                                 vint mask, global const Splat *splats, const BlendConstants *constants) {
-    Waiting *waiting = &pixel->waiting;
+    KBuffer *k_buffer = &pixel->k_buffer;
     vint here = (vint)(int)place;
-    Queue *queue = waiting->queue;
+    Queue *queue = k_buffer->queue;
     if (queue->bounded) {
         mask &= VMASK(z < queue->until) | (VMASK(z == queue->until) & VMASK(here < queue->until_place));
         mask &= VMASK(z > queue->from) | (VMASK(z == queue->from) & VMASK(here >= queue->from_place));
         if (!VANY(mask)) return;
     }
-    Entry own = {VSELECT((vfloat)NONE, z, mask), opacity, here};
-    own.shown.seen = *seen;
-    entry_exchange(&own, &waiting->held, mask & ~entry_before(&own, &waiting->held));
-    vint leaves = VMASK(own.z > NONE);
+    Entry own = {VSELECT((vfloat)NO_FRAGMENT, z, mask), opacity, here};
+    own.data.attributes = *attributes;
+    swap_entries(&own, &k_buffer->farthest, mask & ~entry_before(&own, &k_buffer->farthest));
+    vint leaves = VMASK(own.z > NO_FRAGMENT);
     if (queue->count == 0 && !VANY(VMASK(own.z >= nearest)))
-        composite(pixel, &own.shown.seen, own.opacity, leaves, constants);
+        composite(pixel, &own.data.attributes, own.opacity, leaves, constants);
     else {
-        if (VANY(leaves)) waiting_queue(waiting, &own);
-        waiting_leave(pixel, nearest, constants);
+        if (VANY(leaves)) k_buffer_enqueue(k_buffer, &own);
+        k_buffer_flush(pixel, nearest, constants);
     }
 }
 
-//@@ plane_functions
+//@@ coplanar_functions
 // After the last splat of the list: composites what waits. Returns where the list is to be gone through again.
-static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
-//@@ plane_end
-    waiting_leave(pixel, INFINITY, constants);
-    Entry *held = &pixel->waiting.held;
-    composite(pixel, &held->shown.seen, held->opacity, VMASK(held->z > NONE), constants);
-    held->z = NONE;
-    Queue *queue = pixel->waiting.queue;
+static inline vint k_buffer_finish(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
+//@@ coplanar_finish
+    k_buffer_flush(pixel, INFINITY, constants);
+    Entry *farthest = &pixel->k_buffer.farthest;
+    composite(pixel, &farthest->data.attributes, farthest->opacity, VMASK(farthest->z > NO_FRAGMENT), constants);
+    farthest->z = NO_FRAGMENT;
+    Queue *queue = pixel->k_buffer.queue;
     queue->from = queue->until;
     queue->from_place = queue->until_place;
     queue->until = INFINITY;
     return VMASK(queue->from < INFINITY) & pixel_unfinished(pixel, constants);
 }
-//@ drawn
-            if (ahead > next) {
-                vfloat z = see(&s, c, 1.0f / c.d).z;
-//@@ plane_ahead
-                depths[ahead - 1] = VSELECT(depths[ahead], VMIN(z, depths[ahead]), mask);
-                ahead--;
+//@ skip_fragment
+            if (lookahead > next) {
+                vfloat z = fragment_attributes(&s, c, 1.0f / c.d).z;
+//@@ coplanar_lookahead
+                depths[lookahead - 1] = VSELECT(depths[lookahead], VMIN(z, depths[lookahead]), mask);
+                lookahead--;
                 continue;
             }
             if (!VANY(mask)) {              // nor is a layer closed for what is not drawn
-                ahead = ++next;
+                lookahead = ++next;
                 continue;
             }
 //@ blend_arguments
-                        , splats, listed[which], places[which], VMIN(VAS_FLOAT(in_order((vint)sorted[next] & -CHUNK)), (vfloat)after), following
+                        , splats, listed[which], places[which], VMIN(VAS_FLOAT(in_order((vint)sorted[next] & -CHUNK)), (vfloat)rest_nearest), next_nearest
 //@ pass
     do {
 //@ pass_end
         alive = 0;
         for (int block = 0; block < BLOCKS; block++)
-            if ((on_picture >> block & 1u) && VANY(waiting_end(&pixels[block], splats, &constants))) alive |= 1u << block;
+            if ((on_picture >> block & 1u) && VANY(k_buffer_finish(&pixels[block], splats, &constants))) alive |= 1u << block;
     } while (alive);

@@ -2,17 +2,17 @@
 // is not, where a neighbour in step with it is drawn). Sides of the picture are planes through the camera's centre, `margin` samples
 // outside: as far as the low-pass reaches, and bounds are wider than what they bound. Not for boxes: edges that meet at a sharp angle
 // are filtered far beyond their corner.
-//@ beside
+//@ cull_frustum
 #ifndef BOX_HERE
 #define BOX_HERE false
 #endif
-    real widest = fmax(scales[2 * i], scales[2 * i + 1]), most = sqrt((float)(REAL(-2.0) * view->log_cut));
-    real margin = most * SAMPLES + 4, around = REAL(1.001) * most * fmax(widest, (real)SMALLEST_SCALE);    // for rounding
+    real max_scale = fmax(scales[2 * i], scales[2 * i + 1]), most = sqrt((float)(REAL(-2.0) * view->log_cut));
+    real margin = most * SAMPLES + 4, sphere = REAL(1.001) * most * fmax(max_scale, (real)MIN_SCALE);    // for rounding
     real left = view->center_x + margin, right = view->center_x - view->width - margin;
     real above = view->center_y + margin, below = view->center_y - view->height - margin;
     real to_x = view->focal_x * p.x, to_y = view->focal_y * p.y;
     // |n_x| + |n_z| >= |n|, and what is not a number is not away
-    if (!BOX_HERE && opacities[i] <= 1.0f && (to_x + left * p.z < -around * (view->focal_x + fabs(left))
-                                              || to_x + right * p.z > around * (view->focal_x + fabs(right))
-                                              || to_y + above * p.z < -around * (view->focal_y + fabs(above))
-                                              || to_y + below * p.z > around * (view->focal_y + fabs(below)))) return;
+    if (!BOX_HERE && opacities[i] <= 1.0f && (to_x + left * p.z < -sphere * (view->focal_x + fabs(left))
+                                              || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
+                                              || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))
+                                              || to_y + below * p.z > sphere * (view->focal_y + fabs(below)))) return;

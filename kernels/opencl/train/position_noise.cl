@@ -21,13 +21,13 @@ kernel void shake(
     float4 u = (convert_float4(philox(counter, seed_low, seed_high)) + 0.5f) * 2.3283064e-10f;
     // the logarithm of a number that was rounded to 1 would be 0, that of 0 infinite
     float2 radius = sqrt(-2.0f * log(clamp(u.xy, 1.2e-10f, 0.99999994f))), angle = 6.2831853f * u.zw;
-    float3 draw = {radius.x * cos(angle.x), radius.y * cos(angle.y), radius.x * sin(angle.x)};
+    float3 sample = {radius.x * cos(angle.x), radius.y * cos(angle.y), radius.x * sin(angle.x)};
     float4 q = unit(vload4(i, quats));  // w x y z
     float w = q.x, x = q.y, y = q.z, z = q.w;
     float3 along = {1.0f - 2.0f * (y * y + z * z), 2.0f * (x * y + w * z), 2.0f * (x * z - w * y)};
     float3 across = {2.0f * (x * y - w * z), 1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z + w * x)};
     float2 s = exp(vload2(i, log_scales));
-    float faint = 1.0f / (1.0f + exp(steep * (sigmoid(logits[i]) - clear)));
-    float3 moved = along * (dot(along, draw) * s.x * s.x) + across * (dot(across, draw) * s.y * s.y);
-    vstore3(vload3(i, means) + moved * (faint * size), i, means);
+    float fade = 1.0f / (1.0f + exp(steep * (sigmoid(logits[i]) - clear)));
+    float3 offset = along * (dot(along, sample) * s.x * s.x) + across * (dot(across, sample) * s.y * s.y);
+    vstore3(vload3(i, means) + offset * (fade * size), i, means);
 }

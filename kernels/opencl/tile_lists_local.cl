@@ -1,16 +1,16 @@
 // Lists for GPUs where a work-group's splats share tiles: of many views of few tiles each, and of stores, whose neighbours lie near
 // each other. A work-group takes many splats of one view, counts their pairs by tile in local memory, and asks for the places of all
-// pairs of a tile at once. tiles.cl, whose kernels do the rest, asks pair by pair, and who asks for one tile waits for each other.
+// pairs of a tile at once. tile_lists.cl, whose kernels do the rest, asks pair by pair, and who asks for one tile waits for each other.
 
-#define GATHERED 4096             // splats of a work-group
-#define GATHER_TILES 4096         // that are counted in local memory
+#define GROUP_SPLATS 4096             // splats of a work-group
+#define LOCAL_TILES 4096         // that are counted in local memory
 
 // The work-group's share of the splats of its view [first, end), as places among those of all views.
 typedef struct { uint first, end; } Share;
 
 static inline Share share_of(uint count) {
-    uint before = get_group_id(1) * count, first = get_group_id(0) * GATHERED;
-    Share share = {before + first, before + min(first + GATHERED, count)};
+    uint before = get_group_id(1) * count, first = get_group_id(0) * GROUP_SPLATS;
+    Share share = {before + first, before + min(first + GROUP_SPLATS, count)};
     return share;
 }
 
@@ -19,68 +19,68 @@ typedef struct { uint corner; int columns, tiles; } Area;
 
 // ends: four values for its own use.
 static inline Area area_of(const Share *share, int tiles, int tiles_x, global const uint2 *restrict windows,
-                           global const uint *restrict keys, local int *ends) {
+                           global const uint *restrict keys, local int *extents) {
     Area area = {0, tiles_x, tiles};
-    if (tiles <= GATHER_TILES) return area;
-    if (get_local_id(0) < 4) ends[get_local_id(0)] = 0xFFFF;
+    if (tiles <= LOCAL_TILES) return area;
+    if (get_local_id(0) < 4) extents[get_local_id(0)] = 0xFFFF;
     barrier(CLK_LOCAL_MEM_FENCE);
-    int4 least = 0xFFFF;          // left, top, and right and bottom from the other side
+    int4 extent = 0xFFFF;          // left, top, and right and bottom from the other side
     for (uint splat = share->first + get_local_id(0); splat < share->end; splat += SCAN_ITEMS) {
         if (keys[splat] == CULLED || windows[splat].y == 0) continue;
         int left = windows[splat].x & 0xFFFFu, top = windows[splat].x >> 16;
-        least = min(least, (int4)(left, top, -left, -top));
+        extent = min(extent, (int4)(left, top, -left, -top));
     }
-    atomic_min(ends, least.x);
-    atomic_min(ends + 1, least.y);
-    atomic_min(ends + 2, least.z);
-    atomic_min(ends + 3, least.w);
+    atomic_min(extents, extent.x);
+    atomic_min(extents + 1, extent.y);
+    atomic_min(extents + 2, extent.z);
+    atomic_min(extents + 3, extent.w);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (ends[2] == 0xFFFF) return area;   // none: nothing is counted in it
-    area.corner = (uint)ends[0] | (uint)ends[1] << 16;
-    area.columns = WINDOW_W - ends[2] - ends[0];
-    area.tiles = area.columns * (WINDOW_H - ends[3] - ends[1]);
+    if (extents[2] == 0xFFFF) return area;   // none: nothing is counted in it
+    area.corner = (uint)extents[0] | (uint)extents[1] << 16;
+    area.columns = WINDOW_W - extents[2] - extents[0];
+    area.tiles = area.columns * (WINDOW_H - extents[3] - extents[1]);
     return area;
 }
 
 // A window's place in an area, and the tile of the view that has a place.
-static inline int place_in(const Area *area, uint2 window) { return window_tile((uint2)(window.x - area->corner, window.y), area->columns); }
-static inline int tile_at(const Area *area, int place, int tiles_x) {
+static inline int area_index(const Area *area, uint2 window) { return window_tile((uint2)(window.x - area->corner, window.y), area->columns); }
+static inline int area_tile(const Area *area, int place, int tiles_x) {
     return ((int)(area->corner >> 16) + place / area->columns) * tiles_x + (int)(area->corner & 0xFFFFu) + place % area->columns;
 }
 
 // Numbers of pairs of the share by place in the area. listed: a word for each.
-static inline void gather(const Share *share, const Area *area, global const uint2 *restrict windows, global const uint *restrict keys,
-                          local uint *listed) {
-    for (int place = get_local_id(0); place < area->tiles; place += SCAN_ITEMS) listed[place] = 0;
+static inline void count_pairs(const Share *share, const Area *area, global const uint2 *restrict windows, global const uint *restrict keys,
+                          local uint *pair_counts) {
+    for (int place = get_local_id(0); place < area->tiles; place += SCAN_ITEMS) pair_counts[place] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint splat = share->first + get_local_id(0); splat < share->end; splat += SCAN_ITEMS) {
         if (keys[splat] == CULLED) continue;
-        for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) atomic_inc(listed + place_in(area, window));
+        for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) atomic_inc(pair_counts + area_index(area, window));
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// Index space: for each view a work-group for every GATHERED splats.
+// Index space: for each view a work-group for every GROUP_SPLATS splats.
 // Reads: windows, keys. Writes: adds to tallies.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_gathered(
 //@@ arguments tally_gathered
 ) {
-    local uint listed[GATHER_TILES];
-    local int ends[4];
+    local uint pair_counts[LOCAL_TILES];
+    local int extents[4];
     const Share share = share_of(count);
     int tiles = tiles_of(width, height), tiles_x = (width + TILE_W - 1) / TILE_W;
     tallies += TALLIES + get_group_id(1) * (uint)tiles;
-    const Area area = area_of(&share, tiles, tiles_x, windows, keys, ends);
-    if (area.tiles > GATHER_TILES) {      // too far apart
+    const Area area = area_of(&share, tiles, tiles_x, windows, keys, extents);
+    if (area.tiles > LOCAL_TILES) {      // too far apart
         for (uint splat = share.first + get_local_id(0); splat < share.end; splat += SCAN_ITEMS) {
             if (keys[splat] == CULLED) continue;
             for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) atomic_inc(tallies + window_tile(window, tiles_x));
         }
         return;
     }
-    gather(&share, &area, windows, keys, listed);
+    count_pairs(&share, &area, windows, keys, pair_counts);
     for (int place = get_local_id(0); place < area.tiles; place += SCAN_ITEMS)
-        if (listed[place] != 0) atomic_add(tallies + tile_at(&area, place, tiles_x), listed[place]);
+        if (pair_counts[place] != 0) atomic_add(tallies + area_tile(&area, place, tiles_x), pair_counts[place]);
 }
 
 // Index space: as tally_gathered.
@@ -88,38 +88,38 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_gather
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_gathered(
 //@@ arguments emit_gathered
 ) {
-    local uint listed[GATHER_TILES];
+    local uint pair_counts[LOCAL_TILES];
     local uint visible;
-    local int ends[4];
+    local int extents[4];
     const Share share = share_of(count);
     int tiles = tiles_of(width, height), tiles_x = (width + TILE_W - 1) / TILE_W, before = (int)get_group_id(1) * tiles;
     const Band band = {tiles_x, band_first, band_end, starts[band_first], capacity};
     if (get_local_id(0) == 0) visible = 0;
-    const Area area = area_of(&share, tiles, tiles_x, windows, keys, ends);
-    bool counted = area.tiles <= GATHER_TILES;
+    const Area area = area_of(&share, tiles, tiles_x, windows, keys, extents);
+    bool counted = area.tiles <= LOCAL_TILES;
     if (counted) {
-        gather(&share, &area, windows, keys, listed);
+        count_pairs(&share, &area, windows, keys, pair_counts);
         for (int place = get_local_id(0); place < area.tiles; place += SCAN_ITEMS) {
-            if (listed[place] == 0) continue;
-            int tile = before + tile_at(&area, place, tiles_x);
-            if (tile >= band.first && tile < band.end) listed[place] = atomic_add(cursors + tile, listed[place]);
+            if (pair_counts[place] == 0) continue;
+            int tile = before + area_tile(&area, place, tiles_x);
+            if (tile >= band.first && tile < band.end) pair_counts[place] = atomic_add(cursors + tile, pair_counts[place]);
         }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    uint seen = 0;
+    uint visible_here = 0;
     for (uint splat = share.first + get_local_id(0); splat < share.end; splat += SCAN_ITEMS) {
         uint key = keys[splat];
         if (key == CULLED) continue;
-        if (first_band) seen++;
+        if (first_band) visible_here++;
         for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) {
             int tile = before + window_tile(window, tiles_x);
             if (tile < band.first || tile >= band.end) continue;
             // modulo 2^32, as place_of
-            uint place = counted ? atomic_inc(listed + place_in(&area, window)) - band.start : place_of(tile, &band, cursors);
+            uint place = counted ? atomic_inc(pair_counts + area_index(&area, window)) - band.start : next_offset(tile, &band, cursors);
             if (place < band.capacity) pairs[place] = (uint2)(splat, key);
         }
     }
-    if (seen != 0) atomic_add(&visible, seen);
+    if (visible_here != 0) atomic_add(&visible, visible_here);
     barrier(CLK_LOCAL_MEM_FENCE);
     if (get_local_id(0) == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }

@@ -1,0 +1,185 @@
+// What waits at a pixel, for GPUs (slot/compose_pixel.cl). The furthest are in registers, IN_REGISTERS of them, always full and
+// sorted by depth: one more takes its place among them, and the nearest of all leaves. Nearly always it can be composited; else it goes
+// to a queue in memory, which is short and mostly empty.
+//@ compose_types
+#define NO_SPLAT 0xFFFFFFFFu            // a place where nothing waits
+#define IN_REGISTERS (K_BUFFER_SIZE < 3 ? K_BUFFER_SIZE : 3)
+#define QUEUE_CAPACITY (K_BUFFER_SIZE - IN_REGISTERS)
+typedef struct {                    // apart from what is to stay in registers: an index that is not constant puts all of a struct in memory
+    wide z[QUEUE_CAPACITY + 1], opacity[QUEUE_CAPACITY + 1];    // a ring, sorted by depth
+    uint splat[QUEUE_CAPACITY + 1];
+//@@ k_buffer_queue_fields
+} Queue;
+typedef struct {
+    wide z[IN_REGISTERS], opacity[IN_REGISTERS];
+    uint splat[IN_REGISTERS];
+    Queue *queue;
+    uint head, count;               // of the queue
+    bool bounded;                   // whether not all fragments are taken, but those between
+//@@ k_buffer_fields
+    wide from, until;               // these depths: at the first from `from_splat` on in the list, at the second those before
+    uint from_splat, until_splat;   // `until_splat`
+} KBuffer;
+
+static inline void k_buffer_clear(KBuffer *k_buffer) {
+    for (int k = 0; k < IN_REGISTERS; k++) {
+        k_buffer->z[k] = -INFINITY;
+        k_buffer->splat[k] = NO_SPLAT;
+    }
+}
+
+static inline void k_buffer_start(KBuffer *k_buffer) {
+    k_buffer_clear(k_buffer);
+    k_buffer->head = k_buffer->count = 0;
+//@@ k_buffer_init
+    k_buffer->bounded = false;
+    k_buffer->from = -INFINITY;
+    k_buffer->until = INFINITY;
+    k_buffer->from_splat = k_buffer->until_splat = 0;
+}
+//@ group_start
+    Queue queues[ROWS];
+    for (int row = 0; row < ROWS; row++) pixels[row].k_buffer.queue = &queues[row];
+//@ unfinished
+        & VMASK(pixel->k_buffer.from < INFINITY)
+//@ compose_functions
+// Whether a splat comes before another in the list.
+static inline bool precedes(global const Splat *splats, uint splat, uint other) {
+    wide nearest = splats[splat].nearest, than = splats[other].nearest;
+    return nearest < than || (nearest == than && splat < other);
+}
+
+static inline void k_buffer_composite(Pixel *pixel, wide z, wide opacity, uint splat, global const Splat *splats,
+                                     const BlendConstants *constants) {
+//@@ k_buffer_composition
+    const Splat s = splats[splat];
+    const Crossing nowhere = {1.0f};
+    Attributes attributes = fragment_attributes(&s, nowhere, 1.0f);
+    attributes.z = z;
+    composite(pixel, &attributes, opacity, VMASK(true), constants);
+}
+
+// Where the k-th of the queue lies.
+static inline uint queue_index(const KBuffer *k_buffer, uint k) {
+    uint at = k_buffer->head + k;
+    return at < QUEUE_CAPACITY ? at : at - QUEUE_CAPACITY;
+}
+
+// Composites what of the queue lies no further than `nearest`.
+static inline void k_buffer_flush(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
+    KBuffer *k_buffer = &pixel->k_buffer;
+    Queue *queue = k_buffer->queue;
+    while (k_buffer->count > 0 && queue->z[k_buffer->head] <= nearest) {
+        uint at = k_buffer->head;
+        k_buffer->head = queue_index(k_buffer, 1);
+        k_buffer->count--;
+        k_buffer_composite(pixel, queue->z[at], queue->opacity[at], queue->splat[at], splats, constants);
+    }
+}
+
+// A fragment no further than those in registers, to the queue. Where that is full the furthest of all is dropped.
+static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint splat) {
+    KBuffer *k_buffer = &pixel->k_buffer;
+    Queue *queue = k_buffer->queue;
+    if (k_buffer->count == QUEUE_CAPACITY) {
+        uint dropped = k_buffer->splat[IN_REGISTERS - 1];
+//@@ k_buffer_eviction
+        k_buffer->until = k_buffer->z[IN_REGISTERS - 1];
+        k_buffer->until_splat = dropped;
+        k_buffer->bounded = true;
+#pragma unroll
+        for (int k = IN_REGISTERS - 1; k > 0; k--) {
+            k_buffer->z[k] = k_buffer->z[k - 1];
+            k_buffer->opacity[k] = k_buffer->opacity[k - 1];
+            k_buffer->splat[k] = k_buffer->splat[k - 1];
+        }
+        uint last = queue_index(k_buffer, k_buffer->count - 1);
+        bool further = QUEUE_CAPACITY > 0 && queue->z[last] > z;
+        k_buffer->z[0] = further ? queue->z[last] : z;
+        k_buffer->opacity[0] = further ? queue->opacity[last] : opacity;
+        k_buffer->splat[0] = further ? queue->splat[last] : splat;
+        if (!further) return;
+        k_buffer->count--;
+    }
+    uint k = k_buffer->count++, at = queue_index(k_buffer, k);
+    for (; k > 0; k--) {
+        uint before = queue_index(k_buffer, k - 1);
+        if (queue->z[before] <= z) break;
+        queue->z[at] = queue->z[before];
+        queue->opacity[at] = queue->opacity[before];
+        queue->splat[at] = queue->splat[before];
+        at = before;
+    }
+    queue->z[at] = z;
+    queue->opacity[at] = opacity;
+    queue->splat[at] = splat;
+}
+
+// One fragment more, with nothing to come before `nearest`.
+static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide opacity, uint splat, global const Splat *splats,
+                                const BlendConstants *constants) {
+    KBuffer *k_buffer = &pixel->k_buffer;
+    // a layer that ends may be nearer than what follows it in the list, and than what waits
+    k_buffer_flush(pixel, fmin(nearest, z), splats, constants);
+    bool first = z < k_buffer->z[0];
+    wide first_z = first ? z : k_buffer->z[0], first_opacity = first ? opacity : k_buffer->opacity[0];
+    uint first_splat = first ? splat : k_buffer->splat[0];
+#pragma unroll
+    for (int k = 0; k < IN_REGISTERS; k++) {
+        int from = min(k + 1, IN_REGISTERS - 1);
+        bool moves = k + 1 < IN_REGISTERS && k_buffer->z[from] <= z, here = k_buffer->z[k] <= z;
+        k_buffer->opacity[k] = moves ? k_buffer->opacity[from] : here ? opacity : k_buffer->opacity[k];
+        k_buffer->splat[k] = moves ? k_buffer->splat[from] : here ? splat : k_buffer->splat[k];
+        k_buffer->z[k] = moves ? k_buffer->z[from] : here ? z : k_buffer->z[k];
+    }
+    if (first_splat == NO_SPLAT) return;
+    if (k_buffer->count == 0 && first_z <= nearest)
+        k_buffer_composite(pixel, first_z, first_opacity, first_splat, splats, constants);
+    else
+        k_buffer_enqueue(pixel, first_z, first_opacity, first_splat);
+}
+
+// Takes a fragment of a splat of which none is nearer than `nearest`; place: the splat, which says where in the list it stands.
+static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opacity, const Attributes *attributes, uint splat, uint place,
+                                int mask, global const Splat *splats, const BlendConstants *constants) {
+    KBuffer *k_buffer = &pixel->k_buffer;
+    if (k_buffer->bounded) {
+        if (z > k_buffer->until || (z == k_buffer->until && !precedes(splats, place, k_buffer->until_splat))) return;
+        if (z < k_buffer->from || (z == k_buffer->from && precedes(splats, place, k_buffer->from_splat))) return;
+    }
+//@@ k_buffer_insertion
+    k_buffer_push(pixel, nearest, z, opacity, splat, splats, constants);
+}
+
+//@@ coplanar_functions
+// After the last splat of the list: composites what waits. Returns whether the list is to be gone through again.
+static inline int k_buffer_finish(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
+//@@ coplanar_finish
+    KBuffer *k_buffer = &pixel->k_buffer;
+    k_buffer_flush(pixel, INFINITY, splats, constants);
+#pragma unroll
+    for (int k = 0; k < IN_REGISTERS; k++)
+        if (k_buffer->splat[k] != NO_SPLAT)
+            k_buffer_composite(pixel, k_buffer->z[k], k_buffer->opacity[k], k_buffer->splat[k], splats, constants);
+    k_buffer_clear(k_buffer);
+    k_buffer->from = k_buffer->until;
+    k_buffer->from_splat = k_buffer->until_splat;
+    k_buffer->until = INFINITY;
+    k_buffer->bounded = true;        // where nothing was dropped nothing is taken, if the list is gone through again for others
+    return pixel_unfinished(pixel, constants);
+}
+//@ blend_arguments
+                                , splats, lists[batch + which], lists[batch + which], s.nearest
+                                , staged[k + 1 < listed ? places[cell][k + 1] : length - 1].splat.nearest
+//@ pass
+    local int repeat_pass;
+    do {
+//@ pass_end
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (item == 0) repeat_pass = 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int row = 0; row < ROWS; row++)
+            if (px < width && py + row < height && k_buffer_finish(&pixels[row], splats, &constants)) repeat_pass = 1;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        // uniform: every work-item reads the same vote
+    } while (repeat_pass);

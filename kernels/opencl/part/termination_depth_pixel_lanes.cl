@@ -1,0 +1,9 @@
+// The end of part/termination_depth_pixel.cl, for CPUs.
+//@ pass_end
+    vfloat furthest = -INFINITY;
+    for (int block = 0; block < BLOCKS; block++)
+        if (on_picture >> block & 1u) furthest = fmax(furthest, pixel_termination(&pixels[block], &constants));
+    float lane_depths[LANES];
+    VSTORE(furthest, lane_depths);
+    for (int lane = 1; lane < LANES; lane++) lane_depths[0] = fmax(lane_depths[0], lane_depths[lane]);
+    tile_ends[tile] = on_picture ? sortable(lane_depths[0]) : UINT_MAX;
