@@ -259,7 +259,7 @@ def _off(value: np.ndarray, left: np.ndarray, ideal: np.ndarray, sample: np.ndar
 
 
 def _layered(alpha, light, start, ideal, sample) -> tuple[float, np.ndarray]:
-    """Coplanar splats as one layer (kernels/opencl/slot/compose_planes.cl): error, gradient of alpha."""
+    """Coplanar splats as one layer (kernels/opencl/slot/compose_coplanar.cl): error, gradient of alpha."""
     tau = -np.log1p(-alpha)
     n = np.diff(start, append=len(alpha))
     depth, shone = np.add.reduceat(tau, start), np.add.reduceat(tau * light, start)

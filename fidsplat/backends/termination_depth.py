@@ -43,7 +43,7 @@ class TerminationDepths:
 
 @runtime_checkable
 class GivesTileEnds(Protocol):
-    """A backend whose pipelines support the effect `tile_ends`."""
+    """A backend whose pipelines support the effect `termination_depths`."""
 
     def tile_ends_of(self, images: object) -> TerminationDepths:
         """Termination depths of a frame; waits until it is rendered."""

@@ -39,13 +39,20 @@ def _image(
 _PLAIN = (
     *("camera_pinhole", "camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
     *("camera_orthographic", "color_rgb", "color_sh", "lowpass_none", "lowpass_pixel", "lowpass_screen"),
-    *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_pixel", "compose_planes"),
+    *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_pixel", "compose_coplanar"),
     *("footprint_gaussian", "footprint_box", "footprint_mixed"),
     *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
     *("background_constant", "background_gradient", "background_panorama"),
     *("arithmetic_precise", "arithmetic_fast"),
     # where a picture needs them
-    *("opaque_layer", "motion_groups", "shutter_exposure", "shutter_rows", "blend_double", "tile_ends"),
+    *(
+        "external_depth",
+        "motion_groups",
+        "shutter_exposure",
+        "shutter_rows",
+        "blend_double",
+        "termination_depths",
+    ),
     # steps after blending
     *("fog", "exposure", "vignetting", "noise", "gain"),
     *("response_gamma", "response_srgb", "response_table", "quantise"),

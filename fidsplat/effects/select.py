@@ -123,7 +123,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
             # before what composites, whose fragments it hides
-            *(("opaque_layer",) if capture.layer is not None else ()),
+            *(("external_depth",) if capture.layer is not None else ()),
             _composing(cloud, quality.order, one_depth_each=alone and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
@@ -142,9 +142,9 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
     )
 
 
-def with_tile_ends(features: FeatureSet) -> FeatureSet:
+def with_termination_depths(features: FeatureSet) -> FeatureSet:
     """The same picture, of which blending tells where each tile was finished: what hides what of a store."""
-    return replace(features, slots=(*features.slots, "tile_ends"))
+    return replace(features, slots=(*features.slots, "termination_depths"))
 
 
 def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
@@ -154,7 +154,7 @@ def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
     and nothing need wait.
     """
     if cloud.has_planes:
-        return "compose_ordered" if order == "centre" else "compose_planes"
+        return "compose_ordered" if order == "centre" else "compose_coplanar"
     return "compose_pixel" if order == "pixel" and not one_depth_each else "compose_ordered"
 
 

@@ -18,7 +18,7 @@ from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
-from fidsplat.effects.select import with_tile_ends
+from fidsplat.effects.select import with_termination_depths
 from fidsplat.streaming.bands import Band, Bands, PartOfView
 from fidsplat.streaming.occlusion_culling import Hidden
 from fidsplat.streaming.occlusion_test import is_supported
@@ -74,7 +74,7 @@ class Residency:
         if not self._hidden.expects(whole):
             self._hidden.passed()
         elif self._asks(view, features) and isinstance(backend, GivesTileEnds):
-            asking = backend.pipeline(with_tile_ends(features))
+            asking = backend.pipeline(with_termination_depths(features))
 
             def draw(band: Band, first_id: int) -> tuple[Images, TerminationDepths]:
                 images = asking.render(self._data(band.selection, first_id), band.view)

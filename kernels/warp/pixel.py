@@ -33,9 +33,10 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
     layout = Layout(effects, outputs)
     each = layout.lines
     exclusive, has_depth, waits, layered, bent = (
-        name in effects for name in ("stop_exclusive", "ray_depth", "compose_pixel", "compose_planes", "rays")
+        name in effects
+        for name in ("stop_exclusive", "ray_depth", "compose_pixel", "compose_coplanar", "rays")
     )
-    boxes, opaque = any(name in effects for name in BOXES), "opaque_layer" in effects
+    boxes, opaque = any(name in effects for name in BOXES), "external_depth" in effects
     rays = make_rays(bent, "rays_length" in effects, bent and boxes, opaque)
     Rays, length_of = rays.Rays, rays.length_of
     starts, sees, attenuates, composites, covers, clears = (

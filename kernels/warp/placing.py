@@ -14,7 +14,9 @@ from .records import BOXES
 @cache
 def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
     """pose, tangents, depth_range, and the struct Moving of what moves by itself."""
-    moves, waits, layers = (name in effects for name in ("motion_groups", "compose_pixel", "compose_planes"))
+    moves, waits, layers = (
+        name in effects for name in ("motion_groups", "compose_pixel", "compose_coplanar")
+    )
     screen = "lowpass_screen" in effects
     boxes_too = any(name in effects for name in BOXES)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)

@@ -39,7 +39,7 @@ def make_project(
     lines_each = layout.lines
     has_depth, screen, filtered, waits, layers = (
         name in effects
-        for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_pixel", "compose_planes")
+        for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_pixel", "compose_coplanar")
     )
     recorded = output.having(outputs, "project")
     projects = output.functions(recorded, "project")

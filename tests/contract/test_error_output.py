@@ -169,7 +169,7 @@ def test_markers_are_composited_by_depth_in_float64(reference):
     assert off.max() > 1e-3
     assert (frame["error"] >= off - 2e-7).all()  # `want` is float32
     assert frame["error"].max() < 1.1 * off.max()
-    with pytest.raises(InputError, match=r"'error' must.* warp:cpu bounds, got .*compose_planes"):
+    with pytest.raises(InputError, match=r"'error' must.* warp:cpu bounds, got .*compose_coplanar"):
         fs.Renderer("warp:cpu").render(cloud, camera, OUTPUTS)
 
 

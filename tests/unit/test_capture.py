@@ -117,8 +117,8 @@ GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
         (Traits(sh_degree=0), {}, "color_rgb", "color_sh"),
         (Traits(sh_degree=1), {}, "color_sh", "color_rgb"),
         (Traits(), {}, "compose_ordered", "compose_pixel"),
-        (OF_PLANES, {}, "compose_planes", "compose_ordered"),
-        (OF_PLANES, {"quality": ORDERED}, "compose_ordered", "compose_planes"),
+        (OF_PLANES, {}, "compose_coplanar", "compose_ordered"),
+        (OF_PLANES, {"quality": ORDERED}, "compose_ordered", "compose_coplanar"),
         (Traits(), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
         (THICK, {"quality": BY_PIXEL}, "compose_ordered", "compose_pixel"),  # of one depth each
         (Traits(ellipsoids="some"), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),

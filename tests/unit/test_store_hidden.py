@@ -10,7 +10,7 @@ from store_views import TURNED, look, made_store, splats
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.termination_depth import TerminationDepths
-from fidsplat.effects.select import with_tile_ends
+from fidsplat.effects.select import with_termination_depths
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.streaming import occlusion_culling, occlusion_test, subchunks
 from fidsplat.streaming.selection import Streamed
@@ -287,7 +287,7 @@ def test_a_tile_ends_where_all_of_its_pixels_are_finished(order, schedule):
     camera = fs.Camera.pinhole(96, 64, 60.0, 60.0, 48.0, 32.0)
     capture = fs.Capture(camera, outputs=("alpha", "depth"), quality=f"lowpass=none,order={order}")
     features, shot = prepare(cloud, capture)
-    images = backend.pipeline(with_tile_ends(features)).render(backend.upload(cloud), shot)
+    images = backend.pipeline(with_termination_depths(features)).render(backend.upload(cloud), shot)
     found = backend.tile_ends_of(images)
     height, width = found.tile
     rows, columns = found.depths.shape

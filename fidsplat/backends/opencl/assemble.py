@@ -149,12 +149,12 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files.append(LAYOUTS[f"k_buffer_{shape.schedule}"].file)
     elif shape.schedule == "lanes":
         files.append(LAYOUTS["tile_loop_lanes"].file)
-    if "tile_ends" in layouts:  # after the k-buffer, which may repeat the pass through a list
+    if "termination_depths" in layouts:  # after the k-buffer, which may repeat the pass through a list
         way = "_pixel" if "compose_pixel" in layouts else ""
         files += [LAYOUTS["termination_depth_pixel"].file] if way else []
         files.append(LAYOUTS[f"termination_depth{way}_{shape.schedule}"].file)
-    if "opaque_layer" in layouts:  # after the k-buffer is empty
-        files.append(LAYOUTS["opaque_layer_end"].file)
+    if "external_depth" in layouts:  # after the k-buffer is empty
+        files.append(LAYOUTS["external_depth_end"].file)
     stages = {
         "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),
         "picture": [

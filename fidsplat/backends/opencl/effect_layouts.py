@@ -59,8 +59,8 @@ LAYOUTS: dict[str, Layout] = {
         parts=("ray_depth",),
         splat=(member("wide nearest", "depth before which no fragment of the splat lies"),),
     ),
-    "compose_planes": Layout(
-        "slot/compose_planes.cl",
+    "compose_coplanar": Layout(
+        "slot/compose_coplanar.cl",
         parts=("compose_pixel",),
         splat=(member("int plane"),),
         project=takes(
@@ -116,8 +116,8 @@ LAYOUTS: dict[str, Layout] = {
         "slot/motion_groups.cl",
         project=takes("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
     ),
-    "opaque_layer": Layout(
-        "slot/opaque_layer.cl",
+    "external_depth": Layout(
+        "slot/external_depth.cl",
         parts=("ray_depth",),
         blend=takes(
             "array float layer_depth layer_rgb  // (h, w) infinite where there is none, (h, w, 3)",
@@ -127,7 +127,7 @@ LAYOUTS: dict[str, Layout] = {
     "shutter_exposure": Layout("slot/shutter_exposure.cl"),
     "shutter_rows": Layout("slot/shutter_rows.cl"),
     "blend_double": Layout(),
-    "tile_ends": Layout(
+    "termination_depths": Layout(
         blend=takes("in uint keys", "out uint tile_ends  // of each tile: the key at which it was finished")
     ),
     # what several of them share
@@ -191,7 +191,7 @@ LAYOUTS: dict[str, Layout] = {
     # fragments sorted by depth at each pixel, by the schedule
     "k_buffer_lanes": Layout("part/k_buffer_lanes.cl"),
     "k_buffer_group": Layout("part/k_buffer_group.cl"),
-    "opaque_layer_end": Layout("part/opaque_layer_end.cl"),
+    "external_depth_end": Layout("part/external_depth_end.cl"),
     "coverage": Layout("part/coverage.cl"),
     "ray": Layout(resolve=RAY_UNIFORMS),
     "row_rotation": Layout("part/row_rotation.cl", resolve=takes("array float turns  // (h, 3, 3)")),

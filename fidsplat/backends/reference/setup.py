@@ -85,7 +85,7 @@ class Setup:
         )
         if self.by_depth:
             self.key = z_low.astype(np.float32)
-        if "compose_planes" in features.slots:
+        if "compose_coplanar" in features.slots:
             table = PlaneTable(cloud)
             planes = table.index
             nearest = np.where(planes < 0, nearest, np.append(table.keys(view), 0)[planes])

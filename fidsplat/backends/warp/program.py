@@ -20,10 +20,10 @@ SLOTS = frozenset(
     | {"camera_brown_conrady", "camera_fisheye", "camera_equirectangular"}
     | {"lowpass_none", "lowpass_screen", "lowpass_pixel", "stop_inclusive", "stop_exclusive"}
     | {"ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"}
-    | {"compose_ordered", "compose_pixel", "compose_planes"}
+    | {"compose_ordered", "compose_pixel", "compose_coplanar"}
     | {"footprint_gaussian", "footprint_box", "footprint_mixed"}
     | {"background_constant", "background_gradient", "background_panorama"}
-    | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure", "opaque_layer"}
+    | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure", "external_depth"}
     # they change no picture, and nothing here
     | {"shutter_rows", "ellipsoids_only"}
 )
@@ -31,13 +31,13 @@ SLOTS = frozenset(
 # what depends on an effect: a stage is compiled once for all feature sets that mean the same to it
 _RECORD = (
     *("lowpass_screen", "rays", "camera_orthographic", "ray_depth"),
-    *("compose_pixel", "compose_planes", "footprint_box", "footprint_mixed", "ellipsoid_exact"),
+    *("compose_pixel", "compose_coplanar", "footprint_box", "footprint_mixed", "ellipsoid_exact"),
 )
 _PROJECT = (
     *(*_RECORD, "lowpass_pixel", "motion_groups", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"),
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
-_SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length", "opaque_layer")
+_SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length", "external_depth")
 
 
 def known() -> frozenset[str]:
@@ -69,7 +69,7 @@ class _Needs:
     def of(cls, features: FeatureSet) -> _Needs:
         output = kernels("output")
         posts, effects = set(features.posts), set(features.slots)
-        surface = {"surface_label"} if "opaque_layer" in effects and "label" in features.outputs else set()
+        surface = {"surface_label"} if "external_depth" in effects and "label" in features.outputs else set()
         outputs = output.with_needed((*features.outputs, *(posts & output.known()), *surface))
         measured = output.having(output.having(outputs, "start"), "length")
         if not effects.isdisjoint(kernels("lens").LENSES):
@@ -77,9 +77,9 @@ class _Needs:
         # rays of other lenses have a length of 1
         if "camera_brown_conrady" in effects and measured:
             effects.add("rays_length")
-        if "compose_planes" in effects:
+        if "compose_coplanar" in effects:
             effects.add("compose_pixel")
-        if not effects.isdisjoint({"compose_pixel", "opaque_layer"}) or output.having(outputs, "depth"):
+        if not effects.isdisjoint({"compose_pixel", "external_depth"}) or output.having(outputs, "depth"):
             effects.add("ray_depth")
         steps = tuple(name for name in features.posts if name in kernels("post").known())
         blending = output.having(outputs, "seen", "state", "samples")
@@ -137,11 +137,11 @@ class Program:
     def _make_blend(self, needs: _Needs) -> None:
         buffers, blending = kernels("buffers"), needs.blending
         self.layout = kernels("records").Layout(needs.among(_RECORD), blending)
-        self.layered = "compose_planes" in needs.effects
+        self.layered = "compose_coplanar" in needs.effects
         boxes = not needs.effects.isdisjoint(kernels("records").BOXES)
         self.sloped = boxes and "rays" in needs.effects
         """whether blending reads the derivatives of a lens's rays"""
-        self.opaque = "opaque_layer" in needs.effects
+        self.opaque = "external_depth" in needs.effects
         """whether it reads a layer of another renderer"""
         grouped = self.shape.schedule == "group"
         self.blend, self.state, self.blend_block = kernels("blend").make_blend(

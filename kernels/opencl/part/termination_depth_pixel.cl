@@ -1,6 +1,6 @@
 // For stores (fidsplat/backends/termination_depth.py), by depth at each pixel: of each tile the furthest of the depths at which its pixels were
 // finished, as a sort key; that of infinity where one was not. Fragments behind that are composited behind it, whichever there are, and
-// change nothing. A layer is taken by a depth that is not quite its own (slot/compose_planes.cl).
+// change nothing. A layer is taken by a depth that is not quite its own (slot/compose_coplanar.cl).
 //@ state
     vfloat termination_depth;               // depth of what was composited last
 //@ start

@@ -1,5 +1,5 @@
 // A picture with depths from another renderer, as one opaque surface among the splats: of a fragment at its depth or behind it
-// nothing is seen. It is composited itself after the last splat (part/opaque_layer_end.cl).
+// nothing is seen. It is composited itself after the last splat (part/external_depth_end.cl).
 //@ state
     vfloat opaque_z;        // depth of the surface; infinite where there is none
 //@ pixels_start
