@@ -29,7 +29,7 @@ _HOME = {
     "Sensor": "fidsplat.capture.sensor",
     "Fog": "fidsplat.capture.environment",
     "Gradient": "fidsplat.capture.environment",
-    "Layer": "fidsplat.capture.environment",
+    "ExternalDepth": "fidsplat.capture.environment",
     "Panorama": "fidsplat.capture.environment",
     "Marker": "fidsplat.markers",
     "marker": "fidsplat.markers",

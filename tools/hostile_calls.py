@@ -143,9 +143,9 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "Motion.moved": lambda _: (fs.Motion(PATH).moved, {"camera": CAMERA, "time": 0.5}, None),
     "Shutter.bands": lambda _: (fs.Shutter(readout=0.1).bands, {"height": 9}, None),
     "Shutter.times": lambda _: (fs.Shutter(exposure_time=0.1, sub_poses=3).times, {"middle": 0.5}, None),
-    "Layer": lambda _: (
-        fs.Layer, {"rgb": np.ones((16, 24, 3)), "depth": np.ones((16, 24)), "label": 0},
-        lambda layer: RENDERER.render(CLOUD, CAMERA, layer=layer),
+    "ExternalDepth": lambda _: (
+        fs.ExternalDepth, {"rgb": np.ones((16, 24, 3)), "depth": np.ones((16, 24)), "label": 0},
+        lambda external_depth: RENDERER.render(CLOUD, CAMERA, external_depth=external_depth),
     ),
     "Renderer.render_every": lambda _: (
         RENDERER.render_every, {"step": 4, "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None, "tell": None}, None
@@ -232,7 +232,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     ),
     "Rig.render": lambda _: (
         _rig().render,
-        {"bodies": {"box": POSES}, "cameras": {"eye": POSES}, "outputs": ("rgb",), "layers": None, "mask": np.array([True])},
+        {"bodies": {"box": POSES}, "cameras": {"eye": POSES}, "outputs": ("rgb",), "external_depths": None, "mask": np.array([True])},
         dict,
     ),
     "Rig.outputs_of": lambda _: (_rig().outputs_of, {"camera": "eye"}, None),

@@ -11,7 +11,7 @@ from fidsplat.backends.view import FAR_EYE, View
 
 _SHARED = (
     *("width", "height", "samples", "log_cut", "ceiling", "stop", "background", "first_light", "sensor"),
-    *("fog_density", "surroundings", "layer", "along_ray", "parallel"),
+    *("fog_density", "surroundings", "external_depth", "along_ray", "parallel"),
 )
 _OWN = ("focal_x", "focal_y", "center_x", "center_y", "near", "far", "slopes")
 

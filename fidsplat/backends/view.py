@@ -12,7 +12,7 @@ from fidsplat.cameras import Camera, Orthographic
 from fidsplat.cameras.lenses import Lens
 from fidsplat.cameras.raster import RayRaster, raster_of
 from fidsplat.capture.capture import Capture
-from fidsplat.capture.environment import Gradient, Layer, Panorama
+from fidsplat.capture.environment import ExternalDepth, Gradient, Panorama
 from fidsplat.capture.sensor import Sensor
 from fidsplat.util.errors import InputError
 
@@ -66,7 +66,7 @@ class View:
     """1 / metres"""
     surroundings: Gradient | Panorama | None = None
     """a background that is not one colour"""
-    layer: Layer | None = None
+    external_depth: ExternalDepth | None = None
     """an opaque surface among the splats"""
     raster: RayRaster | None = None
     """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
@@ -139,8 +139,8 @@ class View:
 
     def array(self, name: str) -> np.ndarray:
         """An array of an effect, by its name: float32, but int32 labels."""
-        if self.layer is not None and name.startswith("layer_"):
-            return getattr(self.layer, name.removeprefix("layer_"))
+        if self.external_depth is not None and name.startswith("external_"):
+            return getattr(self.external_depth, name.removeprefix("external_"))
         if name == "turns":
             return self.turns_of_rows.astype(np.float32)
         if name == "panorama" and isinstance(self.surroundings, Panorama):
@@ -165,11 +165,11 @@ class View:
                 f"{camera.width} x {camera.height} pixels with {n} x {n} samples each is too large: at most "
                 f"{MAX_GRID} samples along a side; use fewer samples or a smaller picture"
             )
-        layer = capture.layer
-        if layer is not None and layer.depth.shape != (camera.height, camera.width):
+        external = capture.external_depth
+        if external is not None and external.depth.shape != (camera.height, camera.width):
             raise InputError(
-                f"the layer has {layer.depth.shape[1]} x {layer.depth.shape[0]} pixels and the camera "
-                f"{camera.width} x {camera.height}; draw it with this camera"
+                f"external_depth must have the camera's {camera.width} x {camera.height} pixels, got "
+                f"{external.depth.shape[1]} x {external.depth.shape[0]}; render it with this camera"
             )
         plain = isinstance(backdrop, tuple)
         rotation = camera.world_to_camera[:3, :3]
@@ -209,7 +209,7 @@ class View:
             sensor=capture.sensor,
             fog_density=0.0 if capture.fog is None else capture.fog.density,
             surroundings=None if plain else backdrop,
-            layer=layer,
+            external_depth=external,
             raster=raster,
             slopes=slopes,
             along_ray=lens is not None and lens.along_ray,

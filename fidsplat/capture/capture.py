@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, TypedDict
 
 from fidsplat.cameras import Camera, Motion, Shutter
-from fidsplat.capture.environment import Background, Fog, Layer, background_of
+from fidsplat.capture.environment import Background, ExternalDepth, Fog, background_of
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
 from fidsplat.util.errors import InputError, unknown
@@ -39,8 +39,8 @@ class Capture(PickledByFields):
     """what becomes of rgb on its way out; None: nothing"""
     fog: Fog | None = None
     """between the camera and what it sees"""
-    layer: Layer | None = None
-    """what another renderer has drawn, as an opaque surface among the splats; of the camera's size"""
+    external_depth: ExternalDepth | None = None
+    """image with depths of another renderer, an opaque surface among the splats; of the camera's size"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -52,7 +52,7 @@ class Capture(PickledByFields):
         for name, kind in (("motion", Motion), ("shutter", Shutter), ("sensor", Sensor)):
             put(self, name, _of_kind(name, getattr(self, name), kind) or kind())
         _of_kind("fog", self.fog, Fog)
-        _of_kind("layer", self.layer, Layer)
+        _of_kind("external_depth", self.external_depth, ExternalDepth)
 
     @cached_property
     def foggy(self) -> bool:
@@ -104,7 +104,7 @@ class CaptureParts(TypedDict, total=False):
     shutter: Shutter | None
     sensor: Sensor | None
     fog: Fog | None
-    layer: Layer | None
+    external_depth: ExternalDepth | None
 
 
 def output_names(outputs: Any) -> tuple[str, ...]:

@@ -106,10 +106,10 @@ class Panorama(PickledByFields):
 
 
 @dataclass(frozen=True, eq=False)
-class Layer(PickledByFields):
-    """A picture with depths from another renderer, as an opaque surface among the splats: in each pixel it
-    hides what of them lies behind it, and what lies in front of it is composited over it.
+class ExternalDepth(PickledByFields):
+    """An image with depths from another renderer, composited with the splats as an opaque surface.
 
+    In each pixel the surface occludes the splats behind it, and splats in front are composited over it.
     Raises InputError for arrays of other shapes, colours that are not finite, or depths below 0.
     """
 
@@ -125,14 +125,15 @@ class Layer(PickledByFields):
         rgb, depth = (_array_of(name, getattr(self, name)) for name in ("rgb", "depth"))
         if depth.ndim != 2 or rgb.shape != (*depth.shape, 3):
             raise InputError(
-                f"a layer has rgb (h, w, 3) and depth (h, w), but their shapes are {rgb.shape}, {depth.shape}"
+                f"rgb and depth of external_depth must have shapes (h, w, 3) and (h, w), got {rgb.shape} and "
+                f"{depth.shape}"
             )
         whole = 255 if rgb.dtype == np.uint8 else 1
         if not np.isfinite(rgb).all() or (depth < 0).any():
-            raise InputError("a layer holds colours that are not finite, or depths below 0; replace them")
+            raise InputError("external_depth must hold finite colours and depths of at least 0")
         label = _array_of("label", self.label)
         if label.dtype.kind not in "iu" or label.shape not in ((), depth.shape):
-            raise InputError(f"the label of a layer must be whole numbers {depth.shape}, or one for all")
+            raise InputError(f"label of external_depth must be integers {depth.shape}, or one for all")
         here = np.isfinite(depth) & (depth > 0)
         made = {
             "rgb": np.array(rgb, np.float32, order="C") / np.float32(whole),
@@ -151,7 +152,7 @@ def _array_of(name: str, value: Any) -> np.ndarray:
     except ValueError:  # rows that differ in length
         array = np.empty(0, object)
     if array.dtype.kind not in "fiu":
-        raise InputError(f"the {name} of a layer must be an array of numbers, not {value!r}")
+        raise InputError(f"{name} of external_depth must be an array of numbers, got {value!r}")
     return array
 
 

@@ -99,9 +99,9 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
     quality, background = capture.quality, capture.backdrop
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
-    if capture.layer is not None and capture.exposed:
+    if capture.external_depth is not None and capture.exposed:
         raise InputError(
-            "a layer shows one moment; draw it with a shutter whose exposure_time and readout are 0"
+            "a capture with external_depth must have a shutter with exposure_time=0 and readout=0"
         )
     # what filters itself needs no low-pass
     alone = cloud.ellipsoids == "all" and ellipsoid != "exact"
@@ -123,7 +123,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
             # before what composites, whose fragments it hides
-            *(("external_depth",) if capture.layer is not None else ()),
+            *(("external_depth",) if capture.external_depth is not None else ()),
             _composing(cloud, quality.order, one_depth_each=alone and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.capture.environment import Layer
+from fidsplat.capture.environment import ExternalDepth
 from fidsplat.experiments.plane import plane_picture
 from fidsplat.scenes import PlacedMarker
 
@@ -16,7 +16,7 @@ _LEAST = 1 / 512
 """share of a pixel that a tag must cover to be there"""
 
 
-def tag_layer(tags: Iterable[PlacedMarker], camera: Camera, behind: np.ndarray) -> Layer:
+def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.ndarray) -> ExternalDepth:
     """What a camera sees of printed tags, as a layer for the picture that it took without them.
 
     Where a tag covers a part of a pixel, the rest is what is behind it, and the layer is at the tag's depth.
@@ -49,7 +49,7 @@ def tag_layer(tags: Iterable[PlacedMarker], camera: Camera, behind: np.ndarray) 
         mixed = shown + (1 - covered)[..., None] * rgb[rows]
         rgb[rows] = np.where(there[..., None], mixed, rgb[rows])
         depth[rows] = np.where(there, far, depth[rows])
-    return Layer(rgb, depth)
+    return ExternalDepth(rgb, depth)
 
 
 def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, int, int, int] | None:

@@ -16,7 +16,7 @@ import numpy as np
 from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter, Trajectory
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import Sensor
-from fidsplat.experiments.ideal_tags import tag_layer
+from fidsplat.experiments.ideal_tags import tag_depth_image
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import PlacedMarker
 from fidsplat.sim.localiser import Localiser
@@ -144,8 +144,8 @@ class Localise:
             captures, self.shots(run), renderer.render_views(splats, captures), strict=True
         ):
             if variant.texture:
-                layer = tag_layer(tags.values(), camera_at(self.camera, run.poses[k]), frame["rgb"])
-                frame = renderer.render(splats, capture.with_(layer=layer))
+                ideal = tag_depth_image(tags.values(), camera_at(self.camera, run.poses[k]), frame["rgb"])
+                frame = renderer.render(splats, capture.with_(external_depth=ideal))
             yield frame.to_uint8()
 
     def sightings(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:

@@ -201,4 +201,4 @@ def _colors_behind(view: View) -> list[Any]:
             behind = [image]
         case _:
             behind = []
-    return [view.background, *behind, *([] if view.layer is None else [view.layer.rgb])]
+    return [view.background, *behind, *([] if view.external_depth is None else [view.external_depth.rgb])]

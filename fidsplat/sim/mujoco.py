@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
-from fidsplat.capture.environment import Layer
+from fidsplat.capture.environment import ExternalDepth
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import quaternions_of
@@ -99,7 +99,7 @@ class MujocoRig(Rig):
         data: Any,
         *,
         outputs: Iterable[str] | None = None,
-        layers: Mapping[str, Sequence[Layer]] | None = None,
+        external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
         mask: Any = None,
     ) -> Pictures:
         """What the cameras see.
@@ -107,13 +107,13 @@ class MujocoRig(Rig):
         Args:
             data: an MjData, a list of them, one for each environment, or mujoco_warp's Data; after
                 `mj_forward` or `mj_step`, which say where bodies and cameras are.
-            outputs, layers, mask: as in `Rig.render`.
+            outputs, external_depths, mask: as in `Rig.render`.
 
         Raises:
             InputError: as `Rig.render`; data without poses.
         """
         bodies, cameras = self.poses(data)
-        return super().render(bodies, cameras, outputs=outputs, layers=layers, mask=mask)
+        return super().render(bodies, cameras, outputs=outputs, external_depths=external_depths, mask=mask)
 
 
 def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:

@@ -10,7 +10,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture, output_names
-from fidsplat.capture.environment import Layer
+from fidsplat.capture.environment import ExternalDepth
 from fidsplat.capture.sensor import Sensor
 from fidsplat.render.batch import FrameBatch
 from fidsplat.render.renderer import Renderer
@@ -115,7 +115,7 @@ class Rig:
         cameras: Mapping[str, Any] | Any = None,
         *,
         outputs: Iterable[str] | None = None,
-        layers: Mapping[str, Sequence[Layer]] | None = None,
+        external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
         mask: Any = None,
     ) -> Pictures:
         """Pictures of every environment by every camera.
@@ -128,7 +128,8 @@ class Rig:
             cameras: poses, world from camera, OpenCV axes: {name: (env, 7)} of some cameras, or
                 (env, camera, 7). Cameras without one stand where they are mounted.
             outputs: names of the output images; default the rig's.
-            layers: {name of a camera: a Layer for each environment}, what another renderer drew from there.
+            external_depths: {camera name: an ExternalDepth for each environment}, rendered by another
+                renderer from there.
             mask: (env,) bool; environments that are False are not drawn: 0, and labels of -1.
 
         Raises:
@@ -144,7 +145,7 @@ class Rig:
         stands = {name: self._stands(name, given, count) for name in self.cameras} | views
         names = None if outputs is None else output_names(outputs)
         drawn = _mask_of(mask, count)
-        seen = {name: () for name in self.cameras} | self._layers_of(layers, count)
+        seen = {name: () for name in self.cameras} | self._external_of(external_depths, count)
         groups = {
             label: compose(given[name], self._rest[name]) if name in self._rest else given[name]
             for label, name in self.labels.items()
@@ -182,41 +183,44 @@ class Rig:
         on = np.broadcast_to(IDENTITY, (count, 7)) if camera.body is None else bodies[camera.body]
         return compose(on, camera.mount)
 
-    def _layers_of(self, layers: Any, count: int) -> dict[str, Sequence[Layer]]:
-        if not isinstance(layers, Mapping | None):
-            raise InputError(f"layers is {layers!r}; it must be {{name of a camera: list of Layer}}")
-        for name, each in (layers or {}).items():
+    def _external_of(self, external_depths: Any, count: int) -> dict[str, Sequence[ExternalDepth]]:
+        if not isinstance(external_depths, Mapping | None):
+            raise InputError(
+                f"external_depths must be {{camera name: list of ExternalDepth}}, got {external_depths!r}"
+            )
+        for name, each in (external_depths or {}).items():
             if name not in self.cameras:
                 raise InputError(unknown("camera", name, self.cameras))
             if not isinstance(each, Sequence):
                 raise InputError(
-                    f"the layers of the camera {name!r} are {each!r}; give a list, one for each environment"
+                    f"external_depths[{name!r}] must be a list, one for each environment, got {each!r}"
                 )
             if len(each) != count:
                 raise InputError(
-                    f"{len(each)} layers for the camera {name!r}, but {count} environments; give one for each"
+                    f"external_depths[{name!r}] must have {count} images, got {len(each)}; give one for "
+                    "each environment"
                 )
-        return dict(layers or {})
+        return dict(external_depths or {})
 
     def _taken_by(
-        self, name: str, outputs: tuple[str, ...] | None, layers: Sequence[Layer], count: int
+        self, name: str, outputs: tuple[str, ...] | None, external: Sequence[ExternalDepth], count: int
     ) -> list[Capture]:
-        """How a camera takes its pictures: one capture for all, or where there is noise or a layer one for
-        each."""
+        """Captures of a camera: one for all environments, or one for each if there is noise or an external
+        depth image."""
         own = self.cameras[name]
         capture = self._capture.with_(
             camera=own.camera, sensor=own.sensor, outputs=outputs or self.outputs_of(name)
         )
         if "noise" not in capture.sensor.steps:
-            return [capture.with_(layer=layer) for layer in layers] or [capture]
+            return [capture.with_(external_depth=one) for one in external] or [capture]
         place = list(self.cameras).index(name)
         seeds = [
             (capture.sensor.seed + 0x9E3779B1 * (self._drawn + i) + 0x85EBCA77 * place) % 2**32
             for i in range(count)
         ]
         return [
-            capture.with_(sensor=replace(capture.sensor, seed=seed), layer=layer)
-            for seed, layer in zip(seeds, layers or [None] * count, strict=True)
+            capture.with_(sensor=replace(capture.sensor, seed=seed), external_depth=one)
+            for seed, one in zip(seeds, external or [None] * count, strict=True)
         ]
 
     def _draw(

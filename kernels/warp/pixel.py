@@ -75,7 +75,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
             p.opaque_z = wp.inf
             # a tile has samples beyond the picture too
             if x < view.width and y < view.height:
-                p.opaque_z = rays.layer_depth[pixel_at(x, y, view)]
+                p.opaque_z = rays.external_depth[pixel_at(x, y, view)]
         for k in range(wp.static(len(starts))):
             p = wp.static(starts[k])(p, length, view)
         return p
@@ -198,7 +198,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         p = pixel
         if p.opaque_z < wp.inf:
             seen = Seen()
-            seen.rgb = rays.layer_rgb[pixel_at(x, y, view)]
+            seen.rgb = rays.external_rgb[pixel_at(x, y, view)]
             seen.z = p.opaque_z
             for k in range(wp.static(len(covers))):
                 seen = wp.static(covers[k])(seen)

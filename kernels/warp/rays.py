@@ -22,7 +22,7 @@ def struct_of_rays(bent: bool, sloped: bool = False, opaque: bool = False):
         fields |= {"rays": wp.array(dtype=wp.vec3)}
         fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
     if opaque:  # of each pixel, row by row; a depth that is infinite where there is none
-        fields |= {"layer_depth": wp.array(dtype=wp.float32), "layer_rgb": wp.array(dtype=wp.vec3)}
+        fields |= {"external_depth": wp.array(dtype=wp.float32), "external_rgb": wp.array(dtype=wp.vec3)}
     return struct_of("Rays", "The samples' rays, and a layer.", fields)
 
 

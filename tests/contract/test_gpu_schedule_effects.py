@@ -24,16 +24,16 @@ def taken(cloud, outputs=tuple(OUTPUTS), **how):
     return Combination(cloud, fs.Capture(CAMERA, outputs, **how))
 
 
-def gaussians_beside_a_layer():
+def gaussians_and_an_external_depth_image():
     rng = np.random.default_rng(0)
-    layer = fs.Layer(rng.random((*SIZE[::-1], 3)), rng.uniform(0.9, 3.0, SIZE[::-1]), 77)
+    surface = fs.ExternalDepth(rng.random((*SIZE[::-1], 3)), rng.uniform(0.9, 3.0, SIZE[::-1]), 77)
     thick = some_thick(SPLATS, SPLATS.scales[::-1, 0])
-    return taken(thick, quality="standard,ellipsoid=ewa_antialiased", layer=layer)
+    return taken(thick, quality="standard,ellipsoid=ewa_antialiased", external_depth=surface)
 
 
 PICTURES = {
     **{f"all behind {lens}": lambda lens=lens: combination(everything(lens)) for lens in [None, *LENSES]},
-    "3D Gaussians beside a layer": gaussians_beside_a_layer,
+    "3D Gaussians and an external depth image": gaussians_and_an_external_depth_image,
     "disks under a shutter": lambda: taken(
         SPLATS,
         quality="standard,order=pixel",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments.ideal_tags import tag_layer
+from fidsplat.experiments.ideal_tags import tag_depth_image
 from fidsplat.experiments.plane import plane_picture
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
@@ -20,21 +20,21 @@ def tag():
 
 
 def test_a_pixel_is_the_mean_of_what_it_shows(tag):
-    layer = tag_layer([PlacedMarker(tag, POSE)], CAMERA, BEHIND)
-    there = np.isfinite(layer.depth)
+    image = tag_depth_image([PlacedMarker(tag, POSE)], CAMERA, BEHIND)
+    there = np.isfinite(image.depth)
     camera = fs.Camera.pinhole(120, 90, 110, 110, 61, 44, world_to_camera=POSE)
     for channel, value in enumerate(BEHIND[0, 0]):
         whole = plane_picture(tag.grid, tag.module, camera, background=value)
-        np.testing.assert_allclose(layer.rgb[..., channel][there], whole[there], atol=1e-6)
+        np.testing.assert_allclose(image.rgb[..., channel][there], whole[there], atol=1e-6)
         assert np.abs(whole[~there] - value).max() < 1 / 256
-    np.testing.assert_allclose(layer.rgb[~there], BEHIND[~there], atol=1e-6)
+    np.testing.assert_allclose(image.rgb[~there], BEHIND[~there], atol=1e-6)
 
 
 def test_it_is_where_the_tag_is(tag):
-    layer = tag_layer([PlacedMarker(tag, POSE)], CAMERA, BEHIND)
-    y, x = np.nonzero(np.isfinite(layer.depth))
+    image = tag_depth_image([PlacedMarker(tag, POSE)], CAMERA, BEHIND)
+    y, x = np.nonzero(np.isfinite(image.depth))
     rays = CAMERA.rays(np.column_stack([x, y]) + 0.5)
-    points = (rays / rays[:, 2:]) * layer.depth[y, x, None]
+    points = (rays / rays[:, 2:]) * image.depth[y, x, None]
     local = (points - POSE[:3, 3]) @ POSE[:3, :3]
     assert np.abs(local[:, 2]).max() < 1e-6
     assert np.abs(local[:, :2]).max() < tag.grid.shape[0] * tag.module / 2 + 0.02
@@ -43,7 +43,7 @@ def test_it_is_where_the_tag_is(tag):
 def test_the_nearer_of_two_tags_is_seen(tag):
     near, far = (PlacedMarker(tag, rigid_matrix((0, 0, z))) for z in (0.7, 1.0))
     for tags in ((near, far), (far, near)):
-        depth = tag_layer(tags, CAMERA, BEHIND).depth
+        depth = tag_depth_image(tags, CAMERA, BEHIND).depth
         assert depth[np.isfinite(depth)] == pytest.approx(0.7)
 
 
@@ -53,6 +53,6 @@ def test_the_nearer_of_two_tags_is_seen(tag):
     ids=["behind the camera", "from behind", "beside the picture"],
 )
 def test_what_is_not_seen_leaves_the_picture_as_it_is(tag, pose):
-    layer = tag_layer([PlacedMarker(tag, pose)], CAMERA, BEHIND)
-    assert not np.isfinite(layer.depth).any()
-    np.testing.assert_allclose(layer.rgb, BEHIND, atol=1e-6)
+    image = tag_depth_image([PlacedMarker(tag, pose)], CAMERA, BEHIND)
+    assert not np.isfinite(image.depth).any()
+    np.testing.assert_allclose(image.rgb, BEHIND, atol=1e-6)

@@ -120,24 +120,25 @@ def test_bodies_at_rest_where_the_scene_has_their_splats(scene, renderer):
     np.testing.assert_allclose(one.placed()[0].pose, other.placed()[0].pose, atol=1e-12)
 
 
-def test_layers_of_another_renderer_are_each_environments_own(scene):
+def test_each_environment_has_its_own_external_depth_image(scene):
     camera = {"fixed": fs.Camera.pinhole(*SIZE, 150, 150, 80, 60)}
     rig = Rig(scene, {1: "box"}, camera, renderer=fs.Renderer("reference"), outputs=("label",))
     box = np.tile([0, 0, 1.5, 1, 0, 0, 0.0], (2, 1))
     near, far = (
-        fs.Layer(np.zeros((*SIZE[::-1], 3)), np.full(SIZE[::-1], depth), label=9) for depth in (1.0, 2.0)
+        fs.ExternalDepth(np.zeros((*SIZE[::-1], 3)), np.full(SIZE[::-1], depth), label=9)
+        for depth in (1.0, 2.0)
     )
-    label = rig.render({"box": box}, layers={"fixed": [near, far]})["label"][:, 0]
+    label = rig.render({"box": box}, external_depths={"fixed": [near, far]})["label"][:, 0]
     assert set(np.unique(label[0])) == {9}
     assert set(np.unique(label[1])) == {1, 9}
-    with pytest.raises(fs.InputError, match="1 layers for the camera 'fixed', but 2 environments"):
-        rig.render({"box": box}, layers={"fixed": [near]})
+    with pytest.raises(fs.InputError, match=r"must have 2 images, got 1"):
+        rig.render({"box": box}, external_depths={"fixed": [near]})
     with pytest.raises(fs.InputError, match="unknown camera 'fxed'"):
-        rig.render({"box": box}, layers={"fxed": [near, far]})
-    with pytest.raises(fs.InputError, match=r"the layers of the camera 'fixed' are .*; give a list"):
-        rig.render({"box": box}, layers={"fixed": near})
-    with pytest.raises(fs.InputError, match=r"layers is \[.*\]; it must be"):
-        rig.render({"box": box}, layers=[near, far])
+        rig.render({"box": box}, external_depths={"fxed": [near, far]})
+    with pytest.raises(fs.InputError, match=r"external_depths\['fixed'\] must be a list"):
+        rig.render({"box": box}, external_depths={"fixed": near})
+    with pytest.raises(fs.InputError, match=r"external_depths must be .*, got \["):
+        rig.render({"box": box}, external_depths=[near, far])
 
 
 def test_masked_environments_are_not_drawn(rig):

@@ -120,8 +120,8 @@ LAYOUTS: dict[str, Layout] = {
         "slot/external_depth.cl",
         parts=("ray_depth",),
         blend=takes(
-            "array float layer_depth layer_rgb  // (h, w) infinite where there is none, (h, w, 3)",
-            "array int layer_label  // (h, w)",
+            "array float external_depth external_rgb  // (h, w) infinite where there is none, (h, w, 3)",
+            "array int external_label  // (h, w)",
         ),
     ),
     "shutter_exposure": Layout("slot/shutter_exposure.cl"),

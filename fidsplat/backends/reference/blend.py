@@ -29,7 +29,7 @@ def composite(
     """Samples (k,) at grid positions x, y against all splats: what blending leaves, before resolving."""
     f = fragments_of(s, view, x, y)
     span = error_bounds.span_of(s, view, f)
-    surface = None if view.layer is None else surface_at(view.layer, view, x, y)
+    surface = None if view.external_depth is None else surface_at(view.external_depth, view, x, y)
     if surface is not None:
         span = surface.hide(s, f, span)
     stack = by_depth(s, f, span) if s.by_depth else by_center(s, f, span)

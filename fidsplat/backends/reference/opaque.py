@@ -11,12 +11,12 @@ from fidsplat.backends.reference.fragments import Fragments
 from fidsplat.backends.reference.layers import Stack
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
-from fidsplat.capture.environment import Layer
+from fidsplat.capture.environment import ExternalDepth
 
 
 @dataclass
 class Surface:
-    """What k samples see of a layer."""
+    """What k samples see of an external depth image."""
 
     z: np.ndarray
     """(k,) metres; infinite where there is none"""
@@ -81,8 +81,8 @@ class Surface:
         return replace(stack, **joined)
 
 
-def surface_at(layer: Layer, view: View, x: np.ndarray, y: np.ndarray) -> Surface:
-    """What samples (k,) at grid positions x, y see of a layer."""
+def surface_at(external: ExternalDepth, view: View, x: np.ndarray, y: np.ndarray) -> Surface:
+    """What samples (k,) at grid positions x, y see of an external depth image."""
     row, column = (np.floor(at / view.samples).astype(int) for at in (y, x))
-    color, label = layer.rgb[row, column].astype(np.float64), np.asarray(layer.label)[row, column]
-    return Surface(layer.depth[row, column].astype(np.float64), color, label)
+    color, label = external.rgb[row, column].astype(np.float64), np.asarray(external.label)[row, column]
+    return Surface(external.depth[row, column].astype(np.float64), color, label)

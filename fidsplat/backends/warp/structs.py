@@ -80,7 +80,7 @@ def rays_of(
         return _empty(kind)
     rays = kind()
     if opaque:
-        for name, dtype in (("layer_depth", wp.float32), ("layer_rgb", wp.vec3)):
+        for name, dtype in (("external_depth", wp.float32), ("external_rgb", wp.vec3)):
             setattr(rays, name, inputs.filled(name, view.array(name), dtype))
     if raster is None:
         return rays
@@ -166,11 +166,11 @@ def surroundings_of(view: View, workspace: Workspace) -> Any:
 
 
 def memory_bytes(view: View, workspace: Workspace) -> int:
-    """Bytes that the arrays of a view's lens, panorama and layer take on the device."""
-    around, raster, layer = view.surroundings, view.raster, view.layer
+    """Bytes that the arrays of a view's lens, panorama and external depth image take on the device."""
+    around, raster, external = view.surroundings, view.raster, view.external_depth
     held = {} if raster is None else workspace.lenses.get(raster.whole or raster, {})
     taken = [around.image] if isinstance(around, Panorama) else []
-    taken += [] if layer is None else [layer.rgb, layer.depth, layer.label]
+    taken += [] if external is None else [external.rgb, external.depth, external.label]
     return sum(map(nbytes, held.values())) + sum(array.nbytes for array in taken)
 
 

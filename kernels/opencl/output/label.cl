@@ -35,4 +35,4 @@
 //@ resolve_end
     label_out[out] = label;
 //@ external_lane
-            OPAQUE(int, attributes.label) = layer_label[at];
+            OPAQUE(int, attributes.label) = external_label[at];

@@ -17,9 +17,9 @@
 #define OPAQUE(type, of) ((type *)&(of))[lane]
 #endif
             size_t at = (size_t)(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES;
-            OPAQUE(float, attributes.r) = layer_rgb[3 * at];
-            OPAQUE(float, attributes.g) = layer_rgb[3 * at + 1];
-            OPAQUE(float, attributes.b) = layer_rgb[3 * at + 2];
+            OPAQUE(float, attributes.r) = external_rgb[3 * at];
+            OPAQUE(float, attributes.g) = external_rgb[3 * at + 1];
+            OPAQUE(float, attributes.b) = external_rgb[3 * at + 2];
 //@@ external_lane
         }
 //@@ external_attributes

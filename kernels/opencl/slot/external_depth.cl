@@ -13,7 +13,7 @@
             ((float *)&pixels[row].opaque_z)[lane]
 #endif
                 = opaque_x < width && opaque_y < height
-                      ? layer_depth[(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES] : INFINITY;
+                      ? external_depth[(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES] : INFINITY;
         }
 //@ empty
                        && false         // the surface is drawn everywhere

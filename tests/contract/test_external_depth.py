@@ -1,4 +1,4 @@
-"""A layer of another renderer among splats: exact per pixel, and as the reference has it."""
+"""External depth images among splats: exact per pixel, and equal to the reference renderer."""
 
 from dataclasses import replace
 
@@ -20,12 +20,12 @@ OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "depth_first", "normal", "la
 CAMERA = fs.Camera.pinhole(*SIZE, 30.0, 30.0, 18.0, 11.0)
 
 
-def a_layer(seed=0, label=77):
+def a_surface(seed=0, label=77):
     """Random colours and depths among the splats, with holes."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(0.9, 3.0, (HEIGHT, WIDTH))
     depth[rng.random(depth.shape) < 0.2] = np.inf
-    return fs.Layer(rng.random((HEIGHT, WIDTH, 3)), depth, label)
+    return fs.ExternalDepth(rng.random((HEIGHT, WIDTH, 3)), depth, label)
 
 
 def a_cloud():
@@ -64,13 +64,13 @@ def differences(pipeline, resident, cloud, capture):
 @pytest.mark.parametrize("case", CASES)
 def test_every_output_is_the_references(renderer, case):
     cloud, asked = CASES[case]
-    capture = fs.Capture(**{"camera": CAMERA, "outputs": OUTPUTS, "layer": a_layer()} | asked)
+    capture = fs.Capture(**{"camera": CAMERA, "outputs": OUTPUTS, "external_depth": a_surface()} | asked)
     resident = renderer.upload(cloud).data
     pipeline = renderer.backend.pipeline(prepare(resident, capture)[0])
     wrong = [one for one in differences(pipeline, resident, cloud, capture) if not one.agrees]
     away = np.eye(4)
     away[2, 3] = -100.0
-    behind = cloud.transformed(away)  # the layer alone is seen
+    behind = cloud.transformed(away)  # only the surface is visible
     resident = renderer.upload(behind).data
     wrong += [one for one in differences(pipeline, resident, behind, capture) if not one.agrees]
     assert not wrong, wrong
@@ -78,7 +78,7 @@ def test_every_output_is_the_references(renderer, case):
 
 def test_both_schedules_agree(renderer):
     cloud, asked = CASES["planes, fog, 2 x 2 samples"]
-    capture = fs.Capture(CAMERA, OUTPUTS, layer=a_layer()).with_(**asked)
+    capture = fs.Capture(CAMERA, OUTPUTS, external_depth=a_surface()).with_(**asked)
     resident = renderer.upload(cloud).data
     for shape in renderer.backend.shapes("schedule").values():
         pipeline = renderer.backend.pipeline(prepare(resident, capture)[0], shape)
@@ -87,13 +87,15 @@ def test_both_schedules_agree(renderer):
 
 
 @in_turn()
-def test_a_plane_that_goes_through_the_layer_is_hidden_where_it_is_behind(renderer):
+def test_a_plane_that_crosses_the_surface_is_occluded_where_it_is_behind(renderer):
     """Not by its centre: pixel by pixel, by its own depth there."""
     plane = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[3.0, 3.0]], [0.9], colors=[[1, 0, 0]]).with_boxes()
     plane = plane.transformed(rigid_matrix((0, 0, 2), (1, 0, 0.3, 0))).with_labels(5)
-    layer = fs.Layer(np.full((HEIGHT, WIDTH, 3), (0, 0, 255), np.uint8), np.full((HEIGHT, WIDTH), 2.0), 9)
+    surface = fs.ExternalDepth(
+        np.full((HEIGHT, WIDTH, 3), (0, 0, 255), np.uint8), np.full((HEIGHT, WIDTH), 2.0), 9
+    )
     alone = renderer.render(plane, fs.Capture(CAMERA, OUTPUTS))
-    both = renderer.render(plane, fs.Capture(CAMERA, OUTPUTS, layer=layer))
+    both = renderer.render(plane, fs.Capture(CAMERA, OUTPUTS, external_depth=surface))
     front = (alone["depth"] > 0) & (alone["depth"] < 2.0)
     assert 0.3 < front.mean() < 0.7
     np.testing.assert_array_equal(both["label"], np.where(front, 5, 9))
@@ -103,25 +105,25 @@ def test_a_plane_that_goes_through_the_layer_is_hidden_where_it_is_behind(render
     np.testing.assert_allclose(both["depth"], np.where(front, mixed, 2.0), rtol=1e-6)
 
 
-def test_a_layer_in_front_of_all_is_all_that_is_seen(renderer):
-    layer = a_layer()
-    near = fs.Layer(layer.rgb, np.full((HEIGHT, WIDTH), 0.5), layer.label)
-    frame = renderer.render(a_cloud(), fs.Capture(CAMERA, OUTPUTS, layer=near))
-    np.testing.assert_array_equal(frame["rgb"], layer.rgb)
+def test_only_a_surface_in_front_of_all_splats_is_visible(renderer):
+    surface = a_surface()
+    near = fs.ExternalDepth(surface.rgb, np.full((HEIGHT, WIDTH), 0.5), surface.label)
+    frame = renderer.render(a_cloud(), fs.Capture(CAMERA, OUTPUTS, external_depth=near))
+    np.testing.assert_array_equal(frame["rgb"], surface.rgb)
     np.testing.assert_array_equal(frame["depth"], near.depth)
     assert (frame["label"] == 77).all()
     assert (frame["alpha"] == 1).all()
 
 
-def test_a_layer_of_nothing_changes_no_bit(renderer):
-    nothing = fs.Layer(np.ones((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH)))
+def test_an_empty_surface_changes_no_bit(renderer):
+    nothing = fs.ExternalDepth(np.ones((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH)))
     alone = renderer.render(a_cloud(), fs.Capture(CAMERA, OUTPUTS))
-    beside = renderer.render(a_cloud(), fs.Capture(CAMERA, OUTPUTS, layer=nothing))
+    beside = renderer.render(a_cloud(), fs.Capture(CAMERA, OUTPUTS, external_depth=nothing))
     for name in OUTPUTS:
         assert alone[name].tobytes() == beside[name].tobytes(), name
 
 
-def test_our_depth_is_a_layer_for_the_next(renderer):
+def test_our_depth_is_an_external_depth_image(renderer):
     """What is drawn in two parts, each behind the other where it is: opaque splats give the same picture."""
     boxes = fs.SplatCloud(
         [[-0.2, 0, 1.5], [0.2, 0, 2.0], [0, 0.1, 1.8]],
@@ -137,8 +139,8 @@ def test_our_depth_is_a_layer_for_the_next(renderer):
     ).with_boxes() for rows in ([1], [0, 2]))  # fmt: skip
     quality = "standard,opacity_ceiling=1"
     drawn = renderer.render(first, fs.Capture(CAMERA, OUTPUTS, quality))
-    layer = fs.Layer(drawn["rgb"], drawn["depth"], np.maximum(drawn["label"], 0))
-    both = renderer.render(rest, fs.Capture(CAMERA, OUTPUTS, quality, layer=layer))
+    surface = fs.ExternalDepth(drawn["rgb"], drawn["depth"], np.maximum(drawn["label"], 0))
+    both = renderer.render(rest, fs.Capture(CAMERA, OUTPUTS, quality, external_depth=surface))
     whole = renderer.render(boxes, fs.Capture(CAMERA, OUTPUTS, quality))
     inside = np.abs(whole["rgb"] - np.rint(whole["rgb"])).max(-1) < 1e-6  # edges cover parts of pixels
     assert inside.mean() > 0.8
@@ -146,10 +148,10 @@ def test_our_depth_is_a_layer_for_the_next(renderer):
     np.testing.assert_array_equal(both["label"][inside], whole["label"][inside])
 
 
-def test_views_of_a_batch_have_layers_of_their_own(renderer):
-    first, second = a_layer(1), a_layer(2)
-    for layers in ((first, second), (first, first)):
-        captures = [fs.Capture(CAMERA, OUTPUTS, layer=layer) for layer in layers]
+def test_views_of_a_batch_have_their_own_surfaces(renderer):
+    first, second = a_surface(1), a_surface(2)
+    for surfaces in ((first, second), (first, first)):
+        captures = [fs.Capture(CAMERA, OUTPUTS, external_depth=surface) for surface in surfaces]
         batch = renderer.render_batch(a_cloud(), captures)
         for i, capture in enumerate(captures):
             alone = renderer.render(a_cloud(), capture)
@@ -158,36 +160,39 @@ def test_views_of_a_batch_have_layers_of_their_own(renderer):
 
 
 @pytest.mark.parametrize("shape", [cpu_shape(), gpu_shape()], ids=["lanes", "group"])
-def test_a_scene_without_a_layer_has_none_of_its_text(shape):
+def test_a_scene_without_a_surface_has_none_of_its_kernel_text(shape):
     plain = fs.Capture(CAMERA, OUTPUTS)
     text = assemble(select(a_cloud(), plain), shape).text
     assert "opaque" not in text
-    assert "opaque" in assemble(select(a_cloud(), replace(plain, layer=a_layer())), shape).text
+    assert "opaque" in assemble(select(a_cloud(), replace(plain, external_depth=a_surface())), shape).text
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: fs.Layer(np.zeros((4, 5)), np.zeros((4, 5))), r"their shapes are \(4, 5\), \(4, 5\)"),
-        (lambda: fs.Layer(np.zeros((4, 5, 3)), np.full((4, 5), -1.0)), "depths below 0"),
-        (lambda: fs.Layer(np.full((4, 5, 3), np.nan), np.ones((4, 5))), "not finite"),
-        (lambda: fs.Layer(np.zeros((4, 5, 3)), np.ones((4, 5)), 0.5), "must be whole numbers"),
-        (lambda: fs.Layer(np.zeros((4, 5, 3)), np.ones((4, 5)), [1, 2]), "must be whole numbers"),
-        (lambda: fs.Layer("red", np.ones((4, 5))), "the rgb of a layer must be an array"),
-        (lambda: fs.Capture(CAMERA, layer=3), "layer is 3; it must be a Layer"),
+        (lambda: fs.ExternalDepth(np.zeros((4, 5)), np.zeros((4, 5))), r"got \(4, 5\) and \(4, 5\)"),
+        (lambda: fs.ExternalDepth(np.zeros((4, 5, 3)), np.full((4, 5), -1.0)), "depths of at least 0"),
+        (lambda: fs.ExternalDepth(np.full((4, 5, 3), np.nan), np.ones((4, 5))), "must hold finite colours"),
+        (lambda: fs.ExternalDepth(np.zeros((4, 5, 3)), np.ones((4, 5)), 0.5), "must be integers"),
+        (lambda: fs.ExternalDepth(np.zeros((4, 5, 3)), np.ones((4, 5)), [1, 2]), "must be integers"),
+        (lambda: fs.ExternalDepth("red", np.ones((4, 5))), "rgb of external_depth must be an array"),
+        (lambda: fs.Capture(CAMERA, external_depth=3), "external_depth is 3; it must be a ExternalDepth"),
     ],
 )
-def test_layers_that_cannot_be(make, words):
+def test_unusable_external_depth_images(make, words):
     with pytest.raises(fs.InputError, match=words):
         make()
 
 
-def test_a_layer_of_another_size_and_one_of_a_long_exposure(reference):
-    small = fs.Layer(np.zeros((4, 5, 3)), np.ones((4, 5)))
-    with pytest.raises(fs.InputError, match="the layer has 5 x 4 pixels and the camera 37 x 22"):
-        reference.render(a_cloud(), fs.Capture(CAMERA, layer=small))
+def test_a_surface_of_another_size_and_one_of_a_long_exposure(reference):
+    small = fs.ExternalDepth(np.zeros((4, 5, 3)), np.ones((4, 5)))
+    with pytest.raises(fs.InputError, match="must have the camera's 37 x 22 pixels, got 5 x 4"):
+        reference.render(a_cloud(), fs.Capture(CAMERA, external_depth=small))
     blurred = fs.Capture(
-        CAMERA, layer=a_layer(), motion=fs.Motion(lambda t: np.eye(4)), shutter=fs.Shutter(exposure_time=0.1)
+        CAMERA,
+        external_depth=a_surface(),
+        motion=fs.Motion(lambda t: np.eye(4)),
+        shutter=fs.Shutter(exposure_time=0.1),
     )
-    with pytest.raises(fs.InputError, match="a layer shows one moment"):
+    with pytest.raises(fs.InputError, match="must have a shutter with exposure_time=0"):
         reference.render(a_cloud(), blurred)
