@@ -1,13 +1,13 @@
-// Lists of splats per tile for CPUs, each in depth order: a counting sort whose bins are the tiles.
-// Index space of both kernels: one work-item per chunk of the depth-sorted splats of each view, which have `count` places.
+// Tile binning on CPUs: a stable counting sort of the depth-sorted splats, with the tiles as bins.
+// Index space of both kernels: one work-item per chunk of the depth-sorted splats of each view, which has `count` entries.
 
-// The next splats' windows are fetched ahead: their places in memory follow no order.
+// Windows are prefetched, since the depth order scatters them in memory.
 #define PREFETCH_DISTANCE 16
 
 typedef struct {
     int tiles_x, tiles_y, width, height;
-    uint from, to;           // this chunk of the order
-    global uint *row;        // its row of table[CHUNKS][tiles]
+    uint from, to;           // this chunk
+    global uint *row;        // row of table[CHUNKS][tiles]
 } Chunk;
 
 static inline Chunk chunk_of(uint length, int width, int height, global uint *restrict table) {
@@ -23,18 +23,18 @@ static inline Chunk chunk_of(uint length, int width, int height, global uint *re
     return c;
 }
 
-typedef struct {             // of bin_emit; lists of the tiles of the band [first, end), from `base`
+typedef struct {             // state of bin_emit; lists of the tiles of the band [first, end), from `base`
     int first, end;
     uint base;
     global const uint *starts;
     global uint *lists;
 } Emission;
 
-// Counts a splat's tile or, with an emission, lists the splat there: counts and lists come from the same walk.
+// Counts a splat's tile or, with an emission, writes the splat to its list: one function for both, so they agree.
 static inline void bin_tile(int tile, uint index, const Chunk *c, const Emission *e) {
     if (e) {
         if (tile < e->first || tile >= e->end) return;
-        // modulo 2^32: a place within the band is right even where the picture has more pairs than that
+        // modulo 2^32: indices within the band are right even if the frame has more pairs than that
         uint place = e->starts[tile] - e->base + c->row[tile];
         e->lists[place] = index;
     }
@@ -72,14 +72,14 @@ kernel void bin_count(
     bin_splats(order, windows, big_capacity, big_bounds, &c, 0);
 }
 
-// Reads: as bin_count, and starts. Uses up: table, of the tiles in the band. Writes: lists.
+// Reads: the inputs of bin_count, and starts. Consumes: table, of the tiles in the band. Writes: lists.
 kernel void bin_emit(
 //@@ arguments bin_emit
 ) {
     if (get_global_id(0) >= CHUNKS) return;
     const Chunk c = chunk_of(tallies[get_global_id(1) * TALLIES + TALLY_VISIBLE], width, height, table);
     order += get_global_id(1) * count;
-    int before = (int)get_global_id(1) * c.tiles_x * c.tiles_y;    // tiles of the views before
+    int before = (int)get_global_id(1) * c.tiles_x * c.tiles_y;    // tiles of preceding views
     const Emission e = {band_first - before, band_end - before, starts[band_first], starts + before, lists};
     bin_splats(order, windows, big_capacity, big_bounds, &c, &e);
 }

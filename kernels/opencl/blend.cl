@@ -1,7 +1,7 @@
-// Front-to-back compositing of one fragment per pixel (the paper, section 3.1): C = sum_k c_k alpha_k prod (1 - alpha_j).
-// The schedules (schedule/*.cl) bring the splats of a tile here in depth order.
+// Front-to-back alpha compositing of one fragment per pixel (2DGS, section 3.1): C = sum_k c_k alpha_k prod_{j<k} (1 - alpha_j).
+// The schedules (schedule/*.cl) call it for the splats of a tile in depth order.
 
-typedef struct {            // what shows where something is drawn
+typedef struct {            // colour and outputs of a fragment or layer
     vfloat r, g, b;
 //@@ attributes
 } Attributes;
@@ -28,7 +28,7 @@ static inline void pixel_start(Pixel *pixel) {
 //@@ fragment_mask
 //@@ fragment_half_rho
 
-// What a fragment shows.
+// Attributes of a fragment.
 static inline Attributes fragment_attributes(const Splat *s, Crossing c, vfloat inverse_d) {
     Attributes attributes;
     attributes.r = s->r;
@@ -38,7 +38,7 @@ static inline Attributes fragment_attributes(const Splat *s, Crossing c, vfloat 
     return attributes;
 }
 
-// Composites it over all that follows, where `mask` is set and the pixel still lets light through.
+// Composites a fragment in front of everything behind it, where `mask` is set and the pixel is not terminated.
 static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
@@ -53,17 +53,17 @@ static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat 
 //@@ composite
 #if LANES == 1
     pixel->t = pixel->t - weight;
-#else       // as fragment follows fragment: `live` is found meanwhile
+#else       // in the order of fragments; `live` is computed in parallel
     pixel->t = VSELECT(pixel->t, pixel->t - full_weight, live);
 #endif
 }
 
-// Whether light comes through to what follows.
+// Pixels that still transmit light (transmittance above the stop).
 static inline vint pixel_transmits(const Pixel *pixel, const BlendConstants *constants) {
     return VMASK(pixel->t > constants->stop);
 }
 
-// Whether anything that follows can still be seen.
+// Pixels that a later fragment can still change.
 static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *constants) {
     return pixel_transmits(pixel, constants)
 //@@ unfinished
@@ -71,7 +71,7 @@ static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *co
 }
 
 //@@ compose_functions
-// Draws the fragment where `mask` is set.
+// Renders a fragment where `mask` is set: composites it, or inserts it into the k-buffer.
 static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint mask, vfloat screen,
                                const BlendConstants *constants
 //@@ blend_parameters
@@ -83,7 +83,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
 //@@ compose
 }
 
-// Writes LANES pixels at `at` of each channel of `raw`, which are `channel_stride` samples long.
+// Stores LANES pixels at index `at` of each channel of `raw`; a channel has `channel_stride` samples.
 #define PIXEL_STORE_BASE(pixel, raw, channel_stride, at) \
     BLOCK_STORE((pixel)->r, raw + (at), stride); \
     BLOCK_STORE((pixel)->g, raw + (channel_stride) + (at), stride); \

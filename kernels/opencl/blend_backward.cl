@@ -1,10 +1,10 @@
-// The derivatives of compositing, fragment by fragment. A loss L depends on what a pixel shows,
+// Backward pass of compositing, per fragment. A loss L depends on a pixel's colour
 //   C = sum_k T_k alpha_k c_k + T_end C_behind,   T_k = prod_{j<k} (1 - alpha_j).
-// With g = dL / dC and B_k = what the light is worth that fragment k lets through, from the back
-//   B_end = g C_behind,   B_k-1 = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k):
-// nothing is divided by 1 - alpha, so that opaque fragments have derivatives as all others.
-// The schedules (schedule/*_backward.cl) walk a tile's list forward for T, in the arithmetic of blending and with its
-// decisions, and then back, CHUNK splats at a time.
+// With g = dL / dC and B_k = the gradient by the transmittance behind fragment k, back to front:
+//   B_end = g C_behind,   B_k-1 = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k).
+// Nothing is divided by 1 - alpha, so opaque fragments need no special case.
+// The schedules (schedule/*_backward.cl) process a tile's list forward for T, with the arithmetic and decisions of blending, and
+// then backward, CHUNK splats at a time.
 
 //@@ compose_types
 typedef struct {            // uniforms of the blend stage
@@ -22,7 +22,7 @@ static inline void pixel_start(Pixel *pixel, vfloat transmittance) {
 //@@ start
 }
 
-// What `pixel_start` has to be given to go on from here.
+// Argument of `pixel_start` that continues from this pixel.
 static inline vfloat pixel_transmittance(const Pixel *pixel) {
     vfloat transmittance = pixel->t;
 //@@ transmittance
@@ -33,7 +33,7 @@ static inline vfloat pixel_transmittance(const Pixel *pixel) {
 //@@ fragment_half_rho
 //@@ fragment_branch
 
-// What is drawn of a fragment of this opacity; lets the light behind it go on.
+// Composited opacity of a fragment; attenuates the pixel's transmittance by it.
 static inline vfloat attenuate(Pixel *pixel, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
@@ -42,17 +42,17 @@ static inline vfloat attenuate(Pixel *pixel, vfloat opacity, vint mask, const Bl
     return composited;
 }
 
-typedef struct {            // of a pixel: the loss's derivatives
-    vfloat r, g, b;         // by the light that it shows
+typedef struct {            // gradient of the loss by one pixel
+    vfloat r, g, b;         // by the colour
     vfloat behind;          // B above
 //@@ pixel_gradient
 } PixelGradient;
 
-// The pixels of a block at (x, y), of an image (h, w, channels); 0 outside of it.
+// Pixels of a block at (x, y) of an image (h, w, channels); 0 outside of it.
 static inline vfloat pixels_of(global const float *image, int channels, int channel, int x, int y, int width, int height) {
     float block[LANES];
 #if LANES > 1
-    if (x + BLOCK_W <= width && y + LANES / BLOCK_W <= height) {    // nothing is asked of each pixel
+    if (x + BLOCK_W <= width && y + LANES / BLOCK_W <= height) {    // no test per pixel
         image += channels * (y * (size_t)width + x) + channel;
         for (int lane = 0; lane < LANES; lane++) block[lane] = image[channels * (lane / BLOCK_W * width + lane % BLOCK_W)];
         return VLOAD(block);
@@ -65,7 +65,7 @@ static inline vfloat pixels_of(global const float *image, int channels, int chan
     return VLOAD(block);
 }
 
-typedef struct {            // sums over a lane's fragments
+typedef struct {            // sums over the fragments of a lane
     vfloat nu, nu_x, nu_y, nv, nv_x, nv_y, d, d_x, d_y;
     vfloat log_opacity, r, g, b;
 //@@ sums
@@ -74,12 +74,12 @@ typedef struct {            // sums over a lane's fragments
 typedef struct {
     vfloat nu, nv, inverse_d;
     vfloat half_rho;        // where `on_plane`
-    vint on_plane;          // by the splat's plane, not by a low-pass
+    vint on_plane;          // the weight is that of the plane, not of the low-pass
 //@@ geometry
 } Geometry;
 
 //@@ fragment_functions
-// The fragment's place on the splat, of the rows' forms and the low-pass's own.
+// Position of the fragment on the splat's plane, from the row's forms and the low-pass distance.
 static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vfloat nv_x, vfloat y, vfloat screen) {
     Geometry g;
     g.nu = FMA((vfloat)s->nuy, y, nu_x);
@@ -91,21 +91,21 @@ static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vflo
     return g;
 }
 
-// What a unit of the fragment's light is worth.
+// Gradient by the fragment's weight: g c_k.
 static inline vfloat fragment_by_weight(const Splat *s, const PixelGradient *gradient, const Geometry *g) {
     vfloat by_weight = FMA(gradient->r, (vfloat)s->r, FMA(gradient->g, (vfloat)s->g, gradient->b * s->b));
 //@@ by_weight
     return by_weight;
 }
 
-// dL / d ln(opacity) of a fragment that takes `weight` of the light, where the ceiling does not hold it.
+// dL / d ln(opacity) of a fragment with this weight, unless the opacity ceiling applies.
 static inline vfloat backward_opacity(PixelGradient *gradient, vfloat by_weight, vfloat weight, vfloat opacity) {
     vfloat gain = by_weight - gradient->behind;
     gradient->behind = FMA(opacity, gain, gradient->behind);
     return weight * gain;
 }
 
-// Adds a fragment's derivatives. by_log: by ln(opacity); (x, y): its place, relative to the anchor.
+// Adds the gradients of a fragment. by_log: by ln(opacity); (x, y): position relative to the anchor.
 static inline void add_fragment(Sums *sums, const Splat *s, const PixelGradient *gradient, const Geometry *g, vfloat weight, vfloat by_log,
                                 vfloat screen, vfloat x, vfloat y, const BlendConstants *constants) {
     sums->r = FMA(weight, gradient->r, sums->r);
@@ -135,7 +135,7 @@ static inline float lane_sum(vfloat v) {
     float4 x = w.lo + w.hi;
     return (x.x + x.z) + (x.y + x.w);
 }
-// The sums of many vectors, each added up as above, side by side in one.
+// The same sums of several vectors at once, in one vector.
 #define FOLD_HALVES(a, b) ((vfloat)((a).lo + (a).hi, (b).lo + (b).hi))
 #define FOLD_FOURS(a, b) ((vfloat)((a).lo.lo, (a).hi.lo, (b).lo.lo, (b).hi.lo) + (vfloat)((a).lo.hi, (a).hi.hi, (b).lo.hi, (b).hi.hi))
 #define FOLD_TWOS(a, b) ((vfloat)((a).s014589cd, (b).s014589cd) + (vfloat)((a).s2367abef, (b).s2367abef))
@@ -156,7 +156,7 @@ static inline float lane_sum(vfloat x) { return (x.x + x.z) + (x.y + x.w); }
 #define lane_sum(x) (x)
 #endif
 
-// What becomes of Moments: of each field what its lanes have, or at once their sum.
+// Values of Moments before the sum over lanes, or their sums.
 #if LANES == 16
 typedef struct {
     vfloat fields[(FIELDS + LANES - 1) / LANES * LANES];
@@ -186,15 +186,15 @@ static inline Parts moments_of(const Sums *sums, const BlendConstants *constants
     return m;
 }
 
-// Of a window's tiles, row by row, which one this is.
+// Rank of a tile among those of a window, row by row.
 static inline uint window_rank(uint2 window, int column, int row) {
     int bit = (row - (int)(window.x >> 16)) * WINDOW_W + column - (int)(window.x & 0xFFFFu);
     return popcount(window.y & ((1u << bit) - 1u));
 }
 
-// Which of a splat's tiles this one is, counted row by row.
+// Rank of a tile among those of a splat, row by row.
 #if LANES > 1
-// big_rows: what reserve_slots has left, row by row, so that what a tile reads lies close together.
+// big_rows: from reserve_slots, row by row, for locality within a tile.
 static inline uint tile_rank(uint2 window, uint big_capacity, global const uint *big_rows, int column, int row) {
     return window.y != 0 ? window_rank(window, column, row) : big_rows[row * (size_t)big_capacity + window.x] + column;
 }
@@ -214,7 +214,7 @@ static inline uint tile_rank(uint2 window, global const Bounds *big_bounds, int 
 #endif
 
 #if LANES > 1
-// For each row of tiles of a big splat, how many tiles it has above, less its first column.
+// For each row of tiles of a big splat: number of tiles in the rows above, minus its first column.
 static inline void put_rows(global uint *rows, uint stride, const Bounds *b, int width, int height) {
     int y0, y1;
     bounds_rows(b, height, &y0, &y1);
@@ -227,8 +227,8 @@ static inline void put_rows(global uint *rows, uint stride, const Bounds *b, int
 }
 #endif
 
-// Gives every splat that is drawn a slot for each of its tiles. Where they lie depends on the order of the groups, what they
-// hold and in which order it is added up does not.
+// Reserves a gradient buffer offset for each tile of each visible splat. Offsets depend on the order of the groups; the sums of
+// gradients do not.
 // Index space: one work-item per splat, in groups of RESERVE_ITEMS.
 // Reads: keys, windows, big_bounds. Writes: splat_slots, big_rows; adds to reserved.
 #define RESERVE_ITEMS 64

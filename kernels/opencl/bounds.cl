@@ -1,8 +1,8 @@
-// What part of the picture a splat can touch: the R-sigma ellipse (or a box where the disk crosses the near plane)
-// and, by hook, the support of the low-pass. Everything here is conservative; the per-pixel test decides.
+// Conservative screen-space bounds of a splat: the ellipse of the R-sigma disk (a box where the disk crosses the near plane)
+// and, by hook, the support of the low-pass filter. The per-pixel test decides.
 
 //@@ struct Bounds
-// Room for the rounding of the float fields and of the per-pixel test, in samples.
+// Margin for the rounding of the float fields and of the per-pixel test, in samples.
 #define BOUNDS_PAD 0.02f
 #define BOUNDS_PAD_RELATIVE 2e-4f
 
@@ -19,8 +19,8 @@ static inline Bounds box_bounds(real x0, real x1, real y0, real y1) {
     return b;
 }
 
-// The image of the R-sigma disk when it lies wholly in front: from its dual conic about the projected centre
-// (numerics A4). tu, tv are relative to the projected centre (their z is 0).
+// Projected ellipse of an R-sigma disk in front of the near plane, from its dual conic about the projected centre. tu, tv are
+// relative to the projected centre (their z is 0).
 static inline Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center_x, real center_y, real r2) {
     real d = r2 * (tw.x * tw.x + tw.y * tw.y) - tw.z * tw.z;   // < 0
     real r2_d = r2 / d;
@@ -37,7 +37,7 @@ static inline Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center
     b.hy = (float)hy * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD;
     real shear = qyy > 0 ? qxy / qyy : 0;
     b.slope = (float)shear;
-    // the pad of the width also covers the shift that padding the height gives a sheared chord
+    // the padded width also covers the shift of a sheared chord when the height is padded
     float across = (float)sqrt(fmax(qxx - qxy * shear, REAL(0.0)));
     b.half_width = across * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD + BOUNDS_PAD_RELATIVE * (float)hx
                    + BOUNDS_PAD * fabs(b.slope);
@@ -46,7 +46,7 @@ static inline Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center
     return b;
 }
 
-// The chord of the bounds between heights y0 <= y1, [*x0, *x1]; empty if *x0 > *x1.
+// Chord [*x0, *x1] of the bounds between heights y0 <= y1; empty if *x0 > *x1.
 static inline void bounds_span(const Bounds *b, float y0, float y1, float *x0, float *x1) {
     *x0 = INFINITY;
     *x1 = -INFINITY;
@@ -62,7 +62,7 @@ static inline void bounds_span(const Bounds *b, float y0, float y1, float *x0, f
 //@@ bounds_span
 }
 
-// Rows of samples [*y0, *y1) whose centres the bounds can reach.
+// Rows of samples [*y0, *y1) whose centres are inside the bounds.
 static inline void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
     float low = b->ey - b->hy, high = b->ey + b->hy;
 //@@ bounds_rows
@@ -72,7 +72,7 @@ static inline void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
 
 typedef struct { int first, last; } TileSpan;   // inclusive; empty if first > last
 
-// Tiles of one row of tiles that the bounds can touch. Counts and lists both come from this, so they agree.
+// Tiles in one row of tiles that the bounds overlap. Counting and listing both call this, so they agree.
 static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) {
     float y0 = (float)(tile_row * TILE_H) + 0.5f, y1 = (float)min(tile_row * TILE_H + TILE_H, height) - 0.5f;
     float x0, x1;
@@ -85,8 +85,8 @@ static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int h
 #define WINDOW_W 8
 #define WINDOW_H 4
 
-// Which tiles the bounds can touch, as bits of a window of WINDOW_W x WINDOW_H tiles with its corner at tile
-// (*corner & 0xFFFF, *corner >> 16); 0 if they reach beyond one. Columns [x0, x1) and rows [y0, y1) enclose them.
+// Tiles that the bounds overlap, as bits of a window of WINDOW_W x WINDOW_H tiles with its corner at tile
+// (*corner & 0xFFFF, *corner >> 16); 0 if they do not fit a window. Columns [x0, x1) and rows [y0, y1) enclose them.
 static inline uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, int width, int height, uint *corner) {
     int left = x0 / TILE_W, columns = (x1 - 1) / TILE_W - left + 1;
     int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
@@ -97,14 +97,14 @@ static inline uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, 
     uint mask = 0;
     for (int row = 0; row < rows; row++) {
         TileSpan span = tile_span(b, top + row, width, height);
-        // a chord between two rows of pixels may be wider than those at the rows
+        // a chord between two rows of pixels may be wider than the chords at the rows
         int first = max(span.first - left, 0), last = min(span.last - left, columns - 1);
         if (first <= last) mask |= ((2u << (last - first)) - 1u) << first << (row * WINDOW_W);
     }
     return mask;
 }
 
-// The tile of the lowest bit of a window (corner, bits).
+// Tile of the lowest bit of a window (corner, bits).
 static inline int window_tile(uint2 window, int tiles_x) {
     int bit = 31 - clz(window.y & -window.y);
     return (int)(window.x >> 16) * tiles_x + (int)(window.x & 0xFFFFu) + bit / WINDOW_W * tiles_x + bit % WINDOW_W;

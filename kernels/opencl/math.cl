@@ -1,5 +1,5 @@
-// Vectors of LANES pixels, and the few functions whose spelling depends on LANES. `wide` is what fragments are computed in:
-// the host prints float, or double for the effect blend_double, which has one lane; WIDE(1.5) is a constant of that type.
+// Vectors of LANES pixels, and the functions whose spelling depends on LANES. `wide` is the scalar type of fragments: the host
+// prints float, or double for the effect blend_double (one lane). WIDE(1.5) is a constant of that type.
 
 #define GLUE_(a, b) a##b
 #define GLUE(a, b) GLUE_(a, b)
@@ -25,8 +25,8 @@ typedef int vint;
 typedef GLUE(float, LANES) vfloat;
 typedef GLUE(int, LANES) vint;
 #define VSELECT(no, yes, mask) select(no, yes, mask)
-// VBITS: a bit for each lane that is set. x86 has an instruction for it. VANY: whether any lane is; Clang makes a chain of branches of
-// `any`, a lane each, and one test of its own reduction.
+// VBITS: one bit per set lane, by one instruction on x86. VANY: true if any lane is set; Clang compiles `any` to a branch per
+// lane, and this reduction to one test.
 #if defined(__has_builtin)
 #if LANES == 16 && defined(__AVX512DQ__) && __has_builtin(__builtin_ia32_cvtd2mask512)
 #define VBITS(mask) ((uint)(ushort)__builtin_ia32_cvtd2mask512((__attribute__((__vector_size__(64))) int)(mask)))
@@ -54,7 +54,7 @@ static inline uint lanes_set(vint mask) {
 }
 #define VBITS(mask) lanes_set(mask)
 #endif
-// As fmin and fmax of a `b` that is a number: an instruction each, where those take four.
+// fmin and fmax for a `b` that is not NaN: one instruction each instead of four.
 static inline vfloat VMIN(vfloat a, vfloat b) { return VSELECT(b, a, a < b); }
 static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #define VLOAD(p) GLUE(vload, LANES)(0, p)
@@ -63,8 +63,8 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #define VAS_INT(x) GLUE(as_int, LANES)(x)
 #define VAS_FLOAT(x) GLUE(as_float, LANES)(x)
 #define VFLOAT(i) GLUE(convert_float, LANES)(i)
-// VLANE, VINDEX: the lanes' numbers. Lanes are pixels of a block that is BLOCK_W wide, row by row; in memory its rows lie `stride`
-// apart.
+// VLANE, VINDEX: lane numbers. Lanes are the pixels of a block that is BLOCK_W wide, row by row; its rows are `stride` apart in
+// memory.
 #if LANES == 16
 #define VLANE ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #define VINDEX ((vint)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
@@ -95,7 +95,7 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #endif
 #endif
 
-// A fused multiply-add where the device has one; a device that would emulate it in software rounds twice instead.
+// Fused multiply-add where the device has it in hardware; elsewhere two roundings.
 #if FAST_FMA
 #define FMA(a, b, c) fma(a, b, c)
 #else
@@ -112,15 +112,15 @@ static inline real3_ cross3(real3_ a, real3_ b) {
 
 static inline real dot3(real3_ a, real3_ b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
-// Bits of a float in an order that unsigned comparison keeps, negative values included (numerics C2). No depth is -0, which
-// would come before +0: it is a sum with a term of the view's, which is not (tests/unit/test_prepare.py).
+// Bits of a float in an order that unsigned comparison preserves, negative values included. No depth is -0, which would sort
+// before +0: depth is a sum with a nonzero term of the view (tests/unit/test_prepare.py).
 static inline uint sortable(float x) {
     uint bits = as_uint(x);
     return (bits & 0x80000000u) ? ~bits : (bits | 0x80000000u);
 }
 
-// The whole number at x or the next above, below it, as far as a picture of `limit` pixels reaches: without the undefined
-// conversions of huge values (numerics E2). On CPUs without PoCL's `ceil` and `floor`, a dozen instructions each.
+// Ceil and floor as int, clamped to an image of `limit` pixels, since converting huge values is undefined. On CPUs without
+// PoCL's `ceil` and `floor`, which take a dozen instructions each.
 #if LANES > 1
 static inline int pixel_above(float x, int limit) {
     float within = clamp(x, -1.0f, (float)limit + 1.0f);
@@ -137,7 +137,7 @@ static inline int pixel_above(float x, int limit) { return (int)clamp(ceil(x), -
 static inline int pixel_below(float x, int limit) { return (int)clamp(floor(x), -1.0f, (float)limit + 1.0f); }
 #endif
 
-// A hint on CPUs whose compiler has one: they then wait less for what lies at an unforeseeable place.
+// Prefetch hint for reads at unpredictable addresses, where the CPU compiler has one.
 #if LANES > 1 && defined(__has_builtin)
 #if __has_builtin(__builtin_prefetch)
 #define PREFETCH(p) __builtin_prefetch((const void *)(size_t)(p))

@@ -1,9 +1,9 @@
-// What a tile leaves of the derivatives by a splat's record, and how many slots of them a splat has.
+// Gradients of a splat's record, summed over the pixels of one tile (`Moments`), and the number of tiles of a splat.
 
 //@@ struct Moments
 #define FIELDS (sizeof(Moments) / sizeof(float))
 
-// How many tiles a splat has.
+// Number of tiles of a splat.
 static inline uint tile_count(uint2 window, uint big_capacity, global const Bounds *big_bounds, int width, int height) {
     if (window.y != 0) return popcount(window.y);
     if (window.x >= big_capacity) return 0;

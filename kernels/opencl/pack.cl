@@ -1,8 +1,8 @@
-// For clouds that are projected in chunks: moves the splats of a chunk that may be seen behind those of the chunks
-// before, in their order. The chunk is cut into CHUNKS pieces; the host adds up what they hold.
+// Compaction for clouds that are projected in chunks: appends the visible splats of a chunk to those of preceding chunks, in
+// order. The chunk is cut into CHUNKS pieces; the host adds up their counts.
 
-// Index space: one work-item per piece. Reads: keys. Writes: held[0 .. CHUNKS): splats of the piece to be kept,
-// held[CHUNKS .. 2 * CHUNKS): splats seen in this picture, if only in another band of it.
+// Index space: one work-item per piece. Reads: keys. Writes: held[0 .. CHUNKS): splats of the piece in this band,
+// held[CHUNKS .. 2 * CHUNKS): splats of the piece in any band.
 kernel void pack_count(
 //@@ arguments pack_count
 ) {
@@ -18,7 +18,7 @@ kernel void pack_count(
     held[CHUNKS + piece] = visible;
 }
 
-// Index space: one work-item per piece. Reads: places (where each piece goes), splats, keys, windows.
+// Index space: one work-item per piece. Reads: places (output index of each piece), splats, keys, windows.
 // Writes: splats_out, keys_out, windows_out.
 kernel void pack_move(
 //@@ arguments pack_move

@@ -1,14 +1,14 @@
-// Build constants that `assemble` prints above this file, and the numeric types made from them.
-//   LANES          pixels that one work-item computes side by side (1 on a GPU, 8 or 16 on a CPU)
-//   TILE_W TILE_H  pixels of a tile; the lanes schedule needs TILE_W == LANES
-//   CHUNKS         contiguous pieces into which lists are cut where order must be kept without atomics
+// Build constants, which `assemble` prints above this file, and the numeric types derived from them.
+// LANES          pixels that one work-item computes as a vector (1 on a GPU, 8 or 16 on a CPU)
+// TILE_W TILE_H  pixels of a tile; the lanes schedule requires TILE_W == LANES
+// CHUNKS         contiguous pieces of a list in the stable counting sorts
 //   RADIX_BITS     digit width of the depth sort
-//   SCAN_ITEMS     work-items of the one work-group that scans
-//   SETUP_FP64     1: per-splat set-up in double
+// SCAN_ITEMS     work-items of the single work-group of a scan
+// SETUP_FP64     1: per-splat setup in double
 //   SAMPLES        n of the n x n samples per pixel
 
-// Contraction is chosen by hand (FMA below), never by the compiler: the same pixel must get the same bits in every
-// schedule, tile size and set of outputs, and order and culling must not depend on the device (numerics F1).
+// Contraction is written by hand (FMA in math.cl), never left to the compiler: a pixel must be bit-identical in every
+// schedule, tile size and set of outputs, and order and culling must not depend on the device.
 #pragma OPENCL FP_CONTRACT OFF
 
 #if SETUP_FP64
@@ -20,9 +20,9 @@ typedef float real;
 #define REAL(x) x##f
 #endif
 
-#define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
-#define OUT_OF_BAND 0xFFFFFFFEu  // of one that is drawn in another band of rows only
+#define CULLED 0xFFFFFFFFu   // sort key of a culled splat
+#define OUT_OF_BAND 0xFFFFFFFEu  // sort key of a splat that is visible only in another band of rows
 
-// places in the buffer `tallies`: numbers of visible splats, of pairs (64 bits each) and of big splats; then one word per tile,
-// or the same of the next view
+// Indices in the buffer `tallies`: numbers of visible splats, of splat-tile pairs (64 bits each) and of big splats; then one
+// count per tile, or the same counters of the next view.
 enum { TALLY_VISIBLE = 0, TALLY_PAIRS = 2, TALLY_BIG = 6, TALLIES = 8 };

@@ -1,15 +1,16 @@
-// Index space: one work-item per splat and view. Of each view `view` has a record, `splats`, `keys` and `windows` have `count`.
-// Reads:  view, means, quats, scales, opacities, and what the colour slot and the outputs ask for.
-// Writes: splats[at] of visible splats; keys[at]: depth key, or CULLED or OUT_OF_BAND; windows[at]
-//         of visible splats: the tiles that they touch; big, big_bounds and their number in tallies (numerics A5).
+// Projection: frustum culling, the forms of the ray-splat intersection, tile bounds and sort key of each splat.
+// Index space: one work-item per splat and view. `view` has one record per view; `splats`, `keys` and `windows` have `count` per view.
+// Reads:  view, means, quats, scales, opacities, and the inputs of the colour effect and of the outputs.
+// Writes: splats[at], windows[at] (tile bits) of visible splats; keys[at]: depth key, CULLED or OUT_OF_BAND; big, big_bounds
+//         and their number in tallies: splats that overlap more tiles than a window has.
 //
-// The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
+// The setup is computed in `real` (double where the device has it) from float inputs.
 
-// [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
+// [m]; invisible, and large enough that quotients are not float32 denormals
 #define MIN_SCALE 1e-20f
 
-// Regular polygon around the R-sigma circle, clipped against the near plane and projected: the bounds of a disk that
-// crosses it (numerics A1 iii). Returns false if nothing is left.
+// Box of a regular polygon around the R-sigma circle, clipped at the near plane and projected: bounds of a disk that crosses
+// the near plane. Returns false if nothing is left.
 #define POLYGON 16
 //@@ polygon
 static inline bool clipped_box(real3_ tu, real3_ tv, real3_ tw, real radius, real near, real *box) {
@@ -63,7 +64,7 @@ kernel void project(
     keys[at] = CULLED;
 //@@ splat_view
 
-    // asked for before the first test, so that memory is waited for once; arrays begin where whole vectors may (Resident)
+    // read before the first test, so that memory latency is paid once; arrays are aligned for vector loads (Resident)
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
     float4 quat = ((global const float4 *)quats)[i];
     float2 scale_uv = ((global const float2 *)scales)[i];
@@ -75,7 +76,7 @@ kernel void project(
     wide half_r2 = log_opacity - (wide)view->log_cut;
     if (!(half_r2 > 0.0f)) return;
 
-    // columns of the splat's rotation, from the quaternion as it is (no unit length assumed)
+    // columns of the rotation of an unnormalised quaternion
     real w = quat.x, x = quat.y, y = quat.z, z = quat.w;
     real s = REAL(2.0) / (w * w + x * x + y * y + z * z);
     real3_ tangent_u = {1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)};
@@ -85,16 +86,16 @@ kernel void project(
     real pz = p.z, near = view->near;
 //@@ camera_depth
     real3_ facet = cross3(a, b);        // unit normal
-    real offset = dot3(facet, p);       // of the plane from the camera's centre
+    real offset = dot3(facet, p);       // signed distance of the plane from the camera centre
 //@@ camera_offset
-    // before fmax, which would make a number of a NaN (numerics E1)
+    // before fmax, which would hide a NaN
     if (!(scale_uv.x >= 0.0f && scale_uv.x < INFINITY && scale_uv.y >= 0.0f && scale_uv.y < INFINITY)) return;
     real su = fmax(scale_uv.x, MIN_SCALE), sv = fmax(scale_uv.y, MIN_SCALE);
     a.x *= su; a.y *= su; a.z *= su;
     b.x *= sv; b.y *= sv; b.z *= sv;
 //@@ lowpass_make
 
-    // depth range of the disk (numerics A3)
+    // depth range of the disk
     real radius = sqrt(REAL(2.0) * half_r2);
     real reach = radius * sqrt(a.z * a.z + b.z * b.z);
 //@@ camera_reach
@@ -111,7 +112,7 @@ kernel void project(
     bounds_rows(&bounds, height, &y0, &y1);
     float x0, x1;
     bounds_span(&bounds, (float)y0 + 0.5f, (float)y1 - 0.5f, &x0, &x1);
-    // also what lies between two columns of samples; written so that a NaN is culled (numerics E1)
+    // culls also a splat between two columns of samples; a NaN culls
     int first = pixel_above(x0 - 0.5f, width), last = pixel_below(x1 - 0.5f, width);
     if (!(y0 < y1 && x0 <= x1 && first < width && last >= 0 && first <= last)) return;
 
@@ -120,7 +121,7 @@ kernel void project(
         return;
     }
 
-    // re-anchor at the pixel of the picture that is nearest to the centre
+    // anchor: the pixel of the image nearest to the centre
     int anchor_i = (int)clamp((float)center_x, 0.0f, (float)(width - 1));
     int anchor_j = (int)clamp((float)center_y, 0.0f, (float)(height - 1));
     real anchor_x = anchor_i + REAL(0.5), anchor_y = anchor_j + REAL(0.5);
@@ -131,8 +132,8 @@ kernel void project(
     real scale = (determinant < 0 ? -1 : 1) / steepest;
     real n_scale = scale * REAL(0.70710678118654752440);   // so that q / D^2 is rho / 2
 
-    // Edge-on within rounding: the plane has no visible side, only the low-pass may draw the splat (numerics B2). Asked
-    // of the plane alone, so that neither the splat's size nor the focal length has a say.
+    // Edge-on within rounding: the plane has no visible side, and only the low-pass may render the splat. The test depends on the
+    // plane only, not on the splat's size or the focal length.
     real facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
 //@@ camera_facing
     real z_numerator = determinant * facing;                               // depth = z_numerator / D
@@ -151,12 +152,12 @@ kernel void project(
     record.x1 = (short)min(last + 1, width);
 //@@ color
 //@@ project
-    // in whole vectors
+    // vector stores
     SplatWords packed = {record};
     for (uint part = 0; part < sizeof(Splat) / 16; part++) ((global float4 *)(splats + at))[part] = packed.words[part];
     uint corner, window = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &corner);
     if (window == 0) {
-        // in any order: what is kept of them is looked up by its place or sorted
+        // in any order, since lists are sorted later
         corner = atomic_inc(tallies + TALLY_BIG);
         if (corner < big_capacity) {
             big[corner] = at;

@@ -1,7 +1,7 @@
-// The derivatives by the cloud's arrays, as set_up_backward.cl has them of a splat, and the camera's.
+// Gradients by the cloud's arrays and the camera pose, from those of set_up_backward.cl.
 // Index space: one work-item per splat, in groups of POSE_ITEMS.
 // Reads:  view, the cloud, splats, keys, windows, big_bounds, splat_slots, moments.
-// Writes: derivatives by the cloud's arrays, 0 for splats that are not drawn; group_sums, those by the pose.
+// Writes: gradients by the cloud's arrays, 0 for culled splats; group_sums, by the pose.
 #define POSE_ITEMS 64
 kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_backward(
 //@@ arguments project_backward
@@ -37,7 +37,7 @@ kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_back
     }
 }
 
-// Sums of rows, in a fixed order.
+// Sums over rows in a fixed order.
 // Index space: work-groups of SUM_ITEMS, one per column: three of tile_sums, then six of group_sums. Writes: background, pose.
 #define SUM_ITEMS 64
 kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void add_up(

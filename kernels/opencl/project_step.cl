@@ -1,12 +1,11 @@
-// Adam's step by the derivatives of set_up_backward.cl, which are in no memory but a work-group's own: what a training does with them
-// in place of project_backward.
+// Adam step on the gradients of set_up_backward.cl, which stay in local memory: in training it replaces project_backward.
 // Index space: one work-item per splat, in groups of STEP_ITEMS.
-// Reads:  view, splats, keys, windows, big_bounds, splat_slots, moments. Changes: where `counted` the sums of derivatives by places on
-// the screen; where splats `move` their values, Adam's running means, and what is drawn of them.
+// Reads:  view, splats, keys, windows, big_bounds, splat_slots, moments. Updates: if `counted`, the sums of screen-space gradients;
+// if `move`, the parameters, Adam's moments, and the activated parameters.
 #define STEP_ITEMS 64
-#define VALUES (3 * SH_TERMS)       // of a splat's colour that are drawn
+#define VALUES (3 * SH_TERMS)       // rendered colour values per splat
 #if LANES > 1 && !PLAIN
-#define TERMS_CAPACITY 16               // a whole vector
+#define TERMS_CAPACITY 16               // a full vector
 #else
 #define TERMS_CAPACITY SH_TERMS
 #endif
@@ -29,7 +28,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         by_opacities[item] = own.opacity;
         for (int k = 0; k < 3; k++) by_colors[3 * item + k] = own.color[k];
         for (int k = 0; k < SH_TERMS; k++) basis[TERMS_CAPACITY * item + k] = own.basis[k];
-        // what the picture does not depend on stays as it is, its running means too
+        // parameters without gradient keep their values and Adam's moments
         bool depends = own.opacity != 0.0f;
         for (int k = 0; k < 3; k++) depends |= own.mean[k] != 0.0f || own.basis[0] * own.color[k] != 0.0f;
         skipped[item] = sparse && !depends;
@@ -38,7 +37,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
     if (!move) return;
 
 #if LANES > 1
-    // of whole rows of 16 splats the first steps for all
+    // complete groups of 16 splats: vectors, by the first work-item of each
     bool vectorized = !sparse && (i | 15) < count;
     if (vectorized && item % 16 == 0) {
         for (uint k = 3 * item, at = 3 * i; k < 3 * item + 48; k += 16, at += 16)
@@ -87,12 +86,12 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         drawn_opacities[i] = sigmoid(logits[i]);
     }
 
-    // drawn colours are the values themselves where all of them are drawn and none is plain
+    // the rendered colours are the parameters themselves unless a degree is left out or they are plain
     const bool separate = PLAIN || SH_TERMS < all;
 #if LANES > 1 && !PLAIN
     if (i < count && !skipped[item]) {
         size_t row = i * (size_t)(3 * all), out = i * (size_t)VALUES;
-        // value k is of term k / 3 and colour k % 3; places beyond the last term are multiplied too, and not used
+        // value k belongs to term k / 3 and channel k % 3; values behind the last term are unused
         float16 b = vload16(0, basis + TERMS_CAPACITY * item), c = 0.0f;
         c.s012 = vload3(item, by_colors);
         const float16 by[3] = {
@@ -116,7 +115,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         }
     }
 #else
-    // the group's coefficients one after the other, as they lie in memory
+    // the group's coefficients in the order of memory
     for (uint k = item; k < min(count - first, (uint)STEP_ITEMS) * VALUES; k += STEP_ITEMS) {
         uint which = k / VALUES, within = k % VALUES;
         if (skipped[which]) continue;

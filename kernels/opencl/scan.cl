@@ -1,5 +1,5 @@
-// Counting sort without atomics: a list is cut into CHUNKS contiguous pieces, each piece counts its bins in its own row
-// of table[CHUNKS][bins]. These two kernels turn the counts into places; equal bins keep the list's order.
+// Prefix sums of a stable counting sort without atomics: a list is cut into CHUNKS contiguous pieces, and each piece counts its
+// bins in its own row of table[CHUNKS][bins]. These kernels turn the counts into offsets.
 
 // Index space: one work-item per bin and list.
 // Reads and writes: table (counts become offsets within the bin). Writes: totals[bins].
@@ -19,8 +19,7 @@ kernel void scan_chunks(
 }
 
 // Index space: one work-group of SCAN_ITEMS for each list.
-// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; of the list's tallies [slot] and [slot + 1], the sum in 64
-// bits.
+// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; the list's tallies [slot] and [slot + 1], the sum in 64 bits.
 kernel void scan_bins(
 //@@ arguments scan_bins
 ) {

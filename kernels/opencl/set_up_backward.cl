@@ -1,6 +1,6 @@
-// The derivatives of the set-up: from those by a splat's record, which its tiles have left in its slots, to those by its mean,
-// rotation, scales, opacity and colour, and by the camera's pose. What project.cl decides is taken as it was; the common factor
-// of a record's forms has no derivative, as nothing depends on it.
+// Backward pass of the projection: from gradients of a splat's record, summed over its tiles, to gradients of its mean,
+// rotation, scales, opacity and colour, and of the camera pose. Branches are taken as in project.cl. The common factor of a
+// record's forms has no gradient, since nothing depends on it.
 
 #define MIN_SCALE 1e-20f   // as in project.cl
 
@@ -34,14 +34,14 @@ static inline real3_ rotate_to_world(global const View *view, real3_ v) {
     return c;
 }
 
-typedef struct {            // derivatives by what the cloud has of a splat
+typedef struct {            // gradients by the parameters of one splat
     float mean[3], quat[4], scale[2], opacity;
-    float color[3], basis[SH_TERMS];    // by a term of the colour: what the term is worth times one of `color`
+    float color[3], basis[SH_TERMS];    // by coefficient k of the colour: basis[k] times `color`
     float screen;
-    real3_ by_rotation, by_translation;               // its part of those by the pose
+    real3_ by_rotation, by_translation;               // contribution to the gradient of the pose
 } SplatGradient;
 
-// Of splat i; zeros where it is not drawn. terms: of colours that have some, in rows of so many.
+// Gradients of splat i; zero if it is culled. terms: SH coefficients, `row` per splat.
 static inline SplatGradient splat_gradient(
     uint i, global const View *view, global const float *means, global const float *quats, global const float *scales,
     global const float *opacities, global const float *terms, uint row, global const Splat *splats, global const uint *keys,
@@ -55,7 +55,7 @@ static inline SplatGradient splat_gradient(
     uint tiles = tile_count(windows[i], big_capacity, big_bounds, width, height);
     for (uint tile = 0; tile < tiles; tile++, slot += FIELDS)
         for (uint field = 0; field < FIELDS; field++) ((real *)&total)[field] += slot[field];
-    real3_ by_ray = {0, 0, 0};       // by the way from the eye to the centre, in the world's axes
+    real3_ by_ray = {0, 0, 0};       // by the vector from the camera to the centre, in world axes
 //@@ color_backward
     real by_log = total.log_opacity;
     real w = quats[4 * i], x = quats[4 * i + 1], y = quats[4 * i + 2], z = quats[4 * i + 3];
@@ -70,7 +70,7 @@ static inline SplatGradient splat_gradient(
     real3_ a = scaled(su, unit_a), b = scaled(sv, unit_b);
     real offset = dot3(cross3(unit_a, unit_b), p);
 
-    // the forms, as project.cl and the camera have them
+    // the forms, as in project.cl and the camera's file
     real x_offset = view->center_x - (splats[i].ax + REAL(0.5)), y_offset = view->center_y - (splats[i].ay + REAL(0.5));
     real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {a.z, b.z, p.z};
     real3_ tu = image_row(view->focal_x, x_offset, row_x, tw), tv = image_row(view->focal_y, y_offset, row_y, tw);
@@ -90,7 +90,7 @@ static inline SplatGradient splat_gradient(
     real3_ by_a = {view->focal_x * by_tu.x, view->focal_y * by_tv.x, by_tw.x};
     real3_ by_b = {view->focal_x * by_tu.y, view->focal_y * by_tv.y, by_tw.y};
     real3_ by_p = {view->focal_x * by_tu.z, view->focal_y * by_tv.z, by_tw.z};
-    // by the centre's place in the picture, in half pictures
+    // by the projected centre, in half images
     real across_x = by_tu.z * view->width, across_y = by_tv.z * view->height;
     own.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
 //@@ disk_backward
@@ -103,7 +103,7 @@ static inline SplatGradient splat_gradient(
     real3_ by_mean = add3(rotate_to_world(view, by_p), by_ray);
     real3_ by_u = rotate_to_world(view, by_unit_a);
     real3_ by_v = rotate_to_world(view, by_unit_b);
-    // tangents are 1 - s (y y + z z) and so on with s = 2 / |q|^2
+    // the tangents are 1 - s (y y + z z) etc. with s = 2 / |q|^2
     real by_s = -by_u.x * (y * y + z * z) + by_u.y * (x * y + w * z) + by_u.z * (x * z - w * y)
                 + by_v.x * (x * y - w * z) - by_v.y * (x * x + z * z) + by_v.z * (y * z + w * x);
     real inward = -s * by_s;

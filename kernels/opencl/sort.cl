@@ -1,5 +1,5 @@
-// Stable least-significant-digit radix sort of (depth key, splat index); culled splats are dropped in the first pass. The
-// splats of each view are a list of their own, in `count` places.
+// Stable least-significant-digit radix sort of (depth key, splat index). The first pass drops culled splats. The splats of each
+// view are one list with `count` entries.
 // Index space of both kernels: one work-item per chunk and view.
 
 #define RADIX_BINS (1u << RADIX_BITS)
@@ -20,7 +20,7 @@ kernel void sort_count(
         if (keys[k] != CULLED) row[(keys[k] >> shift) & (RADIX_BINS - 1)]++;
 }
 
-// Reads: keys, indices (or none in the first pass, where the index is the place), starts. Uses up: table.
+// Reads: keys, indices (in the first pass the index is the position), starts. Consumes: table.
 // Writes: keys_out, indices_out.
 kernel void sort_scatter(
 //@@ arguments sort_scatter

@@ -1,17 +1,17 @@
-// The ONE ray-splat crossing and weight (2DGS, Huang et al. 2024, section 4; numerics.md section 0, facts 1 to 3).
+// Ray-splat intersection and Gaussian weight (2DGS, Huang et al. 2024, section 4); the only copy of this maths.
 //
 // Rows Tu, Tv, Tw of M = K [a b p] (a, b scaled tangents, p centre, camera space). The ray through pixel (x, y)
-// meets the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = Tu x Tv + x (Tv x Tw) + y (Tw x Tu):
-// numerators and denominator are affine in the pixel. They are kept relative to an integer anchor pixel near the
-// splat, so that x - anchor is exact and nothing cancels (numerics B1), with a common factor that makes D > 0 in
-// front of the camera, and sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is rho / 2.
+// intersects the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = Tu x Tv + x (Tv x Tw) + y (Tw x Tu):
+// numerators and denominator are affine in the pixel. They are stored relative to an integer anchor pixel near the
+// splat, so that x - anchor is exact and nothing cancels, with a common factor that makes D > 0 in front of the
+// camera, and with sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is rho / 2.
 
 //@@ struct View
 //@@ struct Splat
 typedef struct {
     vfloat d;               // denominator
     vfloat q;               // n_u^2 + n_v^2
-    vint inside;            // the ray meets the splat's plane within R and beyond the near plane
+    vint inside;            // the intersection is within the cut-off radius R and beyond the near plane
 //@@ crossing
 //@@ footprint_crossing
 } Crossing;
@@ -19,21 +19,21 @@ typedef struct {
 //@@ footprint
 //@@ footprint_functions
 
-// Affine forms at heights y: `*_x` are the parts that only columns have a say in.
+// Affine forms at heights y; `*_x` hold the terms that depend on the column only.
 static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, vfloat y, wide half_r2) {
     Crossing c;
     vfloat nu = FMA((vfloat)s->nuy, y, nu_x);
     vfloat nv = FMA((vfloat)s->nvy, y, nv_x);
     c.d = FMA((vfloat)s->dy, y, d_x);
     c.q = FMA(nu, nu, nv * nv);
-    // product form: no division, and no special value of D (numerics B2)
+    // product form: no division, and no special case for D = 0
     c.inside = VMASK(c.q <= half_r2 * (c.d * c.d)) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
 //@@ footprint_cross
     return c;
 }
 
 //@@ cross_functions
-// Opacity (the alpha of the paper) of a fragment at half squared distance rho / 2
+// Opacity (the paper's alpha) of a fragment at half the squared distance, rho / 2.
 static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, wide ceiling) {
 //@@ opacity
 }

@@ -1,8 +1,8 @@
-// Lists of splats per tile for GPUs: places from the tiles' tallies, pairs of (depth key, splat) written
-// there in any order, and a sort of each list. Keys are unique (the splat's index breaks ties), so the sorted lists are
-// the same on every run. The tiles of many views stand one view after the other.
+// Tile binning and sorting on GPUs: prefix sum of the tile counts, pairs of (depth key, splat) written to each tile's list in
+// any order, then a sort per list. Keys are unique (ties are broken by splat index), so the sorted lists are deterministic.
+// Tiles of a batch are numbered view after view.
 
-// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS values.
+// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum. partial: scratch of SCAN_ITEMS values.
 static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulong *total) {
     partial[item] = mine;
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -18,13 +18,13 @@ static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulon
     return exclusive;
 }
 
-// places in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats
+// Indices in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats.
 enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 
 // Index space: one work-group of SCAN_ITEMS.
-// Reads: tallies, and zeroes them for the next picture if `clear`. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles]
-// (the same), counts, of which the visible splats are still to be added up.
-// If there are more pairs than `capacity` (and that is not 2^32 - 1), all lists are made empty.
+// Reads: tallies, zeroed for the next frame if `clear`. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts;
+// `emit` adds the number of visible splats.
+// All lists are empty if there are more pairs than `capacity`, unless that is 2^32 - 1.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 //@@ arguments tile_starts
 ) {
@@ -47,7 +47,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
         starts[tiles] = (uint)running;
         counts[COUNT_BIG] = tallies[TALLY_BIG];
         if (clear) tallies[TALLY_BIG] = 0;
-        counts[COUNT_VISIBLE] = 0;   // emit adds them up
+        counts[COUNT_VISIBLE] = 0;   // added up by `emit`
         counts[COUNT_PAIRS] = (uint)running;
         counts[COUNT_PAIRS + 1] = (uint)(running >> 32);
     }
@@ -57,12 +57,11 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     }
 }
 
-// Work-groups of BIN_ITEMS, for what is done splat by splat. Of a splat that touches more than a window a whole group
-// shares the tiles.
+// Work-items of a group of the per-splat kernels. A splat that overlaps more tiles than a window is shared by a complete group.
 #define BIN_ITEMS 256
 
-// The rectangle of tiles that a big splat may touch. Counts and lists both come from this, so they agree, also with `tile_count`
-// (moments.cl), by which derivatives have their places.
+// Rectangle of tiles that a big splat may overlap. Counting and listing both call this, so they agree, and `tile_count`
+// (moments.cl), which numbers the gradient buffer offsets, agrees with both.
 typedef struct { int top, left, columns, cells, tiles_x; } TileRect;
 
 static inline TileRect tile_rect(const Bounds *b, int width, int height) {
@@ -70,7 +69,7 @@ static inline TileRect tile_rect(const Bounds *b, int width, int height) {
     float x0, x1;
     bounds_rows(b, height, &y0, &y1);
     bounds_span(b, -INFINITY, INFINITY, &x0, &x1);
-    // a row's chord may be rounded to be wider than the widest, but never beyond these: tile_span gives no tile that is not here
+    // rounding may widen a row's chord, but never beyond this: tile_span returns no tile outside of the rectangle
     x0 = fmin(x0, b->ex - b->hx);
     x1 = fmax(x1, b->ex + b->hx);
     int first = clamp(pixel_above(x0 - 0.5f, width), 0, width - 1), last = clamp(pixel_below(x1 - 0.5f, width), first, width - 1);
@@ -79,12 +78,12 @@ static inline TileRect tile_rect(const Bounds *b, int width, int height) {
     return rect;
 }
 
-// Tiles of one view.
+// Number of tiles of a view.
 static inline int tiles_of(int width, int height) {
     return ((width + TILE_W - 1) / TILE_W) * ((height + TILE_H - 1) / TILE_H);
 }
 
-// The tile of one cell of these rows; -1 if the splat cannot touch it.
+// Tile of a cell of the rectangle; -1 if the splat does not overlap it.
 static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int width, int height) {
     int row = rect->top + cell / rect->columns, column = rect->left + cell % rect->columns;
     TileSpan span = tile_span(b, row, width, height);
@@ -92,7 +91,7 @@ static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int
 }
 
 // Adds the tiles of big splats to the tallies.
-// Index space: any number of work-groups; each takes every so many-th splat.
+// Index space: any number of work-groups; each processes every n-th splat.
 // Reads: tallies' number of big splats, big, big_bounds.
 kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void tally_big(
 //@@ arguments tally_big
@@ -112,29 +111,30 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void tally_big(
 #define NO_OFFSET 0xFFFFFFFFu
 #define NO_ENTRY 0xFFFFFFFFu
 #define WINDOW_TILES (WINDOW_W * WINDOW_H)
-#define UNROLL 4                // places that a work-item asks for before it waits
+#define UNROLL 4                // atomics in flight per work-item
 
-// Lists of the tiles of the band [band_first, band_end), from 0; never beyond `capacity`.
+// Lists of the tiles of a band [band_first, band_end), at most `capacity` pairs.
 typedef struct {
     int tiles_x, first, end;
     uint start, capacity;
 } Band;
 
-// The next place in a tile's list, or one beyond all capacity. Modulo 2^32: a place within the band is right even where the picture
-// has more pairs than that.
+// Next free index of a tile's list, or NO_OFFSET outside of the band. Modulo 2^32: indices within the band are right even if the
+// frame has more pairs than that.
 static inline uint next_offset(int tile, const Band *band, global uint *restrict cursors) {
     return tile < band->first || tile >= band->end ? NO_OFFSET : atomic_inc(cursors + tile) - band->start;
 }
 
-// Index space: for each view `splat_groups` work-groups, a work-item per splat, and then the same number of work-groups as for
-// every other view; these share out the big splats.
-// Reads: windows, keys, starts, big, big_bounds. Uses up: cursors of the band. Writes: pairs; adds to counts' number of
-// visible splats.
+// Writes the (splat, key) pairs of all tiles of a band.
+// Index space: for each view `splat_groups` work-groups, one work-item per splat, then the same number of work-groups for every
+// view, which share the big splats.
+// Reads: windows, keys, starts, big, big_bounds. Consumes: cursors of the band. Writes: pairs; adds to counts' number of visible
+// splats.
 kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
 ) {
     local uint visible, queued;
-    local ushort queue[BIN_ITEMS * WINDOW_TILES];     // of a splat of the group (by its work-item) and a tile of its window
+    local ushort queue[BIN_ITEMS * WINDOW_TILES];     // (work-item of the splat, tile of its window)
     local uint corners[BIN_ITEMS], depths[BIN_ITEMS];
     const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
     uint item = get_local_id(0), number = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
@@ -166,7 +166,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
         }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    // shared out evenly, since splats touch few tiles or many, and several at once, since each waits for its place
+    // evenly shared, since splats overlap few or many tiles; several at once, since each atomic has latency
     int before = (int)number * tiles_of(width, height);
     uint first_splat = number * count + (uint)get_global_id(0) - item;
     for (uint from = item; from < queued; from += UNROLL * BIN_ITEMS) {
@@ -186,30 +186,29 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
     if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }
 
-// Sorts each list by (depth key, splat), which are all different.
+// Sorts each tile's list by (depth key, splat); all keys differ.
 // Index space: work-groups of SORT_ITEMS, one per tile of the band.
-// Reads: starts. Uses up: pairs. Writes: lists.
+// Reads: starts. Consumes: pairs. Writes: lists.
 //
-// A list that fits local memory is spread over ranges of depth. Where one of them is crowded, and for short and longer lists, there is
-// a bitonic network whose every comparison puts the smaller first, so that a list of any length is sorted as if it were followed by
-// infinities.
+// A list that fits local memory is bucket-sorted by depth. Short and long lists, and those with an overfull bucket, go through a
+// bitonic network; every comparator moves the smaller key to the front, as if the list were padded with infinities.
 #define SORT_ITEMS 256
-#define SORT_LOCAL 2048          // pairs that are sorted in local memory at once
-#define SHORT 64                 // pairs that the network sorts sooner
-#define BUCKETS 1024              // of depth
-#define BUCKET_LIMIT 128              // pairs of one range: more are not compared each with all
-#define ROW 16                   // work-items whose sums are added up one after the other; SORT_ITEMS is its square
-enum { ITEM_PAIRS = SORT_LOCAL / SORT_ITEMS, ITEM_BUCKETS = BUCKETS / SORT_ITEMS };   // of one work-item
+#define SORT_LOCAL 2048          // pairs sorted in local memory
+#define SHORT 64                 // pairs for which the network is faster
+#define BUCKETS 1024              // buckets of the depth range
+#define BUCKET_LIMIT 128              // pairs of one bucket: larger ones are not sorted by comparing all pairs
+#define ROW 16                   // work-items whose sums are added serially; SORT_ITEMS is its square
+enum { ITEM_PAIRS = SORT_LOCAL / SORT_ITEMS, ITEM_BUCKETS = BUCKETS / SORT_ITEMS };   // per work-item
 
-// The places i < j of comparator t in the step whose partners are `stride` (a power of two) apart; in the first step of a
-// block of 2 * stride places (`mirrored`) partners are mirror images.
+// Indices i < j of comparator t of a step with partners `stride` (a power of two) apart; in the first step of a block of
+// 2 * stride elements (`mirrored`) partners are mirror images.
 static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint *j) {
     uint inside = t & (stride - 1);
     *i = 2 * t - inside;
     *j = mirrored ? *i + 2 * (stride - inside) - 1 : *i + stride;
 }
 
-// One step of the network on `items`, which lie where `fence` says.
+// One step of the network on `items`; `fence` names their address space.
 #define SORT_STEP(items, length, comparators, stride, mirrored, fence)                      \
     for (uint t = get_local_id(0); t < (comparators); t += SORT_ITEMS) {                    \
         uint i, j;                                                                          \
@@ -224,22 +223,21 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
     }                                                                                       \
     barrier(fence)
 
-// The depth that a key stands for: `sortable`, back.
+// Depth of a key: the inverse of `sortable`.
 static inline float depth_of(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
 
-// A pair's range of depth. Every step keeps the order of depths, so a pair of a later range is further. fmax: where all depths are
-// one, or without end, the product may be no number.
+// Bucket of a pair, monotonic in depth. fmax: where all depths are equal, or infinite, the product may be NaN.
 static inline uint bucket_of(ulong pair, float nearest, float scale) {
     return (uint)fmin(fmax((depth_of((uint)(pair >> 32)) - nearest) * scale, 0.0f), BUCKETS - 1.0f);
 }
 
-typedef struct {             // in local memory, while a list is spread
-    uint lowest, highest, overfull;    // keys; whether a range is
+typedef struct {             // state of the bucket sort, in local memory
+    uint lowest, highest, overfull;    // keys; whether a bucket is
     uint rows[ROW];                   // pairs of each row of work-items
-    uint starts[BUCKETS];              // pairs in each range, then where it starts
+    uint starts[BUCKETS];              // number of pairs of each bucket, then its start
 } Buckets;
 
-// The least and the greatest key of `length` pairs. ends: SORT_ITEMS values for its own use.
+// Lowest and highest key of `length` pairs. scratch: SORT_ITEMS values.
 static inline void find_key_range(global const ulong *pairs, uint length, local uint2 *scratch, local Buckets *buckets) {
     uint item = get_local_id(0), lowest = 0xFFFFFFFFu, highest = 0;
     for (uint k = item; k < length; k += SORT_ITEMS) {
@@ -249,7 +247,7 @@ static inline void find_key_range(global const ulong *pairs, uint length, local 
     }
     scratch[item] = (uint2)(lowest, highest);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item < 2 * ROW) {    // few, as atomics of one place wait for each other
+    if (item < 2 * ROW) {    // few, since atomics on one address are serialised
         for (uint k = item + 2 * ROW; k < SORT_ITEMS; k += 2 * ROW) {
             lowest = min(lowest, scratch[k].x);
             highest = max(highest, scratch[k].y);
@@ -260,8 +258,7 @@ static inline void find_key_range(global const ulong *pairs, uint length, local 
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// Turns the numbers of pairs in each range into where the range starts, unless one is crowded. sums: SORT_ITEMS values for its own
-// use.
+// Turns the bucket counts into bucket starts and detects an overfull bucket. sums: scratch of SORT_ITEMS values.
 static inline void bucket_starts(local uint *sums, local Buckets *buckets) {
     uint item = get_local_id(0), numbers[ITEM_BUCKETS], sum = 0, before = 0;
     for (uint n = 0; n < ITEM_BUCKETS; n++) {
@@ -282,8 +279,8 @@ static inline void bucket_starts(local uint *sums, local Buckets *buckets) {
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// Sorts at most SORT_LOCAL pairs into `list`: puts each into its range, where it counts those before it. Returns false, for the whole
-// group, if a range is crowded. items: SORT_LOCAL values for its own use.
+// Bucket sort of at most SORT_LOCAL pairs into `list`. Within its bucket, a pair's index is the number of smaller keys. Returns
+// false, for all work-items, if a bucket is overfull. items: scratch of SORT_LOCAL values.
 static inline bool bucket_sort(global const ulong *pairs, uint length, local ulong *items, local Buckets *buckets,
                                global uint *restrict list) {
     uint item = get_local_id(0), places[ITEM_PAIRS];
@@ -332,7 +329,7 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
     // blocks that fit local memory: all of a short list
     uint block = min(padded, (uint)SORT_LOCAL);
     for (uint size = block; size <= padded; size *= 2) {
-        bool all_stages = size == block;   // all stages of each block; later what a wider stage leaves to do within them
+        bool all_stages = size == block;   // all stages of each block; afterwards the stages that a wider stage leaves within the blocks
         for (uint stride = size / 2; stride >= SORT_LOCAL; stride /= 2) {
             SORT_STEP(list, length, padded / 2, stride, stride == size / 2, CLK_GLOBAL_MEM_FENCE);
         }

@@ -1,11 +1,11 @@
-// Lists for GPUs where a work-group's splats share tiles: of many views of few tiles each, and of stores, whose neighbours lie near
-// each other. A work-group takes many splats of one view, counts their pairs by tile in local memory, and asks for the places of all
-// pairs of a tile at once. tile_lists.cl, whose kernels do the rest, asks pair by pair, and who asks for one tile waits for each other.
+// Tile binning on GPUs with counts in local memory, for many views of few tiles and for stores, whose neighbouring splats share
+// tiles. A work-group counts the pairs of many splats per tile, then reserves all list entries of a tile by one atomic. The
+// kernels of tile_lists.cl, which complete the lists, take one global atomic per pair, and atomics on one tile are serialised.
 
 #define GROUP_SPLATS 4096             // splats of a work-group
-#define LOCAL_TILES 4096         // that are counted in local memory
+#define LOCAL_TILES 4096         // tiles with a count in local memory
 
-// The work-group's share of the splats of its view [first, end), as places among those of all views.
+// Splats of the work-group [first, end), as indices among those of all views.
 typedef struct { uint first, end; } Share;
 
 static inline Share share_of(uint count) {
@@ -14,17 +14,18 @@ static inline Share share_of(uint count) {
     return share;
 }
 
-// The tiles whose pairs are counted: all of a small view, else a rectangle around the share's windows. corner: as a window's.
+// Tiles that are counted: all tiles of a small view, else a rectangle around the windows of the work-group's splats. corner: as in
+// a window.
 typedef struct { uint corner; int columns, tiles; } Area;
 
-// ends: four values for its own use.
+// extents: scratch of four values.
 static inline Area area_of(const Share *share, int tiles, int tiles_x, global const uint2 *restrict windows,
                            global const uint *restrict keys, local int *extents) {
     Area area = {0, tiles_x, tiles};
     if (tiles <= LOCAL_TILES) return area;
     if (get_local_id(0) < 4) extents[get_local_id(0)] = 0xFFFF;
     barrier(CLK_LOCAL_MEM_FENCE);
-    int4 extent = 0xFFFF;          // left, top, and right and bottom from the other side
+    int4 extent = 0xFFFF;          // left, top, -right, -bottom
     for (uint splat = share->first + get_local_id(0); splat < share->end; splat += SCAN_ITEMS) {
         if (keys[splat] == CULLED || windows[splat].y == 0) continue;
         int left = windows[splat].x & 0xFFFFu, top = windows[splat].x >> 16;
@@ -35,20 +36,20 @@ static inline Area area_of(const Share *share, int tiles, int tiles_x, global co
     atomic_min(extents + 2, extent.z);
     atomic_min(extents + 3, extent.w);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (extents[2] == 0xFFFF) return area;   // none: nothing is counted in it
+    if (extents[2] == 0xFFFF) return area;   // no splat has a window
     area.corner = (uint)extents[0] | (uint)extents[1] << 16;
     area.columns = WINDOW_W - extents[2] - extents[0];
     area.tiles = area.columns * (WINDOW_H - extents[3] - extents[1]);
     return area;
 }
 
-// A window's place in an area, and the tile of the view that has a place.
+// Index of a window's tile in the area, and the inverse: the tile of an index.
 static inline int area_index(const Area *area, uint2 window) { return window_tile((uint2)(window.x - area->corner, window.y), area->columns); }
 static inline int area_tile(const Area *area, int place, int tiles_x) {
     return ((int)(area->corner >> 16) + place / area->columns) * tiles_x + (int)(area->corner & 0xFFFFu) + place % area->columns;
 }
 
-// Numbers of pairs of the share by place in the area. listed: a word for each.
+// Number of pairs of each tile of the area. pair_counts: one word per tile.
 static inline void count_pairs(const Share *share, const Area *area, global const uint2 *restrict windows, global const uint *restrict keys,
                           local uint *pair_counts) {
     for (int place = get_local_id(0); place < area->tiles; place += SCAN_ITEMS) pair_counts[place] = 0;
@@ -61,7 +62,7 @@ static inline void count_pairs(const Share *share, const Area *area, global cons
 }
 
 // Index space: for each view a work-group for every GROUP_SPLATS splats.
-// Reads: windows, keys. Writes: adds to tallies.
+// Reads: windows, keys. Adds to: tallies.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_gathered(
 //@@ arguments tally_gathered
 ) {
@@ -71,7 +72,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_gather
     int tiles = tiles_of(width, height), tiles_x = (width + TILE_W - 1) / TILE_W;
     tallies += TALLIES + get_group_id(1) * (uint)tiles;
     const Area area = area_of(&share, tiles, tiles_x, windows, keys, extents);
-    if (area.tiles > LOCAL_TILES) {      // too far apart
+    if (area.tiles > LOCAL_TILES) {      // too many tiles for local memory
         for (uint splat = share.first + get_local_id(0); splat < share.end; splat += SCAN_ITEMS) {
             if (keys[splat] == CULLED) continue;
             for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) atomic_inc(tallies + window_tile(window, tiles_x));
@@ -83,8 +84,8 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_gather
         if (pair_counts[place] != 0) atomic_add(tallies + area_tile(&area, place, tiles_x), pair_counts[place]);
 }
 
-// Index space: as tally_gathered.
-// Reads: windows, keys, starts. Uses up: cursors of the band. Writes: pairs; adds to counts' number of visible splats.
+// Index space: that of tally_gathered.
+// Reads: windows, keys, starts. Consumes: cursors of the band. Writes: pairs; adds to counts' number of visible splats.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_gathered(
 //@@ arguments emit_gathered
 ) {
@@ -114,7 +115,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_gathere
         for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) {
             int tile = before + window_tile(window, tiles_x);
             if (tile < band.first || tile >= band.end) continue;
-            // modulo 2^32, as place_of
+            // modulo 2^32, see next_offset
             uint place = counted ? atomic_inc(pair_counts + area_index(&area, window)) - band.start : next_offset(tile, &band, cursors);
             if (place < band.capacity) pairs[place] = (uint2)(splat, key);
         }

@@ -1,6 +1,5 @@
-// Values of [0, 1] as 8 bits, when somebody reads an image so: a quarter of what a copy to the host would move. Bit for bit
-// `to_uint8` of fidsplat/images/files.py: clamped, rounded to the nearest, of two the even one; 0 where the value is no number.
-// VALUES: of a work-item, 4 or 16.
+// Conversion of an image from float to 8 bits on the device, which quarters the copy to the host. Bit-identical to `to_uint8` of
+// fidsplat/images/files.py: clamped to [0, 1], rounded half to even; NaN becomes 0. VALUES: per work-item, 4 or 16.
 #pragma OPENCL FP_CONTRACT OFF
 #define JOINED(name, count) name##count
 #define OF(name, count) JOINED(name, count)

@@ -1,7 +1,7 @@
-// What the device can do at best: rates of copying, multiply-add, exp and division, for the host to time. Built with prelude.cl
-// and math.cl in front; vectors of LANES, as the blend stage has them.
+// Peak rates of copy, multiply-add, exp and division, timed by the host. Compiled after prelude.cl and math.cl; vectors of LANES,
+// as in the blend stage.
 
-// Values that each work-item keeps going side by side, so that no result is waited for.
+// Independent chains per work-item, so that latency is hidden.
 #define CHAINS 8
 
 // Index space: one work-item per float4. Reads: in. Writes: out, the same.
@@ -10,9 +10,9 @@ kernel void roofline_copy(global const float4 *restrict in, global float4 *restr
     out[at] = in[at];
 }
 
-// Three kernels that differ in one expression. Index space: any. `rounds` results per chain and lane of each work-item.
-// Reads: nothing. Writes: out[LANES * items], so that nothing can be left out.
-// `a` and `b` come from the host: what is constant would be worked out beforehand.
+// Three kernels that differ in one expression. Index space: any. Each work-item computes `rounds` results per chain and lane.
+// Reads: nothing. Writes: out[LANES * items], so that the compiler removes nothing.
+// `a` and `b` are arguments, since constants would be folded.
 #define RATE(name, expression) \
     kernel void name(uint rounds, float a, float b, global float *restrict out) { \
         vfloat x[CHAINS]; \

@@ -1,5 +1,5 @@
-// For GPUs: the splat is added to the tallies of its tiles as soon as they are known (tile_lists.cl). The tallies are integers,
-// so their sums do not depend on the order of the additions.
+// Counts tiles during projection (GPUs): adds each tile of the splat's window to the tallies (tile_lists.cl). Integer sums do
+// not depend on the order of the additions.
 //@ list
     int tiles_x = (width + TILE_W - 1) / TILE_W;
     tallies += number * (uint)(tiles_x * ((height + TILE_H - 1) / TILE_H));

@@ -1,3 +1,3 @@
-// The light that the sensor gathers, times a factor.
+// Exposure: scales the light.
 //@ resolve_end
     for (int channel = 0; channel < 3; channel++) rgb_out[3 * out + channel] *= exposure;

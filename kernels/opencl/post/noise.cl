@@ -1,7 +1,7 @@
-// Shot and read noise: a value v is v * full well electrons, whose number varies by its square root, and the read-out adds its
-// own. The variate of a pixel and channel is the sum of twelve uniform 16-bit numbers, in integers: mean 0 and variance 1 (as
-// a normal one to 0.1 in kurtosis, none beyond 6), the same on every device. They come from a hash of where and which (pcg4d,
-// Jarzynski and Olano 2020), so that nothing depends on what is drawn first.
+// Shot noise and read noise. A value v is v * full well electrons, with variance equal to their number, plus the variance of the
+// readout. The normal variate of a pixel and channel is a sum of twelve uniform 16-bit integers: mean 0, variance 1, kurtosis
+// 0.1 below normal, at most 6 in magnitude, and equal on every device. The integers are a hash of pixel, channel and seed
+// (pcg4d, Jarzynski and Olano 2020), so they do not depend on the order of pixels.
 //@ functions
 static inline uint4 pcg4d(uint4 v) {
     v = v * 1664525u + 1013904223u;

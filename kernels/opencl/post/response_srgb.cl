@@ -1,4 +1,4 @@
-// The transfer function of sRGB (IEC 61966-2-1) of what lies in [0, 1]; its power by exp and log as in response_gamma.cl.
+// sRGB response curve (IEC 61966-2-1) on [0, 1]; the power by exp and log, as in response_gamma.cl.
 //@ resolve_end
     for (int channel = 0; channel < 3; channel++) {
         float light = clamp(rgb_out[3 * out + channel], 0.0f, 1.0f);

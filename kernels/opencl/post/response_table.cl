@@ -1,4 +1,4 @@
-// A response curve given as values at even steps from 0 to 1, with straight lines between them.
+// Response curve from a table at even steps of [0, 1], with linear interpolation.
 //@ resolve_end
     for (int channel = 0; channel < 3; channel++) {
         float step = clamp(rgb_out[3 * out + channel], 0.0f, 1.0f) * (float)(response_count - 1);

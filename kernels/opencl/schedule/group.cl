@@ -1,18 +1,19 @@
-// For GPUs: one work-group draws one tile, ROWS pixels of a column per work-item; splats are staged in local memory.
-// Barriers stand in loops whose bounds are the same for the whole group (numerics F5).
+// Blend stage for GPUs: one work-group per tile, ROWS pixels of a column per work-item; splats are staged in local memory.
+// Barriers are only in loops with the same bounds for the complete group.
 //
-// ITEMS neighbours in a group draw a cell of CELL_W x CELL_H pixels, and walk through those of the staged splats alone that can
-// touch it: work-items of a GPU that go in step with them have cells and splats of their own, side by side.
+// ITEMS neighbouring work-items share a cell of CELL_W x CELL_H pixels and loop over those staged splats that overlap the cell:
+// the cells of one warp have lists of their own.
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile of each view.
-// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
+// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, for complete
+// tiles.
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 //@@ arguments blend
 ) {
     local Staged staged[STAGED];
-    local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // by row of cells, a byte for each splat: bits of the cells that it can touch
-    local uint touched[CELLS_X * CELLS_Y][ITEMS];           // by cell and work-item: bits of a share of the staged splats
-    local uchar places[CELLS_X * CELLS_Y][CELLS_STRIDE];    // those that can touch a cell, in order
+    local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // [row of cells][splat]: a byte of bits, one per cell that the splat overlaps
+    local uint touched[CELLS_X * CELLS_Y][ITEMS];           // [cell][work-item]: bits of the splats in the work-item's share
+    local uchar places[CELLS_X * CELLS_Y][CELLS_STRIDE];    // [cell]: staged splats that overlap it, in order
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
@@ -35,7 +36,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         uint length = min(end - batch, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item == 0) alive = 0;
-        // vector by vector, so that neighbours in the group read neighbours in memory
+        // in vectors, so that neighbouring work-items read consecutive memory
         for (uint word = item; word < length * VECTORS; word += GROUP) {
             uint which = word / VECTORS, part = word % VECTORS;
             staged[which].words[part] = ((global const float4 *)(splats + lists[batch + which]))[part];
@@ -48,11 +49,11 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, (local uchar *)cells + which);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
-        // uniform: every work-item reads the same vote, taken before this batch is drawn
+        // uniform: all work-items read the same vote, taken before this batch is blended
 //@@ voted
         if (!alive) break;
         uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
-        // not where all of a work-item's pixels are finished
+        // skipped if all pixels of the work-item are terminated
         bool unfinished = false;
         for (int row = 0; row < ROWS; row++) unfinished |= pixel_unfinished(&pixels[row], &constants) != 0;
         if (!unfinished) listed = 0;

@@ -1,12 +1,12 @@
-// For GPUs, in two kernels. `blend_light` walks each tile's list once, as blending does, and keeps of every CHUNK splats, pixel by pixel,
-// the light that comes to them and what light is worth that passes them. Those known, chunks have nothing to do with each other: of
-// `blend_backward` a work-group takes one of them back, so that a long list occupies as many groups as it has chunks. No sum
-// runs across work-items but those of a splat's parts, in a fixed order and without atomics.
-// Barriers stand where the whole group comes to them.
+// Backward pass of blending for GPUs, in two kernels. `blend_light` loops over each tile's list once, front to back, and stores a
+// checkpoint per pixel and CHUNK splats: the transmittance in front of them, and the gradient by the light behind them. Chunks are
+// then independent: each work-group of `blend_backward` processes one, so that long lists occupy many groups. Sums over
+// work-items are per splat, in a fixed order and without atomics.
+// Barriers are only where the complete group reaches them.
 #define PIXELS (TILE_W * TILE_H)
-#define PARTS (GROUP + 1)                    // of one field's sums: neighbours among the fields lie in other banks
-#define PREFETCH_CHUNKS 8                       // that are fetched at once
-#define UNROLL 2                            // splats of a cell's list
+#define PARTS (GROUP + 1)                    // per field: one more than GROUP, against bank conflicts
+#define PREFETCH_CHUNKS 8                       // loaded at once
+#define UNROLL 2                            // splats of a cell's list per iteration
 
 static inline Splat copy_of(local const Staged *staged) {
     Staged copy;
@@ -24,7 +24,7 @@ static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConst
     return cross_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
 }
 
-typedef struct {            // of a splat at a pixel, whether light comes there or not
+typedef struct {            // a splat at a pixel, before transmittance is known
     wide opacity, by_weight;
     int mask;
 } FragmentTerms;
@@ -40,7 +40,7 @@ static inline FragmentTerms fragment_terms(const Splat *s, int px, int py, const
     return terms;
 }
 
-// Lets the splat take its light at a pixel; returns its opacity there.
+// Attenuates a pixel by the splat; returns the opacity there.
 static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, screen;
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
@@ -50,15 +50,15 @@ static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel
 }
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
-// Reads:  splats, lists, starts[tiles + 1], and the images' derivatives.
-// Writes: checkpoints, of each pixel of each chunk that light comes to; reached, chunk_tiles; tile_sums.
+// Reads:  splats, lists, starts[tiles + 1], and the gradients of the images.
+// Writes: checkpoints of all pixels and reached chunks; reached, chunk_tiles; tile_sums.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
 //@@ arguments blend_light
 ) {
     local Staged staged[STAGED];
-    local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // by row of cells, a byte for each splat: bits of the cells that it can touch
-    local uint touched[CELLS_X * CELLS_Y][ITEMS];           // by cell and work-item: bits of a share of the staged splats
-    local uchar places[CELLS_X * CELLS_Y][STAGED];          // those that can touch a cell, in order
+    local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // [row of cells][splat]: a byte of bits, one per cell that the splat overlaps
+    local uint touched[CELLS_X * CELLS_Y][ITEMS];           // [cell][work-item]: bits of the splats in the work-item's share
+    local uchar places[CELLS_X * CELLS_Y][STAGED];          // [cell]: staged splats that overlap it, in order
     local float parts[3 * PARTS];
     local int alive;
     local uint max_reached;
@@ -86,13 +86,13 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
         gradient->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
         gradient->behind = FMA(gradient->r, (vfloat)background_r, FMA(gradient->g, (vfloat)background_g, gradient->b * background_b));
 //@@ pixel_gradient_start
-        // outside of the picture nothing is drawn
+        // pixels outside of the image have no transmittance
         pixel_start(&pixels[row], x < width && y < height ? 1.0f : 0.0f);
         transmittances[row] = pixels[row].t;
         by_weights[row] = 0.0f;
     }
     global float2 *checkpoint = (global float2 *)checkpoints + (size_t)first_chunk * PIXELS + top * TILE_W + column;
-    uint chunk = 0, reached_chunks = 0;        // the chunk that is walked; those that light of this work-item's pixels comes to
+    uint chunk = 0, reached_chunks = 0;        // current chunk; number of chunks that transmittance reaches at this work-item's pixels
     if (item == 0) max_reached = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
 
@@ -116,9 +116,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
         if (!alive) break;
         uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
         if (!unfinished) listed = 0;
-        uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // of the batch's chunks
+        uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // chunks up to the end of the batch
         for (uint k = 0; k <= listed; k += UNROLL) {
-            // what they are depends on no light: side by side, where light then goes from one to the next
+            // evaluated in parallel, since they do not depend on transmittance; attenuation is sequential
             uint which[UNROLL];
             FragmentTerms terms[UNROLL][ROWS];
             for (int next = 0; next < UNROLL; next++) {
@@ -127,7 +127,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
                 for (int row = 0; row < ROWS; row++) terms[next][row] = fragment_terms(&s, px, py + row, &gradients[row], &constants);
             }
             for (int next = 0; next < UNROLL; next++) {
-                // what the chunks hold that are over
+                // completed chunks
                 for (uint to = k + next < listed ? (batch - start + which[next]) / CHUNK : beyond; chunk < to; chunk++)
                     for (int row = 0; row < ROWS; row++) {
                         checkpoint[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(transmittances[row], by_weights[row]);
@@ -145,7 +145,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
     }
     atomic_max(&max_reached, reached_chunks);
     barrier(CLK_LOCAL_MEM_FENCE);
-    // what light is worth behind each chunk: where a pixel is finished, what there is behind all splats
+    // gradient by the light behind each chunk; behind terminated pixels, that of the background
     for (int row = 0; row < ROWS; row++) {
         vfloat behind = gradients[row].behind, shown_behind = pixels[row].t * behind;
         for (int last = (int)max_reached - 1; last >= 0; last -= PREFETCH_CHUNKS) {
@@ -180,26 +180,26 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
 #undef PARTS
 #define GROUP BACK_ITEMS
 #define PARTS (GROUP + 1)
-#define EACH (PIXELS / GROUP)                // pixels of a work-item
-#define PATCH_W 8                            // of 32 work-items, which go in step
+#define EACH (PIXELS / GROUP)                // pixels per work-item
+#define PATCH_W 8                            // of the 32 work-items of a warp
 #define PATCH_H (4 * EACH)
 #define PATCHES_X (TILE_W / PATCH_W)
 #define PATCHES (PIXELS / (PATCH_W * PATCH_H))
-#define SHARE_OF_SPLAT (GROUP / CHUNK)       // work-items that add up a splat's fragments: a tile's width
-#define STRIDE (PIXELS + TILE_W)             // of one splat's fragments: neighbours among the splats lie in other banks
+#define SHARE_OF_SPLAT (GROUP / CHUNK)       // work-items that sum a splat's fragments
+#define STRIDE (PIXELS + TILE_W)             // per splat: more than PIXELS, against bank conflicts
 #define SCRATCH (2 * CHUNK * STRIDE > PARTS * FIELDS ? 2 * CHUNK * STRIDE : PARTS * FIELDS)
 
 // Index space: work-groups of GROUP, one per chunk of a tile's list.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, checkpoints, reached, chunk_tiles, and the images'
-// derivatives. Writes: moments, a slot for each splat of each tile.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, checkpoints, reached, chunk_tiles, and the gradients
+// of the images. Writes: moments of each splat of each tile.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 //@@ arguments blend_backward
 ) {
     local Staged staged[CHUNK];
     local float scratch[SCRATCH];
-    local float2 *fragments = (local float2 *)scratch;      // by splat and pixel: light and opacity, then weight and derivative
+    local float2 *fragments = (local float2 *)scratch;      // by splat and pixel: transmittance and opacity, then weight and gradient by ln(opacity)
     local PixelGradient shared[PIXELS];
-    local uint slots[CHUNK], within[PATCHES];               // as bits, the splats whose bounds meet a patch
+    local uint slots[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
     uint id = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H, tiles = tiles_x * tiles_y;
@@ -221,7 +221,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     }
     if (item < PATCHES) within[item] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (chunk >= reached[number]) {          // no light comes here
+    if (chunk >= reached[number]) {          // no transmittance left
         for (uint cell = item; cell < count * FIELDS; cell += GROUP)
             moments[(size_t)slots[cell / FIELDS] * FIELDS + cell % FIELDS] = 0.0f;
         return;
@@ -267,7 +267,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             fragments[which * STRIDE + (top + 4 * each) * TILE_W + column] = (float2)(transmittance, opacity);
         }
     }
-    // each work-item reads what it has written itself; yet without a barrier NVIDIA's compiler (driver 580) has read before it wrote
+    // a work-item reads only its own writes, but without a barrier NVIDIA's compiler (driver 580) moved the read before the write
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint bits = mine, which; bits != 0; bits ^= 1u << which) {
         which = 31 - clz((int)bits);
@@ -287,7 +287,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    // work-items of a splat have a column each, and of narrow ones the rows by turns
+    // one column per work-item of a splat; for narrow splats the work-items share a column's rows
     uint which = item / SHARE_OF_SPLAT;
     Sums sums = {0};
     if (which < count) {

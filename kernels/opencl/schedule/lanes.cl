@@ -1,7 +1,8 @@
-// For CPUs: one work-item draws one tile, a block of LANES pixels at a time; no barriers, no local memory.
+// Blend stage for CPUs: one work-item per tile, vectors of LANES pixels (a block); no barriers, no local memory.
 // Index space: one work-item (and work-group) per tile of each view.
-// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles; images where it resolves.
-// Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
+// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, for complete
+// tiles; the images where resolving is fused.
+// Splats are scattered in memory, so the next ones are prefetched.
 #define PREFETCH_SPLATS 8
 
 kernel void blend(
@@ -13,7 +14,7 @@ kernel void blend(
     uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
 
-    // of a tile without splats all blocks are alike, so that one is enough
+    // in a tile without splats all blocks are equal, so one is computed
     const uint base = starts[band_first];
     const bool empty = starts[tile] == starts[tile + 1]
 //@@ empty
@@ -23,7 +24,7 @@ kernel void blend(
 //@@ lanes_start
 //@@ pixels_start
     const uint on_picture = empty ? 0 : blocks_within(0, min(width - x0, TILE_W), 0, min(height - y0, TILE_H));
-    uint alive = on_picture;      // those that still let light through
+    uint alive = on_picture;      // blocks that are not terminated
 
 //@@ pass
 //@@ tile_loop

@@ -1,34 +1,34 @@
-// For CPUs: a work-item takes one tile after another back, a block of LANES pixels at a time: whichever nobody has taken yet, so
-// that there is a tape for each work-item alone, in memory of the device, as long as it needs to be.
+// Backward pass of blending for CPUs. Each work-item takes the next unprocessed tile until none is left, so that one tape per
+// work-item is enough.
 // Index space: one work-item (and work-group) per core.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_rows, splat_slots, and the images' derivatives.
-// Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints, tapes; reserved[1], tiles that are taken.
-// Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_rows, splat_slots, and the gradients of the images.
+// Writes: moments of each splat of the tile; tile_sums. Consumes: checkpoints, tapes; reserved[1], the number of tiles taken.
+// Splats are scattered in memory, so the next ones are prefetched.
 #define PREFETCH_SPLATS 8
 
-// Of a tile's list as many splats are walked forward and then back as the tape has room for: CHUNK at least, TAPE_SPLATS at most.
+// A chunk is as many splats of a tile's list as fit the tape: at least CHUNK, at most TAPE_SPLATS.
 #define TAPE_SPLATS (8 * CHUNK)
 #define TAPE_FRAGMENTS (CHUNK * BLOCKS)
-#define CHECKPOINT_FLOATS (TILE_W * TILE_H + LANES)        // of a checkpoint: the light of each pixel, and the first splat
+#define CHECKPOINT_FLOATS (TILE_W * TILE_H + LANES)        // of a checkpoint: transmittance of each pixel, and the index of the first splat
 
-typedef struct {            // fragments in the order in which they were drawn, block by block
+typedef struct {            // fragments in the order of compositing, block by block
     vfloat transmittance[TAPE_FRAGMENTS], opacity[TAPE_FRAGMENTS];
-    uint blocks[TAPE_SPLATS];      // of a splat, as bits: blocks where anything is drawn
+    uint blocks[TAPE_SPLATS];      // per splat, as bits: blocks with fragments
     uint slots[TAPE_SPLATS];
     uint length;            // blocks
 } Tape;
 
 typedef struct {
     int x0, y0;
-    float left[BLOCKS], top[BLOCKS];    // of its blocks
+    float left[BLOCKS], top[BLOCKS];    // corners of its blocks
     const BlendConstants *constants;
 } Tile;
 
-typedef struct {            // of a tile's first block: where its pixels are, relative to a splat's anchor; whole numbers all
+typedef struct {            // pixels of a tile's first block, relative to a splat's anchor; integers
     vfloat x, y;
 } BlockOrigin;
 
-typedef struct {            // of a splat in a block: places relative to its anchor, and its forms
+typedef struct {            // a splat in a block: pixel positions relative to its anchor, and its forms
     vfloat x, y, nu_x, nv_x, screen;
     vint mask;
     Crossing crossing;
@@ -51,7 +51,7 @@ static inline Block block_of(const Splat *s, const Tile *tile, const BlockOrigin
     return b;
 }
 
-// Lets the splat take its light in the blocks that are alive; keeps on the tape what it took there. Returns which stay alive.
+// Attenuates the live blocks by the splat and records its fragments on the tape. Returns the blocks that are still live.
 static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, global Tape *tape, uint place) {
     const BlendConstants *constants = tile->constants;
     uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_cut, constants->filter), contributing = 0;
@@ -73,7 +73,7 @@ static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels
     return alive;
 }
 
-// Takes the splat's fragments, the last ones on the tape, back and off it.
+// Backward pass of a splat's fragments, which are the last on the tape; removes them.
 static inline void backward_splat(const Splat *s, const Tile *tile, global Tape *tape, uint place, PixelGradient *gradients, global float *slot) {
     const BlendConstants *constants = tile->constants;
     Sums sums = {0};
@@ -106,7 +106,7 @@ static inline void store_zero_moments(global float *moments, uint slot) {
     ((global Moments *)moments)[slot] = nothing;
 }
 
-// All that is asked of the splat that the list has at `next`.
+// Prefetches all data of the splat at `next` in the list.
 #define PREFETCH_SPLAT(next)                                                          \
     PREFETCH(splats + lists[next]);                                             \
     PREFETCH((global const char *)(splats + lists[next]) + 64);                 \
@@ -131,7 +131,7 @@ kernel void blend_backward(
         tile.y0 = tile_row * TILE_H;
         uint start = starts[number], end = starts[number + 1];
 
-        // the derivatives of the tile's pixels; there is nothing outside of the picture
+        // gradients of the tile's pixels; 0 outside of the image
         PixelGradient gradients[BLOCKS];
         for (int block = 0; block < BLOCKS; block++) {
             PixelGradient *gradient = &gradients[block];
@@ -144,7 +144,7 @@ kernel void blend_backward(
 //@@ pixel_gradient_start
         }
 
-        // forward: the light in front of each chunk; of the last one the fragments stay on the tape
+        // forward: transmittance in front of each chunk; the last chunk's fragments stay on the tape
         Pixel pixels[BLOCKS];
         for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block], (vfloat)1.0f);
         const uint on_picture = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
@@ -175,7 +175,7 @@ kernel void blend_backward(
         tile_sums[3 * number + 1] = lane_sum(behind_g);
         tile_sums[3 * number + 2] = lane_sum(behind_b);
 
-        // splats behind the last that was walked have nothing to do with the picture
+        // splats behind the last one processed do not contribute
         for (uint k = position; k < end; k++) {
             PREFETCH(windows + lists[min(k + PREFETCH_SPLATS, end - 1)]);
             PREFETCH(splat_slots + lists[min(k + PREFETCH_SPLATS, end - 1)]);

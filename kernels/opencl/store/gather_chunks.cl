@@ -1,12 +1,12 @@
-// Puts chunks of splats that lie on the device into the arrays that a picture is drawn of, in the order of the scene;
-// where a store stands at many places, they are moved on the way. INSTANCED: whether the device has float64 for that.
+// Gathers resident chunks of stores into the arrays of the rendered cloud, in scene order, and transforms chunks of placed
+// stores. INSTANCED: the device has float64 for the transform.
 #pragma OPENCL FP_CONTRACT OFF
 #if INSTANCED
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 #endif
 
-// Index space: (words of the largest piece, pieces). Reads: pieces (row that it is taken from, row where it goes, rows,
-// its pose or NOT_PLACED), source. Writes: target. words: of a row.
+// Index space: (words of the largest piece, pieces). Reads: pieces (source row, target row, rows, pose or NOT_PLACED), source.
+// Writes: target. words: per row.
 kernel void gather(global const uint *source, global const uint4 *pieces, uint words, global uint *target) {
     uint4 piece = pieces[get_global_id(1)];
     ulong word = get_global_id(0);
@@ -17,8 +17,8 @@ kernel void gather(global const uint *source, global const uint4 *pieces, uint w
 #if INSTANCED
 #define NOT_PLACED 0xffffffffu
 
-// As `moved` (fidsplat/store/subset.py), sum by sum, so that both have the same bits. A pose: its rotation by rows, where
-// it puts the zero of the means, its quaternion.
+// Bit-identical to `moved` (fidsplat/store/subset.py), sum by sum. A pose: rotation by rows, translation of the origin of the
+// means, quaternion.
 // Index space: (rows of the largest piece, pieces).
 kernel void gather_means(
     global const float *source, global const uint4 *pieces, global const double *poses, global float *target) {
@@ -37,7 +37,7 @@ kernel void gather_means(
         to[i] = (float)(pose[3 * i] * x + pose[3 * i + 1] * y + pose[3 * i + 2] * z + pose[9 + i]);
 }
 
-// Index space: as gather_means.
+// Index space: that of gather_means.
 kernel void gather_quats(
     global const float *source, global const uint4 *pieces, global const double *poses, global float *target) {
     uint4 piece = pieces[get_global_id(1)];

@@ -1,6 +1,6 @@
-// Splats before their activations: what is drawn of them, and who is seen.
+// Activations of the trained parameters, and visibility counts.
 
-// Index space: one work-item per splat. Reads: the values. Writes: unit quaternions, scales, opacities.
+// Index space: one work-item per splat. Reads: the parameters. Writes: unit quaternions, scales, opacities.
 kernel void activate(
 //@@ arguments activate
 ) {
@@ -11,8 +11,8 @@ kernel void activate(
     drawn_opacities[i] = sigmoid(logits[i]);
 }
 
-// Index space: one work-item per splat and drawn coefficient of a channel. Reads: sh, of `all` coefficients. Writes: the first
-// `drawn` of them, side by side; of degree 0, where `plain`, the colours that they mean.
+// Index space: one work-item per splat and rendered coefficient of a channel. Reads: sh, of `all` coefficients. Writes: the first
+// `drawn` of them, packed; at degree 0, if `plain`, the RGB colours.
 kernel void activate_sh(
 //@@ arguments activate_sh
 ) {
@@ -22,8 +22,8 @@ kernel void activate_sh(
     drawn_sh[k] = plain ? plain_color(value) : value;
 }
 
-// Index space: one work-item per splat. Reads: means, scales. Changes: how often a splat was seen: a sphere of three standard deviations
-// around it reaches into the picture.
+// Index space: one work-item per splat. Reads: means, scales. Updates: the number of frames in whose frustum the splat was, by a
+// sphere of three standard deviations.
 kernel void count_seen(
 //@@ arguments count_seen
 ) {
@@ -34,7 +34,7 @@ kernel void count_seen(
     float y = turn_10 * p.x + turn_11 * p.y + turn_12 * p.z + move_y;
     float z = turn_20 * p.x + turn_21 * p.y + turn_22 * p.z + move_z;
     float reach = 3.0f * fmax(drawn_scales[2 * i], drawn_scales[2 * i + 1]);
-    // of pixels times depth, so that nothing is divided by a depth of 0
+    // pixels times depth, so that nothing is divided by a depth of 0
     float u = focal_x * x + center_x * z, v = focal_y * y + center_y * z;
     bool inside = z > near && u + focal_x * reach > 0.0f && u - focal_x * reach < width * z && v + focal_y * reach > 0.0f
         && v - focal_y * reach < height * z;

@@ -1,6 +1,6 @@
-// Adam on the splats' values before their activations. Its twin in NumPy, with the formulas: fidsplat/train/optimiser.py.
+// Adam on the parameters before activation. NumPy reference with formulas: fidsplat/train/optimiser.py.
 
-// One value's step; m and v are its running means.
+// Step of one value; m and v are Adam's first and second moment.
 static inline float adam(
     float value, global float *m, global float *v, float gradient, float beta1, float beta2, float rest1, float rest2, float size,
     float root, float epsilon
@@ -15,7 +15,7 @@ static inline float adam(
     (name[k] = adam(name[k], first_##name + (k), second_##name + (k), gradient, beta1, beta2, rest1, rest2, size, root, epsilon))
 
 #if LANES > 1
-// For CPUs the same of 16 numbers side by side, whichever splat they belong to.
+// On CPUs: a vector of 16 values of any splats.
 static inline float16 adam_16(
     float16 value, global float *m, global float *v, float16 gradient, float beta1, float beta2, float rest1, float rest2, float16 size,
     float root, float epsilon
@@ -26,11 +26,11 @@ static inline float16 adam_16(
     return value - size * first / (sqrt(second) / root + epsilon);
 }
 
-// Of 16 numbers from `k` on: their new values.
+// New values of 16 elements from `k` on.
 #define ADAM_16(name, k, gradient, size) \
     adam_16(vload16(0, name + (k)), first_##name + (k), second_##name + (k), gradient, beta1, beta2, rest1, rest2, size, root, epsilon)
 
-// Of each four numbers the sum, in all four places.
+// Sums of each four elements, in all four positions.
 static inline float16 sums_of_4(float16 v) {
     return v.s000044448888cccc + v.s111155559999dddd + v.s22226666aaaaeeee + v.s33337777bbbbffff;
 }

@@ -1,7 +1,7 @@
-// The splats that go on, and those that come: the twin of fidsplat/train/densify.py's Plan.
+// Pruning and densification of an array: gathers the rows of the new set of splats. Reference: Plan in fidsplat/train/densify.py.
 
-// Index space: one work-item per number of an array (count, row) that is made. Reads: the array that there was, rows (count). Writes:
-// its rows in this order, zeros from the row `kept` on.
+// Index space: one work-item per element of the new array (count, row). Reads: the old array, rows (count). Writes: its rows in
+// this order, zeros from row `kept` on.
 kernel void pick(
 //@@ arguments pick
 ) {

@@ -1,16 +1,16 @@
-// The loss for GPUs, image by image (see loss_values.cl). A work-item computes LANES values of a row.
+// Training loss for GPUs, image by image (loss_values.cl). A work-item computes LANES values of a row.
 
-// Rows that a work-item computes in the passes over columns, which share what they read.
+// Rows per work-item in the passes over columns, which share their reads.
 #define EACH_ROWS 4
 
-// Where a work-item's values lie in an image, `rows` rows of them.
+// Declares a work-item's position in an image, `rows` rows of LANES values; returns outside of the image.
 #define LOCATE(rows) \
     int column = get_global_id(0) * LANES, row = get_global_id(1) * (rows); \
     if (column >= width || row >= height) return; \
     size_t at = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column
 
-// Index space: one work-item per value of the picture. Reads: the picture, the truth, the mask. Writes: images 0 and 1 of `images`.
-// Where the mask is 0 the picture is the truth.
+// Index space: one work-item per value of the image. Reads: the render, the target, the mask. Writes: images 0 and 1 of `images`.
+// Where the mask is 0 the render is replaced by the target.
 kernel void loss_take(
 //@@ arguments loss_take
 ) {
@@ -23,8 +23,8 @@ kernel void loss_take(
     images[image_stride + to] = target;
 }
 
-// Index space: (LANES values, rows). Reads: images 0 and 1, of a and b. Writes: images 2 to 6, the means along rows of a, b, a a,
-// b b, a b.
+// Index space: (LANES values, rows). Reads: images 0 and 1 (a and b). Writes: images 2 to 6, the row-wise means of a, b, a a, b b,
+// a b.
 kernel void loss_rows(
 //@@ arguments loss_rows
 ) {
@@ -45,8 +45,8 @@ kernel void loss_rows(
     VSTORE(INSIDE(ab), images + 6 * image_stride + at);
 }
 
-// Means along columns of `count` images from `from` on, for EACH_ROWS rows. The rows that are read below the last margin belong to
-// rows that the picture has not: they lie in the next image.
+// Column-wise means of `count` images from `from` on, for EACH_ROWS rows. Rows that are read below the last margin belong to rows
+// outside of the image; they are in the next image of the buffer.
 static inline void columns_of(global const float *from, int count, int stride, uint image_stride, vfloat means[][5]) {
     for (int each = 0; each < EACH_ROWS; each++)
         for (int image = 0; image < count; image++) means[each][image] = 0;
@@ -61,8 +61,8 @@ static inline void columns_of(global const float *from, int count, int stride, u
         }
 }
 
-// Index space: (LANES values, EACH_ROWS rows). Reads: images 2 to 6. Writes: images 7 to 9, the derivatives of the SSIM by the mean of
-// a, by the mean of a a, by that of a b; image 10, the SSIM.
+// Index space: (LANES values, EACH_ROWS rows). Reads: images 2 to 6. Writes: images 7 to 9, the gradients of the SSIM by the means of
+// a, a a and a b; image 10, the SSIM.
 kernel void loss_columns(
 //@@ arguments loss_columns
 ) {
@@ -79,7 +79,7 @@ kernel void loss_columns(
     }
 }
 
-// Index space: (LANES values, rows). Reads: images 7 to 9. Writes: images 2 to 4, their means along rows.
+// Index space: (LANES values, rows). Reads: images 7 to 9. Writes: images 2 to 4, their row-wise means.
 kernel void loss_rows_backward(
 //@@ arguments loss_rows_backward
 ) {
@@ -97,7 +97,7 @@ kernel void loss_rows_backward(
     VSTORE(INSIDE(by_shared), images + 4 * image_stride + at);
 }
 
-// Index space: (LANES values, EACH_ROWS rows). Reads: images 0 to 4. Writes: the derivative of the loss, of the picture's shape.
+// Index space: (LANES values, EACH_ROWS rows). Reads: images 0 to 4. Writes: the gradient of the loss, in the shape of the image.
 kernel void loss_columns_backward(
 //@@ arguments loss_columns_backward
 ) {
@@ -117,9 +117,9 @@ kernel void loss_columns_backward(
     }
 }
 
-// Index space: any number of work-groups of SUM_ITEMS. Reads: images 0, 1 and 10, margins of zeros too. Writes: each work-group's sums
-// of |a - b|, (a - b)^2 and the SSIM, in a fixed order: the same on every run. A group has a piece of the images, so that a core that
-// takes one work-item after another stays in the same pages.
+// Index space: any number of work-groups of SUM_ITEMS. Reads: images 0, 1 and 10, zero margins included. Writes: each work-group's
+// sums of |a - b|, (a - b)^2 and the SSIM, in a fixed order (deterministic). A group sums a contiguous piece of the images, for
+// locality on CPUs.
 #define SUM_ITEMS 128
 kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void loss_sums(
 //@@ arguments loss_sums

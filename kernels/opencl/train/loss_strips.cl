@@ -1,5 +1,5 @@
-// The loss for CPUs (see loss_values.cl): a work-item takes a strip of the picture down, PANEL values wide, and keeps the means along
-// the last TAPS rows, so that those along columns are read while they are in the first cache.
+// Training loss for CPUs (loss_values.cl): a work-item processes a strip of PANEL values from top to bottom, and keeps the row-wise
+// means of the last TAPS rows, so that the column-wise means read from the first-level cache.
 // Index space of both kernels: (panels, strips), each a work-group.
 
 #define PANEL 128
@@ -7,8 +7,8 @@
 #define STRIP 64
 #define TAPS (2 * RADIUS + 1)
 
-// Of a row the picture's and the truth's values from `column` - MARGIN on, zeros beyond the picture. Where the mask is 0 the picture
-// is the truth.
+// Loads a row of the render and of the target from `column` - MARGIN on, zeros outside of the image. Where the mask is 0 the render
+// is replaced by the target.
 static inline void load_row(
     float *a, float *b, int column, int width, global const float *rgb, global const uchar *truth, int masked,
     global const uchar *mask
@@ -38,8 +38,8 @@ static inline real sum_of(vfloat v) {
     return sum;
 }
 
-// Reads: the picture, the truth, the mask. Writes: images 0 to 2, the derivatives of the SSIM by the mean of a, by that of a a, by
-// that of a b; each work-group's sums of |a - b|, (a - b)^2 and the SSIM.
+// Reads: the render, the target, the mask. Writes: images 0 to 2, the gradients of the SSIM by the means of a, a a and a b; each
+// work-group's sums of |a - b|, (a - b)^2 and the SSIM.
 kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
 //@@ arguments loss_strips
 ) {
@@ -107,7 +107,7 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
     sums[3 * group + 2] = (float)ssim;
 }
 
-// Reads: images 0 to 2, the picture, the truth, the mask. Writes: the derivative of the loss, of the picture's shape.
+// Reads: images 0 to 2, the render, the target, the mask. Writes: the gradient of the loss, in the shape of the image.
 kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips_backward(
 //@@ arguments loss_strips_backward
 ) {

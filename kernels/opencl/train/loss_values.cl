@@ -1,8 +1,8 @@
-// What both ways of computing the loss share (loss.cl for GPUs, loss_strips.cl for CPUs): the loss of a picture,
-// (1 - w) L1 + w (1 - SSIM), and its derivative by each value. Its twin in NumPy, with the formulas: fidsplat/train/losses.py.
+// Shared by loss.cl (GPUs) and loss_strips.cl (CPUs): the training loss (1 - w) L1 + w (1 - SSIM) and its gradient by each value.
+// NumPy reference with formulas: fidsplat/train/losses.py.
 //
-// An image is rows of `stride` floats, the three channels of a pixel side by side, with MARGIN_ROWS rows and MARGIN floats of zeros
-// around the picture, so that a window that leaves it sees zeros without asking.
+// An image is rows of `stride` floats with interleaved channels, with MARGIN_ROWS rows and MARGIN floats of zeros around it, so
+// that windows that overlap its edge read zeros without a test.
 
 #define RADIUS 5
 #define MARGIN_ROWS RADIUS
@@ -15,10 +15,10 @@ constant float WINDOW[2 * RADIUS + 1] = {
 #define C1 1e-4f
 #define C2 9e-4f
 
-// Values beyond the picture's last column stay 0.
+// 0 for values behind the last column.
 #define INSIDE(v) VSELECT((vfloat)(0.0f), v, VMASK((vfloat)((float)column) + VLANE < (vfloat)((float)width)))
 
-// Of means in a window: the SSIM, and its derivatives by that of a, by that of a a, by that of a b.
+// SSIM of a window's means, and its gradients by the means of a, a a and a b.
 typedef struct {
     vfloat ssim, by_mean, by_variance, by_shared;
 } Ssim;

@@ -1,5 +1,5 @@
-// Random steps of means within their disks (MCMC). Random numbers by counter: Philox 4x32-10 of the splat's index, the iteration and
-// the purpose, keyed by the seed; the twin in NumPy is fidsplat/train/random_numbers.py.
+// Position noise of MCMC densification: random steps of means within their disks. Counter-based random numbers: Philox 4x32-10 of
+// the splat's index, the iteration and the purpose, keyed by the seed. NumPy reference: fidsplat/train/random_numbers.py.
 
 static inline uint4 philox(uint4 c, uint k0, uint k1) {
     for (int round = 0; round < 10; round++) {
@@ -11,7 +11,7 @@ static inline uint4 philox(uint4 c, uint k0, uint k1) {
     return c;
 }
 
-// Index space: one work-item per splat. Reads: the other values. Changes: means.
+// Index space: one work-item per splat. Reads: the other parameters. Updates: means.
 kernel void shake(
 //@@ arguments shake
 ) {
@@ -19,7 +19,7 @@ kernel void shake(
     if (i >= count) return;
     uint4 counter = {(uint)i, iteration, purpose, 0};
     float4 u = (convert_float4(philox(counter, seed_low, seed_high)) + 0.5f) * 2.3283064e-10f;
-    // the logarithm of a number that was rounded to 1 would be 0, that of 0 infinite
+    // clamped: log(1) is 0, and log(0) infinite
     float2 radius = sqrt(-2.0f * log(clamp(u.xy, 1.2e-10f, 0.99999994f))), angle = 6.2831853f * u.zw;
     float3 sample = {radius.x * cos(angle.x), radius.y * cos(angle.y), radius.x * sin(angle.x)};
     float4 q = unit(vload4(i, quats));  // w x y z

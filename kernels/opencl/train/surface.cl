@@ -1,7 +1,7 @@
-// How far a picture's normals are from those of the surface that its depths make; its twin in NumPy, with the formulas: `normal_loss` in
+// Normal consistency loss: rendered normals against the normals of the depth map. NumPy reference with formulas: `normal_loss` in
 // fidsplat/train/losses.py.
 
-// The point that a pixel shows.
+// Unprojected point of a pixel.
 static inline float3 point_at(
     int x, int y, int width, global const float *depth, float inverse_x, float inverse_y, float middle_x, float middle_y
 ) {
@@ -12,7 +12,7 @@ static inline float3 point_at(
 #define POINT(x, y) point_at(x, y, width, depth, inverse_x, inverse_y, middle_x, middle_y)
 #define HAS_DEPTH(x, y) (depth[(y) * (size_t)width + (x)] > 0.0f)
 
-// Index space: (columns, rows). Reads: the images, the mask. Writes: the derivatives by normals and, of each pixel, those by the
+// Index space: (columns, rows). Reads: the images, the mask. Writes: the gradients by normals and, for each pixel, by the
 // differences of the points below and above it, right and left of it.
 kernel void surface_normals(
 //@@ arguments surface_normals
@@ -41,7 +41,7 @@ kernel void surface_normals(
     vstore3(by_across, 2 * at + 1, differences);
 }
 
-// Index space: (columns, rows). Reads: differences. Writes: the derivatives by depths.
+// Index space: (columns, rows). Reads: differences. Writes: the gradients by depths.
 kernel void surface_depths(
 //@@ arguments surface_depths
 ) {
