@@ -12,6 +12,7 @@ import numpy as np
 
 from fidsplat.capture.quality import Quality
 from fidsplat.formats.collect import Progress
+from fidsplat.splats.arrays import find_defects
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.store import layout
@@ -69,6 +70,14 @@ class Store(Summarised):
         self.nodes = layout.read_nodes(self._folder, own)
         """(n,) records of `layout.NODE`: chunks and the nodes above them, of one place"""
         self._columns = self._mapped()
+        if self.has_planes:  # the coplanar groups are prepared on the host, and belong to every frame
+            rows = self._rows(own.pinned, own.splats, None)
+            if wrong := _unrenderable(rows):
+                raise InputError(
+                    f"{self._folder} must have coplanar splats that can be rendered, got {wrong}"
+                )
+            if (rows["planes"] < 0).any():
+                raise InputError(f"{self._folder} must have coplanar splats with group ids of at least 0")
 
     def __reduce__(self):
         return Store, (str(self.path.absolute()),)
@@ -279,20 +288,20 @@ class Store(Summarised):
         return StorePart.of(joined(parts), self, self.header.dropped)
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """What is damaged, in words: every chunk is read and compared with its checksum. Empty: it is
-        whole."""
+        """What is damaged, in words: every chunk is read, compared with its checksum, and searched for
+        values that cannot be rendered. Empty: it is whole."""
         callback("progress", progress)
         wrong = []
         for number, node in enumerate(self.nodes):
             first, end = int(node["first"]), int(node["first"] + node["count"])
-            if (
-                layout.checksum({name: array[first:end] for name, array in self._columns.items()})
-                != node["crc"]
-            ):
-                kind = "chunk" if node["level"] == 0 else "node"
+            rows = {name: array[first:end] for name, array in self._columns.items()}
+            kind = "chunk" if node["level"] == 0 else "node"
+            if layout.checksum(rows) != node["crc"]:
                 wrong.append(
                     f"{kind} {number}, rows {first} to {end - 1}, is damaged: its checksum is another"
                 )
+            elif values := _unrenderable(rows, merged=node["level"] > 0):
+                wrong.append(f"{kind} {number}, rows {first} to {end - 1}, has splats with {values}")
             if progress is not None:
                 progress(f"checking {self.path.name}", (number + 1) / len(self.nodes))
         return wrong
@@ -314,6 +323,18 @@ class Store(Summarised):
         if self.poses is None or place is None:
             return made
         return moved(made, self.poses[place], self._moves[place])
+
+
+def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:
+    """Defects of splats that cannot be rendered, with their counts; empty without. merged: of splats that
+    stand for several, whose opacities may exceed 1."""
+    names = rows.keys() - {"labels", "planes"}
+    _, found = find_defects({name: rows[name].astype(np.float32, copy=False) for name in names})
+    if merged:
+        found.pop("opacity outside [0, 1]", None)
+    if "thickness" in rows and (thin := int((rows["thickness"] < 0).sum())):
+        found["thickness below 0"] = thin
+    return ", ".join(f"{reason}: {count}" for reason, count in found.items())
 
 
 def _rounded(middles: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
