@@ -1,19 +1,20 @@
-"""Flat source texts from a FeatureSet and the shape of a device. Needs no OpenCL.
+"""Kernel source assembly: flat program texts from a FeatureSet and the shape of a device. Needs no OpenCL.
 
-They are two programs, as most feature sets list and sort their splats alike: drivers keep what they have
-compiled by its text, so that the program `lists` is compiled once for all of those.
+A frame takes two programs, `lists` and `picture`: drivers cache compiled programs by their text, and most
+feature sets have the same `lists`. Derivatives (`gradients`, `step`) and `training` are separate programs,
+which a renderer without derivatives never compiles.
 
-A stage's file, or a section of an effect's, has hooks, lines `//@@ name`, where the sections `//@ name` of
-the chosen effects go, and lines `//@@ struct NAME` and `//@@ arguments KERNEL`, where the declarations of
-layout.py are printed. What nobody fills leaves an empty line, so the text names no effect that was not asked
-for; `#line` directives say where each line comes from.
+A stage's file, or a section of an effect's file, has hooks, lines `//@@ name`, which are replaced by the
+sections `//@ name` of the chosen effects, and lines `//@@ struct NAME` and `//@@ arguments KERNEL`, which are
+replaced by the declarations of layout.py. An unfilled hook becomes an empty line, so the text names no absent
+effect; `#line` directives give the file and line of each line.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -21,11 +22,19 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.backends.opencl.declare import Argument, Layout, Record, Samples, Scalars, output_argument
+from fidsplat.backends.opencl.declare import (
+    Argument,
+    Layout,
+    Record,
+    Samples,
+    Scalars,
+    member,
+    output_argument,
+)
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS
-from fidsplat.backends.opencl.layout import BOUNDS, KERNELS, SPLAT, VIEW
+from fidsplat.backends.opencl.layout import BOUNDS, GROUP_KERNELS, KERNELS, MOMENTS, SPLAT, VIEW
 from fidsplat.backends.opencl.shapes import DeviceShape
-from fidsplat.effects import FeatureSet
+from fidsplat.effects import FeatureSet, Output
 from fidsplat.util.errors import DeviceError
 from fidsplat.util.kernel_files import kernels_folder
 
@@ -49,13 +58,31 @@ _DRAWN = (
 )
 """stages of the program `picture`, with the way in which a device walks tiles; only splats that are listed in
 order are packed"""
+_GRADIENTS = (
+    *("prelude", "math", "splat", "bounds", "moments", "blend_backward"),
+    *("schedule/{}_cells", "schedule/{}_backward", "set_up_backward", "project_backward"),
+)
+_STEP = (
+    *("prelude", "math", "splat", "bounds", "moments", "set_up_backward"),
+    *("train/activation_functions", "train/adam", "project_step"),
+)
+_TRAINING = (
+    "train/surface",
+    "train/activation_functions",
+    "train/activate",
+    "train/gather_rows",
+    "train/position_noise",
+)
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _SECTION = re.compile(r"//@ (\w+)[ \t]*")
-_KERNEL = re.compile(r"^kernel\b.*?\bvoid (\w+)\(", re.MULTILINE)
 # both begin with a word itself, which re finds 20 times as fast as a boundary
 _WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
 _WIDE = re.compile(r"wide(?<=\bwide)\b")
-_DECLARED = ("struct", "arguments")
+_EFFECT_ARGUMENTS = {
+    **{name: name for name in ("project", "blend", "backdrop", "resolve", "project_backward")},
+    **{"blend_light": "blend_backward", "blend_backward": "blend_backward"},
+}
+"""fields of `Layout` with the arguments that effects add to these kernels"""
 
 
 @dataclass(frozen=True)
@@ -73,9 +100,9 @@ class Source:
     """Flat kernel sources with what the host must know of them."""
 
     programs: dict[str, Text]
-    """`lists` and `picture`"""
+    """by their names"""
     records: dict[str, np.dtype]
-    """`View`, `Splat` and `Bounds` as the kernels have them"""
+    """structs of the texts, as NumPy types"""
     arguments: dict[str, tuple[Argument, ...]]
     """of each kernel of the texts"""
     samples: tuple[tuple[Samples, bool], ...]
@@ -130,7 +157,6 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     """
     layouts = layouts_of(features)
     fused = _resolves_fused(features, layouts)
-    declared = Declarations(layouts, features, fused)
     files = [layout.file for layout in layouts.values() if layout.file]
     files.append(LAYOUTS["resolve_pixel"].file)
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
@@ -164,11 +190,76 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         ],
     }
     _refuse_unknown_hooks(files)
-    writer = Writer(files, declared, numbers_of(features, shape))
-    programs = {name: writer.program(name, stages[name]) for name in stages}
-    kernels = (kernel for each in programs.values() for kernel in kernels_in(each))
-    arguments = {kernel: declared.arguments(kernel) for kernel in kernels}
-    return Source(programs, declared.records, arguments, declared.samples, declared.scalars)
+    declared = Declarations(_scalars(features), layouts, features.images, fused)
+    return Assembler(files, declared, numbers_of(features, shape)).source(stages)
+
+
+def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
+    """The source of the derivatives of these features on a device of this shape."""
+    return _assemble_backward("gradients", _GRADIENTS, features, shape)
+
+
+def assemble_step(features: FeatureSet, shape: DeviceShape) -> Source:
+    """The source of a training step: the last stage of the derivatives, fused with Adam."""
+    return _assemble_backward("step", _STEP, features, shape)
+
+
+def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape) -> Source:
+    layouts = layouts_of(features)
+    # the forward text of slots is used again, of outputs only the derivatives
+    slots = (part for slot in features.slots for part in (slot, *LAYOUTS[slot].parts))
+    files = [LAYOUTS[part].file for part in dict.fromkeys(slots)]
+    files += [layout.backward_file for layout in layouts.values()]
+    kernels = KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
+    declared = Declarations(_scalars(features), layouts, kernels=kernels)
+    backward = {"BACK_ITEMS": backward_items(features, shape), "CHUNK": backward_chunk(features, shape)}
+    assembler = Assembler(files, declared, numbers_of(features, shape) | backward)
+    return assembler.source({name: [stage.format(shape.schedule) for stage in stages]})
+
+
+@cache
+def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
+    """The source of a training step's other kernels, for vectors of `lanes` floats; sums are in float64 where
+    the device has it."""
+    files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
+    numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
+    declared = Declarations(Scalars("double" if float64 else "float", "float"))
+    stages = ("prelude", "math", *(f"train/{file}" for file in files))
+    return Assembler((), declared, numbers).source({"training": stages})
+
+
+def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterable[str] = ()) -> str:
+    """The text of a file below kernels/opencl/ that tests a device, after prelude.cl and math.cl.
+
+    Args:
+        file: empty for the two alone.
+        effects: files whose sections fill hooks.
+    """
+    numbers = {"LANES": shape.lanes, "FAST_FMA": int(shape.fast_fma), "SETUP_FP64": int(float64)}
+    declared = Declarations(Scalars("double" if float64 else "float", "float"))
+    stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
+    return Assembler(effects, declared, numbers).source({"check": stages}).text
+
+
+def backward_items(features: FeatureSet, shape: DeviceShape) -> int:
+    """Work-items that walk a chunk of a tile's list back. Half as many with outputs other than rgb, which
+    keep more per pixel: with distortion, 256 would exceed the 48 KiB of local memory of NVIDIA's OpenCL."""
+    if shape.schedule == "lanes":
+        return 1
+    return min(shape.tile_width * shape.tile_height, 128 if features.outputs else 256)
+
+
+def backward_chunk(features: FeatureSet, shape: DeviceShape) -> int:
+    """Splats of a tile's list that are walked forward and then back: on GPUs a column of a splat's pixels for
+    each work-item, on CPUs the minimum, for splats that cover the tile."""
+    if shape.schedule == "lanes":
+        return shape.tape
+    return backward_items(features, shape) // shape.tile_width
+
+
+def _scalars(features: FeatureSet) -> Scalars:
+    real = "double" if features.setup_precision == "float64" else "float"
+    return Scalars(real, "double" if "blend_double" in features.slots else "float")
 
 
 def _resolves_fused(features: FeatureSet, layouts: Mapping[str, Layout]) -> bool:
@@ -198,32 +289,37 @@ def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
     return numbers
 
 
-class Writer:
-    """Puts programs together from stage files, whose hooks effects' files and declarations fill."""
+class Assembler:
+    """Assembles programs from stage files; effects' files and declarations fill their hooks."""
 
-    def __init__(
-        self,
-        files: Iterable[str],
-        declared: Declarations,
-        defines: Mapping[str, int],
-    ) -> None:
+    def __init__(self, files: Iterable[str], declared: Declarations, defines: Mapping[str, int]) -> None:
         """files: of the effects, below kernels/opencl/, in the order in which they fill a hook."""
-        self._sections = [(file, sections_of(file)) for file in files]
+        self._sections = [(file, sections_of(file)) for file in files if file]
         self._declared, self._defines = declared, defines
+        self._used: dict[str, list[str]] = {"struct": [], "arguments": []}
+        """names of the structs and kernels of the texts"""
 
-    def program(self, name: str, stages: Iterable[str]) -> Text:
-        """The program of these stage files."""
+    def source(self, programs: Mapping[str, Iterable[str]]) -> Source:
+        """The programs of these stages, by their names."""
+        declared = self._declared
+        texts = {name: self._program(name, stages) for name, stages in programs.items()}
+        records = {name: declared.structs[name].dtype(declared.scalars) for name in self._used["struct"]}
+        arguments = {kernel: declared.arguments(kernel) for kernel in self._used["arguments"]}
+        return Source(texts, records, arguments, declared.samples, declared.scalars)
+
+    def _program(self, name: str, stages: Iterable[str]) -> Text:
         files = [f"{stage}.cl" for stage in stages]
         body = "".join(f"#line 1 {_shown(file)}\n{self._expand(file, 1, lines_of(file))}" for file in files)
         body = with_scalars(with_constants(body, self._declared.constants), self._declared.scalars.wide)
         bare = "\n".join(_without_comment(line) if "//" in line else line for line in body.split("\n"))
-        # a number that a program does not name must not make another program
+        # an unused number must not change the text
         numbers = sorted(self._defines.items())
         head = "".join(f"#define {name} {value}\n" for name, value in numbers if name in bare)
         return Text(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
 
     def _fill(self, hook: str, subject: str) -> Iterator[str]:
-        if hook in _DECLARED:
+        if hook in self._used:
+            self._used[hook].append(subject)
             yield f'#line 1 "layout.py: {subject}"\n{self._declared.text(hook, subject)}'
         for file, by_hook in self._sections:
             for first, lines in by_hook.get(hook, ()):
@@ -241,57 +337,56 @@ class Writer:
         return "\n".join(made) + "\n"
 
 
-def kernels_in(text: Text) -> list[str]:
-    """Names of a program's kernels."""
-    return _KERNEL.findall(text.compiled)
-
-
 class Declarations:
-    """What layout.py declares, with what the chosen effects add to it."""
+    """The declarations of layout.py together with those of the chosen effects."""
 
-    def __init__(self, layouts: dict[str, Layout], features: FeatureSet, fused: bool = False) -> None:
+    def __init__(
+        self,
+        scalars: Scalars,
+        layouts: Mapping[str, Layout] | None = None,
+        outputs: Sequence[Output] = (),
+        fused: bool = False,
+        kernels: Mapping[str, tuple[Argument, ...]] = KERNELS,
+    ) -> None:
         """fused: blending resolves, with the arguments of both."""
-        real = "double" if features.setup_precision == "float64" else "float"
-        self.scalars = Scalars(real, "double" if "blend_double" in layouts else "float")
-        self.samples = tuple((one, layout.averaged) for layout in layouts.values() for one in layout.samples)
-        self._layouts, self._outputs, self._resolves_fused = layouts, features.images, fused
-        every = layouts.values()
+        every = list((layouts or {}).values())
+        self.scalars = scalars
+        self.samples = tuple((one, layout.averaged) for layout in every for one in layout.samples)
+        self._layouts, self._outputs, self._fused, self._kernels = every, outputs, fused, kernels
         self.constants = dict(one for layout in every for one in layout.constant)
         """fields of `Splat` that all splats share, and their values"""
-        splat = SPLAT.with_members(one for layout in every for one in layout.splat)
-        self._structs: dict[str, Record] = {
-            "View": VIEW.with_members(one for layout in every for one in layout.view),
-            "Splat": splat.without(self.constants),
-            "Bounds": BOUNDS.with_members(one for layout in every for one in layout.bounds),
-        }
-        self.records: dict[str, np.dtype] = {}
-        self.add(*self._structs.values())
-
-    def add(self, *records: Record) -> None:
-        """Further structs that kernels may ask for."""
-        self._structs |= {record.name: record for record in records}
-        self.records |= {record.name: record.dtype(self.scalars) for record in records}
+        moments = MOMENTS.with_members(one for layout in every for one in layout.moments)
+        names = " ".join(name for one in moments.members for name, _ in one.names)
+        # as many fields of padding as in `Moments`
+        alignment = moments.alignment // 4 * scalars.dtype("real").itemsize
+        structs = (
+            VIEW.with_members(one for layout in every for one in layout.view),
+            SPLAT.with_members(one for layout in every for one in layout.splat).without(self.constants),
+            BOUNDS.with_members(one for layout in every for one in layout.bounds),
+            moments,
+            Record("Totals", (member(f"real {names}", "of all tiles"),), alignment),
+        )
+        self.structs = {record.name: record for record in structs}
 
     def arguments(self, kernel: str) -> tuple[Argument, ...]:
-        """Its own, then those of the effects in their order, each name once."""
-        every = self._layouts.values()
+        """A kernel's own arguments, then those of the effects in their order, each name once."""
         added: list[Argument] = []
-        if kernel in ("project", "blend", "backdrop", "resolve"):
-            added += (one for layout in every for one in getattr(layout, kernel))
+        if field := _EFFECT_ARGUMENTS.get(kernel):
+            added += (one for layout in self._layouts for one in getattr(layout, field))
         if kernel in ("blend", "resolve"):
             access = "out" if kernel == "blend" else "in"
             added += (Argument(one.ctype, one.name, access, note=one.note) for one, _ in self.samples)
         if kernel == "resolve":
             added += map(output_argument, self._outputs)
-        if kernel == "blend" and self._resolves_fused:
-            own = {"stride", *(one.name for one in (*KERNELS[kernel], *added))}
+        if kernel == "blend" and self._fused:
+            own = {"stride", *(one.name for one in (*self._kernels[kernel], *added))}
             added += [one for one in self.arguments("resolve") if one.name not in own]
-        return tuple({one.name: one for one in (*KERNELS[kernel], *added)}.values())
+        return tuple({one.name: one for one in (*self._kernels[kernel], *added)}.values())
 
     def text(self, hook: str, subject: str) -> str:
         """C for `//@@ struct NAME` or `//@@ arguments KERNEL`."""
         if hook == "struct":
-            return self._structs[subject].text(self.scalars)
+            return self.structs[subject].text(self.scalars)
         arguments = self.arguments(subject)
         lines = [f"    {one.text}{',' if one is not arguments[-1] else ''}" for one in arguments]
         notes = [f"  // {one.note}" if one.note else "" for one in arguments]
@@ -336,11 +431,6 @@ def _refuse_unknown_hooks(files: list[str]) -> None:
 def kernel_text(path: str) -> str:
     """A file below kernels/opencl/, as it stands."""
     return "\n".join(lines_of(path)) + "\n"
-
-
-def section_text(path: str, hook: str) -> str:
-    """What an effect's file has for a hook."""
-    return "".join("\n".join(lines) + "\n" for _, lines in sections_of(path)[hook])
 
 
 @cache

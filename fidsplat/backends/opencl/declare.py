@@ -200,6 +200,12 @@ class Layout:
     samples: tuple[Samples, ...] = ()
     averaged: bool = False
     """Whether its samples are light: the mean of what several shots leave, not one shot's."""
+    backward_file: str = ""
+    """derivatives, below kernels/opencl/; empty: no text of their own"""
+    moments: tuple[Member, ...] = ()
+    """fields of `Moments` (layout.py)"""
+    blend_backward: tuple[Argument, ...] = ()
+    project_backward: tuple[Argument, ...] = ()
     behind: tuple[tuple[str, str], ...] = ()
     """(camera or another slot, part): where that is chosen that part takes this one's place"""
 

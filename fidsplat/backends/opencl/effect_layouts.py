@@ -36,9 +36,21 @@ LAYOUTS: dict[str, Layout] = {
         parts=("chord", "conic"),
         splat=(member("wide z0 zx zy", "depth times D = z0 + zx x + zy y"), member("wide z_near")),
     ),
-    "color_rgb": Layout("slot/color_rgb.cl", project=takes("cloud float colors  // (n, 3)")),
-    "color_sh": Layout("slot/color_sh.cl", project=takes("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)")),
-    "lowpass_none": Layout("slot/lowpass_none.cl"),
+    "color_rgb": Layout(
+        "slot/color_rgb.cl",
+        project=takes("cloud float colors  // (n, 3)"),
+        backward_file="slot/color_rgb_backward.cl",
+        project_backward=takes("out float by_colors  // (n, 3)"),
+    ),
+    "color_sh": Layout(
+        "slot/color_sh.cl",
+        project=takes("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)"),
+        backward_file="slot/color_sh_backward.cl",
+        project_backward=takes(
+            "cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)", "out float by_sh  // the same shape"
+        ),
+    ),
+    "lowpass_none": Layout("slot/lowpass_none.cl", backward_file="slot/lowpass_none_backward.cl"),
     "lowpass_pixel": Layout("slot/lowpass_pixel.cl", parts=("lowpass_none",)),
     "lowpass_screen": Layout(
         "slot/lowpass_screen.cl",
@@ -50,9 +62,11 @@ LAYOUTS: dict[str, Layout] = {
         bounds=(
             member("float px py pr", "the filter's support: centre and radius [samples]; radius < 0: none"),
         ),
+        backward_file="slot/lowpass_screen_backward.cl",
+        moments=(member("float dot_x dot_y", "by the dot's place"),),
     ),
     "stop_inclusive": Layout(),
-    "stop_exclusive": Layout("slot/stop_exclusive.cl"),
+    "stop_exclusive": Layout("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),
     "compose_ordered": Layout("slot/compose_ordered.cl"),
     "compose_pixel": Layout(
         "slot/compose_pixel.cl",
@@ -176,6 +190,8 @@ LAYOUTS: dict[str, Layout] = {
     "ray_depth": Layout(
         "part/ray_depth.cl",
         splat=(member("wide z_numerator", "depth = z_numerator / D"), member("wide z_center z_reach")),
+        backward_file="part/ray_depth_backward.cl",
+        moments=(member("float z_numerator z_center"),),
     ),
     # how pixels are made of samples, and by whom
     "resolve_pixel": Layout("part/resolve_pixel.cl"),
@@ -206,16 +222,24 @@ LAYOUTS: dict[str, Layout] = {
     "rays_sample_length": Layout("part/rays_sample_length.cl", parts=("rays_length",), resolve=_RAYS),
     "world_ray": Layout("part/world_ray.cl"),
     # outputs
-    "alpha": Layout("output/alpha.cl"),
+    "alpha": Layout(
+        "output/alpha.cl",
+        backward_file="output/alpha_backward.cl",
+        blend_backward=takes("in float by_alpha  // (h, w)"),
+    ),
     "depth": Layout(
         "output/depth.cl",
         parts=("ray_depth", "coverage"),
         samples=(Samples("float", "depth_raw", 2, "sum w z, sum w"),),
+        backward_file="output/depth_backward.cl",
+        blend_backward=takes("in float depth_raw  // 2 channels", "in float by_depth  // (h, w)"),
     ),
     "distortion": Layout(
         "output/distortion.cl",
         parts=("ray_depth",),
         samples=(Samples("float", "distortion_raw", 4, "the first m, W, sum w m, sum w m^2"),),
+        backward_file="output/distortion_backward.cl",
+        blend_backward=takes("in float distortion_raw  // 4 channels", "in float by_distortion  // (h, w)"),
     ),
     "depth_median": Layout(
         "output/depth_median.cl",
@@ -236,6 +260,9 @@ LAYOUTS: dict[str, Layout] = {
         parts=("coverage",),
         splat=(member("wide nx ny nz"),),
         samples=(Samples("float", "normal_raw", 3),),
+        backward_file="output/normal_backward.cl",
+        moments=(member("float nx ny nz"),),
+        blend_backward=takes("in float normal_raw  // 3 channels", "in float by_normal  // (h, w, 3)"),
     ),
     "normal_world": Layout("output/normal_world.cl", parts=("normal", "row_rotation")),
     "label": Layout(

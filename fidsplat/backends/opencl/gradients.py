@@ -19,15 +19,14 @@ from fidsplat.backends.gradients import (
     check_shape,
     gradient_shape,
 )
-from fidsplat.backends.opencl.counts import pairs_of
-from fidsplat.backends.opencl.gradients_again import Again
-from fidsplat.backends.opencl.gradients_source import (
+from fidsplat.backends.opencl.assemble import (
     assemble_gradients,
     assemble_step,
-    chunk_of,
-    group_of,
-    tape_bytes,
+    backward_chunk,
+    backward_items,
 )
+from fidsplat.backends.opencl.counts import pairs_of
+from fidsplat.backends.opencl.gradients_again import Again
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.launches import Launches
 from fidsplat.backends.opencl.picture import Picture
@@ -148,7 +147,7 @@ class OpenCLGradients:
         self._take_gradients(picture, gradients)
         tile = shape.tile_width * shape.tile_height
         features, in_groups = self._pipeline.features, shape.schedule == "group"
-        chunks = picture.pairs // chunk_of(features, shape) + picture.tiles
+        chunks = picture.pairs // backward_chunk(features, shape) + picture.tiles
         picture.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
         reserved = picture.take("reserved", 8)
         if not in_groups:
@@ -165,14 +164,22 @@ class OpenCLGradients:
             items = shape.blend_items
             picture.launch("blend backward", "blend_light", picture.tiles * items, items, log_ceiling=ceiling)
         else:
-            picture.take("tapes", tape_bytes(features, shape) * groups)
-        items = group_of(features, shape)
+            picture.take("tapes", self._tape_bytes() * groups)
+        items = backward_items(features, shape)
         picture.launch("blend backward", "blend_backward", groups * items, items, log_ceiling=ceiling)
         self._ask(drawn)
         if drawn.counted is not None:
             wanted = {f"by_{name}" for name in GRADIENT_OUTPUTS} & self._wanted
             self._again.keep_back(picture, first, gradients, wanted)
         return picture
+
+    def _tape_bytes(self) -> int:
+        """Size of the record `Tape` (schedule/lanes_backward.cl): light and opacity of each pixel for a
+        chunk's splats, two words for each of eight times as many splats, one more word; in whole vectors."""
+        shape = self._pipeline.shape
+        chunk, vector = backward_chunk(self._pipeline.features, shape), 4 * shape.lanes
+        words = 2 * 8 * chunk + 1
+        return 8 * chunk * shape.tile_width * shape.tile_height + -(-4 * words // vector) * vector
 
     def _with_slots(self, drawn: Picture) -> Picture:
         """The picture with the kernels of the way back, and what those leave that go through tiles."""

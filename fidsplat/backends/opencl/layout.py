@@ -55,7 +55,21 @@ BOUNDS = Record(
     ),
 )
 
+MOMENTS = Record(
+    "Moments",
+    (
+        member("float nu0 nux nuy", "by n_u: its derivatives times 1, x, y, summed over a tile"),
+        member("float nv0 nvx nvy"),
+        member("float d0 dx dy"),
+        member("float log_opacity"),
+        member("float r g b"),
+    ),
+    alignment=16,  # as few lines of a cache as can be
+)
+"""What a tile adds to the derivatives by a splat's record."""
+
 _SIZE = takes("int width height  // of the sample grid")
+_IMAGE_SIZE = takes("int width height  // of the picture")
 _BIG = takes("uint big_capacity", "in Bounds big_bounds")
 _DIGIT = takes("uint count  // places for the splats of a view", "in uint tallies", "uint first shift")
 _WALK = takes(
@@ -77,6 +91,32 @@ RAY_UNIFORMS = uniforms(
     "float ray_focal_x ray_focal_y ray_center_x ray_center_y",
     note="of the sample grid; infinite where depths are distances",
 )
+
+_TILES = takes("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _IMAGE_SIZE)
+_RESERVED = takes(
+    *("uint count", "in uint keys", _TILES),
+    "out uint splat_slots  // (n): the first of a splat's, which has one for each of its tiles",
+    "out uint reserved  // how many there are",
+)
+
+_BLENDED = takes(
+    "wide log_cut ceiling stop filter",
+    *("float log_ceiling", "float background_r background_g background_b"),
+    *("int stride  // of the padded picture", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
+)
+
+_LOSS_SIZE = takes(
+    "int width height  // values of a row: three of a pixel; rows",
+    "int stride  // floats of an image's row",
+    "uint image_stride  // floats of an image",
+)
+_MASK = takes("int masked", "in uchar mask  // (rows, pixels), where `masked`")
+_IMAGES = takes("out float images")
+_SURFACE = takes(
+    _IMAGE_SIZE,
+    "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
+)
+_DRAWN_SH = takes("uint count drawn all", "int plain")
 
 KERNELS: dict[str, tuple[Argument, ...]] = {
     "project": takes(
@@ -153,5 +193,126 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "in uint slots  // of each view: its place among the output images",
         *("float background_r background_g background_b", "in float raw"),
     ),
+    # derivatives
+    "reserve_slots": takes(
+        *(_RESERVED, "out uint big_rows  // (rows of tiles, big splats): tiles above, less the first column"),
+    ),
+    "blend_backward": takes(
+        *(
+            "in Splat splats",
+            "in uint lists starts",
+            "in uint2 windows",
+            "uint big_capacity",
+            _IMAGE_SIZE,
+            "in uint splat_slots big_rows",
+        ),
+        _BLENDED,
+        "out float checkpoints  // tiles' transmittances in front of every CHUNK splats",
+        "out float moments  // of the record Moments, by slots",
+        "out real tile_sums  // (tiles, 3) by the background",
+        "out float tapes  // a Tape for each work-item",
+        "out uint reserved  // its second word: tiles that are taken",
+    ),
+    "project_backward": takes(
+        *("uint count", "in View view", "cloud float means quats scales opacities"),
+        *("in Splat splats", "in uint keys", _TILES, "in uint splat_slots", "in float moments"),
+        "out float by_means  // (n, 3)",
+        "out float by_quats  // (n, 4)",
+        "out float by_scales  // (n, 2)",
+        "out float by_opacities  // (n)",
+        "out float screen  // (n)",
+        "out real group_sums  // (work-groups, 6) by the pose",
+    ),
+    "project_step": takes(
+        *("uint count", "in View view", "in Splat splats", "in uint keys", _TILES),
+        *("in uint splat_slots", "in float moments"),
+        "int counted move sparse  // sparse: splats that the picture does not depend on rest",
+        "uint all  // coefficients of a splat",
+        "float beta1 beta2 rest1 rest2 root epsilon",
+        "float size_means size_scales size_quats size_logits  // rates of this step",
+        "float size_sh size_rest  // of degree 0 and above",
+        "float scale_penalty opacity_penalty",
+        "out float gradients",
+        "out float means first_means second_means",
+        "out float log_scales first_log_scales second_log_scales",
+        "out float quats first_quats second_quats",
+        "out float logits first_logits second_logits",
+        "out float sh first_sh second_sh",
+        "out float drawn_quats drawn_scales drawn_opacities drawn_sh",
+    ),
+    "add_up": takes(
+        *("uint tiles groups", "in real tile_sums group_sums  // (tiles, 3), (groups, 6)"),
+        "out float background pose",
+    ),
+    # training
+    "loss_take": takes(_LOSS_SIZE, "in float rgb", "in uchar truth", _MASK, _IMAGES),
+    "loss_rows": takes(_LOSS_SIZE, _IMAGES),
+    "loss_columns": takes(_LOSS_SIZE, _IMAGES),
+    "loss_rows_backward": takes(_LOSS_SIZE, _IMAGES),
+    "loss_columns_backward": takes(
+        _LOSS_SIZE, "float l1_share ssim_share", _MASK, "in float images", "out float by_rgb"
+    ),
+    "loss_sums": takes("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
+    "loss_strips": takes(
+        *(_LOSS_SIZE, "in float rgb", "in uchar truth", _MASK),
+        *(_IMAGES, "out float sums  // (work-groups, 3)"),
+    ),
+    "loss_strips_backward": takes(
+        *(_LOSS_SIZE, "in float rgb", "in uchar truth", _MASK),
+        *("float l1_share ssim_share", "in float images", "out float by_rgb"),
+    ),
+    "surface_normals": takes(
+        _SURFACE,
+        _MASK,
+        "float normal_share  // of each pixel",
+        "in float depth normal alpha",
+        "out float by_normal",
+        "out float differences  // (rows, columns, 2, 3)",
+    ),
+    "surface_depths": takes(_SURFACE, "in float differences", "out float by_depth"),
+    "activate": takes(
+        "uint count",
+        "in float quats log_scales logits",
+        "out float drawn_quats drawn_scales drawn_opacities",
+    ),
+    "activate_sh": takes(_DRAWN_SH, "in float sh", "out float drawn_sh"),
+    "pick": takes(
+        "uint count row kept",
+        "in uint rows",
+        "in float before",
+        "out float picked",
+    ),
+    "count_seen": takes(
+        "uint count",
+        "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
+        "float move_x move_y move_z  // camera-space position of the means' zero [m]",
+        "float focal_x focal_y center_x center_y near width height",
+        "in float means drawn_scales",
+        "out float seen",
+    ),
+    "shake": takes(
+        "uint count seed_low seed_high iteration purpose",
+        "float size  // metres times 1 / m^2 of the steps",
+        "float steep clear  // of the opacity beyond which splats stay where they are",
+        "in float quats log_scales logits",
+        "out float means",
+    ),
 }
 """The arguments of each kernel; those of effects and outputs follow them."""
+
+GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
+    "reserve_slots": _RESERVED,
+    "blend_light": takes(
+        *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
+        "out float checkpoints  // of each pixel of CHUNK splats: light in front, its worth behind",
+        "out uint reached  // (tiles) chunks that light comes to",
+        "out uint chunk_tiles  // the tiles of chunks",
+        "out real tile_sums  // (tiles, 3) by the background",
+    ),
+    "blend_backward": takes(
+        *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots", _BLENDED),
+        *("in float checkpoints", "in uint reached chunk_tiles"),
+        "out float moments  // of the record Moments, by slots",
+    ),
+}
+"""Where work-groups share a tile."""

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.assemble import section_text
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import build_options, check_kernels
 from fidsplat.backends.opencl.workspace import BufferPool, Workspace
@@ -123,8 +122,7 @@ class OpenCLProbe:
     ) -> dict[str, np.ndarray]:
         """Kernels of check/arithmetic.cl."""
         workspace, n = self._workspace, len(exponents)
-        fast = section_text("slot/arithmetic_fast.cl", "arithmetic")
-        kernels = check_kernels(workspace, "check/arithmetic.cl", arithmetic=fast)
+        kernels = check_kernels(workspace, "check/arithmetic.cl", effects=("slot/arithmetic_fast.cl",))
 
         def run(kernel: str, items: int, made: np.ndarray, *given: Any) -> np.ndarray:
             values = [buffer_of(workspace, one) if isinstance(one, np.ndarray) else one for one in given]

@@ -6,13 +6,14 @@ import importlib
 import threading
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
-from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
+from fidsplat.backends.opencl.assemble import Source, assemble_check
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl
 from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_program
 from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
@@ -177,24 +178,15 @@ def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
 
 
 def check_kernels(
-    workspace: Workspace, file: str = "", text: str = "", lanes: int = 0, **sections: str
+    workspace: Workspace, file: str = "", text: str = "", lanes: int = 0, effects: Sequence[str] = ()
 ) -> dict[str, cl.Kernel]:
     """The kernels of a file below kernels/opencl/, or of a text, compiled as the stages are: after prelude.cl
-    and math.cl, whose hooks `sections` fill. lanes: 0 for the device's own.
+    and math.cl, whose hooks the files `effects` fill. lanes: 0 for the device's own.
 
     Raises:
         DeviceError: the compiler refuses.
     """
-    defines = {
-        "LANES": lanes or workspace.shape.lanes,
-        "FAST_FMA": int(workspace.shape.fast_fma),
-        "SETUP_FP64": int(workspace.info.float64),
-    }
-    head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
-    files = ("prelude.cl", "math.cl", *([file] if file else ()))
-    head += "".join(map(kernel_text, files))
-    for name, section in sections.items():
-        head = head.replace(f"//@@ {name}\n", section)
-    built = build(workspace, with_scalars(head) + text)
+    shape = replace(workspace.shape, lanes=lanes) if lanes else workspace.shape
+    built = build(workspace, assemble_check(file, shape, workspace.info.float64, effects) + text)
     load_invoker()
     return {kernel.function_name: kernel for kernel in built.all_kernels()}

@@ -12,22 +12,19 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
+from fidsplat.backends.opencl.assemble import assemble_training
 from fidsplat.backends.opencl.launches import Launch, Launches
 from fidsplat.backends.opencl.loss_sums import LATE, LossSums
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.training_source import (
-    MARGIN,
-    MARGIN_ROWS,
-    PANEL,
-    STRIP,
-    images_of,
-    training_source,
-)
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras import Camera
 from fidsplat.util.errors import DeviceError
 
 _GROUP = 64
+_MARGIN, _MARGIN_ROWS = 16, 5
+"""zeros around an image: floats of a row, and rows"""
+_PANEL, _STRIP = 128, 64
+"""values of a row, and rows, of a work-item on CPUs (kernels/opencl/train/loss_strips.cl)"""
 _SUMS, _SUMMED = 512, 128
 """work-groups that add up the loss, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
 _EACH_ROWS = 4
@@ -92,7 +89,7 @@ class OpenCLTraining:
         self._workspace = workspace
         lanes = lanes or (workspace.shape.lanes if workspace.shape.schedule == "lanes" else 1)
         self._lanes = lanes
-        source = training_source(lanes, workspace.info.float64, workspace.shape.fast_fma)
+        source = assemble_training(lanes, workspace.info.float64, workspace.shape.fast_fma)
         self._program = Program(workspace, source)
         self._held: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
@@ -191,7 +188,7 @@ class OpenCLTraining:
         rgb, (height, columns, _) = images.device_buffer("rgb")
         truth, size, strided = self._truths[view], 3 * height * columns, self._lanes > 1
         number, stride = truth.counted, self._stride(columns)
-        grid = (-(-3 * columns // PANEL), -(-height // STRIP)) if strided else (_SUMS,)
+        grid = (-(-3 * columns // _PANEL), -(-height // _STRIP)) if strided else (_SUMS,)
         sums = self._sums_of(math.prod(grid))
         slot, room = sums.take()
         given = {
@@ -205,7 +202,7 @@ class OpenCLTraining:
                 **{"by_rgb": slope.data, "ssim_share": dssim_weight / size},
                 **{"width": 3 * columns, "height": height, "stride": stride},
                 **{"images": self._room_for_images(height, columns)},
-                "image_stride": stride * (height + 2 * MARGIN_ROWS),
+                "image_stride": stride * (height + 2 * _MARGIN_ROWS),
             }
             if strided:
                 kernels = "loss_strips", "loss_strips_backward"
@@ -355,13 +352,13 @@ class OpenCLTraining:
         return self._sums[groups]
 
     def _stride(self, columns: int) -> int:
-        return -(-3 * columns // self._lanes) * self._lanes + 2 * MARGIN
+        return -(-3 * columns // self._lanes) * self._lanes + 2 * _MARGIN
 
     def _room_for_images(self, height: int, columns: int) -> cl.Buffer:
         """Images for pictures of this size, all zeros at first: kernels leave the margins so."""
         if self._loss_images is not None and self._loss_images[0] == (height, columns):
             return self._loss_images[1]
-        size = 4 * images_of(self._lanes) * self._stride(columns) * (height + 2 * MARGIN_ROWS)
+        size = 4 * (11 if self._lanes == 1 else 3) * self._stride(columns) * (height + 2 * _MARGIN_ROWS)
         self._loss_images = None  # the old ones go first
         buffer = self._workspace.pool.fresh("the loss's images", size)
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
