@@ -14,7 +14,7 @@ import imageio_ffmpeg
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.experiments.localise import FAMILY, RATE, VARIANTS, Localise
+from fidsplat.experiments.localise import FAMILY, RATE, VARIANTS, Drive
 from fidsplat.images.files import write_png
 from fidsplat.images.visualize import outlined, shrunk
 from fidsplat.vision.detect import detect
@@ -31,7 +31,7 @@ WAYS = {"as it was": (150, 150, 150), "by wheels and gyroscope": (209, 73, 91), 
 
 def main(out: str) -> None:
     """Draw it and write the file."""
-    asked, whole, renderer = Localise(), Localise().run(), fs.Renderer()
+    asked, whole, renderer = Drive(), Drive().run(), fs.Renderer()
     part = slice(*np.searchsorted(whole.times, (START, END)).tolist())
     run = Run(whole.times[part], whole.poses[part], whole.wheels[part], whole.gyro[part])
     pictures, sightings = [], []
@@ -51,7 +51,7 @@ def main(out: str) -> None:
         subprocess.run([*words, "-c:v", "libwebp_anim", "-quality", "55", "-loop", "0", out], check=True)
 
 
-def floor_plan(asked: Localise, ways: list[np.ndarray], height: int) -> np.ndarray:
+def floor_plan(asked: Drive, ways: list[np.ndarray], height: int) -> np.ndarray:
     """The greenhouse from above with the ways (n, 2) [m] so far, (height, MAP, 3) uint8; x is up."""
     house = asked.house
     sheet = np.full((height, MAP, 3), GROUND, np.uint8)

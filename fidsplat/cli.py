@@ -5,18 +5,17 @@
 
 import contextlib
 import errno
-import functools
 import inspect
 import io
-import operator
 import os
 import re
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
-from typing import Annotated, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+from fidsplat.commands import COMMANDS, CommandTable
 from fidsplat.util import interrupts
 from fidsplat.util.process_limits import check_imports
 
@@ -121,62 +120,67 @@ def _drop_output() -> None:
 
 
 def _parse(words: list[str]):
-    """The command that the words make. Raises SystemExit: 0 after help or the version, 2 after one line about
+    """The command object of the words. Raises SystemExit: 0 after help or the version, 2 after one line about
     what is wrong."""
     import tyro
 
     from fidsplat import __version__
-    from fidsplat.commands import COMMANDS
+    from fidsplat.commands.output import optional_values
+    from fidsplat.util.errors import InputError, unknown
 
     if not words:
-        _fail(
+        raise InputError(
             "no command; try `fidsplat demo` first, which makes, draws and reads markers here, then "
             "`fidsplat view fidsplat-demo/scene.toml`; "
-            f"`fidsplat --help` explains: {', '.join(COMMANDS)}",
-            2,
+            f"`fidsplat --help` explains: {', '.join(COMMANDS)}"
         )
-        raise SystemExit(2)
     if words == ["--version"]:
         print(f"fidsplat {__version__}")
         raise SystemExit(0)
-    known: dict[str, Any] = COMMANDS
+    known: Mapping[str, type] = COMMANDS
     kind: Any = None
     about, program = ABOUT, "fidsplat"
     while words and words[0] in known:
         kind, program = known[words[0]], f"{program} {words[0]}"
-        about = inspect.cleandoc(kind.__doc__)
+        about = inspect.cleandoc(kind.__doc__ or "")
         known, words = getattr(kind, "PARTS", {}), words[1:]
-    if known and not hasattr(kind, "run"):  # a group, and no word that leads on
-        if words and not words[0].startswith("-"):
-            from fidsplat.util.errors import unknown
-
-            _fail(f"{unknown('command', words[0], known)}; see {program} --help", 2)
-            raise SystemExit(2)
-        kind = _any_of(known)
+    if not hasattr(kind, "run"):  # a group of commands
+        if words and words[0] in ("-h", "--help"):
+            print(_group_help(program, about, known))
+            raise SystemExit(0)
+        given = unknown("command", words[0], known) if words else f"no command; known: {', '.join(known)}"
+        raise InputError(f"{given}; see {program} --help")
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
             # tyro runs lines that begin with a letter together; a space before each keeps them as they are
             about = "\n".join(f" {line}" for line in about.splitlines())
-            return tyro.cli(kind, prog=program, description=about, args=words, config=config)
+            return tyro.cli(
+                kind, prog=program, description=about, args=words, config=config, registry=optional_values
+            )
     except SystemExit as stop:
-        if stop.code not in (0, None):
-            _fail(f"{_one_line(said.getvalue())}; see {program} --help", 2)
-            raise SystemExit(2) from None
-        raise
+        if stop.code in (0, None):
+            raise
+        refused = stop.__context__
+        while refused is not None and not isinstance(refused, InputError):
+            refused = refused.__context__
+        message = str(refused) if refused else f"{_one_line(said.getvalue())}; see {program} --help"
+        raise InputError(message) from None
 
 
-def _any_of(commands: dict[str, type]) -> Any:
-    import tyro
-
-    return functools.reduce(
-        operator.or_,
-        (
-            Annotated[kind, tyro.conf.subcommand(name, description=str(kind.__doc__).partition("\n")[0])]
-            for name, kind in commands.items()
-        ),
-    )
+def _group_help(program: str, about: str, commands: Mapping[str, type]) -> str:
+    """The help of a group: what it is about, and its commands with their first docstring lines."""
+    width = max(map(len, commands)) + 2
+    lines = [f"usage: {program} COMMAND ...", "", about, "", "Commands:"]
+    for name in commands:
+        summary = (
+            commands.summary(name)
+            if isinstance(commands, CommandTable)
+            else str(commands[name].__doc__).partition("\n")[0]
+        )
+        lines.append(f"  {name:{width}}{summary}")
+    return "\n".join(lines)
 
 
 _NO_NUMBER = re.compile(r"Error parsing (\S+): .*(int\(\) with base 10|string to float): ('.*?'|\".*?\")")

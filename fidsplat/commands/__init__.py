@@ -1,49 +1,59 @@
-"""One module for each command: a dataclass of its options, whose ``run`` does the work and returns the exit
-status. Its docstring is what `fidsplat COMMAND --help` says, and the first line of that stands in the list of
-commands. A group of commands has PARTS instead, or as well: its commands by the word that follows.
+"""Commands: one dataclass of options each, whose method `run` does the work and returns the exit status.
 
-Nothing heavy is imported before ``run``, so that help and errors come at once.
+The docstring of a command is its help. Its options are its fields and those of the settings dataclasses that
+it nests or inherits. A group of commands has PARTS: its commands by name. A module is imported when its
+command is requested, so that `fidsplat --help` and errors come at once.
 """
 
-from fidsplat.commands.bench import Bench
-from fidsplat.commands.check import Check
-from fidsplat.commands.convert import Convert
-from fidsplat.commands.demo import Demo
-from fidsplat.commands.detect import Detect
-from fidsplat.commands.devices import Devices
-from fidsplat.commands.experiment import Experiment
-from fidsplat.commands.fly import Fly
-from fidsplat.commands.gallery import Gallery
-from fidsplat.commands.greenhouse import Greenhouse
-from fidsplat.commands.info import Info
-from fidsplat.commands.marker import Marker
-from fidsplat.commands.render import Render
-from fidsplat.commands.source import Source
-from fidsplat.commands.store import Store
-from fidsplat.commands.tradeoff import Tradeoff
-from fidsplat.commands.train import Train
-from fidsplat.commands.view import View
-from fidsplat.commands.warm import Warm
+import ast
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
 
-COMMANDS = {
-    "demo": Demo,
-    "devices": Devices,
-    "info": Info,
-    "marker": Marker,
-    "render": Render,
-    "view": View,
-    "fly": Fly,
-    "detect": Detect,
-    "convert": Convert,
-    "check": Check,
-    "bench": Bench,
-    "tradeoff": Tradeoff,
-    "warm": Warm,
-    "experiment": Experiment,
-    "gallery": Gallery,
-    "greenhouse": Greenhouse,
-    "train": Train,
-    "store": Store,
-    "source": Source,
-}
-"""Every command by its name, in the order in which help lists them."""
+
+class CommandTable(Mapping[str, type]):
+    """Command classes by name, imported on access."""
+
+    def __init__(self, **places: str) -> None:
+        self._places = places
+
+    def __getitem__(self, name: str) -> type:
+        module, _, kind = self._places[name].partition(".")
+        return getattr(import_module(f"{__name__}.{module}"), kind)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def summary(self, name: str) -> str:
+        """First docstring line of a command, read from its source without importing it."""
+        module, _, kind = self._places[name].partition(".")
+        tree = ast.parse(Path(__file__).with_name(f"{module}.py").read_text("utf-8"))
+        found = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind)
+        return (ast.get_docstring(found) or "").partition("\n")[0]
+
+
+COMMANDS = CommandTable(
+    demo="demo.Demo",
+    devices="devices.Devices",
+    info="info.Info",
+    marker="marker.Marker",
+    render="render.Render",
+    view="view.View",
+    fly="fly.Fly",
+    detect="detect.Detect",
+    convert="convert.Convert",
+    check="check.Check",
+    bench="bench.Bench",
+    tradeoff="tradeoff.Tradeoff",
+    warm="warm.Warm",
+    experiment="experiment.Experiment",
+    gallery="gallery.Gallery",
+    greenhouse="greenhouse.Greenhouse",
+    train="train.Train",
+    store="store.Store",
+    source="source.Source",
+)
+"""Every command, in the order of the help."""

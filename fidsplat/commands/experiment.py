@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 from fidsplat.commands.experiment_files import (
-    CATEGORY_HELP,
     Baseline,
     Blender,
     Dataset,
@@ -16,103 +15,61 @@ from fidsplat.commands.experiment_files import (
     write_report,
 )
 from fidsplat.commands.localise import Localise
-from fidsplat.commands.output import Json, console, counted, option, say, switch, tell
+from fidsplat.commands.output import Json, console, counted, option, repeatable, say, tell
 from fidsplat.commands.plants import Plants
 from fidsplat.commands.remote import RayAddress, measure_by
-from fidsplat.commands.sweeps import Names, Overwrite, Seed, asked, need_reports, run_sweeps
+from fidsplat.commands.sweeps import need_reports, run_sweeps
+from fidsplat.experiments.settings import (
+    AngleSettings,
+    ExperimentSettings,
+    ImageSettings,
+    MarkerSettings,
+    MeasureSettings,
+    RenderSettings,
+    ViewSettings,
+)
 from fidsplat.util.errors import InputError
 
-if TYPE_CHECKING:
-    from fidsplat.experiments.run import Options
 
-
-@dataclass
-class Basic:
-    """Options of every word that works on markers."""
+@dataclass(frozen=True)
+class Command(MarkerSettings):
+    """Options of every experiment."""
 
     out: Annotated[
-        str | None,
+        Path | None,
         option(
             "DIR",
             "folder for results (default: fidsplat-experiments, with --quick fidsplat-experiments-quick)",
             "-o",
         ),
     ] = None
-    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
-    seed: Seed = 0
     json: Json = False
 
-    def options(self) -> Options:
-        """The options as the experiments take them."""
-        from fidsplat.experiments.run import Options
 
-        # rough results and full ones do not mix
-        out = self.out or "fidsplat-experiments" + ("-quick" if getattr(self, "quick", False) else "")
-        return asked(Options, self, out=Path(out))
+@dataclass(frozen=True)
+class RayCommand(Command):
+    """Options of an experiment that a Ray cluster can measure."""
 
-
-@dataclass
-class Measuring(Basic):
-    """Options of the experiments that measure."""
-
-    quick: Annotated[bool, switch("a rough picture in minutes: one marker of each category")] = False
-    markers: Annotated[int | None, option("N", "of each category, 1 to 5 (default: 5, with --quick 1)")] = (
-        None
-    )
-    shard: Annotated[str | None, option("i/n", "measure the i-th of n shares, then see `merge`")] = None
-    overwrite: Overwrite = False
-
-
-@dataclass
-class Drawn:
-    """Options of what draws splats."""
-
-    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
-    mixture: Annotated[Names, option("NAME", "mixture of Gaussians, once more for each (default: all)")] = ()
-    trained: Annotated[
-        Path | None, option("DIR", "trained models for the 2DGS columns, as 2dgs-17/small-0.ply")
-    ] = None
-
-
-@dataclass
-class Threaded(Drawn, Measuring):
-    """Options of experiments that look at pictures in several threads."""
-
-    workers: Annotated[
-        int | None, option("N", "threads that look at pictures (default: one for each core)")
-    ] = None
     ray: RayAddress = None
 
 
-@dataclass
-class Compared(Threaded):
-    """Options of experiments that compare pictures."""
-
-    blender: Annotated[
-        Path | None, option("DIR", "Blender's pictures for `views` (default: blender in the results' folder)")
-    ] = None
-    lpips: Annotated[
-        Path | None,
-        option("FILE.npz", "weights for LPIPS in `views`; how to make the file: docs/experiments.md"),
-    ] = None
-
-
-def measure(names: tuple[str, ...], options: Options, as_json: bool, ray: str | None = None) -> int:
+def measure(names: tuple[str, ...], options: MeasureSettings, as_json: bool, ray: str | None = None) -> int:
     """Run experiments, each to its file, and say where; what is no time by the cluster of --ray, if there is
     one."""
     from fidsplat.experiments import counts
     from fidsplat.experiments.run import prepared
 
     away = tuple(name for name in names if ray is not None and name != counts.NAME)
-    files = {} if ray is None else measure_by(ray, away, options)
+    files = measure_by(ray, away, options) if ray and isinstance(options, ImageSettings) else {}
     with prepared([name for name in names if name not in away], options) as sweeps:
         run_sweeps(sweeps)
         files |= {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
     return tell(as_json, {"files": files}, *files.values())
 
 
-@dataclass
-class Angles(Threaded):
+@repeatable
+@dataclass(frozen=True)
+class Angles(RayCommand, AngleSettings):
     """The largest tilt at which each detector finds and reads each marker (table 3).
 
     Every tilt from 0 to 89.8 degrees in steps of 0.2 is drawn and shown to every detector: for tags OpenCV's
@@ -127,16 +84,13 @@ class Angles(Threaded):
       fidsplat experiment angles --shard 1/4 --device opencl:nvidia
     """
 
-    protocol: Annotated[Names, option("NAME", "fixed-plane or fixed-module (default: both)")] = ()
-    tilts: Annotated[str | None, option("A:B:STEP", "degrees, joined by commas (default: 0:89.8:0.2)")] = None
-    ideal: Annotated[bool, switch("only the ideal texture: the ceiling of the detectors")] = False
-
     def run(self) -> int:
-        return measure(("angles",), self.options(), self.json, self.ray)
+        return measure(("angles",), self, self.json, self.ray)
 
 
-@dataclass
-class Views(Compared):
+@repeatable
+@dataclass(frozen=True)
+class Views(RayCommand, ViewSettings):
     """PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
 
     Ground truth: the exact renderer (a pixel is the mean of its square), the same with means of linear light,
@@ -150,11 +104,12 @@ class Views(Compared):
     """
 
     def run(self) -> int:
-        return measure(("views",), self.options(), self.json, self.ray)
+        return measure(("views",), self, self.json, self.ray)
 
 
-@dataclass
-class Counts(Measuring):
+@repeatable
+@dataclass(frozen=True)
+class Counts(Command, MeasureSettings):
     """Components, rectangles, Gaussians and seconds of each marker (table 2, figure).
 
     Squares of modules, runs of rows and the minimum partition, for every mixture. The time is that from the
@@ -166,11 +121,12 @@ class Counts(Measuring):
     """
 
     def run(self) -> int:
-        return measure(("counts",), self.options(), self.json)
+        return measure(("counts",), self, self.json)
 
 
-@dataclass
-class Localisation(Threaded):
+@repeatable
+@dataclass(frozen=True)
+class Localisation(RayCommand, ImageSettings):
     """Pose errors of AprilTags and small QR codes by distance and tilt.
 
     Codes of 0.16 m; 1280 x 720, 60 degrees; 0.5 to 4 m, 0 to 70 degrees; corners by `fidsplat detect`. The
@@ -187,11 +143,12 @@ class Localisation(Threaded):
 
         if self.category and not set(self.category) & set(LOCATED):
             raise InputError(f"localisation is of {' and '.join(LOCATED)}, not of {', '.join(self.category)}")
-        return measure(("localisation",), self.options(), self.json, self.ray)
+        return measure(("localisation",), self, self.json, self.ray)
 
 
-@dataclass
-class Pictures(Drawn, Basic):
+@repeatable
+@dataclass(frozen=True)
+class Pictures(Command, RenderSettings):
     """Draw sheets of marker 0 of each category, by every method, at tilts of 0, 45 and 70 degrees.
 
     The report takes them in.
@@ -202,27 +159,27 @@ class Pictures(Drawn, Basic):
     """
 
     def run(self) -> int:
-        files = draw_sheets(self.options())
+        files = draw_sheets(self)
         return tell(self.json, {"files": files}, *files)
 
 
-def draw_sheets(options: Options) -> list[str]:
+def draw_sheets(options: RenderSettings) -> list[str]:
     """Draw the sheets with a progress bar; returns the files."""
     from fidsplat.experiments.methods import Painter
     from fidsplat.experiments.pictures import write_sheets
-    from fidsplat.experiments.run import check
     from fidsplat.experiments.setup import chosen_categories
     from fidsplat.render.renderer import Renderer
 
-    check(options)
+    options.check()
     categories = chosen_categories(options.category)
     painter = Painter(Renderer(options.device), options.trained)
-    sheets = write_sheets(categories, options.methods, painter, options.seed, options.out)
+    sheets = write_sheets(categories, options.methods, painter, options.seed, options.folder)
     return [str(file) for file in counted("pictures", sheets, len(categories))]
 
 
-@dataclass
-class All(Compared):
+@repeatable
+@dataclass(frozen=True)
+class All(RayCommand, ExperimentSettings):
     """Counts, localisation, views and angles, then the report.
 
     --quick takes under five minutes on two cores. A run that was stopped loses nothing that was finished: the
@@ -236,17 +193,16 @@ class All(Compared):
     """
 
     def run(self) -> int:
-        from fidsplat.experiments.run import NAMES, check
+        from fidsplat.experiments.run import NAMES
 
-        options = self.options()
-        check(options)
+        self.check()
         if self.shard is None:
             need_reports()
-        status = measure(NAMES, options, self.json, self.ray)
+        status = measure(NAMES, self, self.json, self.ray)
         if self.shard is not None:
             return status
-        draw_sheets(options)
-        say(console(True), f"report in {write_report([options.out], options.out)[0]}")
+        draw_sheets(self)
+        say(console(True), f"report in {write_report([self.folder], self.folder)[0]}")
         return status
 
 

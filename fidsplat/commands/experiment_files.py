@@ -7,26 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from fidsplat.commands.output import Device, Json, console, counted, option, switch, tell
+from fidsplat.commands.output import Device, Json, console, counted, option, repeatable, switch, tell
 from fidsplat.commands.sweeps import (
+    BlenderEnvironment,
     Folders,
-    Names,
-    Overwrite,
     ReportTo,
-    Seed,
-    asked,
     need_reports,
     run_in_turn,
 )
+from fidsplat.experiments.settings import CountedSettings
+from fidsplat.experiments.trained import BaselineSettings
 from fidsplat.util.errors import InputError
 
-CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
 
-
-@dataclass
-class Dataset:
+@repeatable
+@dataclass(frozen=True)
+class Dataset(CountedSettings):
     """Write the data set of section 4.1: 100 scenes for COLMAP, 25 markers x 4 collections.
 
     Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Scenes that
@@ -37,43 +33,39 @@ class Dataset:
       fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender
     """
 
-    out: Annotated[str, option("DIR", "folder for the scenes (default: fidsplat-dataset)", "-o")] = (
+    out: Annotated[Path, option("DIR", "folder for the scenes (default: fidsplat-dataset)", "-o")] = Path(
         "fidsplat-dataset"
     )
-    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
-    markers: Annotated[int, option("N", "of each category, 1 to 5 (default: 5)")] = 5
     truth: Annotated[
-        str,
-        option("NAME", "who draws: exact, exact-linear, blender-standard or blender-raw (default: exact)"),
+        str, option("NAME", "renderer: exact, exact-linear, blender-standard or blender-raw (default: exact)")
     ] = "exact"
-    blender: Annotated[Path, option("DIR", "Blender's pictures (default: fidsplat-experiments/blender)")] = (
+    blender: Annotated[Path, option("DIR", "Blender's images (default: fidsplat-experiments/blender)")] = (
         Path("fidsplat-experiments/blender")
     )
-    seed: Seed = 0
     json: Json = False
 
     def run(self) -> int:
         from fidsplat.experiments.blender import check_pictures
         from fidsplat.experiments.dataset import dataset_scenes, write_scene
-        from fidsplat.experiments.setup import MARKERS, chosen_categories
+        from fidsplat.experiments.setup import chosen_categories
         from fidsplat.experiments.views import TRUTHS
         from fidsplat.util.files import writable_folder
 
         if self.truth not in TRUTHS:
             raise InputError(f"unknown truth {self.truth!r}; known: {', '.join(TRUTHS)}")
-        if not 1 <= self.markers <= MARKERS:
-            raise InputError(f"--markers is {self.markers}; each category has 1 to {MARKERS}")
+        self.check()
         if self.truth.startswith("blender-"):
             check_pictures(self.blender, self.truth.removeprefix("blender-"), self.seed)
         folder = writable_folder(self.out)
-        wanted = dataset_scenes(chosen_categories(self.category), self.markers)
+        wanted = dataset_scenes(chosen_categories(self.category), self.marker_count)
         scenes = (write_scene(part, folder, self.seed, self.truth, self.blender) for part in wanted)
         names = [scene.name for scene in counted("scenes", scenes, len(wanted))]
         return tell(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
 
 
-@dataclass
-class Baseline:
+@repeatable
+@dataclass(frozen=True)
+class Baseline(BaselineSettings):
     """Train the paper's baseline: 2DGS on 3, 5, 9 and 17 views of each marker, 7,000 iterations.
 
     Writes the data set's scenes where they are missing, the splats as 2dgs-17/small-0.ply and the like, and
@@ -88,42 +80,26 @@ class Baseline:
       fidsplat experiment report fidsplat-experiments fidsplat-baseline
     """
 
-    out: Annotated[str, option("DIR", "folder for splats and results (default: fidsplat-baseline)", "-o")] = (
-        "fidsplat-baseline"
-    )
-    dataset: Annotated[Path, option("DIR", "of `experiment dataset` (default: fidsplat-dataset)")] = Path(
-        "fidsplat-dataset"
-    )
+    out: Annotated[
+        Path | None, option("DIR", "folder for splats and results (default: fidsplat-baseline)", "-o")
+    ] = None
     device: Device = None
-    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
-    markers: Annotated[int, option("N", "of each category, 1 to 5 (default: 5)")] = 5
-    views: Annotated[
-        tyro.conf.UseAppendAction[tuple[int, ...]],
-        option("N", "3, 5, 9 or 17, once more for each (default: all)"),
-    ] = ()
-    iterations: Annotated[int, option("N", "of each training (default: 7000)")] = 7000
-    seeds: Annotated[int, option("N", "trainings of each, by other random numbers (default: 1)")] = 1
-    seed: Seed = 0
-    shard: Annotated[str | None, option("i/n", "train the i-th of n shares, then see `merge`")] = None
-    workers: Annotated[int, option("N", "threads that look at pictures (default: 2)")] = 2
-    overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.trained import Baseline as Wanted
         from fidsplat.experiments.trained import baseline_sweeps
         from fidsplat.render.renderer import Renderer
 
-        wanted = asked(Wanted, self, out=Path(self.out))
-        wanted.check()  # says what is wrong before the device is opened
-        with baseline_sweeps(wanted, Renderer(self.device)) as sweeps:
+        self.check()  # before the device is opened
+        with baseline_sweeps(self, Renderer(self.device)) as sweeps:
             run_in_turn("baseline", sweeps)
             files = {sweep.name: str(sweep.results.file) for sweep in sweeps}
         return tell(self.json, {"files": files}, *files.values())
 
 
-@dataclass
-class Blender:
+@repeatable
+@dataclass(frozen=True)
+class Blender(CountedSettings):
     """Draw every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
 
     --install makes a virtual environment of its own (about 1 GB, Python 3.11 needed) with bpy. Without it,
@@ -137,47 +113,43 @@ class Blender:
     """
 
     out: Annotated[
-        str, option("DIR", "folder for the pictures (default: fidsplat-experiments/blender)", "-o")
-    ] = "fidsplat-experiments/blender"
+        Path, option("DIR", "folder for the images (default: fidsplat-experiments/blender)", "-o")
+    ] = Path("fidsplat-experiments/blender")
     install: Annotated[bool, switch("install Blender instead of rendering")] = False
-    environment: Annotated[
-        Path | None,
-        option("DIR", "Blender's virtual environment (default: fidsplat/blender in the user's cache)"),
-    ] = None
-    view: Annotated[Names, option("NAME", "standard or raw (default: both)")] = ()
-    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
-    markers: Annotated[int, option("N", "of each category, 1 to 5 (default: 5)")] = 5
-    training: Annotated[bool, switch("the training views as well")] = False
-    samples: Annotated[int, option("N", "for each pixel (default: 64)")] = 64
-    threads: Annotated[int | None, option("N", "of Cycles (default: one for each core)")] = None
-    seed: Seed = 0
+    environment: BlenderEnvironment = None
+    view: tuple[str, ...] = ()
+    """View transform: standard or raw. By default both."""
+    training: Annotated[bool, switch("render the training views as well")] = False
+    samples: int = 64
+    """Samples per pixel."""
+    threads: Annotated[int | None, option("N", "threads of Cycles (default: one per core)")] = None
     json: Json = False
 
     def run(self) -> int:
         from fidsplat.experiments import blender
-        from fidsplat.experiments.setup import MARKERS, chosen_categories
+        from fidsplat.experiments.setup import chosen_categories
 
         environment = self.environment or blender.default_environment()
         if self.install:
             with console(self.json).status("") as status:
                 python = blender.install(environment, status.update)
             return tell(self.json, {"python": str(python)}, f"Blender is in {environment}")
-        if not (1 <= self.markers <= MARKERS and self.samples >= 1):
-            raise InputError(f"--markers must be 1 to {MARKERS} and --samples at least 1")
-        if self.threads is not None and self.threads < 1:
-            raise InputError(f"--threads is {self.threads}; at least 1 thread draws")
+        self.check()
+        for name in ("samples", "threads"):
+            if (number := getattr(self, name)) is not None and number < 1:
+                raise InputError(f"--{name} must be at least 1, got {number}")
         views = self.view or blender.VIEW_NAMES
         categories = chosen_categories(self.category)
         for view in views:
             blender.ready(view, environment)
-        folder, done = Path(self.out), 0
+        folder, done = self.out, 0
         for view in views:
             blender.note_pictures(folder, view, self.seed, self.samples)
         for view in views:
             jobs = [
                 blender.marker_job(category, index, self.seed, folder, view, self.training)
                 for category in categories
-                for index in range(self.markers)
+                for index in range(self.marker_count)
             ]
             drawn = blender.render(jobs, view, environment, self.samples, threads=self.threads)
             done += len(list(counted(f"view {view}", drawn, sum(len(job["shots"]) for job in jobs))))

@@ -1,11 +1,13 @@
 """`fidsplat greenhouse`."""
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import dataclass, field
+from typing import Annotated
 
 from fidsplat.commands.output import Json, Overwrite, option, tell
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of, writable_folder
+from fidsplat.worlds.greenhouse import Greenhouse as World
+from fidsplat.worlds.greenhouse import GreenhouseSettings
 
 
 @dataclass
@@ -24,13 +26,7 @@ class Greenhouse:
     """
 
     out: Annotated[str, option("DIR", "folder (default: greenhouse)", "-o")] = "greenhouse"
-    rows: Annotated[int, option("N", "of plants (default: 8)")] = 8
-    plants: Annotated[int, option("N", "in each row (default: 12)")] = 12
-    seed: Annotated[int, option("N", "of the plants and the floor (default: 0)")] = 0
-    mixture: Annotated[
-        Literal["exact", "fitted", "facets", "paper"] | None,
-        option("NAME", "of the markers (default: exact)"),
-    ] = None
+    settings: GreenhouseSettings = field(default_factory=GreenhouseSettings)
     plants_from: Annotated[
         str | None, option("DIR", "KIND-NUMBER.ply to take plants from (default: grown as disks)")
     ] = None
@@ -38,21 +34,22 @@ class Greenhouse:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.worlds.greenhouse import Greenhouse as Made
         from fidsplat.worlds.plants import load_plants
 
         stock = None if self.plants_from is None else load_plants(self.plants_from)
-        made = Made(self.rows, self.plants, self.seed, self.mixture, stock)
+        settings = self.settings
+        made = World(**vars(settings), stock=stock)
         folder = path_of(self.out)
         scene_file, model = folder / "greenhouse.toml", folder / "greenhouse.xml"
         if scene_file.exists() and not self.overwrite:
             raise InputError(f"{scene_file} is there already; give another folder, or --overwrite")
+        scene = made.scene
         writable_folder(folder)
         with atomic_write(model) as stream:
             stream.write(made.mjcf().encode())
-        made.scene.save(scene_file)  # last: by it the next run knows that all is there
-        splats, markers = len(made.scene.cloud()), len(made.markers)
+        scene.save(scene_file)  # last: by it the next run knows that all is there
+        plants, splats, markers = settings.rows * settings.plants, len(scene.cloud()), len(made.markers)
         facts = {"scene": str(scene_file), "model": str(model), "splats": splats, "markers": markers}
-        facts |= {"rows": self.rows, "plants": self.rows * self.plants, "length_m": made.length}
-        words = f"{self.rows * self.plants} plants in {self.rows} rows, {splats} splats, {markers} markers"
+        facts |= {"rows": settings.rows, "plants": plants, "length_m": made.length}
+        words = f"{plants} plants in {settings.rows} rows, {splats} splats, {markers} markers"
         return tell(self.json, facts, words, f"draw it: fidsplat render {scene_file}")

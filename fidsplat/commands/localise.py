@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from fidsplat.commands.output import Device, Json, console, late_progress, option, switch, tell
+from fidsplat.experiments.localise import Drive
 
 if TYPE_CHECKING:
-    from fidsplat.experiments.localise import Localise as Asked
     from fidsplat.render.renderer import Renderer
 
 
@@ -32,8 +32,7 @@ class Localise:
 
     out: Annotated[str, option("DIR", "folder (default: fidsplat-localise)", "-o")] = "fidsplat-localise"
     quick: Annotated[bool, switch("one row of four plants, and the first three variants")] = False
-    rows: Annotated[int, option("N", "of plants (default: 5, a path of 60 m)")] = 5
-    plants: Annotated[int, option("N", "in each row (default: 12)")] = 12
+    drive: Drive = field(default_factory=Drive)
     variant: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         option("NAME", "what to compare, once more for each (default: all)"),
@@ -44,7 +43,6 @@ class Localise:
     video: Annotated[
         str | None, option("FILE.mp4", "the pictures of `exact` as a video as well (extra: video)")
     ] = None
-    seed: Annotated[int, option("N", "of plants and of errors of the sensors (default: 0)")] = 0
     device: Device = None
     overwrite: Annotated[bool, switch("measure again what is in the folder")] = False
     json: Json = False
@@ -53,14 +51,13 @@ class Localise:
         import fidsplat as fs
         from fidsplat.commands.sweeps import need_reports
         from fidsplat.experiments.localise import VARIANTS
-        from fidsplat.experiments.localise import Localise as Asked
         from fidsplat.images.video import check_video
         from fidsplat.util.provenance import digest_of
 
         need_reports()
         from fidsplat.experiments.localise_sweep import drive_sweep, found_of, table_of, write_report
 
-        asked = Asked(1, 4, self.seed) if self.quick else Asked(self.rows, self.plants, self.seed)
+        asked = replace(self.drive, rows=1, plants=4) if self.quick else self.drive
         names = list(self.variant) or (list(VARIANTS)[:3] if self.quick else list(VARIANTS))
         if self.video is not None:
             check_video(self.video)
@@ -95,7 +92,7 @@ class Localise:
             table=(f"{length:.1f} m", rows.columns, rows.itertuples(index=False)),
         )
 
-    def _record(self, asked: Asked, renderer: Renderer, source: str | None) -> None:
+    def _record(self, asked: Drive, renderer: Renderer, source: str | None) -> None:
         """Write the log and the video. source: of the log; None: a run that was stopped has written it."""
         from fidsplat.experiments.localise import RATE, VARIANTS, write_log
         from fidsplat.images.video import write_video

@@ -9,10 +9,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
@@ -24,6 +27,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Table = tuple[str, Sequence[str], Iterable[Sequence[object]]]
 """title, heads and rows, as of `print_table`"""
+
+
+repeatable = tyro.conf.configure(tyro.conf.UseAppendAction)
+"""Decorator of a command whose options of several values are repeated, one value each."""
 
 
 def option(metavar: str, text: str, short: str | None = None):
@@ -68,6 +75,25 @@ MemoryBudget = Annotated[
     str | None,
     option("SIZE", "of the device, for a picture and its splats, e.g. 2GiB (default: nine tenths of it)"),
 ]
+
+
+optional_values = ConstructorRegistry()
+"""tyro's rules for values, with one for options that may be left out: their help names the type alone."""
+
+
+@optional_values.primitive_rule
+def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if get_origin(info.type) not in (Union, UnionType) or len(kinds) != 1:
+        return None
+    of = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
+    if not isinstance(of, PrimitiveConstructorSpec):
+        return None
+    return replace(
+        of,
+        is_instance=lambda value: value is None or of.is_instance(value),
+        str_from_instance=lambda value: ["none"] if value is None else of.str_from_instance(value),
+    )
 
 
 def switch(text: str):

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from fidsplat.commands.output import Device, Json, console, late_progress, option, tell
-from fidsplat.commands.sweeps import Names, asked
+from fidsplat.commands.output import Device, Json, console, late_progress, option, repeatable, tell
+from fidsplat.commands.sweeps import BlenderEnvironment
+from fidsplat.experiments.plants import PlantSettings
 
 
+@repeatable
 @dataclass
 class Plants:
     """Make plants in Blender: grown as meshes, drawn from many poses, and trained by our trainer.
@@ -27,17 +29,8 @@ class Plants:
     """
 
     out: Annotated[str, option("DIR", "folder (default: fidsplat-plants)", "-o")] = "fidsplat-plants"
-    kind: Annotated[Names, option("NAME", "tomato, cucumber or lettuce, once for each (default: all)")] = ()
-    each: Annotated[int, option("N", "plants of a kind (default: 2)")] = 2
-    views: Annotated[int, option("N", "pictures of each to train on (default: 24)")] = 24
-    samples: Annotated[int, option("N", "of Blender for each pixel (default: 16)")] = 16
-    splats: Annotated[int, option("N", "of each (default: 5000)")] = 5000
-    iterations: Annotated[int, option("N", "of training (default: 1500)")] = 1500
-    seed: Annotated[int, option("N", "of the plants (default: 0)")] = 0
-    environment: Annotated[
-        Path | None,
-        option("DIR", "Blender's virtual environment (default: fidsplat/blender in the user's cache)"),
-    ] = None
+    settings: PlantSettings = field(default_factory=PlantSettings)
+    environment: BlenderEnvironment = None
     device: Device = None
     json: Json = False
 
@@ -45,10 +38,11 @@ class Plants:
         from fidsplat.experiments import plants
         from fidsplat.experiments.blender import default_environment
 
-        wanted = asked(plants.Plants, self, kinds=self.kind or None)
         environment = self.environment or default_environment()
         with late_progress(console(True)) as progress:
-            made = list(plants.write_plants(wanted, Path(self.out), environment, self.device, progress))
+            made = list(
+                plants.write_plants(self.settings, Path(self.out), environment, self.device, progress)
+            )
         facts = {"plants": [{"file": str(file), "psnr": score} for file, score in made]}
         rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in made]
         return tell(self.json, facts, table=("plants", ("file", "PSNR of test views [dB]"), rows))

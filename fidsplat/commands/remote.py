@@ -9,7 +9,7 @@ from fidsplat.commands.sweeps import words
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
-    from fidsplat.experiments.run import Options
+    from fidsplat.experiments.settings import ImageSettings
 
 RayAddress = Annotated[
     str | None,
@@ -28,7 +28,7 @@ def check_workers(ray: str | None, workers: int | None) -> None:
         raise InputError(f"--workers is {workers}; give at least 1, and --ray ADDRESS")
 
 
-def measure_by(ray: str, names: tuple[str, ...], options: Options) -> dict[str, str]:
+def measure_by(ray: str, names: tuple[str, ...], options: ImageSettings) -> dict[str, str]:
     """Let a cluster measure experiments; returns the files of their results."""
     from fidsplat.experiments.run import points_of, results_of
     from fidsplat.remote.experiments import ExperimentWork, measure

@@ -3,37 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import counted, option, switch, writable_file
+from fidsplat.commands.output import counted, option, writable_file
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.sweep import Key, Record, Sweep
 
-T = TypeVar("T")
-
-Names = tyro.conf.UseAppendAction[tuple[str, ...]]
-"""an option that may be given several times"""
 Folders = tyro.conf.Positional[tuple[str, ...]]
-Seed = Annotated[int, option("N", "of texts and views (default: 0)")]
-Overwrite = Annotated[bool, switch("measure again what is in the results' folder")]
+BlenderEnvironment = Annotated[
+    Path | None,
+    option("DIR", "Blender's virtual environment (default: fidsplat/blender in the user's cache)"),
+]
 ReportTo = Annotated[
     str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
 ]
-
-
-def asked(kind: type[T], command: object, **others: object) -> T:
-    """What a command was asked for, as its work takes it: a dataclass of that kind, whose values are `others`
-    and the options of its fields' names. What is None, or no option, is left to its default."""
-    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
-    given: dict[str, Any] = {name: getattr(command, name, None) for name in names}
-    return kind(**{name: value for name, value in (given | others).items() if value is not None})
 
 
 def need_reports(

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from fidsplat.commands.output import Devices, Json, option, switch, tell
+from fidsplat.commands.output import Devices, Json, option, tell
 from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
 from fidsplat.commands.sweeps import (
     Folders,
-    Overwrite,
     ReportTo,
-    asked,
     check_plot,
     need_reports,
     run_sweeps,
     words,
 )
+from fidsplat.experiments.tradeoff.run import TradeoffSettings
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
 
@@ -87,15 +86,9 @@ class Tradeoff:
         ),
     ] = None
     device: Devices = ()
-    scenes: Annotated[tuple[str, ...], option("NAME...", "scenes (default: all; --quick: four)")] = ()
+    settings: TradeoffSettings = field(default_factory=TradeoffSettings)
     scene: OwnScenes = ()
     cameras: Cameras = None
-    knobs: Annotated[
-        tuple[str, ...],
-        option("NAME...", "knobs of Quality, or preset, marker, together (default: all)"),
-    ] = ()
-    quick: Annotated[bool, switch("few values, few frames, four scenes")] = False
-    overwrite: Overwrite = False
     plot: Annotated[
         str | None,
         option("FILE.svg", "a chart of time against error as well, or FILE.png (extra: experiments)"),
@@ -103,20 +96,20 @@ class Tradeoff:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.tradeoff.run import Options, prepared
+        from fidsplat.experiments.tradeoff.run import prepared
         from fidsplat.experiments.tradeoff.scenes import own_pictures
         from fidsplat.render.renderer import default_device
 
         if self.plot is not None:
             check_plot(self.plot, "pandas")
-        folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.quick else ""))
+        folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.settings.quick else ""))
         devices = tuple(dict.fromkeys(self.device)) or (default_device(),)
-        own = own_pictures(own_scenes_of(self.scene, self.cameras, self.scenes))
+        own = own_pictures(own_scenes_of(self.scene, self.cameras, self.settings.scenes))
         folders = [folder / name.replace(":", "-") for name in devices] if len(devices) > 1 else [folder]
         with ExitStack() as stack:
             # all are opened first: one that is not there is said before minutes of another
             sweeps = [
-                stack.enter_context(prepared(asked(Options, self, out=out, device=device, own=own)))
+                stack.enter_context(prepared(self.settings, out, device, own))
                 for out, device in zip(folders, devices, strict=True)
             ]
             measured = run_sweeps(sweeps)

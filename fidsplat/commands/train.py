@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,7 +24,8 @@ from fidsplat.commands.output import (
     tell,
     writable_file,
 )
-from fidsplat.commands.sweeps import asked, need_reports
+from fidsplat.commands.sweeps import need_reports
+from fidsplat.train.settings import TrainSettings
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
@@ -54,19 +55,10 @@ class Train:
     dataset: Annotated[tyro.conf.Positional[str], option("DATASET", "folder, or transforms.json")]
     out: Annotated[str, option("FILE.ply", "where the splats go", "-o")]
     device: Device = None
-    iterations: Annotated[int, option("N", "views that are looked at (default: 7000)")] = 7000
-    strategy: Annotated[
-        str,
-        option(
-            "NAME", "default: the 2DGS authors' densification; mcmc: up to --max-splats (default: default)"
-        ),
-    ] = "default"
-    max_splats: Annotated[int, option("N", "most splats (default: 1000000)")] = 1_000_000
+    settings: TrainSettings = field(default_factory=TrainSettings)
     within_memory: Annotated[
         float | None, option("GIB", "of splats and pictures while training: fewer splats where it needs them")
     ] = None
-    sh_degree: Annotated[int, option("N", "of the colours, 0 to 3 (default: 3)")] = 3
-    seed: Annotated[int, option("N", "of all random numbers (default: 0)")] = 0
     hold_out: Annotated[
         int | None, option("N", "keep every N-th view to compare with, 0 for none (default: see above)")
     ] = None
@@ -83,20 +75,20 @@ class Train:
 
     def run(self) -> int:
         from fidsplat.render.renderer import Renderer
-        from fidsplat.train import Trainer, TrainSettings, load_dataset, splats_within
+        from fidsplat.train import Trainer, load_dataset, splats_within
 
         if path_of(self.out).suffix.lower() != ".ply":
             raise InputError(f"-o is {self.out}; splats are written as PLY: name a file that ends in .ply")
         if self.report is not None:
             need_reports()
-        settings = asked(TrainSettings, self)
+        settings = self.settings
         file = writable_file(self.out)
         checkpoint = file.with_suffix(".training.npz")
         if file.exists() and not checkpoint.exists():  # it is not of this training
             new_file(file, self.overwrite)
         where = console(self.json)
         with late_progress(console(True)) as progress:
-            dataset = load_dataset(self.dataset, self.hold_out, self.random_points, self.seed, progress)
+            dataset = load_dataset(self.dataset, self.hold_out, self.random_points, settings.seed, progress)
         if self.within_memory is not None:
             settings = splats_within(settings, _bytes(self.within_memory), dataset)
         with where.status("opening the device"):

@@ -86,14 +86,17 @@ effects, speeds, and how far away tags are used"""
 
 
 @dataclass(frozen=True)
-class Localise:
-    """The experiment. Raises InputError for a greenhouse that cannot be."""
+class Drive:
+    """A robot's drive through a greenhouse. Raises InputError for an impossible greenhouse."""
 
     rows: int = 5
+    """Number of rows of plants; 5 make a path of 60 m."""
     plants: int = 12
+    """Number of plants in each row."""
     seed: int = 0
+    """Seed of the plants and of the sensors' errors."""
     speed: float = 0.5
-    """metres a second"""
+    """Speed in metres per second."""
 
     @cached_property
     def house(self) -> Greenhouse:
@@ -244,7 +247,7 @@ def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
 
 
 def write_log(
-    asked: Localise, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
+    asked: Drive, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
 ) -> Iterator[np.ndarray]:
     """One variant's drive as a log: pictures (JPEG), intrinsics, detections, the gyroscope, where the camera
     is (/tf) and where the robot takes itself to be (/odom). Yields the pictures as they are logged. source:

@@ -13,7 +13,7 @@ import pandas as pd
 
 from fidsplat.cameras import Trajectory
 from fidsplat.experiments.charts import COLOURS, chart, legend_above
-from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Localise, Variant
+from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Drive, Variant
 from fidsplat.experiments.pages import fixed, write_page
 from fidsplat.experiments.summary import Frame
 from fidsplat.experiments.sweep import Key, Results, Sweep
@@ -39,7 +39,7 @@ _SPANS = (
 
 def drive_sweep(
     out: Path,
-    asked: Localise,
+    asked: Drive,
     names: Sequence[str],
     renderer: Renderer,
     tell: Callable[[str, float], object],
@@ -67,7 +67,7 @@ class _Drive:
     """Measures variants one by one; drives and detections that several share are kept."""
 
     def __init__(
-        self, folder: Path, asked: Localise, renderer: Renderer, tell: Callable[[str, float], object]
+        self, folder: Path, asked: Drive, renderer: Renderer, tell: Callable[[str, float], object]
     ) -> None:
         self._folder, self._asked, self._renderer, self._tell = folder, asked, renderer, tell
         self._runs: dict[float | None, Run] = {}
@@ -137,7 +137,7 @@ def table_of(found: Found) -> Frame:
     )
 
 
-def write_report(folder: Path, asked: Localise, device: str, found: Found) -> Path:
+def write_report(folder: Path, asked: Drive, device: str, found: Found) -> Path:
     """The page, with its chart beside it."""
     _draw(folder, found)
     context = {

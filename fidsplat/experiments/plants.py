@@ -39,26 +39,28 @@ Tell = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Plants:
-    """What is to be made. Raises InputError for numbers out of range, or an unknown kind."""
+class PlantSettings:
+    """Number and training of plants. Raises InputError for numbers out of range, or an unknown kind."""
 
-    kinds: tuple[str, ...] = tuple(MESHES)
+    kind: tuple[str, ...] = ()
+    """Kind of plant: tomato, cucumber or lettuce. By default all; repeat for several."""
     each: int = 2
-    """plants of a kind"""
+    """Number of plants of a kind."""
     views: int = 24
-    """pictures to train on"""
+    """Number of images of each plant to train on."""
     test: int = 4
-    """pictures to compare with"""
+    """Number of images of each plant to compare with."""
     samples: int = 16
-    """of Cycles for each pixel"""
+    """Samples per pixel of Blender's Cycles."""
     splats: int = 5000
-    """of a plant"""
+    """Number of splats of a plant."""
     iterations: int = 1500
-    """of training; 0: the disks on the mesh as they are, and no pictures"""
+    """Training iterations. 0 writes the disks on the mesh without images or training."""
     seed: int = 0
+    """Seed of the plants."""
 
     def __post_init__(self) -> None:
-        for kind in self.kinds:
+        for kind in self.kind:
             if kind not in MESHES:
                 raise InputError(unknown("kind of plant", kind, MESHES))
         ranges = {"each": (1, 1000), "views": (2, 1000), "test": (1, 1000), "samples": (1, 10_000)}
@@ -69,7 +71,7 @@ class Plants:
     @property
     def names(self) -> list[tuple[str, int]]:
         """Kind and number of each plant, one of every kind first."""
-        return [(kind, number) for number in range(self.each) for kind in self.kinds]
+        return [(kind, number) for number in range(self.each) for kind in self.kind or MESHES]
 
     def mesh(self, kind: str, number: int) -> Mesh:
         """A plant's surface."""
@@ -95,7 +97,7 @@ def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:
 
 
 def write_plants(
-    wanted: Plants,
+    wanted: PlantSettings,
     folder: Path,
     environment: Path,
     device: str | None = None,
@@ -135,11 +137,11 @@ def write_plants(
         yield file, score
 
 
-def _note(wanted: Plants, folder: Path) -> None:
+def _note(wanted: PlantSettings, folder: Path) -> None:
     """What the folder's plants are made with, kept beside them."""
     file = folder / NOTE
     # more of them, or of other kinds, may come to those that are there
-    own = {name: value for name, value in asdict(wanted).items() if name not in ("kinds", "each")}
+    own = {name: value for name, value in asdict(wanted).items() if name not in ("kind", "each")}
     own["sources"] = code_hash()
     try:
         before = from_json(read_text(file)) if file.exists() else own
@@ -151,7 +153,7 @@ def _note(wanted: Plants, folder: Path) -> None:
         stream.write(json.dumps(own).encode())
 
 
-def _draw(wanted: Plants, mesh: Mesh, place: Path, python: Path, tell: Tell) -> None:
+def _draw(wanted: PlantSettings, mesh: Mesh, place: Path, python: Path, tell: Tell) -> None:
     """The data set of a plant; pictures that are there stay."""
     views, shots = [], []
     for folder, stem, cameras in (
@@ -187,7 +189,9 @@ def _draw(wanted: Plants, mesh: Mesh, place: Path, python: Path, tell: Tell) -> 
         stream.write(json.dumps({"background": BACKGROUND, "seed": wanted.seed}).encode())
 
 
-def _train(wanted: Plants, mesh: Mesh, place: Path, file: Path, renderer: Renderer, tell: Tell) -> float:
+def _train(
+    wanted: PlantSettings, mesh: Mesh, place: Path, file: Path, renderer: Renderer, tell: Tell
+) -> float:
     """Train on the pictures from disks on the mesh, and write those that show; the mean PSNR of the test
     views."""
     settings = TrainSettings(

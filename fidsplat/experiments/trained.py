@@ -16,7 +16,8 @@ import numpy as np
 from fidsplat.experiments import angles, views
 from fidsplat.experiments.dataset import write_scene
 from fidsplat.experiments.methods import Painter
-from fidsplat.experiments.run import Part, device_words, results_of
+from fidsplat.experiments.run import device_words, results_of
+from fidsplat.experiments.settings import SweepSettings
 from fidsplat.experiments.setup import COLLECTIONS, TEST_VIEWS, chosen_categories
 from fidsplat.experiments.sweep import Key, Sweep, shard
 from fidsplat.render.renderer import Renderer
@@ -33,25 +34,38 @@ _PROTOCOL = "fixed-plane"
 
 
 @dataclass(frozen=True)
-class Baseline(Part):
-    """What is to be trained, and where it goes."""
+class BaselineSettings(SweepSettings):
+    """Settings of the baseline's trainings."""
 
+    out: Path | None = None
+    """Folder for splats and results. By default fidsplat-baseline."""
     dataset: Path = Path("fidsplat-dataset")
-    """folder of the scenes"""
+    """Folder that `fidsplat experiment dataset` wrote; missing scenes are written into it."""
     views: tuple[int, ...] = ()
-    """of each training; none for all of `COLLECTIONS`"""
+    """Number of training views: 3, 5, 9 or 17. By default all; repeat for several."""
     iterations: int = 7000
+    """Iterations of each training."""
     seeds: int = 1
-    """trainings of each, by random numbers of their own; the first is shown to the detectors"""
+    """Number of trainings per marker and number of views, each with its own random numbers. The detectors
+    evaluate the first."""
+    workers: int = 2
+    """Number of threads that evaluate images."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder for splats and results."""
+        return self.out or Path("fidsplat-baseline")
 
     def check(self) -> None:
-        """Raises InputError for what cannot be trained."""
+        """Raise InputError for settings that cannot be used."""
         super().check()
         for number in self.views:
             if number not in COLLECTIONS:
-                raise InputError(f"--views is {number}; known: {', '.join(map(str, COLLECTIONS))}")
+                raise InputError(f"--views must be {', '.join(map(str, COLLECTIONS))}, got {number}")
         if self.seeds < 1:
-            raise InputError(f"--seeds is {self.seeds}; at least 1 training is made of each")
+            raise InputError(f"--seeds must be at least 1, got {self.seeds}")
+        if self.workers < 1:
+            raise InputError(f"--workers must be at least 1 thread, got {self.workers}")
         TrainSettings(iterations=self.iterations)
 
     @property
@@ -71,7 +85,7 @@ class Baseline(Part):
 
 
 @contextmanager
-def baseline_sweeps(wanted: Baseline, renderer: Renderer) -> Iterator[list[Sweep]]:
+def baseline_sweeps(wanted: BaselineSettings, renderer: Renderer) -> Iterator[list[Sweep]]:
     """The trainings, and the views and angles of those of the first seed, to be measured in turn: a run that
     is stopped has all of what it has trained.
 
@@ -80,7 +94,7 @@ def baseline_sweeps(wanted: Baseline, renderer: Renderer) -> Iterator[list[Sweep
     """
     points = wanted.points
     shown = [point for point in points if point["seed"] == 0]
-    folder, painter = writable_folder(wanted.out), Painter(renderer, wanted.out)
+    folder, painter = writable_folder(wanted.folder), Painter(renderer, wanted.folder)
     device = device_words(renderer)
     trainings = results_of(NAME, wanted, device)
     if other := {record.key["iterations"] for record in trainings.done.values()} - {wanted.iterations}:

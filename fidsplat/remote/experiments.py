@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fidsplat.experiments import counts
-from fidsplat.experiments.run import Options, check, device_words, prepared
+from fidsplat.experiments.methods import IDEAL
+from fidsplat.experiments.run import device_words, prepared
+from fidsplat.experiments.settings import ImageSettings, ViewSettings
 from fidsplat.experiments.sweep import Key, Record, Results
 from fidsplat.remote.queue import Engine, drain
 from fidsplat.render.renderer import Renderer
@@ -24,15 +26,17 @@ class ExperimentWork:
     """
 
     names: tuple[str, ...]
-    options: Options
+    options: ImageSettings
 
     def __post_init__(self) -> None:
         options = self.options
-        check(options)
+        options.check()
         if counts.NAME in self.names:
             raise InputError("counts measures times of one quiet machine; run it without --ray")
-        blender = options.blender_folder if options.blender_folder.exists() else None
-        for path in (options.trained, options.lpips, blender):
+        local = [options.trained]
+        if isinstance(options, ViewSettings):
+            local += [options.lpips, options.blender_folder if options.blender_folder.exists() else None]
+        for path in local:
             if path is not None:
                 raise InputError(
                     f"{path} is on the disk of this machine, which workers do not share; run it without "
@@ -51,7 +55,7 @@ class ExperimentDoer:
         folder = self._open.enter_context(tempfile.TemporaryDirectory())
         options = replace(work.options, out=Path(folder))
         self._sweeps = {s.name: s for s in self._open.enter_context(prepared(work.names, options))}
-        self.title = "" if options.ideal else device_words(Renderer(options.device))
+        self.title = "" if options.methods == (IDEAL,) else device_words(Renderer(options.device))
 
     def __call__(self, item: tuple[str, int]) -> dict:
         """The result of an experiment's point, counted from 0."""

@@ -40,28 +40,38 @@ DARK, EARTH, FRAME = (0.2, 0.16, 0.12), (0.45, 0.4, 0.34), (0.75, 0.77, 0.78)
 
 
 @dataclass(frozen=True)
-class Greenhouse:
-    """Rows of plants; the same for the same numbers on every machine. Raises InputError for numbers that make
-    none."""
+class GreenhouseSettings:
+    """Size and seed of a greenhouse. Raises InputError for numbers out of range."""
 
     rows: int = 8
+    """Number of rows of plants."""
     plants: int = 12
-    """in each row"""
+    """Number of plants in each row."""
     seed: int = 0
+    """Seed of the plants and the floor."""
     mixture: str | None = None
-    """of the markers; None: exact"""
-    stock: Mapping[str, Sequence[SplatCloud]] | None = field(default=None, compare=False, repr=False)
-    """plants to take from, by kind, each in its own frame (`fidsplat.worlds.plants.load_plants`), a kind a
-    row; None: they are grown as disks"""
+    """Mixture of the markers: exact, fitted, facets or paper. By default exact."""
 
     def __post_init__(self) -> None:
         for name, most in (("rows", MOST), ("plants", MOST), ("seed", 2**32 - 1)):
             value = getattr(self, name)
             least = 0 if name == "seed" else 1
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-                raise InputError(f"{name} of a greenhouse is {value!r}; it must be {least} to {most}")
+                raise InputError(f"{name} of a greenhouse must be {least} to {most}, got {value!r}")
+
+
+@dataclass(frozen=True)
+class Greenhouse(GreenhouseSettings):
+    """Rows of plants under glass; equal settings make equal greenhouses on every machine."""
+
+    stock: Mapping[str, Sequence[SplatCloud]] | None = field(default=None, compare=False, repr=False)
+    """Plants by kind, one kind per row, each in its own frame (`fidsplat.worlds.plants.load_plants`); None
+    grows them as disks."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.stock is not None and not (self.stock and all(self.stock.values())):
-            raise InputError("the stock of a greenhouse has no plants of a kind; None grows them")
+            raise InputError("the stock of a greenhouse must have plants of each kind; None grows them")
 
     @property
     def length(self) -> float:

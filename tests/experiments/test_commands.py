@@ -11,7 +11,7 @@ from fidsplat.commands.experiment import Experiment
 from fidsplat.experiments import angles, localisation, views
 from fidsplat.experiments import run as run_module
 from fidsplat.experiments.blender import check_pictures, note_pictures
-from fidsplat.experiments.run import Options
+from fidsplat.experiments.settings import ExperimentSettings
 from fidsplat.experiments.sweep import read_records
 from fidsplat.images.files import write_png
 
@@ -95,7 +95,7 @@ def test_shards_merge_into_what_one_run_gives(capsys, tmp_path):
 
 
 def test_a_quick_run_has_few_tilts_and_distances(tmp_path):
-    quick, full = (Options(tmp_path, quick=quick) for quick in (True, False))
+    quick, full = (ExperimentSettings(tmp_path, quick=quick) for quick in (True, False))
     for options, tilts in ((full, angles.FULL_TILTS), (quick, angles.QUICK_TILTS)):
         assert {point["tilts"] for point in run_module._points(angles.NAME, options)} == {tilts}
     spans = (localisation.DISTANCES, localisation.TILTS)
@@ -148,19 +148,25 @@ def test_scenes_for_trainers(capsys, tmp_path):
         (["angles", "--protocol", "P*"], "unknown protocol 'P*'; known: fixed-plane, fixed-module"),
         (["angles", "--tilts", "0-90"], "first:last:step"),
         (["angles", "--shard", "3/2", "--ideal"], "write i/n"),
-        (["angles", "--markers", "6"], "--markers is 6; each category has 1 to 5"),
-        (["angles", "--workers", "0"], "--workers is 0"),
-        (["views", "--trained", "nowhere"], "nowhere is not a folder"),
+        (["angles", "--markers", "6"], "--markers must be 1 to 5, got 6"),
+        (["angles", "--workers", "0"], "--workers must be at least 1 thread, got 0"),
+        (
+            ["views", "--trained", "nowhere"],
+            "--trained must be a folder with 2dgs-17/small-0.ply",
+        ),
         (["views", "--lpips", "nowhere.npz", "--quick"], "cannot read the LPIPS weights"),
-        (["counts", "--category", "huge", "--markers", "0"], "--markers is 0"),
+        (["counts", "--category", "huge", "--markers", "0"], "--markers must be 1 to 5, got 0"),
         (["dataset", "--truth", "photo"], "unknown truth 'photo'; known: exact"),
-        (["dataset", "--markers", "9"], "--markers is 9"),
+        (["dataset", "--markers", "9"], "--markers must be 1 to 5, got 9"),
         (["blender", "--environment", "nowhere"], "fidsplat experiment blender --install"),
-        (["blender", "--samples", "0"], "--samples at least 1"),
-        (["blender", "--threads", "0"], "--threads is 0"),
+        (["blender", "--samples", "0"], "--samples must be at least 1, got 0"),
+        (["blender", "--threads", "0"], "--threads must be at least 1, got 0"),
         (["views", "--trained", "."], "holds none of 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17"),
         (["localisation", "--category", "huge"], "localisation is of apriltag and small, not of huge"),
-        (["views", "--blender", "nowhere"], "nowhere is not a folder; give the one that"),
+        (
+            ["views", "--blender", "nowhere"],
+            "--blender must be a folder that `fidsplat experiment blender`",
+        ),
         (["blender", "--view", "agx"], "unknown view 'agx'"),
         (["merge", "nowhere"], "no results of shards in nowhere"),
         (["report", "nowhere"], "no results in nowhere"),
@@ -207,7 +213,7 @@ def test_trained_models_that_are_missing_are_shown_before_the_work(capsys, tmp_p
     status, _, err = run(capsys, *words)
     assert status == 2
     assert "small-0.ply is missing; --category and --markers leave out" in err
-    run_module.check(Options(tmp_path, category=("apriltag",), markers=1, trained=tmp_path))
+    ExperimentSettings(tmp_path, category=("apriltag",), markers=1, trained=tmp_path).check()
 
 
 def test_merge_names_shards_that_are_missing(capsys, tmp_path):

@@ -11,7 +11,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments import blender, plants
-from fidsplat.experiments.plants import Plants, cameras_around, write_plants
+from fidsplat.experiments.plants import PlantSettings, cameras_around, write_plants
 from fidsplat.images.files import read_rgba
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.worlds.greenhouse import Greenhouse
@@ -56,7 +56,7 @@ def test_splats_lie_in_the_faces_and_have_their_colours():
 
 @pytest.mark.parametrize("kind", MESHES)
 def test_cameras_see_the_whole_plant(kind):
-    mesh = Plants().mesh(kind, 0)
+    mesh = PlantSettings().mesh(kind, 0)
     cameras = cameras_around(mesh, 12)
     for camera in cameras:
         seen = camera.project(mesh.vertices)
@@ -100,21 +100,21 @@ def test_a_stock_of_sampled_plants_fills_a_greenhouse(tmp_path, capsys):
         assert message in capsys.readouterr().err
     assert main(["greenhouse", "-o", str(tmp_path / "h"), "--plants-from", str(tmp_path)]) == 2
     assert "holds no plants" in capsys.readouterr().err
-    with pytest.raises(fs.InputError, match="no plants of a kind"):
+    with pytest.raises(fs.InputError, match="must have plants of each kind"):
         Greenhouse(1, 1, stock={"tomato": []})
 
 
 def test_plants_of_other_sources_are_not_mixed(tmp_path, monkeypatch):
-    plants._note(Plants(), tmp_path)
-    plants._note(Plants(), tmp_path)
+    plants._note(PlantSettings(), tmp_path)
+    plants._note(PlantSettings(), tmp_path)
     monkeypatch.setattr(plants, "code_hash", lambda: "another")
     with pytest.raises(fs.InputError, match=r"'sources': 'another'.*; give another folder"):
-        plants._note(Plants(), tmp_path)
+        plants._note(PlantSettings(), tmp_path)
 
 
 def test_without_blender_the_error_says_how_to_get_it(tmp_path):
     with pytest.raises(fs.InputError, match=r"fidsplat experiment blender --install"):
-        list(write_plants(Plants(("lettuce",), 1), tmp_path, tmp_path / "nowhere"))
+        list(write_plants(PlantSettings(("lettuce",), 1), tmp_path, tmp_path / "nowhere"))
 
 
 FAKE = """
@@ -156,7 +156,7 @@ def test_pictures_become_a_data_set_and_what_is_trained_a_plant(tmp_path, monkey
 
     monkeypatch.setattr(plants, "Trainer", Quick)
     told = []
-    wanted = Plants(("lettuce",), 1, views=3, test=2, splats=200, iterations=5)
+    wanted = PlantSettings(("lettuce",), 1, views=3, test=2, splats=200, iterations=5)
     out = tmp_path / "out"
     made = list(write_plants(wanted, out, tmp_path, "reference", lambda words, share: told.append(share)))
     assert made == [(out / "lettuce-0.ply", 32.0)]
@@ -178,7 +178,7 @@ def test_blender_draws_a_plant(tmp_path):
     python = blender.environment_python(blender.default_environment())
     if not python.is_file():
         pytest.skip("Blender is not here; fidsplat experiment blender --install")
-    wanted = Plants(("lettuce",), 1, views=2, test=1, samples=4)
+    wanted = PlantSettings(("lettuce",), 1, views=2, test=1, samples=4)
     plants._draw(wanted, wanted.mesh("lettuce", 0), tmp_path / "lettuce-0", python, lambda words, share: None)
     picture = read_rgba(tmp_path / "lettuce-0/images/view-000.png").astype(int)
     assert picture[0, 0, 3] == 0

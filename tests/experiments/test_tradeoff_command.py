@@ -27,7 +27,7 @@ def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
         return real(session, part, quick)
 
     monkeypatch.setattr(run, "_begin", stopped)
-    monkeypatch.setattr(run.Options, "workers", 1)
+    monkeypatch.setattr(run.TradeoffSettings, "workers", 1)
     monkeypatch.setattr(compare, "QUICK_TILTS", "0:40:20")
     assert main(words) == 130
     assert "interrupted" in capsys.readouterr().err
@@ -124,8 +124,8 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
         raise fs.InputError("no such thing here")
 
     monkeypatch.setattr(run, "_begin", refuse)
-    options = run.Options(tmp_path, "opencl", ("apriltag",), ("samples",), quick=True)
-    with run.prepared(options) as sweep:
+    settings = run.TradeoffSettings(("apriltag",), ("samples",), quick=True)
+    with run.prepared(settings, tmp_path, "opencl") as sweep:
         records = list(sweep.run())
     assert records
     assert all(record.result == {"error": "no such thing here"} for record in records)
@@ -133,7 +133,7 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
     # it may have been the device that failed: another run tries again
     monkeypatch.setattr(run, "_begin", lambda *_: lambda: {"maximum": 0.0})
     for left in (len(records), 0):
-        with run.prepared(options) as sweep:
+        with run.prepared(settings, tmp_path, "opencl") as sweep:
             assert len(sweep.left) == len(list(sweep.run())) == left
     assert [record.result for record in read_records(tmp_path / run.FILE)] == [{"maximum": 0.0}] * len(
         records

@@ -14,7 +14,7 @@ from fidsplat.splats.rotations import rigid_matrix
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
 
-from fidsplat.experiments.localise import Localise, errors_of, write_log  # noqa: E402 (needs MuJoCo)
+from fidsplat.experiments.localise import Drive, errors_of, write_log  # noqa: E402 (needs MuJoCo)
 from fidsplat.experiments.localise_sweep import write_report  # noqa: E402
 from fidsplat.worlds.greenhouse import Greenhouse  # noqa: E402
 from fidsplat.worlds.robot import (  # noqa: E402
@@ -185,7 +185,7 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     assert np.sqrt((off**2).mean()) == pytest.approx(
         ate, rel=1e-6, abs=0.5e-6 * 10 ** math.ceil(math.log10(ate))
     )
-    monkeypatch.setattr(Localise, "run", lambda self, speed=None: pytest.fail("measured again"))
+    monkeypatch.setattr(Drive, "run", lambda self, speed=None: pytest.fail("measured again"))
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == first
     assert "<svg" in (tmp_path / "out/localise.svg").read_text()
@@ -213,9 +213,9 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
     monkeypatch.setattr("fidsplat.experiments.localise.RATE", 0.5)
     grey = np.full((480, 640, 3), 128, np.uint8)
     monkeypatch.setattr(
-        Localise, "pictures", lambda self, variant, run, renderer: (grey for _ in self.shots(run))
+        Drive, "pictures", lambda self, variant, run, renderer: (grey for _ in self.shots(run))
     )
-    asked = Localise(1, 1)
+    asked = Drive(1, 1)
     pictures = list(write_log(asked, "exact", None, str(tmp_path / "run.mcap"), False))
     with (tmp_path / "run.mcap").open("rb") as stream:
         counts = reader.make_reader(stream).get_summary().statistics.channel_message_counts
@@ -237,7 +237,7 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
 
 def test_with_ideal_corners_it_knows_its_way():
     """The filter alone: every tag that the camera could see, with corners where they are."""
-    asked = Localise(1, 3)
+    asked = Drive(1, 3)
     house = asked.house
     moved = drive(
         house.mjcf(BODY), np.array([[-0.5, -0.75], [2.0, -0.75]]), errors=Errors(0.03, gyro_bias=0.01, seed=3)
@@ -274,5 +274,5 @@ def test_a_drive_at_another_speed_alone_has_a_page(tmp_path):
     times = np.arange(20) / 10
     fs.save_trajectory(fs.Trajectory(times, np.tile(np.eye(4), (20, 1, 1))), tmp_path / "truth-0.25-m-s.tum")
     facts = {"ate_m": 0.01, "worst_m": 0.02, "rpe_m": 0.01, "heading_deg": 0.1, "tags": 3, "refused": 0}
-    page = write_report(tmp_path, Localise(), "a device", {"0.25 m/s, blur": facts | {"length_m": 60.2}})
+    page = write_report(tmp_path, Drive(), "a device", {"0.25 m/s, blur": facts | {"length_m": 60.2}})
     assert "0.25 m/s, blur" in page.read_text()

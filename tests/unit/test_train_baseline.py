@@ -56,10 +56,10 @@ def test_the_baseline_trained_anew_forgets_what_was_stopped(folder, tmp_path, mo
 
 def test_the_baseline_of_other_iterations_is_not_mixed_in(tmp_path):
     """What it looks like and how far it is read would stay that of the first splats."""
-    from fidsplat.experiments.trained import Baseline, baseline_sweeps
+    from fidsplat.experiments.trained import BaselineSettings, baseline_sweeps
 
     renderer = fs.Renderer("reference")
-    wanted = Baseline(tmp_path, category=("small",), markers=1, views=(3,), iterations=5)
+    wanted = BaselineSettings(tmp_path, category=("small",), markers=1, views=(3,), iterations=5)
     with baseline_sweeps(wanted, renderer) as (trainings, *_):
         trainings.results.append(wanted.points[0], {"psnr": 30.0})
     with pytest.raises(fs.InputError, match=r"holds trainings of 5 iterations, not 7; .* --overwrite"):
@@ -73,9 +73,9 @@ def test_the_baseline_of_other_iterations_is_not_mixed_in(tmp_path):
 def test_the_baseline_begins_with_one_marker_of_each_category(tmp_path):
     """So that a run that is stopped says something of all; what is shared among machines is all of it."""
     from fidsplat.experiments.setup import CATEGORIES
-    from fidsplat.experiments.trained import Baseline
+    from fidsplat.experiments.trained import BaselineSettings
 
-    wanted = Baseline(tmp_path, markers=2, seeds=3)
+    wanted = BaselineSettings(tmp_path, markers=2, seeds=3)
     assert len(wanted.points) == 5 * 2 * 4 * 3
     first = wanted.points[:20]
     assert {(p["category"], p["views"]) for p in first} == {(c, n) for c in CATEGORIES for n in (3, 5, 9, 17)}

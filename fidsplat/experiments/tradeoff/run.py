@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -32,42 +32,44 @@ _BATCH = 16
 
 
 @dataclass(frozen=True)
-class Options:
-    """What a run is to measure."""
+class TradeoffSettings:
+    """Scenes, quality settings and length of a trade-off measurement."""
 
-    out: Path
-    device: str
     scenes: tuple[str, ...] = ()
+    """Scenes to measure. By default all, with --quick four."""
     knobs: tuple[str, ...] = ()
+    """Quality settings to vary: names of Quality's fields, or preset, marker, together. By default all."""
     quick: bool = False
+    """Measure few values, few frames and four scenes."""
     overwrite: bool = False
-    own: scenes.Own = field(default_factory=dict)
-    """one's own pictures, instead of scenes"""
+    """Measure again what the folder for results holds."""
     workers: int = min(_BATCH, os.cpu_count() or 1)
-    """threads that look at pictures, while nothing is timed"""
+    """Number of threads that evaluate images while nothing is timed."""
 
 
 @contextmanager
-def prepared(options: Options) -> Iterator[Sweep]:
+def prepared(
+    options: TradeoffSettings, out: Path, device: str, own: scenes.Own | None = None
+) -> Iterator[Sweep]:
     """A run with all that it needs. What a device refuses to draw is a result with `error`.
 
     Raises InputError for options that cannot be used, DeviceError when the device cannot be opened.
     """
-    own = options.own
+    own = own or {}
     keys = (
         own_points(own, options.knobs, options.quick)
         if own
         else all_points(options.scenes, options.knobs, options.quick)
     )
-    renderer = Renderer(options.device)
+    renderer = Renderer(device)
     info = renderer.device
     if info.always_float64:
         raise InputError(f"{info.name} is what others are measured against; give another --device")
-    writable_folder(options.out)
+    writable_folder(out)
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(f"{info.title}, {info.version}", scenes.SEED, versions)
     facts |= {"kind": info.kind, "title": info.title} | ({"scene": scenes.digests(own)} if own else {})
-    results = Results(options.out / FILE, facts, options.overwrite)
+    results = Results(out / FILE, facts, options.overwrite)
     session = Session(renderer, own)
 
     def begin(key: Key) -> Callable[[], dict]:
@@ -79,7 +81,7 @@ def prepared(options: Options) -> Iterator[Sweep]:
 
     pool = ThreadPoolExecutor(options.workers)
     try:
-        yield Sweep(f"{NAME} on {options.device}", results, keys, begin, options.workers, pool)
+        yield Sweep(f"{NAME} on {device}", results, keys, begin, options.workers, pool)
     finally:
         # an interrupt must not wait for pictures that nobody will look at
         pool.shutdown(cancel_futures=True)

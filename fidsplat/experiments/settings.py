@@ -1,0 +1,204 @@
+"""Settings of the paper's experiments. Their fields are the options of `fidsplat experiment`."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fidsplat.experiments.angles import parse_tilts
+from fidsplat.experiments.blender import VIEW_NAMES, check_pictures
+from fidsplat.experiments.methods import IDEAL, method_names
+from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, chosen_categories
+from fidsplat.util.errors import InputError, unknown
+
+
+@dataclass(frozen=True)
+class MarkerSettings:
+    """Markers of an experiment and the folder of its results."""
+
+    out: Path | None = None
+    """Folder for results. By default fidsplat-experiments, with --quick fidsplat-experiments-quick."""
+    category: tuple[str, ...] = ()
+    """Category of markers: apriltag, small, medium, large or huge. By default all; repeat for several."""
+    seed: int = SEED
+    """Seed of texts and views."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder for results."""
+        return self.out or Path("fidsplat-experiments")
+
+    @property
+    def marker_count(self) -> int:
+        """Number of markers of each category."""
+        return MARKERS
+
+    def check(self) -> None:
+        """Raise InputError for settings that cannot be used."""
+        chosen_categories(self.category)
+
+
+@dataclass(frozen=True)
+class CountedSettings(MarkerSettings):
+    """Number of markers of each category."""
+
+    markers: int | None = None
+    """Number of markers of each category, 1 to 5. By default 5, in a quick run 1."""
+
+    @property
+    def marker_count(self) -> int:
+        """Number of markers of each category."""
+        return MARKERS if self.markers is None else self.markers
+
+    def check(self) -> None:
+        """Raise InputError for settings that cannot be used."""
+        super().check()
+        if not 1 <= self.marker_count <= MARKERS:
+            raise InputError(f"--markers must be 1 to {MARKERS}, got {self.markers}")
+
+
+@dataclass(frozen=True)
+class SweepSettings(CountedSettings):
+    """Part of a sweep that one machine measures."""
+
+    shard: str | None = None
+    """Share of the work to measure, as i/n; `fidsplat experiment merge` joins the shares."""
+    overwrite: bool = False
+    """Measure again what the folder for results holds."""
+
+    def file(self, name: str) -> Path:
+        """File for the results of an experiment."""
+        ending = "" if self.shard is None else "-" + self.shard.replace("/", "-of-")
+        return self.folder / f"{name}{ending}.jsonl"
+
+
+@dataclass(frozen=True)
+class MeasureSettings(SweepSettings):
+    """Settings of every experiment that measures."""
+
+    quick: bool = False
+    """Measure one marker of each category with few tilts and views, in minutes."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder for results; quick results and complete ones never share a file."""
+        return self.out or Path("fidsplat-experiments" + ("-quick" if self.quick else ""))
+
+    @property
+    def marker_count(self) -> int:
+        """Number of markers of each category."""
+        return 1 if self.quick and self.markers is None else super().marker_count
+
+
+@dataclass(frozen=True)
+class RenderSettings(MarkerSettings):
+    """Device and rendering methods of an experiment."""
+
+    device: str = "opencl"
+    """Device that renders; see `fidsplat devices`."""
+    mixture: tuple[str, ...] = ()
+    """Mixture of Gaussians. By default all; repeat for several."""
+    trained: Path | None = None
+    """Folder with trained models for the 2DGS columns, such as 2dgs-17/small-0.ply."""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Rows of the tables."""
+        return method_names(self.mixture, self.trained)
+
+    def check(self) -> None:
+        """Raise InputError for settings that cannot be used."""
+        super().check()
+        method_names(self.mixture)
+        self._check_trained()
+
+    def _check_trained(self) -> None:
+        folder = self.trained
+        if folder is None or self.methods == (IDEAL,):
+            return
+        if not folder.is_dir():
+            raise InputError(
+                f"--trained must be a folder with 2dgs-17/small-0.ply and the like, got {folder}"
+            )
+        models = [method for method in self.methods if method.startswith("2dgs-")]
+        if not models:
+            raise InputError(f"{folder} holds none of 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17")
+        for model in models:
+            for category in chosen_categories(self.category):
+                for index in range(self.marker_count):
+                    file = folder / model / f"{category.name}-{index}.ply"
+                    if not file.is_file():
+                        raise InputError(
+                            f"{file} is missing; --category and --markers leave out what was not trained"
+                        )
+
+
+@dataclass(frozen=True)
+class ImageSettings(RenderSettings, MeasureSettings):
+    """Settings of experiments that evaluate rendered images."""
+
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Number of threads that evaluate images. By default one per core."""
+
+    def check(self) -> None:
+        """Raise InputError for settings that cannot be used."""
+        super().check()
+        if self.workers < 1:
+            raise InputError(f"--workers must be at least 1 thread, got {self.workers}")
+
+
+@dataclass(frozen=True)
+class AngleSettings(ImageSettings):
+    """Settings of the experiment on tilts."""
+
+    protocol: tuple[str, ...] = ()
+    """Protocol: fixed-plane or fixed-module. By default both."""
+    tilts: str | None = None
+    """Tilts in degrees as first:last:step, joined by commas. By default 0:89.8:0.2."""
+    ideal: bool = False
+    """Measure only the ideal texture, the ceiling of the detectors; no device is opened."""
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Rows of the tables."""
+        return (IDEAL,) if self.ideal else super().methods
+
+    def check(self) -> None:
+        """Raise InputError for settings that cannot be used."""
+        super().check()
+        for name in self.protocol:
+            if name not in PROTOCOLS:
+                raise InputError(unknown("protocol", name, PROTOCOLS))
+        if self.tilts is not None:
+            parse_tilts(self.tilts)
+
+
+@dataclass(frozen=True)
+class ViewSettings(ImageSettings):
+    """Settings of the experiment on novel views."""
+
+    blender: Path | None = None
+    """Folder with Blender's images. By default the folder `blender` in the folder for results."""
+    lpips: Path | None = None
+    """File with LPIPS weights (.npz); docs/experiments.md says how to make it."""
+
+    @property
+    def blender_folder(self) -> Path:
+        """Folder with Blender's images."""
+        return self.folder / "blender" if self.blender is None else self.blender
+
+    def check(self) -> None:
+        """Raise InputError for settings that cannot be used."""
+        super().check()
+        if self.blender is not None and not self.blender.is_dir():
+            raise InputError(
+                f"--blender must be a folder that `fidsplat experiment blender` wrote, got {self.blender}"
+            )
+        for view in VIEW_NAMES:
+            check_pictures(self.blender_folder, view, self.seed)
+
+
+@dataclass(frozen=True)
+class ExperimentSettings(AngleSettings, ViewSettings):
+    """Settings of all experiments."""
