@@ -19,7 +19,7 @@ from store_views import path_of, placed
 
 import fidsplat as fs
 from fidsplat.accuracy.level_of_detail import measure_detail
-from fidsplat.streaming.occlusion_culling import Hidden
+from fidsplat.streaming.occlusion_culling import OcclusionCulling
 from fidsplat.worlds.city import City
 
 
@@ -39,13 +39,13 @@ def cameras(store: fs.Store, size: tuple[int, int], count: int, step: float) -> 
 def drive(renderer: fs.Renderer, store: fs.Store, quality: str, path: list[fs.Camera]) -> list[dict]:
     """A row for each view."""
     rows, resident, counts = [], renderer.upload(store), []
-    drawn = Hidden.drawn
+    drawn = OcclusionCulling.render
 
     def noted(self, whole, *given):
         counts.append(whole.count)
         return drawn(self, whole, *given)
 
-    Hidden.drawn = noted
+    OcclusionCulling.render = noted
     try:
         for camera in path:
             begun, cpu = time.perf_counter(), time.process_time()
@@ -57,7 +57,7 @@ def drive(renderer: fs.Renderer, store: fs.Store, quality: str, path: list[fs.Ca
             rows.append(row)
             PROGRESS.print(f"{quality}: {row['drawn']:,} of {row['in_view']}, {row['s']:.2f} s")
     finally:
-        Hidden.drawn = drawn
+        OcclusionCulling.render = drawn
     return rows
 
 

@@ -26,7 +26,8 @@ import fidsplat as fs
 from fidsplat.accuracy.error import TRUTH_CUTOFF
 from fidsplat.accuracy.level_of_detail import measure_detail
 from fidsplat.backends.prepare import prepare
-from fidsplat.streaming.selection import Streamed
+from fidsplat.store.chunked_splats import ChunkedSplats
+from fidsplat.streaming.level_of_detail import select
 from fidsplat.worlds.city import City
 
 
@@ -102,7 +103,7 @@ def along(store: fs.Store, renderer: fs.Renderer, asked, error: float) -> dict:
 
 def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
     """A row for each view and allowed error."""
-    rows, streamed = [], Streamed([store])
+    rows, splats = [], ChunkedSplats([store])
     width, height = map(int, asked.size.split("x"))
     for name, camera in views(store, (width, height)).items():
         if name not in asked.views:
@@ -113,9 +114,9 @@ def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
             if error != "standard":
                 quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
             capture = fs.Capture(camera, quality=quality)
-            features, view = prepare(streamed, capture)
+            features, view = prepare(splats, capture)
             begun = time.perf_counter()
-            selection = streamed.select([view], features, streamed.pixels_of(quality))
+            selection = select(splats, [view], features, splats.cell_sizes(quality))
             chosen = time.perf_counter() - begun
             seen = sum(int(store.counts(np.array(nodes)).sum()) for nodes in selection.nodes if nodes)
             row = {"view": name, "splats": len(store), "error": error, "drawn": seen}

@@ -15,9 +15,10 @@ from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import LOWPASS, Quality
 from fidsplat.render.renderer import Renderer
+from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.detail import Detail, load_details, save_details
 from fidsplat.store.store import Store
-from fidsplat.streaming.selection import Streamed
+from fidsplat.streaming.level_of_detail import select
 from fidsplat.util.errors import InputError
 
 SIZES = tuple(2.0 ** (k / 2) for k in range(-8, 3))
@@ -81,19 +82,19 @@ def errors_of(
 ) -> list[float | None]:
     """The largest difference of rgb from the exact picture for each size [samples], rising, with nodes up to
     a level; None where no cells are merged that smaller sizes would leave apart, or none that shows."""
-    streamed = Streamed([store])
-    features, view = prepare(streamed, capture)
-    before, exact = streamed.select([view], features), None
+    splats = ChunkedSplats([store])
+    features, view = prepare(splats, capture)
+    before, exact = select(splats, [view], features), None
     whole = before
     worst: list[float | None] = [None] * len(sizes)
     for number, size in enumerate(sizes):
         limits = tuple(size if 0 < at <= level else 0.0 for at in range(store.levels + 1))
-        selection = streamed.select([view], features, (limits,))
+        selection = select(splats, [view], features, (limits,))
         if selection == before:
             continue
         if exact is None:
-            exact = renderer.render(streamed.part(whole), capture)["rgb"].astype(np.float64)
-        picture = renderer.render(streamed.part(selection), capture)["rgb"]
+            exact = renderer.render(splats.part(whole), capture)["rgb"].astype(np.float64)
+        picture = renderer.render(splats.part(selection), capture)["rgb"]
         # what is merged where nobody sees it says nothing about this size
         worst[number], before = float(np.abs(picture - exact).max()) or None, selection
     return worst

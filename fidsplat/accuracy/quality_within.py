@@ -20,8 +20,8 @@ from fidsplat.render.certified_error import cutoff_of, nothing_left_out
 from fidsplat.render.renderer import Renderer, default_device
 from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
-from fidsplat.streaming.selection import Streamed
 from fidsplat.util.arguments import as_float
 from fidsplat.util.errors import DeviceError, InputError
 from fidsplat.util.provenance import code_hash, digest_of
@@ -166,20 +166,20 @@ def choose(
         assert error is not None
         scenes = SceneClass(whole_number("layers", layers, 1, 2**31 - 1), _color_range(colors))
         return _from_list(error, scenes, candidates, asked.quality, renderer)
-    streamed = scene.streamed if isinstance(scene, Scene) else None
+    splats = scene.splats if isinstance(scene, Scene) else scene
+    chunked = splats if isinstance(splats, ChunkedSplats) else None
     bases = [asked.quality]
-    if streamed is not None:  # of an error levels of detail have half
+    if chunked is not None:  # of an error levels of detail have half
         allowed = [0.0, *DETAILS] if error is None else [min(max(error, 0.0) / 2, DETAILS[-1])]
-        bases = [_with_detail(streamed, asked.quality, detail) for detail in allowed]
+        bases = [_with_detail(chunked, asked.quality, detail) for detail in allowed]
         asked = replace(asked, quality=asked.quality.with_(detail_error=0.0))
-    splats = scene.cloud() if isinstance(scene, Scene) and streamed is None else scene
     info = renderer.device
     drawn_by = (info.name, info.title, info.platform, info.version, code_hash())
-    key = _key(drawn_by, (error, ms), asked, bases, streamed.content if streamed else splats)
+    key = _key(drawn_by, (error, ms), asked, bases, chunked.content if chunked is not None else splats)
     kept = _kept(key, asked.quality, info.name)
     if kept is not None:
         return kept
-    calibration = Calibration(renderer, splats, asked, tell)
+    calibration = Calibration(renderer, splats if chunked is None else scene, asked, tell)
 
     def measured(base: Quality) -> Choice:
         calibration.base = base  # the truth of all is the same
@@ -195,11 +195,11 @@ DETAILS = (1 / 255, 4 / 255, 16 / 255, 0.5)
 """errors of levels of detail that are tried where the time alone is bounded"""
 
 
-def _with_detail(streamed: Streamed, quality: Quality, error: float) -> Quality:
+def _with_detail(chunked: ChunkedSplats, quality: Quality, error: float) -> Quality:
     """A quality that may spend an error on levels of detail, where what they cost was measured."""
     detailed = quality.with_(detail_error=error)
     try:
-        pixels = streamed.pixels_of(detailed)
+        pixels = chunked.cell_sizes(detailed)
         useful = isinstance(pixels, tuple) and any(map(any, pixels))
         return detailed if useful else quality.with_(detail_error=0.0)
     except InputError:

@@ -71,8 +71,7 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
             renderers[wanted] = Renderer(wanted)
         renderer = renderers[wanted]
         names = piece.scene.capture.outputs
-        splats = piece.scene.splats if piece.scene.streamed is None else piece.scene.streamed.content
-        key = digest_of((splats, piece.scene.capture, renderer.device.title, __version__))
+        key = digest_of((piece.scene.content, piece.scene.capture, renderer.device.title, __version__))
         files = [folder / f"{piece.name[:60]}-{name}-{key}.png" for name in names]
         if not all(file.exists() for file in files):
             _draw(renderer.render(piece.scene), files)

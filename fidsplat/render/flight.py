@@ -76,8 +76,7 @@ class Flight:
 
     def key(self, device: str) -> str:
         """16 hexadecimal digits of all that its pictures depend on: splats, captures, device, version."""
-        splats = self.scene.splats if self.scene.streamed is None else self.scene.streamed.content
-        content = (splats, self.capture, self.trajectory, self.path, device, __version__)
+        content = (self.scene.content, self.capture, self.trajectory, self.path, device, __version__)
         try:
             return digest_of(content)
         except (pickle.PicklingError, AttributeError, TypeError) as error:

@@ -32,8 +32,9 @@ from fidsplat.render.frame import Frame, check_process, stacked
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
-from fidsplat.streaming.bands import PartOfView
+from fidsplat.streaming.bands import BandData
 from fidsplat.streaming.residency import Residency
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import whole_number
@@ -93,10 +94,9 @@ class Renderer:
         check_process(self._process, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _PLAIN
         stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
-        streamed = stored.streamed if isinstance(stored, Scene) else None
-        if streamed is not None:
-            return ResidentCloud(self.backend, Residency(streamed, self.backend), capture)
-        cloud = scene.cloud() if isinstance(scene, Scene) else scene
+        cloud = stored.splats if isinstance(stored, Scene) else stored
+        if isinstance(cloud, ChunkedSplats):
+            return ResidentCloud(self.backend, Residency(cloud, self.backend), capture)
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene, a SplatCloud or a Store")
         with self._lock:
@@ -247,7 +247,7 @@ class Renderer:
         resident = self._resident(scene)
         asked = (_asked(scene, one, outputs=outputs, quality=quality, **parts) for one in rest)
         if isinstance(resident.data, Residency):
-            asked = resident.data.read_ahead(asked)
+            asked = resident.data.prefetched(asked)
         waiting: Frame | None = None
         failure: Exception | None = None
         while True:
@@ -365,11 +365,11 @@ class Renderer:
                     error = ErrorImage(images, ideal, plan)
                 return Frame(images, capture, error=error)
 
-            def part(one: PartOfView) -> Frame:
+            def part(one: BandData) -> Frame:
                 images = one.images or draw(pipeline, one.data, one.view)
                 return Frame(images, capture, one.ids)
 
-            return stacked(data.parts(view, features, capture.quality, pipeline), part)
+            return stacked(data.bands(view, features, capture.quality, pipeline), part)
 
 
 def _banded(view: View, band: tuple[int, int] | None) -> View:

@@ -63,5 +63,5 @@ class ResidentCloud:
         """The splats on the device that these views are drawn from, and their indices in the whole where
         these are not their own."""
         if isinstance(self.data, Residency):
-            return self.data.of(list(views), features, qualities)
+            return self.data.gather(list(views), features, qualities)
         return self.data, None

@@ -17,8 +17,8 @@ from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import check_similarity
+from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
-from fidsplat.streaming.selection import Streamed
 from fidsplat.util.errors import InputError
 from fidsplat.util.scalars import PickledByFields
 
@@ -152,20 +152,20 @@ class SceneParts(PickledByFields):
     def cloud(self) -> SplatCloud:
         """All splats in one cloud: those of stores, all of which are read, then the clouds' in their order,
         with their own labels if they do not move by themselves, then each marker's."""
-        return self._merged if self.streamed is None else self.streamed.cloud()
+        return self.splats.cloud() if isinstance(self.splats, ChunkedSplats) else self.splats
 
     @cached_property
-    def streamed(self) -> Streamed | None:
-        """All splats as views see them, of a scene with stores; None without any."""
-        return Streamed(self.stores, self._merged) if self.stores else None
+    def splats(self) -> SplatCloud | ChunkedSplats:
+        """All splats: one cloud, or stores and a cloud in memory that are read in chunks."""
+        return ChunkedSplats(self.stores, self._in_memory) if self.stores else self._in_memory
 
     @property
-    def splats(self) -> SplatCloud | Streamed:
-        """What is drawn: all splats in one cloud, or as views see them where some are on disk."""
-        return self.streamed or self._merged
+    def content(self) -> SplatCloud | tuple:
+        """The splats for digests: a cloud, or the identities of stores and a cloud."""
+        return self.splats.content if isinstance(self.splats, ChunkedSplats) else self.splats
 
     @cached_property
-    def _merged(self) -> SplatCloud:
+    def _in_memory(self) -> SplatCloud:
         labels = self._labels
         clouds = [
             cloud.with_labels(labels[i]) if i in labels else cloud for i, cloud in enumerate(self.clouds)

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from fidsplat.formats.collect import WINDOW
-from fidsplat.store.layout import CHUNK, MOST_SPLATS, NODE, row_bytes, shapes_of
+from fidsplat.store.layout import CHUNK, MAX_SPLATS, NODE, row_bytes, shapes_of
 from fidsplat.store.merge import REDUCTION
 from fidsplat.store.morton import Grid, grid_around
 from fidsplat.store.sources import Source, degree_of, sample, spans
@@ -130,8 +130,8 @@ def plan_of(
     grid = grid_around(means)
     wide = sum(row_bytes(kind, shapes_of(degree)[name]) for name, kind in kinds.items()) + 8
     rows = sum(each.count for each in given)
-    if rows > MOST_SPLATS:
-        raise InputError(f"{rows:,} splats are too many for a store: a scene has at most {MOST_SPLATS:,}")
+    if rows > MAX_SPLATS:
+        raise InputError(f"{rows:,} splats are too many for a store: a scene has at most {MAX_SPLATS:,}")
     buckets = int(np.clip(-(-rows * wide // (memory // 16)), 1, _MOST_BUCKETS))
     codes = np.sort(grid.codes(means))
     splitters = codes[len(codes) * np.arange(1, buckets) // buckets] if len(codes) else codes

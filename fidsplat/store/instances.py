@@ -12,7 +12,7 @@ import numpy as np
 
 from fidsplat.splats.rotations import check_similarity
 from fidsplat.store.folders import emptied, filled, refuse_existing, store_folder
-from fidsplat.store.layout import MOST_SPLATS, PLACES
+from fidsplat.store.layout import MAX_SPLATS, PLACES
 from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
@@ -55,9 +55,9 @@ def place_store(
         raise InputError("poses must be a list of rigid 4x4 matrices, one at least")
     for number, pose in enumerate(given):
         check_similarity(pose, f"pose {number}", rigid=True)
-    if len(given) * len(source) > MOST_SPLATS:
+    if len(given) * len(source) > MAX_SPLATS:
         raise InputError(
-            f"{len(given)} places of {len(source):,} splats are too many: a scene has at most {MOST_SPLATS:,}"
+            f"{len(given)} places of {len(source):,} splats are too many: a scene has at most {MAX_SPLATS:,}"
         )
     folder = store_folder(out)
     refuse_existing(folder, overwrite)

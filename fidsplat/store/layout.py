@@ -37,7 +37,7 @@ CHUNK = 32768
 is a sequential read of some 2 MB"""
 FAR = 5.0
 """standard deviations to which the larger boxes of a node reach"""
-MOST_SPLATS = 2**31 - 1
+MAX_SPLATS = 2**31 - 1
 """of a scene: their indices are int32"""
 NPY_HEADER = 128
 """bytes of a column's own header, whatever its shape"""
@@ -146,7 +146,7 @@ def _check(header: Header) -> None:
     counts = (header.splats, header.rows, header.pinned, header.chunk, header.sh_degree, header.nodes_crc)
     if not all(type(value) is int for value in counts):
         raise ValueError("a count is no whole number")
-    if not 0 <= header.splats <= header.rows <= _MOST_ROWS or not 0 < header.chunk <= MOST_SPLATS:
+    if not 0 <= header.splats <= header.rows <= _MOST_ROWS or not 0 < header.chunk <= MAX_SPLATS:
         raise ValueError("a count is out of range")
     if not (0 <= header.pinned <= header.splats and -1 <= header.sh_degree <= 3):
         raise ValueError("a count is out of range")

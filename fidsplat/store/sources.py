@@ -15,7 +15,7 @@ from fidsplat.formats.files import format_of, load_splats
 from fidsplat.formats.ply import ply_rows
 from fidsplat.splats.arrays import choose_origin, unit_quaternions
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.store.subset import colors_of
+from fidsplat.store.partial_cloud import colors_of_degree
 from fidsplat.util.arguments import invalid
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
@@ -137,7 +137,7 @@ def splats_of(
         means = (means.astype(np.float64) + (source.origin - origin)).astype(np.float32)
     made = {"means": means, "quats": unit_quaternions(part["quats"])}
     made |= {name: part[name] for name in ("scales", "opacities")}
-    made |= colors_of(part, sh_degree)
+    made |= colors_of_degree(part, sh_degree)
     if "thickness" in columns:
         made["thickness"] = part.get("thickness", np.zeros(count, np.float32))
     if "labels" in columns:

@@ -17,7 +17,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.store import layout
 from fidsplat.store.detail import Detail, load_details, pixels
-from fidsplat.store.subset import StorePart, joined, moved
+from fidsplat.store.partial_cloud import PartialCloud, concatenated, transformed
 from fidsplat.util.arguments import callback, flag, instance, invalid, whole_number
 from fidsplat.util.arguments import number as checked_number
 from fidsplat.util.errors import InputError
@@ -285,7 +285,7 @@ class Store(Summarised):
         """All of its splats in one cloud, mapped where the files have them as they are drawn, else in memory:
         the scene that its pictures are bit for bit those of."""
         parts = [self._rows(0, self._own.splats, place) for place in range(self.places)]
-        return StorePart.of(joined(parts), self, self.header.dropped)
+        return PartialCloud.of(concatenated(parts), self, self.header.dropped)
 
     def verify(self, progress: Progress | None = None) -> list[str]:
         """What is damaged, in words: every chunk is read, compared with its checksum, and searched for
@@ -322,7 +322,7 @@ class Store(Summarised):
             made["labels"] = np.zeros(end - first, np.int32)
         if self.poses is None or place is None:
             return made
-        return moved(made, self.poses[place], self._moves[place])
+        return transformed(made, self.poses[place, :3, :3], self._moves[place])
 
 
 def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:

@@ -1,5 +1,7 @@
-"""Views that are drawn of more than fits a device at once: band after band of their rows, each of what it
-sees."""
+"""Row bands: frames that do not fit on the device are rendered in bands of rows, each of its visible chunks.
+
+Where a band cannot be split further, the device projects the splats in chunks: slower, with the same image.
+"""
 
 from __future__ import annotations
 
@@ -10,197 +12,189 @@ from itertools import pairwise
 
 import numpy as np
 
+from fidsplat.backends.bands import cut
 from fidsplat.backends.interface import Images, ResidentData
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
+from fidsplat.store.chunked_splats import CellSizes, ChunkedSplats, NodeMasks, Selection
+from fidsplat.store.subchunks import Subchunks
 from fidsplat.streaming.frustum_culling import in_frustum
-from fidsplat.streaming.occlusion_test import contributing_tiles, occluded
-from fidsplat.streaming.selection import Nodes, Pixels, Selection, Streamed
-from fidsplat.streaming.subchunks import Pieces
+from fidsplat.streaming.level_of_detail import visible_nodes
+from fidsplat.streaming.occlusion_test import contributing_tiles, node_keys, occluded, occluded_nodes
 
-_LEAST_ROWS = 16
-"""pixels: what a device lists together at least"""
-_FUTILE = 1.6
-"""times as many splats as both halves see of a band are not worth cutting it: of a fisheye's, say, each is
-drawn of all"""
+_MIN_ROWS = 16
+"""pixels"""
+_MAX_OVERLAP = 1.6
+"""a band is not split where its halves together need more than this times its splats, e.g. under a fisheye,
+where each half needs all"""
 
 
 @dataclass(frozen=True)
-class PartOfView:
-    """A band of a view on the device."""
+class BandData:
+    """A band of rows on the device: the splats to render it from, or its images if it is rendered already."""
 
     rows: tuple[int, int]
-    """of pixels, [first, end)"""
+    """pixels [first, end)"""
     view: View
     data: ResidentData | None
-    """None if it is drawn already"""
     ids: Callable[[], np.ndarray]
-    """the indices in the whole (n,) int32 of its splats"""
+    """returns the scene indices (n,) int32 of its splats"""
     images: Images | None = None
-    """if it is"""
 
 
 @dataclass(frozen=True)
 class Band:
-    """Rows of pixels of a view."""
+    """A band of rows of a view, and the chunks from which it is rendered."""
 
-    scene: Streamed
-    whole: View
+    scene: ChunkedSplats
+    full_view: View
     features: FeatureSet
-    pixels: Pixels
-    """as of `Streamed.select`"""
+    cell_sizes: CellSizes
     rows: tuple[int, int]
-    some: Nodes | None = None
-    """all that it is drawn of, if that is not all that it sees"""
-    pieces: tuple[tuple[Pieces, np.ndarray], ...] | None = None
-    """of these the pieces, and which of them (k,) bool it is drawn of; None: all"""
+    """pixels [first, end)"""
+    subset: NodeMasks | None = None
+    """nodes from which it is rendered; None: all visible nodes"""
+    subchunks: tuple[tuple[Subchunks, np.ndarray], ...] | None = None
+    """subchunks of these nodes, and a mask (k,) bool of those from which it is rendered; None: all"""
 
     @staticmethod
-    def of(scene: Streamed, view: View, features: FeatureSet, pixels: Pixels) -> Band:
-        """All rows that are wanted of a view."""
+    def of(scene: ChunkedSplats, view: View, features: FeatureSet, cell_sizes: CellSizes) -> Band:
+        """All rows of a view."""
         first, end = view.band or (0, view.height)
-        return Band(scene, view, features, pixels, (first // view.samples, end // view.samples))
+        return Band(scene, view, features, cell_sizes, (first // view.samples, end // view.samples))
 
-    def within(self, first: int, end: int) -> Band:
-        """Fewer of its rows, drawn of all that they see."""
-        return replace(self, rows=(first, end), some=None, pieces=None)
+    def with_rows(self, first: int, end: int) -> Band:
+        """A band of other rows, rendered from all of its visible nodes."""
+        return replace(self, rows=(first, end), subset=None, subchunks=None)
 
-    def drawn_of(self, some: Nodes) -> Band:
-        """It, drawn of some of what it sees."""
-        return self._kept(replace(self, some=some, pieces=None))
+    def with_nodes(self, nodes: NodeMasks) -> Band:
+        """The same rows, rendered from some of the visible nodes."""
+        return self._with_cache(replace(self, subset=nodes, subchunks=None))
 
-    def _kept(self, made: Band) -> Band:
-        if "seen" in self.__dict__:
-            made.__dict__["seen"] = self.seen  # a cached property
+    def _with_cache(self, made: Band) -> Band:
+        if "visible" in self.__dict__:
+            made.__dict__["visible"] = self.visible
         return made
 
-    def cut_to(self, ends: TerminationDepths) -> Band:
-        """It, drawn of those pieces alone that may show where its tiles end there."""
-        pieces = self.scene.pieces(self.nodes)
-        return self._kept(replace(self, pieces=tuple((each, self._needed(each, ends)) for each in pieces)))
+    def without_occluded(self, ends: TerminationDepths) -> Band:
+        """The same rows, without occluded nodes and subchunks."""
+        occluded = self.occluded(ends)
+        nodes = tuple(a & ~b for a, b in zip(self.nodes, occluded, strict=True))
+        return self.with_nodes(nodes).without_occluded_subchunks(ends)
 
-    def lacking(self, ends: TerminationDepths, missing: Nodes) -> list[Pieces]:
-        """The pieces that may show where tiles end there and that it was not drawn of: of its nodes, and of
-        some that are missing."""
-        own = [each.only(self._needed(each, ends) & ~drawn) for each, drawn in self.pieces or ()]
-        others = (each.only(self._needed(each, ends)) for each in self.scene.pieces(missing))
+    def without_occluded_subchunks(self, ends: TerminationDepths) -> Band:
+        """The same rows, rendered from those subchunks of its nodes that can contribute."""
+        every = self.scene.subchunks(self.nodes)
+        masked = tuple((each, self._can_contribute(each, ends)) for each in every)
+        return self._with_cache(replace(self, subchunks=masked))
+
+    def missing_subchunks(self, ends: TerminationDepths, missing: NodeMasks) -> list[Subchunks]:
+        """Subchunks that can contribute but are not rendered: of its own nodes and of missing nodes."""
+        own = [each.only(self._can_contribute(each, ends) & ~used) for each, used in self.subchunks or ()]
+        others = (each.only(self._can_contribute(each, ends)) for each in self.scene.subchunks(missing))
         return [each for each in (*own, *others) if len(each.nodes)]
 
-    def shown(self, pieces: Sequence[Pieces], ends: TerminationDepths) -> np.ndarray:
-        """(rows, columns) bool: the tiles that end there in which pieces may show."""
+    def contributing_tiles(self, subchunks: Sequence[Subchunks], ends: TerminationDepths) -> np.ndarray:
+        """(rows, columns) bool: tiles to which subchunks can contribute."""
         made = np.zeros(ends.depths.shape, bool)
-        for each in pieces:
+        for each in subchunks:
             made |= contributing_tiles(self.view, self.features, each.boxes, each.reach, ends)
         return made
 
-    def ended(self, ends: TerminationDepths) -> Band:
-        """It, drawn of what may show where its tiles end there."""
-        hidden = self.hidden(ends)
-        return self.drawn_of(tuple(a & ~b for a, b in zip(self.nodes, hidden, strict=True))).cut_to(ends)
-
-    def _needed(self, pieces: Pieces, ends: TerminationDepths) -> np.ndarray:
-        """(k,) bool: which pieces may show where tiles end there."""
-        if not len(pieces.nodes):
+    def _can_contribute(self, subchunks: Subchunks, ends: TerminationDepths) -> np.ndarray:
+        """(k,) bool: subchunks that are pinned, or in the frustum and not occluded."""
+        if not len(subchunks.nodes):
             return np.zeros(0, bool)
-        shows = in_frustum(self.view, self.features, pieces.boxes, pieces.reach)
-        shows &= ~occluded(self.view, self.features, pieces.boxes, pieces.reach, ends)
-        return shows | pieces.always
+        visible = in_frustum(self.view, self.features, subchunks.boxes, subchunks.reach)
+        visible &= ~occluded(self.view, self.features, subchunks.boxes, subchunks.reach, ends)
+        return visible | subchunks.pinned
 
     @cached_property
     def view(self) -> View:
-        """That wants these rows alone."""
-        first, end = (row * self.whole.samples for row in self.rows)
-        return (
-            self.whole if (first, end) == (0, self.whole.height) else replace(self.whole, band=(first, end))
-        )
+        """The view restricted to this band."""
+        first, end = (row * self.full_view.samples for row in self.rows)
+        if (first, end) == (0, self.full_view.height):
+            return self.full_view
+        return replace(self.full_view, band=(first, end))
 
     @cached_property
-    def seen(self) -> Nodes:
-        """All nodes that it may see."""
-        return self.scene.seen([self.view], self.features, self.pixels)
+    def visible(self) -> NodeMasks:
+        """All visible nodes."""
+        return visible_nodes(self.scene, [self.view], self.features, self.cell_sizes)
 
     @property
-    def nodes(self) -> Nodes:
-        """Those that it is drawn of."""
-        return self.seen if self.some is None else self.some
+    def nodes(self) -> NodeMasks:
+        """Nodes from which it is rendered."""
+        return self.visible if self.subset is None else self.subset
 
     @property
-    def missing(self) -> Nodes:
-        """Those that it may see and is not drawn of."""
-        return tuple(each & ~own for each, own in zip(self.seen, self.nodes, strict=True))
+    def missing(self) -> NodeMasks:
+        """Visible nodes from which it is not rendered."""
+        return tuple(each & ~own for each, own in zip(self.visible, self.nodes, strict=True))
 
-    def hidden(self, ends: TerminationDepths) -> Nodes:
-        """The nodes of which it shows nothing where its tiles end there."""
-        return self.scene.hidden(self.view, self.features, ends)
+    def occluded(self, ends: TerminationDepths) -> NodeMasks:
+        """Nodes that are occluded, given termination depths."""
+        return occluded_nodes(self.scene, self.view, self.features, ends)
 
-    def least_keys(self) -> Nodes:
-        """As that of `Streamed`."""
-        return self.scene.least_keys(self.view, self.features)
+    def minimum_keys(self) -> tuple[np.ndarray, ...]:
+        """(places * nodes,) metres for each store: lower bounds on sort keys."""
+        return node_keys(self.scene, self.view, self.features)
 
     @cached_property
     def selection(self) -> Selection:
-        """What it is drawn of."""
-        if self.pieces is None:
+        """Chunks, or rows of chunks, from which it is rendered."""
+        if self.subchunks is None:
             return Selection.of(self.nodes)
-        return Selection.of_pieces([pieces.only(drawn) for pieces, drawn in self.pieces])
+        return Selection.of_subchunks([each.only(used) for each, used in self.subchunks])
 
     @cached_property
     def count(self) -> int:
-        """Splats of that."""
-        if self.pieces is None:
-            return self.count_of(self.nodes) + len(self.scene.beside)
-        return sum(int(each.rows[drawn].sum()) for each, drawn in self.pieces) + len(self.scene.beside)
+        """Number of splats from which it is rendered."""
+        if self.subchunks is None:
+            return self.count_of(self.nodes) + len(self.scene.in_memory)
+        return sum(int(each.rows[used].sum()) for each, used in self.subchunks) + len(self.scene.in_memory)
 
-    def count_of(self, nodes: Nodes) -> int:
-        """Splats of some nodes."""
+    def count_of(self, nodes: NodeMasks) -> int:
+        """Number of splats of nodes."""
         return sum(int(n[own].sum()) for n, own in zip(self.scene.node_counts, nodes, strict=True))
 
     @property
     def halves(self) -> list[Band]:
-        """Bands of half as many rows; none, if that is of no use."""
+        """The two halves of its rows; empty where splitting does not help."""
         first, end = self.rows
         middle = (first + end) // 2
-        if end - first < 2 * _LEAST_ROWS or self.whole.shots:
+        if end - first < 2 * _MIN_ROWS or self.full_view.shots:
             return []
-        made = [self.within(first, middle), self.within(middle, end)]
-        return made if sum(half.count for half in made) <= _FUTILE * self.count else []
+        made = [self.with_rows(first, middle), self.with_rows(middle, end)]
+        return made if sum(half.count for half in made) <= _MAX_OVERLAP * self.count else []
 
 
-class Bands:
-    """Where views are cut, from view to view: what the last was cut into is where the next begins."""
+class BandSplitter:
+    """Splits views into bands that fit on the device, starting with the bands of the previous view."""
 
     def __init__(self) -> None:
         self._cuts: dict[tuple[int, int], list[int]] = {}
-        """by the rows that were wanted of the last view"""
-        self._most = 0
-        """splats that were drawn at once"""
+        """rows of the previous view -> rows at which its bands began, and the end"""
+        self._capacity = 0
+        """largest number of splats that fitted"""
 
-    def cut(self, whole: Band, fits: Callable[[Band], bool]) -> Iterator[Band]:
-        """Bands that each fit, from the top, or cannot be cut further. What fits is asked right before a band
-        is given."""
-        waiting = [whole.within(*rows) for rows in pairwise(self._cuts.get(whole.rows, whole.rows))]
+    def split(self, full: Band, fits: Callable[[Band], bool]) -> Iterator[Band]:
+        """Bands from the top that fit, or cannot be split further. `fits` is called right before its band is
+        yielded."""
+        waiting = [full.with_rows(*rows) for rows in pairwise(self._cuts.get(full.rows, full.rows))]
         made: list[Band] = []
         while waiting:
             band = waiting.pop(0)
             fitting = fits(band)
             if not fitting and (halves := band.halves):
-                self._most = min(self._most, band.count // 2)
+                self._capacity = min(self._capacity, band.count // 2)
                 waiting[:0] = halves
                 continue
             if fitting:
-                self._most = max(self._most, band.count)
+                self._capacity = max(self._capacity, band.count)
             made.append(band)
             yield band
-        self._cuts = {whole.rows: self._joined(made)}
-
-    def _joined(self, bands: list[Band]) -> list[int]:
-        """The rows at which bands begin and the last ends: neighbours together, as far as so many splats
-        fitted before."""
-        cuts, splats = [bands[0].rows[0]], 0
-        for band in bands:
-            if splats and splats + band.count > self._most:
-                cuts.append(band.rows[0])
-                splats = 0
-            splats += band.count
-        return [*cuts, bands[-1].rows[1]]
+        counts = np.array([band.count for band in made])
+        firsts = [made[first].rows[0] for first, _, _ in cut(counts, self._capacity)]
+        self._cuts = {full.rows: [*firsts, made[-1].rows[1]]}

@@ -7,12 +7,14 @@ A box is occluded if its lowest sort key is above the termination depth of every
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
+from fidsplat.store.chunked_splats import ChunkedSplats, NodeMasks
 from fidsplat.streaming.frustum_culling import PADDING, Boxes, CameraBoxes, Extent, ewa_reach
 
 _RANGE = 3.33
@@ -56,6 +58,23 @@ def contributing_tiles(
     for depth, top, bottom, left, right in zip(least, *spans, strict=True):
         made[top:bottom, left:right] |= ends.depths[top:bottom, left:right] >= depth
     return made
+
+
+def node_keys(scene: ChunkedSplats, view: View, features: FeatureSet) -> tuple[np.ndarray, ...]:
+    """(places * nodes,) metres for each store: lower bounds on the sort keys of nodes."""
+    numbers = range(len(scene.stores))
+    return tuple(minimum_keys(view, features, partial(scene.boxes, number)) for number in numbers)
+
+
+def occluded_nodes(
+    scene: ChunkedSplats, view: View, features: FeatureSet, ends: TerminationDepths
+) -> NodeMasks:
+    """Masks of the nodes that are occluded in a frame with these termination depths, except pinned ones."""
+    made = []
+    for number, (store, pinned) in enumerate(zip(scene.stores, scene.pinned, strict=True)):
+        reach = np.tile(store.nodes["reach"].astype(np.float64), store.places)
+        made.append(occluded(view, features, partial(scene.boxes, number), reach, ends) & ~pinned)
+    return tuple(made)
 
 
 def _tile_spans(

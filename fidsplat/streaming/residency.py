@@ -1,5 +1,4 @@
-"""Parts of stores on a device: what views were drawn of stays there, and what the next one needs is brought
-while this one is drawn."""
+"""Device chunk cache with prefetch: chunks of rendered views stay, those of the next view are prefetched."""
 
 from __future__ import annotations
 
@@ -19,114 +18,117 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.select import with_termination_depths
-from fidsplat.streaming.bands import Band, Bands, PartOfView
-from fidsplat.streaming.occlusion_culling import Hidden
-from fidsplat.streaming.occlusion_test import is_supported
-from fidsplat.streaming.selection import Selection, Streamed
+from fidsplat.store.chunked_splats import ChunkedSplats, Selection
+from fidsplat.streaming import occlusion_test
+from fidsplat.streaming.bands import Band, BandData, BandSplitter
+from fidsplat.streaming.device_chunks import DeviceChunks
+from fidsplat.streaming.level_of_detail import select
+from fidsplat.streaming.occlusion_culling import OcclusionCulling
 from fidsplat.util.errors import FidsplatError
 
 
 class Residency:
-    """What of a scene that is on disk lies on a device. Used by one thread at a time."""
+    """The chunks of a scene on a device. Used by one thread at a time."""
 
-    def __init__(self, scene: Streamed, backend: Backend) -> None:
-        self.scene, self._backend = scene, backend
+    def __init__(self, scene: ChunkedSplats, backend: Backend) -> None:
+        self.scene, self._backend, self.chunks = scene, backend, DeviceChunks(scene)
         self._cache = (
-            backend.chunk_cache(scene, scene.largest_chunk) if isinstance(backend, KeepsChunks) else None
+            backend.chunk_cache(self.chunks, self.chunks.largest_chunk)
+            if isinstance(backend, KeepsChunks)
+            else None
         )
-        self._there: tuple[Selection, int, ResidentData] | None = None
-        self._bands, self._hidden = Bands(), Hidden()
-        self._fetching: threading.Thread | None = None
+        self._current: tuple[Selection, int, ResidentData] | None = None
+        self._splitter, self._occlusion = BandSplitter(), OcclusionCulling()
+        self._prefetch_thread: threading.Thread | None = None
         self.nodes = 0
-        """of the last views"""
+        """number of nodes of the last views"""
 
     @property
     def count(self) -> int:
-        """Splats of the whole."""
+        """Number of splats of the complete scene."""
         return len(self.scene)
 
     @property
     def memory_bytes(self) -> int:
-        """Device memory of what is there."""
-        return 0 if self._there is None else self._there[-1].memory_bytes
+        """Device memory of the current splats."""
+        return 0 if self._current is None else self._current[-1].memory_bytes
 
-    def parts(
+    def bands(
         self, view: View, features: FeatureSet, quality: Quality, pipeline: Pipeline
-    ) -> Iterator[PartOfView]:
-        """What a view is drawn of: all that it sees, or, where the device cannot draw that at once, bands of
-        its rows from the top, each with what it sees. Each is asked for when the last is being drawn.
+    ) -> Iterator[BandData]:
+        """Bands of a view with their visible splats, from the top; one band if the device can render all at
+        once. Each is uploaded when the caller requests it.
 
         Raises:
             InputError: the quality allows an error that was not measured.
         """
-        whole = Band.of(self.scene, view, features, self.scene.pixels_of(quality))
+        full = Band.of(self.scene, view, features, self.scene.cell_sizes(quality))
 
         def fits(band: Band, first_id: int = 0) -> bool:
             data = self._data(band.selection, first_id)
             return not isinstance(pipeline, KnowsRoom) or pipeline.fits(data, band.view)
 
-        def numbered(bands: Sequence[Band]) -> Callable[[], np.ndarray]:
+        def ids_of(bands: Sequence[Band]) -> Callable[[], np.ndarray]:
             self.nodes += sum(len(band.selection) for band in bands)
             return lambda: np.concatenate([self.scene.ids(band.selection) for band in bands])
 
         self.nodes = 0
         backend = self._backend
-        if not self._hidden.expects(whole):
-            self._hidden.passed()
-        elif self._asks(view, features) and isinstance(backend, GivesTileEnds):
-            asking = backend.pipeline(with_termination_depths(features))
+        if not self._occlusion.is_worthwhile(full):
+            self._occlusion.skip_view()
+        elif self._can_cull(view, features) and isinstance(backend, GivesTileEnds):
+            culling_pipeline = backend.pipeline(with_termination_depths(features))
 
-            def draw(band: Band, first_id: int) -> tuple[Images, TerminationDepths]:
-                images = asking.render(self._data(band.selection, first_id), band.view)
+            def render_band(band: Band, first_id: int) -> tuple[Images, TerminationDepths]:
+                images = culling_pipeline.render(self._data(band.selection, first_id), band.view)
                 return images, backend.tile_ends_of(images)
 
-            shown = self._hidden.drawn(whole, fits, draw, backend.take_tiles)
-            if shown is not None:
-                bands, images = shown
-                yield PartOfView(whole.rows, whole.view, None, numbered(bands), images)
+            rendered = self._occlusion.render(full, fits, render_band, backend.take_tiles)
+            if rendered is not None:
+                bands, images = rendered
+                yield BandData(full.rows, full.view, None, ids_of(bands), images)
                 return
-        for band in self._bands.cut(whole, fits):
-            yield PartOfView(band.rows, band.view, self._data(band.selection), numbered([band]))
+        for band in self._splitter.split(full, fits):
+            yield BandData(band.rows, band.view, self._data(band.selection), ids_of([band]))
 
-    def of(
+    def gather(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[ResidentData, Callable[[], np.ndarray]]:
-        """The splats that these views see, on the device, and what gives their indices in the whole (n,)
-        int32; the quality that needs most decides for all views.
+        """The visible splats of several views on the device, and a function that returns their scene indices
+        (n,) int32. The strictest quality decides for all views.
 
         Raises:
             InputError: a quality allows an error that was not measured.
         """
-        pixels = self.scene.pixels_of(*qualities)
-        selection = self.scene.select(views, features, pixels)
+        selection = select(self.scene, views, features, self.scene.cell_sizes(*qualities))
         self.nodes = len(selection)
         return self._data(selection), partial(self.scene.ids, selection)
 
     def _data(self, selection: Selection, first_id: int = 0) -> ResidentData:
-        if self._there is None or self._there[:2] != (selection, first_id):
-            self._there = None  # before the next is there, so that both need not fit
-            self._there = selection, first_id, self._brought(selection, first_id)
-        return self._there[-1]
+        if self._current is None or self._current[:2] != (selection, first_id):
+            self._current = None  # released first, so that both need not fit
+            self._current = selection, first_id, self._uploaded(selection, first_id)
+        return self._current[-1]
 
-    def _brought(self, selection: Selection, first_id: int) -> ResidentData:
+    def _uploaded(self, selection: Selection, first_id: int) -> ResidentData:
         if self._cache is None:
             return self._backend.upload(self.scene.part(selection))
-        return self._cache.gather(self.scene.chunks(selection, self._cache.places), first_id)
+        return self._cache.gather(self.chunks.of(selection, self._cache.places), first_id)
 
-    def _asks(self, view: View, features: FeatureSet) -> bool:
-        """Whether it can be told what is hidden."""
-        tells = isinstance(self._backend, GivesTileEnds) and isinstance(self._backend, KeepsChunks)
-        return tells and is_supported(view, features)
+    def _can_cull(self, view: View, features: FeatureSet) -> bool:
+        """Whether occlusion culling is supported."""
+        has_depths = isinstance(self._backend, GivesTileEnds) and isinstance(self._backend, KeepsChunks)
+        return has_depths and occlusion_test.is_supported(view, features)
 
-    def read_ahead(self, captures: Iterator[Capture]) -> Iterator[Capture]:
-        """The captures, each when what the next needs is being brought."""
+    def prefetched(self, captures: Iterator[Capture]) -> Iterator[Capture]:
+        """The captures, each yielded while the chunks of the next are prefetched."""
         waiting: Capture | None = None
         try:
             while True:
                 try:
                     following = next(captures, None)
                     if following is not None and waiting is not None:
-                        self._fetch(following)
+                        self._prefetch(following)
                 except Exception:
                     if waiting is not None:
                         yield waiting
@@ -137,31 +139,29 @@ class Residency:
                     return
                 waiting = following
         finally:
-            if self._fetching is not None:  # it uses the device, which may be gone when the process ends
-                self._fetching.join()
+            if self._prefetch_thread is not None:  # the device may be gone when the process ends
+                self._prefetch_thread.join()
 
-    def _fetch(self, capture: Capture) -> None:
-        """Bring what a view will need, beside what goes on; nothing, while the last such work goes on.
+    def _prefetch(self, capture: Capture) -> None:
+        """Start to prefetch the chunks of a view in another thread, unless one is still running.
 
-        What fails here fails again when that view is drawn, where it can be told.
+        An error is ignored here: rendering the view reports it again.
         """
         features, view = prepare(self.scene, capture)
-        pixels = self.scene.pixels_of(capture.quality)
-        if self._fetching is not None and self._fetching.is_alive():
+        cell_sizes = self.scene.cell_sizes(capture.quality)
+        if self._prefetch_thread is not None and self._prefetch_thread.is_alive():
             return
-
-        asks = self._asks(view, features)
+        can_cull = self._can_cull(view, features)
 
         def work() -> None:
             with suppress(FidsplatError, OSError, MemoryError):
-                whole = Band.of(self.scene, view, features, pixels)
-                if asks and self._hidden.expects(whole, later=1):
-                    whole = self._hidden.begun(whole)
-                selection = whole.selection
+                band = Band.of(self.scene, view, features, cell_sizes)
+                if can_cull and self._occlusion.is_worthwhile(band, views_later=1):
+                    band = self._occlusion.initial_guess(band)
                 if self._cache is None:
-                    self.scene.fetch(selection)
+                    self.scene.prefetch(band.selection)
                 else:
-                    self._cache.bring(self.scene.chunks(selection, self._cache.places))
+                    self._cache.bring(self.chunks.of(band.selection, self._cache.places))
 
-        self._fetching = threading.Thread(target=work, name="fidsplat-fetch", daemon=True)
-        self._fetching.start()
+        self._prefetch_thread = threading.Thread(target=work, name="fidsplat-prefetch", daemon=True)
+        self._prefetch_thread.start()

@@ -21,6 +21,7 @@ from fidsplat.cameras import Trajectory
 from fidsplat.formats import save_trajectory
 from fidsplat.images.files import png_bytes
 from fidsplat.scenes import Scene
+from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.markdown import escaped
 from fidsplat.viewer.controls import NOBODY, Controls
@@ -391,8 +392,8 @@ def _distance(scene: Scene, pose: np.ndarray) -> float:
     """Metres before the camera about which the page turns: to the nearest marker, else to the middle of the
     splats."""
     targets = [placed.pose[:3, 3] for placed in scene.markers]
-    if not targets and scene.streamed is not None:
-        targets = [sum(scene.streamed.bounds()) / 2]
+    if not targets and isinstance(scene.splats, ChunkedSplats):
+        targets = [sum(scene.splats.bounds()) / 2]
     elif not targets and len(cloud := scene.cloud()):
         targets = [np.median(cloud.means, axis=0) + cloud.origin]
     ahead = [float((target - pose[:3, 3]) @ pose[:3, 2]) for target in targets]

@@ -10,7 +10,7 @@ from agreement import assert_agrees
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.store.merge import MAX_OPACITY
-from fidsplat.store.subset import StorePart
+from fidsplat.store.partial_cloud import PartialCloud
 from fidsplat.streaming.frustum_culling import in_frustum
 
 SIZE, FOCAL, DEPTH, SIGMA = (61, 47), 4000.0, 2.0, 200.0
@@ -42,7 +42,7 @@ def beside(side, thick=False):
     like = fs.SplatCloud(
         made["means"], made["quats"], np.full((1, 3 if thick else 2), scale), [1.0], colors=made["colors"]
     )
-    return StorePart.of(made | {"labels": np.zeros(1, np.int32)}, like)
+    return PartialCloud.of(made | {"labels": np.zeros(1, np.int32)}, like)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "formats": {"splats", "cameras", "images"},
     "markers": {"splats", "capture", "images"},
     "store": DATA | {"formats"},
-    "scenes": DATA | {"markers", "formats", "store", "streaming"},
+    "scenes": DATA | {"markers", "formats", "store"},
     "effects": DATA,
     "backends": DATA | {"effects"},
     "streaming": DATA | {"store", "effects", "backends"},

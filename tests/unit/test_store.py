@@ -316,14 +316,14 @@ def test_a_store_of_places_has_the_splats_as_many_times(store, files, tmp_path):
 
 
 def test_sh_turns_with_its_splats(store, files, tmp_path):
-    from fidsplat.store.subset import moved
+    from fidsplat.store.partial_cloud import transformed
 
     part = store.load(0)
     pose = rigid_matrix((1, 2, 3), (0.3, 0.1, -0.7, 0.2))
-    turned = moved(part, pose, pose[:3, 3])
+    turned = transformed(part, pose[:3, :3], pose[:3, 3])
     cloud = fs.SplatCloud(
         part["means"], part["quats"], part["scales"], part["opacities"], sh=part["sh"]
     ).transformed(pose)
     assert turned["sh"] == pytest.approx(cloud.sh, abs=1e-5)
-    few = moved({name: array[7:9] for name, array in part.items()}, pose, pose[:3, 3])
+    few = transformed({name: array[7:9] for name, array in part.items()}, pose[:3, :3], pose[:3, 3])
     assert all(np.array_equal(few[name], turned[name][7:9]) for name in few)

@@ -16,10 +16,11 @@ from fidsplat.accuracy.quality_within import Choice
 from fidsplat.backends.prepare import prepare
 from fidsplat.cli import main
 from fidsplat.store import build_plan
+from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.detail import MARGIN, Detail, load_details, pixels, save_details
 from fidsplat.store.sources import sample, splats_of
 from fidsplat.streaming.frustum_culling import projected_sizes
-from fidsplat.streaming.selection import Streamed
+from fidsplat.streaming.level_of_detail import select
 from fidsplat.vision import read_back
 from fidsplat.worlds.city import PITCH, City, flight
 
@@ -45,9 +46,9 @@ def seen_from(away, size=(48, 32)):
 
 
 def chosen(store, camera, limits):
-    streamed = Streamed([store])
-    features, view = prepare(streamed, fs.Capture(camera, quality=QUALITY))
-    return streamed.select([view], features, limits).nodes[0], view
+    splats = ChunkedSplats([store])
+    features, view = prepare(splats, fs.Capture(camera, quality=QUALITY))
+    return select(splats, [view], features, limits).nodes[0], view
 
 
 @pytest.mark.parametrize("limit", [0.05, 0.3, 1.0, 4.0])
@@ -129,8 +130,8 @@ def test_errors_grow_with_the_size_of_cells_and_are_kept_beside_the_store(store,
     assert limits[1] >= met[0][0]
     assert set(again.pixels_of(QUALITY.with_(detail_error=1e-9))) == {0.0}
     loose, tight = QUALITY.with_(detail_error=0.3), QUALITY.with_(detail_error=allowed)
-    assert Streamed([again]).pixels_of(loose, tight) == (limits,)
-    assert Streamed([again]).pixels_of(QUALITY) == 0.0
+    assert ChunkedSplats([again]).cell_sizes(loose, tight) == (limits,)
+    assert ChunkedSplats([again]).cell_sizes(QUALITY) == 0.0
     with pytest.raises(fs.InputError, match=r"store measure .* --lowpass none"):
         again.pixels_of(fs.Quality(lowpass="none", detail_error=0.1))
 

@@ -15,11 +15,11 @@ import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
-from fidsplat.store import build_plan
+from fidsplat.store import build_plan, chunked_splats
+from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.sources import source_of
-from fidsplat.streaming import selection
 from fidsplat.streaming.frustum_culling import in_frustum
-from fidsplat.streaming.selection import Streamed
+from fidsplat.streaming.level_of_detail import select
 
 CAPTURES = {
     "pinhole": fs.Capture(look(turn=TURNED)),
@@ -64,12 +64,12 @@ def test_views_are_drawn_of_what_they_see(stores, reference, name):
     kinds = ["thick"] if name in ("pinhole", "off-centre", "fisheye") else []
     for kind in ["disks", *kinds]:
         store, capture = stores[kind], CAPTURES[name].with_(outputs=("rgb", "splat_id", "label"))
-        streamed = reference.upload(store)
-        ours, whole = reference.render(streamed, capture), reference.render(store.cloud(), capture)
+        resident = reference.upload(store)
+        ours, whole = reference.render(resident, capture), reference.render(store.cloud(), capture)
         for output in ours:
             assert np.array_equal(ours[output], whole[output]), output
         assert whole["rgb"].any()
-        read, every = streamed.data.nodes, store.chunks
+        read, every = resident.data.nodes, store.chunks
         assert 0 < read <= every
         if name in ("pinhole", "distorted", "pixel"):
             assert read < 0.75 * every
@@ -221,11 +221,11 @@ def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
 def test_what_cannot_be_fetched_ahead_is_told_by_the_picture_that_needs_it(stores, reference, monkeypatch):
     tried, told = [], []
 
-    def fetch(self, selection):
+    def prefetch(self, selection):
         tried.append(selection)
         raise fs.DeviceError("no memory")
 
-    monkeypatch.setattr(Streamed, "fetch", fetch)
+    monkeypatch.setattr(ChunkedSplats, "prefetch", prefetch)
     monkeypatch.setattr(threading, "excepthook", told.append)
     cameras = [look(), look(turn=TURNED)]
     frames = list(reference.render_views(stores["disks"], cameras))
@@ -316,10 +316,10 @@ def test_stores_with_origins_of_their_own_stand_where_they_were_built(tmp_path, 
 
 
 def test_a_scene_has_no_more_splats_than_indices(stores, monkeypatch):
-    monkeypatch.setattr(selection, "MOST_SPLATS", 2 * COUNT - 1)
-    with pytest.raises(fs.InputError, match="6,000 splats are too many"):
-        Streamed([stores["disks"], stores["thick"]])
-    monkeypatch.setattr(build_plan, "MOST_SPLATS", COUNT - 1)
+    monkeypatch.setattr(chunked_splats, "MAX_SPLATS", 2 * COUNT - 1)
+    with pytest.raises(fs.InputError, match="at most 5,999 splats, got 6,000"):
+        ChunkedSplats([stores["disks"], stores["thick"]])
+    monkeypatch.setattr(build_plan, "MAX_SPLATS", COUNT - 1)
     with pytest.raises(fs.InputError, match="3,000 splats are too many for a store"):
         build_plan.plan_of([source_of(splats(1), stores["disks"].path, "test")])
 
@@ -333,12 +333,14 @@ def test_planes_of_stores_are_always_whole(tmp_path, reference):
     near = look(5, at=(0.19, 0.19, 1.0))
     ours, whole = (reference.render(each, near)["rgb"] for each in (store, store.cloud()))
     assert np.array_equal(ours, whole)
-    selection = Streamed([store]).select(
-        [prepare(store, fs.Capture(look(at=(0, 0, 90))))[1]], prepare(store, fs.Capture(near))[0]
+    selection = select(
+        ChunkedSplats([store]),
+        [prepare(store, fs.Capture(look(at=(0, 0, 90))))[1]],
+        prepare(store, fs.Capture(near))[0],
     )
-    part = Streamed([store]).part(selection)
+    part = ChunkedSplats([store]).part(selection)
     assert len(part) == len(marker)
-    assert Streamed([store]).ids(selection).tolist() == list(range(len(store) - len(marker), len(store)))
+    assert ChunkedSplats([store]).ids(selection).tolist() == list(range(len(store) - len(marker), len(store)))
 
 
 def test_a_flight_over_a_store_goes_on_by_its_content(stores, tmp_path):

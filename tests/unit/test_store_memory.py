@@ -15,8 +15,9 @@ import fidsplat as fs
 from fidsplat.backends.opencl import chunks, workspace
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.splats.rotations import rigid_matrix
+from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.streaming import bands
-from fidsplat.streaming.selection import Streamed
+from fidsplat.streaming.device_chunks import DeviceChunks
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +45,11 @@ def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatc
 
 
 def test_a_part_of_what_is_gathered_may_begin_within_a_chunk(stores):
-    backend, scene = fs.Renderer("opencl").backend, Streamed([stores["disks"]])
-    gathered = backend.chunk_cache(scene, scene.largest_chunk).gather(scene.chunks(scene.everything(), True))
+    backend, scene = fs.Renderer("opencl").backend, ChunkedSplats([stores["disks"]])
+    device_chunks = DeviceChunks(scene)
+    gathered = backend.chunk_cache(device_chunks, device_chunks.largest_chunk).gather(
+        device_chunks.of(scene.all_chunks(), True)
+    )
     gathered.streamed = True
     found = np.empty(130, np.float32)
     cl.enqueue_copy(backend.queue, found, gathered.part("opacities", 70, 200))
@@ -94,14 +98,14 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
         ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
         for output in outputs:
             assert np.array_equal(ours[output], whole[output]), output
-    cache, scene = resident.data._cache, resident.data.scene
+    cache, scene, device_chunks = resident.data._cache, resident.data.scene, resident.data.chunks
     held = set(cache._slots)
     assert 0 < len(held) <= 2
     # what is drawn does not make room for what is fetched ahead
-    cache.bring(scene.chunks(scene.everything(), True))
+    cache.bring(device_chunks.of(scene.all_chunks(), True))
     assert set(cache._slots) == held
     # nor does one chunk that is fetched ahead for another
-    every = scene.chunks(scene.everything(), True)
+    every = device_chunks.of(scene.all_chunks(), True)
     cache._drawn = set()
     cache.bring(every[:2])
     cache.bring(every)
@@ -159,7 +163,7 @@ def test_a_budget_of_memory_makes_bands(stores):
     resident = limited.upload(store)
     ours = limited.render(resident, camera)
     assert np.array_equal(ours["rgb"], plain.render(store.cloud(), camera)["rgb"])
-    assert len(resident.data._bands._cuts[0, 90]) > 2
+    assert len(resident.data._splitter._cuts[0, 90]) > 2
 
 
 def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypatch):
@@ -181,8 +185,8 @@ def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypat
         cache = resident.data._cache
         assert 0 < cache.memory_bytes <= cache.reserved_bytes <= budget // 4
         # room is left for all that the cache may come to take, whatever it holds yet
-        empty = limited.backend.chunk_cache(resident.data.scene, cache._rows)
-        gathered = empty.gather(resident.data.scene.chunks(resident.data.scene.everything(), True))
+        empty = limited.backend.chunk_cache(resident.data.chunks, cache._rows)
+        gathered = empty.gather(resident.data.chunks.of(resident.data.scene.all_chunks(), True))
         assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * gathered.room
         assert len(store) <= gathered.room <= 9 / 8 * len(store)
         assert empty.memory_bytes == 0
@@ -204,19 +208,19 @@ def test_pictures_of_fewer_splats_take_what_those_of_more_have_left():
 
 
 def test_bands_that_fitted_together_are_drawn_together():
-    made = bands.Bands()
+    made = bands.BandSplitter()
     whole = SimpleNamespace(rows=(0, 64), count=64)
-    whole.within = lambda first, end: SimpleNamespace(
-        rows=(first, end), count=end - first, within=whole.within,
-        halves=[] if end - first < 2 else [whole.within(first, (first + end) // 2),
-                                           whole.within((first + end) // 2, end)],
+    whole.with_rows = lambda first, end: SimpleNamespace(
+        rows=(first, end), count=end - first, with_rows=whole.with_rows,
+        halves=[] if end - first < 2 else [whole.with_rows(first, (first + end) // 2),
+                                           whole.with_rows((first + end) // 2, end)],
     )  # fmt: skip
-    assert [band.rows for band in made.cut(whole, lambda band: band.count <= 20)] == [
+    assert [band.rows for band in made.split(whole, lambda band: band.count <= 20)] == [
         (0, 16), (16, 32), (32, 48), (48, 64)
     ]  # fmt: skip
-    assert len(list(made.cut(whole, lambda band: band.count <= 20))) == 4
-    assert len(list(made.cut(whole, lambda band: band.count <= 8))) == 8
-    assert len(list(made.cut(whole, lambda band: True))) == 8
-    made._most = 33
-    list(made.cut(whole, lambda band: True))
+    assert len(list(made.split(whole, lambda band: band.count <= 20))) == 4
+    assert len(list(made.split(whole, lambda band: band.count <= 8))) == 8
+    assert len(list(made.split(whole, lambda band: True))) == 8
+    made._capacity = 33
+    list(made.split(whole, lambda band: True))
     assert made._cuts == {(0, 64): [0, 32, 64]}

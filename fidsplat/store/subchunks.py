@@ -1,5 +1,7 @@
-"""Pieces of chunks, rows that lie next to each other on the curve, in boxes of their own: of a chunk that is
-not hidden as a whole, some are. Their boxes are made when a view first needs the chunk."""
+"""Subchunks: runs of 1024 splats of a chunk with their own bounding boxes, for finer occlusion culling.
+
+The boxes of a chunk are computed when a view first needs them.
+"""
 
 from __future__ import annotations
 
@@ -10,49 +12,53 @@ import numpy as np
 from fidsplat.store.store import Store
 
 ROWS = 1024
-"""splats of a piece"""
+"""splats of a subchunk"""
 
 
 @dataclass(frozen=True)
-class Pieces:
-    """Of nodes of a store, in the order of their splats."""
+class Subchunks:
+    """Subchunks of some nodes of a store, in splat order."""
 
     nodes: np.ndarray
-    """(k,) int64 whose they are"""
+    """(k,) int64 number of the node"""
     first: np.ndarray
-    """(k,) int64 rows of the node at which they begin"""
+    """(k,) int64 first row within the node"""
     rows: np.ndarray
-    """(k,) int64 how many they have"""
+    """(k,) int64 number of rows"""
     low: np.ndarray
-    """(k, 3) float64 metres: corners of boxes around their centres, as `high`"""
+    """(k, 3) float64 metres: lowest corners of boxes around the centres"""
     high: np.ndarray
+    """(k, 3) float64 metres: highest corners"""
     reach: np.ndarray
     """(k,) metres: largest standard deviation"""
-    always: np.ndarray
-    """(k,) bool: those that every picture has"""
+    pinned: np.ndarray
+    """(k,) bool: part of every frame"""
 
-    def only(self, which: np.ndarray) -> Pieces:
-        """Some of them (k,) bool."""
-        return Pieces(*(getattr(self, field.name)[which] for field in fields(self)))
+    def only(self, which: np.ndarray) -> Subchunks:
+        """The subchunks that a mask (k,) bool selects."""
+        return Subchunks(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
-        """As `Store.boxes`."""
+        """Lowest and highest corners (k, 3) of boxes around splats to that many standard deviations."""
         around = sigmas * self.reach[:, None]
         return self.low - around, self.high + around
 
 
-class PiecesOf:
-    """The pieces of a store, as views come to need them."""
+class SubchunkTable:
+    """Subchunks of a store, computed on first use.
 
-    def __init__(self, store: Store, move: np.ndarray, pinned: np.ndarray) -> None:
-        """move: (3,) metres, to the origin from which views see the store. pinned: (n,) bool nodes that every
-        picture has."""
-        self._store, self._move, self._pinned = store, move, pinned
+    Args:
+        offset: (3,) metres, added to all boxes.
+        pinned: (n,) bool: nodes that are part of every frame.
+    """
+
+    def __init__(self, store: Store, offset: np.ndarray, pinned: np.ndarray) -> None:
+        self._store, self._offset, self._pinned = store, offset, pinned
         self._known: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-        """of a node of one place: boxes, and the largest standard deviation in each"""
+        """node of one place -> corners of the boxes, largest standard deviations"""
 
-    def of(self, numbers: np.ndarray) -> Pieces:
-        """Those of nodes (k,) by their numbers."""
+    def of(self, numbers: np.ndarray) -> Subchunks:
+        """The subchunks of nodes (k,), by their numbers."""
         store = self._store
         places, own = np.divmod(numbers, max(len(store.nodes), 1))
         each = [self._boxes(node) for node in own.tolist()]
@@ -64,8 +70,9 @@ class PiecesOf:
             low, high = store.placed_boxes(low, high, place)
         first = ROWS * (np.arange(len(nodes)) - np.repeat(np.cumsum(counts) - counts, counts))
         rows = np.minimum(store.counts(nodes) - first, ROWS)
-        low, high = low + self._move, high + self._move
-        return Pieces(nodes, first, rows, low, high, reach, self._pinned[nodes])
+        return Subchunks(
+            nodes, first, rows, low + self._offset, high + self._offset, reach, self._pinned[nodes]
+        )
 
     def _boxes(self, node: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if node not in self._known:

@@ -12,8 +12,10 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.effects.select import with_termination_depths
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.streaming import occlusion_culling, occlusion_test, subchunks
-from fidsplat.streaming.selection import Streamed
+from fidsplat.store import subchunks
+from fidsplat.store.chunked_splats import ChunkedSplats
+from fidsplat.streaming import occlusion_culling, occlusion_test
+from fidsplat.streaming.level_of_detail import select
 
 
 def walls():
@@ -49,11 +51,11 @@ def town(tmp_path_factory):
 @pytest.fixture
 def asked(monkeypatch):
     """Every view is asked for what is hidden; gives what each was drawn of, of how many splats."""
-    drawn, counts = occlusion_culling.Hidden.drawn, []
-    monkeypatch.setattr(occlusion_culling, "LEAST", 0)
-    monkeypatch.setattr(occlusion_culling, "_FIRST", 3000)
-    monkeypatch.setattr(occlusion_culling, "_SMALL", 1)
-    monkeypatch.setattr(occlusion_culling, "_RESTS", 0)
+    drawn, counts = occlusion_culling.OcclusionCulling.render, []
+    monkeypatch.setattr(occlusion_culling, "MIN_SPLATS", 0)
+    monkeypatch.setattr(occlusion_culling, "_INITIAL_SPLATS", 3000)
+    monkeypatch.setattr(occlusion_culling, "_PROBE_SHARE", 1)
+    monkeypatch.setattr(occlusion_culling, "_PAUSE", 0)
     monkeypatch.setattr(subchunks, "ROWS", 24)
 
     def noted(self, whole, *given):
@@ -61,7 +63,7 @@ def asked(monkeypatch):
         counts.append((whole.count if made is None else made[0][0].count, whole.count))
         return made
 
-    monkeypatch.setattr(occlusion_culling.Hidden, "drawn", noted)
+    monkeypatch.setattr(occlusion_culling.OcclusionCulling, "render", noted)
     return counts
 
 
@@ -109,7 +111,7 @@ def test_what_is_hidden_is_not_read(town, asked):
     for _ in renderer.render_views(resident, PATH[:2]):
         pass
     features, view = prepare(resident.whole, fs.Capture(PATH[1]))
-    seen = resident.whole.select([view], features)
+    seen = select(resident.whole, [view], features)
     assert len(resident.data._cache._slots) < 0.95 * len(seen)
     assert resident.data.nodes < 0.95 * len(seen)
 
@@ -131,8 +133,8 @@ def test_the_same_view_is_drawn_once(town, asked, monkeypatch):
 @pytest.mark.parametrize("way", ["centres", "pixels", "samples", "odd samples", "groups", "bands"])
 def test_what_is_missing_is_drawn_in_its_tiles_alone(town, asked, monkeypatch, way):
     """The last view's ends are taken too near, so that some of what shows is not drawn at first."""
-    monkeypatch.setattr(occlusion_culling, "_SLACK", -6.0)
-    monkeypatch.setattr(occlusion_culling, "_SOME", 1)
+    monkeypatch.setattr(occlusion_culling, "_MOTION_SLACK", -6.0)
+    monkeypatch.setattr(occlusion_culling, "_PATCH_RATIO", 1)
     renderer, taken, path = fs.Renderer("opencl"), [], [view(), view(0.02, 0.1), view(0.03, 0.5)]
     backend = type(renderer.backend)
     take, outputs = backend.take_tiles, ALL_OUTPUTS if way != "groups" else ("rgb", "splat_id")
@@ -175,9 +177,9 @@ def test_views_of_about_as_many_splats_take_no_new_memory(town, asked, monkeypat
 
 
 def test_of_what_lets_light_through_nothing_is_hidden(tmp_path, asked, monkeypatch):
-    monkeypatch.setattr(occlusion_culling, "_RESTS", 2)
-    monkeypatch.setattr(occlusion_culling, "_SMALL", 4)
-    monkeypatch.setattr(occlusion_culling, "_FIRST", 500)
+    monkeypatch.setattr(occlusion_culling, "_PAUSE", 2)
+    monkeypatch.setattr(occlusion_culling, "_PROBE_SHARE", 4)
+    monkeypatch.setattr(occlusion_culling, "_INITIAL_SPLATS", 500)
     cloud = splats(4)
     faint = fs.SplatCloud(
         cloud.means, cloud.quats, cloud.scales, np.full(len(cloud), 0.05, np.float32), colors=cloud.colors
@@ -194,19 +196,19 @@ def test_levels_of_detail_and_places_are_hidden_too(town, tmp_path, asked, monke
     poses = [np.eye(4), rigid_matrix((1, 0, 16)), rigid_matrix((-2, 0, 30))]
     places = fs.Store(fs.place_store(town.stores[1], tmp_path / "places.fss", poses))
     whole = fs.Scene(stores=(town.stores[0], places))
-    renderer, scene = fs.Renderer("opencl"), Streamed(whole.stores)
+    renderer, scene = fs.Renderer("opencl"), ChunkedSplats(whole.stores)
     resident = renderer.upload(whole)
-    monkeypatch.setattr(Streamed, "pixels_of", lambda self, *qualities: 4.0)
+    monkeypatch.setattr(ChunkedSplats, "cell_sizes", lambda self, *qualities: 4.0)
     features, shot = prepare(scene, fs.Capture(view()))
     assert any(
         places.nodes["level"][node % len(places.nodes)]
-        for node in scene.select([shot], features, 4.0).nodes[1]
+        for node in select(scene, [shot], features, 4.0).nodes[1]
     )
     for camera in PATH[:3]:
         ours = renderer.render(resident, camera, outputs=("rgb", "depth", "splat_id"))
-        monkeypatch.setattr(occlusion_culling, "LEAST", 1 << 60)
+        monkeypatch.setattr(occlusion_culling, "MIN_SPLATS", 1 << 60)
         every = renderer.render(renderer.upload(whole), camera, outputs=("rgb", "depth", "splat_id"))
-        monkeypatch.setattr(occlusion_culling, "LEAST", 0)
+        monkeypatch.setattr(occlusion_culling, "MIN_SPLATS", 0)
         for output in every:
             assert np.array_equal(ours[output], every[output])
     assert all(count < 0.9 * of for count, of in asked)

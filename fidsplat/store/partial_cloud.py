@@ -1,4 +1,4 @@
-"""Splats of a store as a cloud that is drawn, and splats of a store at another place."""
+"""Partial clouds: some splats of a scene with the traits of the complete scene; and arrays of splats."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from fidsplat.splats.harmonics import C0, rotation_of_coefficients
 from fidsplat.splats.rotations import matrix_to_quaternion
 
 
-class WholeTraits(Protocol):
-    """What the whole has of which a cloud is a part: by it the kernels are chosen, so that a part has the
-    bits of the whole."""
+class SceneTraits(Protocol):
+    """Traits of a complete scene, which select the kernels, so that a part renders bit-identically."""
 
     @property
     def sh_degree(self) -> int: ...
@@ -33,40 +32,40 @@ class WholeTraits(Protocol):
     def origin(self) -> np.ndarray: ...
 
 
-class StorePart(SplatCloud):
-    """Some splats of a whole, in its order, drawn as the whole is."""
+class PartialCloud(SplatCloud):
+    """Some splats of a scene, in its order, rendered with the traits of the complete scene."""
 
-    _whole: WholeTraits
+    _scene: SceneTraits
 
     @classmethod
     def of(
-        cls, arrays: Mapping[str, np.ndarray], whole: WholeTraits, dropped: Mapping[str, int] | None = None
-    ) -> StorePart:
-        """A cloud of arrays that can all be drawn, without a copy. dropped: what is left out of the whole."""
+        cls, arrays: Mapping[str, np.ndarray], scene: SceneTraits, dropped: Mapping[str, int] | None = None
+    ) -> PartialCloud:
+        """A cloud of valid arrays, without a copy. dropped: number of omitted splats by the reason."""
         made = object.__new__(cls)
         given: dict[str, Any] = {"colors": None, "sh": None, "planes": None, "boxes": None, "thickness": None}
-        made._set(**given | dict(arrays), origin=whole.origin, dropped=dict(dropped or {}))
-        object.__setattr__(made, "_whole", whole)
+        made._set(**given | dict(arrays), origin=scene.origin, dropped=dict(dropped or {}))
+        object.__setattr__(made, "_scene", scene)
         return made
 
     def __reduce__(self):
-        """Pickled and copied as a cloud of its own."""
+        """Pickled and copied as a plain SplatCloud."""
         return _cloud_of, ({each.name: getattr(self, each.name) for each in fields(self)},)
 
     @property
     def has_planes(self) -> bool:
-        """As the whole."""
-        return self._whole.has_planes
+        """Whether the complete scene has coplanar groups."""
+        return self._scene.has_planes
 
     @property
     def footprint(self) -> str:
-        """As the whole."""
-        return self._whole.footprint
+        """Footprint of the complete scene: `gaussian`, `box` or `mixed`."""
+        return self._scene.footprint
 
     @property
     def ellipsoids(self) -> str:
-        """As the whole."""
-        return self._whole.ellipsoids
+        """Which splats of the complete scene are 3D Gaussians: `none`, `some` or `all`."""
+        return self._scene.ellipsoids
 
 
 def _cloud_of(values: dict[str, Any]) -> SplatCloud:
@@ -75,16 +74,18 @@ def _cloud_of(values: dict[str, Any]) -> SplatCloud:
     return cloud
 
 
-def joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The arrays of several parts as one; each of one part is taken as it is."""
+def concatenated(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Concatenated arrays of several parts; a single part is not copied."""
     if len(parts) == 1:
         return dict(parts[0])
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def colors_of(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
-    """Of splats with `colors` or `sh` those of one degree: plain colours where it is -1, with the bits of
-    `SplatCloud.plain_colors`; else SH, its missing bands 0."""
+def colors_of_degree(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
+    """`colors` or `sh` converted to an SH degree, with 0 for missing bands.
+
+    Degree -1: plain colours, bit-identical to `SplatCloud.plain_colors`.
+    """
     if sh_degree < 0:
         if "colors" in given:
             return {"colors": given["colors"]}
@@ -94,21 +95,24 @@ def colors_of(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.n
         return {"sh": given["sh"]}
     sh = np.zeros((len(given["means"]), terms, 3), np.float32)
     if "sh" in given:
-        kept = min(terms, given["sh"].shape[1])
-        sh[:, :kept] = given["sh"][:, :kept]
+        common = min(terms, given["sh"].shape[1])
+        sh[:, :common] = given["sh"][:, :common]
     else:
         sh[:, 0] = (given["colors"].astype(np.float64) - 0.5) / C0
     return {"sh": sh}
 
 
-def moved(splats: Mapping[str, np.ndarray], pose: np.ndarray, move: np.ndarray) -> dict[str, np.ndarray]:
-    """Splats turned by a rigid pose (4, 4) and moved by (3,) metres. Sums in one order, number by number: a
-    splat has the same bits whichever splats it is moved with."""
-    turn = pose[:3, :3]
+def transformed(
+    splats: Mapping[str, np.ndarray], rotation: np.ndarray, offset: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Splats rotated by a matrix (3, 3) and moved by (3,) metres.
+
+    Sums have a fixed order, so that the result for a splat does not depend on the others.
+    """
     x, y, z = splats["means"].T.astype(np.float64)
-    means = [turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z + move[i] for i in range(3)]
+    means = [rotation[i, 0] * x + rotation[i, 1] * y + rotation[i, 2] * z + offset[i] for i in range(3)]
     w, a, b, c = splats["quats"].T.astype(np.float64)
-    p, q, r, s = matrix_to_quaternion(turn)
+    p, q, r, s = matrix_to_quaternion(rotation)
     quats = [
         p * w - q * a - r * b - s * c,
         p * a + q * w + r * c - s * b,
@@ -121,9 +125,9 @@ def moved(splats: Mapping[str, np.ndarray], pose: np.ndarray, move: np.ndarray) 
     }
     if "sh" in made and made["sh"].shape[1] > 1:
         degree = int(np.sqrt(made["sh"].shape[1])) - 1
-        matrix = rotation_of_coefficients(degree, turn).astype(np.float32)
-        turned = np.zeros_like(made["sh"])
+        matrix = rotation_of_coefficients(degree, rotation).astype(np.float32)
+        rotated = np.zeros_like(made["sh"])
         for i, j in zip(*np.nonzero(matrix), strict=True):
-            turned[:, i] += matrix[i, j] * made["sh"][:, j]
-        made["sh"] = turned
+            rotated[:, i] += matrix[i, j] * made["sh"][:, j]
+        made["sh"] = rotated
     return made

@@ -1,0 +1,249 @@
+"""Splats of several stores and of a cloud in memory, as one scene that is read in chunks.
+
+The splats keep the order stores, then cloud. A frame of the chunks that a view needs is bit-identical to that
+of all splats in memory.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fidsplat.capture.quality import Quality
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.store.layout import MAX_SPLATS
+from fidsplat.store.partial_cloud import PartialCloud, colors_of_degree, concatenated
+from fidsplat.store.store import Store
+from fidsplat.store.subchunks import Subchunks, SubchunkTable
+from fidsplat.util.errors import InputError
+
+HOST_CACHE_BYTES = 2 * 2**30
+"""capacity of the cache of chunks whose arrays are computed rather than mapped from the files"""
+
+CellSizes = float | tuple[tuple[float, ...], ...]
+"""samples: cells of a smaller size on the image are merged; one for all, or for each level of each store"""
+
+NodeMasks = tuple[np.ndarray, ...]
+"""(places * nodes,) bool for each store: the selected nodes"""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Selected nodes of each store, or rows of them, in splat order."""
+
+    nodes: tuple[tuple[int, ...], ...]
+    """numbers of the nodes of each store"""
+    rows: tuple[tuple[tuple[int, int], ...], ...] | None = None
+    """first row and number of rows of each node; None: all rows"""
+
+    @staticmethod
+    def of(masks: NodeMasks) -> Selection:
+        """All rows of the nodes that masks select."""
+        return Selection(tuple(tuple(np.flatnonzero(each).tolist()) for each in masks))
+
+    @staticmethod
+    def of_subchunks(subchunks: Sequence[Subchunks]) -> Selection:
+        """The rows of subchunks of each store."""
+        return Selection(
+            tuple(tuple(each.nodes.tolist()) for each in subchunks),
+            tuple(tuple(zip(each.first.tolist(), each.rows.tolist(), strict=True)) for each in subchunks),
+        )
+
+    def __len__(self) -> int:
+        return sum(len(set(each)) for each in self.nodes)
+
+
+class ChunkedSplats:
+    """Stores, then splats in memory, as one scene that is read in chunks. Threads may share one."""
+
+    def __init__(self, stores: Sequence[Store], in_memory: SplatCloud | None = None) -> None:
+        self.stores = tuple(stores)
+        self.in_memory = SplatCloud.empty() if in_memory is None else in_memory
+        self.origin = self.stores[0].origin
+        """(3,) float64 metres: the world's position of the means' zero"""
+        parts = [*self.stores, self.in_memory] if len(self.in_memory) else list(self.stores)
+        self.sh_degree = max(max(part.sh_degree for part in parts), -1)
+        if self.sh_degree == 0:
+            self.sh_degree = -1
+        self.has_planes = any(part.has_planes for part in parts)
+        footprints = {part.footprint for part in parts if len(part)} or {"gaussian"}
+        self.footprint = footprints.pop() if len(footprints) == 1 else "mixed"
+        ellipsoids = {part.ellipsoids for part in parts if len(part)} or {"none"}
+        self.ellipsoids = ellipsoids.pop() if len(ellipsoids) == 1 else "some"
+        if len(self) > MAX_SPLATS:
+            raise InputError(
+                f"a scene must have at most {MAX_SPLATS:,} splats, got {len(self):,}; use fewer stores"
+            )
+        self._cache: OrderedDict[tuple[int, int], dict[str, np.ndarray]] = OrderedDict()
+        self._cache_bytes, self._lock = 0, threading.Lock()
+
+    def __len__(self) -> int:
+        return sum(map(len, self.stores)) + len(self.in_memory)
+
+    @property
+    def content(self) -> tuple:
+        """Identities of the stores and the cloud in memory, for digests."""
+        return (*(store.identity for store in self.stores), self.in_memory)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats."""
+        boxes = [part.bounds() for part in (*self.stores, self.in_memory) if len(part)]
+        if not boxes:
+            raise InputError("a scene without splats has no bounds")
+        low, high = zip(*boxes, strict=True)
+        return np.min(low, axis=0), np.max(high, axis=0)
+
+    def cloud(self) -> SplatCloud:
+        """All splats in one cloud."""
+        if len(self.stores) == 1 and not len(self.in_memory):
+            return self.stores[0].cloud()
+        return self.part(self.all_chunks())
+
+    def all_chunks(self) -> Selection:
+        """All chunks, without nodes of levels of detail."""
+        return Selection.of([np.tile(store.nodes["level"] == 0, store.places) for store in self.stores])
+
+    def cell_sizes(self, *qualities: Quality) -> CellSizes:
+        """Size on the image [samples] below which cells are merged, by `detail_error`; the strictest quality
+        decides. 0: exact.
+
+        Raises:
+            InputError: an error is allowed, but that of the store's levels of detail was not measured.
+        """
+        if not all(quality.detail_error for quality in qualities):
+            return 0.0
+        each = ([store.pixels_of(quality) for quality in qualities] for store in self.stores)
+        return tuple(tuple(np.min(sizes, axis=0).tolist()) for sizes in each)
+
+    # index: boxes, counts and subchunks of nodes
+
+    @cached_property
+    def node_counts(self) -> tuple[np.ndarray, ...]:
+        """Number of splats of each store's nodes, (places * nodes,) int64."""
+        return tuple(np.tile(store.nodes["count"].astype(np.int64), store.places) for store in self.stores)
+
+    @cached_property
+    def pinned(self) -> NodeMasks:
+        """Chunks with coplanar groups, which are part of every frame."""
+        return tuple(_pinned(store) for store in self.stores)
+
+    def boxes(self, number: int, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+        """Corners (places * nodes, 3) [m] of boxes around a store's nodes, from the origin."""
+        store = self.stores[number]
+        low, high = store.boxes(sigmas)
+        return low + (store.origin - self.origin), high + (store.origin - self.origin)
+
+    def subchunks(self, masks: NodeMasks) -> list[Subchunks]:
+        """Subchunks of selected nodes, for each store."""
+        every = zip(self._subchunk_tables, masks, strict=True)
+        return [table.of(np.flatnonzero(mask)) for table, mask in every]
+
+    @cached_property
+    def _subchunk_tables(self) -> list[SubchunkTable]:
+        each = zip(self.stores, self.pinned, strict=True)
+        return [SubchunkTable(store, store.origin - self.origin, pinned) for store, pinned in each]
+
+    # splats of a selection
+
+    def part(self, selection: Selection) -> PartialCloud:
+        """The splats of a selection of complete nodes."""
+        parts = [self.chunk(number, node) for number, nodes in enumerate(selection.nodes) for node in nodes]
+        if len(self.in_memory) or not parts:
+            parts.append(self.in_memory_arrays)
+        return PartialCloud.of(concatenated(parts), self)
+
+    def ids(self, selection: Selection) -> np.ndarray:
+        """Scene indices (n,) int32 of the splats of a selection; -1 for splats of levels of detail."""
+        made, first = [np.empty(0, np.int32)], 0
+        for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
+            numbers = np.array(nodes, np.int64)
+            starts, counts = store.first_of(numbers), store.counts(numbers)
+            if selection.rows is not None:
+                rows = np.array(selection.rows[number], np.int64).reshape(-1, 2)
+                starts, counts = np.where(starts < 0, -1, starts + rows[:, 0]), rows[:, 1]
+            for start, count in zip(starts, counts, strict=True):
+                own = np.full(count, -1) if start < 0 else np.arange(first + start, first + start + count)
+                made.append(own.astype(np.int32))
+            first += len(store)
+        made.append(np.arange(first, first + len(self.in_memory), dtype=np.int32))
+        return np.concatenate(made)
+
+    def prefetch(self, selection: Selection) -> None:
+        """Read the nodes of a selection into memory."""
+        for number, nodes in enumerate(selection.nodes):
+            for node in nodes:
+                for array in self.chunk(number, node).values():
+                    # one byte of each page is enough
+                    array.reshape(-1).view(np.uint8)[:: 1 << 12].max(initial=0)
+
+    def chunk(self, number: int, node: int) -> dict[str, np.ndarray]:
+        """Arrays of a node of a store, in the columns and relative to the origin of this scene."""
+        store, key = self.stores[number], (number, node)
+        with self._lock:
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+        made = self._with_columns(self._relative(store.load(node), store.origin), self._first_planes[number])
+        computed = sum(array.nbytes for array in made.values() if array.base is None)
+        if computed * 4 >= sum(array.nbytes for array in made.values()):
+            with self._lock:
+                self._cache_bytes += 0 if key in self._cache else computed
+                self._cache[key] = made
+                while self._cache_bytes > HOST_CACHE_BYTES and len(self._cache) > 1:
+                    _, evicted = self._cache.popitem(last=False)
+                    self._cache_bytes -= sum(a.nbytes for a in evicted.values() if a.base is None)
+        return made
+
+    def unplaced_chunk(self, number: int, node: int) -> dict[str, np.ndarray]:
+        """Arrays of a node of a placed store, before its pose is applied."""
+        return self._with_columns(self.stores[number].load(node, placed=False), self._first_planes[number])
+
+    @cached_property
+    def in_memory_arrays(self) -> dict[str, np.ndarray]:
+        """Arrays of the cloud in memory, in the columns and relative to the origin of this scene."""
+        cloud = self.in_memory
+        arrays = {name: getattr(cloud, name) for name in ("means", "quats", "scales", "opacities", "labels")}
+        arrays = self._relative(arrays, cloud.origin)
+        optional = {"sh": cloud.sh, "colors": cloud.colors, "planes": cloud.planes}
+        optional |= {"thickness": cloud.thickness, "boxes": cloud.boxes}
+        arrays |= {name: array for name, array in optional.items() if array is not None}
+        return self._with_columns(arrays, self._first_planes[-1])
+
+    @cached_property
+    def _first_planes(self) -> list[int]:
+        """Offset added to the group ids of each store, and last of the cloud in memory."""
+        made = [0]
+        for store in self.stores:
+            made.append(made[-1] + store.last_plane() + 1)
+        return made
+
+    def _relative(self, arrays: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
+        """Arrays with means relative to this scene's origin instead of another."""
+        offset = origin - self.origin
+        if not offset.any():
+            return arrays
+        return arrays | {"means": (arrays["means"] + offset).astype(np.float32)}
+
+    def _with_columns(self, arrays: dict[str, np.ndarray], first_plane: int) -> dict[str, np.ndarray]:
+        """Arrays in the columns of this scene, with defaults for absent ones."""
+        count = len(arrays["means"])
+        made = {name: arrays[name] for name in ("means", "quats", "scales", "opacities", "labels")}
+        made |= colors_of_degree(arrays, self.sh_degree)
+        if self.has_planes:
+            ids = arrays.get("planes", np.full(count, -1, np.int32))
+            made["planes"] = np.where(ids >= 0, ids + np.int32(first_plane), np.int32(-1))
+        if self.ellipsoids != "none":
+            made["thickness"] = arrays.get("thickness", np.zeros(count, np.float32))
+        if self.footprint != "gaussian":
+            made["boxes"] = arrays.get("boxes", np.zeros(count, bool))
+        return made
+
+
+def _pinned(store: Store) -> np.ndarray:
+    nodes = store.nodes
+    return np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), store.places)

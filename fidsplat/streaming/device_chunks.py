@@ -1,0 +1,104 @@
+"""Chunks of a scene as a device's chunk cache loads them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from fidsplat.backends.chunk_cache import Chunk
+from fidsplat.backends.coplanar_groups import PlaneTable
+from fidsplat.store.chunked_splats import ChunkedSplats, Selection
+from fidsplat.store.partial_cloud import PartialCloud
+from fidsplat.store.store import Store
+
+
+class DeviceChunks:
+    """Chunks of a scene for a device, with the traits of the complete scene."""
+
+    def __init__(self, scene: ChunkedSplats) -> None:
+        self.scene, self.origin = scene, scene.origin
+        self.sh_degree, self.has_planes = scene.sh_degree, scene.has_planes
+        self.footprint, self.ellipsoids = scene.footprint, scene.ellipsoids
+        self._chunks: dict[tuple[int, bool], dict[int, Chunk]] = {}
+        """(number of the store, posed by the device) -> chunks, by node"""
+
+    @property
+    def largest_chunk(self) -> int:
+        """Number of splats of the largest node; splats in memory are split into chunks of this size."""
+        return max(int(store.nodes["count"].max(initial=1)) for store in self.scene.stores)
+
+    def of(self, selection: Selection, places: bool) -> list[Chunk]:
+        """Chunks of a selection. places: whether the device applies the poses of placed stores."""
+        made = []
+        for number, (store, nodes) in enumerate(zip(self.scene.stores, selection.nodes, strict=True)):
+            posed = places and self._can_pose(store)
+            known = self._chunks.setdefault((number, posed), {})
+            for index, node in enumerate(nodes):
+                if (chunk := known.get(node)) is None:
+                    chunk = known[node] = self._chunk_of(number, node, posed)
+                if selection.rows is not None:
+                    first, count = selection.rows[number][index]
+                    chunk = replace(chunk, first=first, count=count)
+                made.append(chunk)
+        size, count = self.largest_chunk, len(self.scene.in_memory)
+        for first in range(0, count if made else max(count, 1), size):
+            end = min(first + size, count)
+            made.append(Chunk(("in memory", first), end - first, partial(self._in_memory, first, end)))
+        return made
+
+    def distinct(self, places: bool) -> int:
+        """Number of different chunk keys. places: whether the device applies the poses of placed stores."""
+        each = (
+            len(store.nodes) * (1 if places and self._can_pose(store) else store.places)
+            for store in self.scene.stores
+        )
+        return sum(each) + -(-len(self.scene.in_memory) // self.largest_chunk)
+
+    @cached_property
+    def planes(self) -> PlaneTable | None:
+        """Coplanar groups of all splats; their chunks are part of every frame."""
+        return PlaneTable(self._pinned_part) if self.has_planes else None
+
+    @cached_property
+    def _pinned_part(self) -> PartialCloud:
+        """The chunks that are part of every frame, and the splats in memory."""
+        return self.scene.part(Selection.of(self.scene.pinned))
+
+    @cached_property
+    def _plane_ids(self) -> np.ndarray:
+        ids = self._pinned_part.planes
+        assert ids is not None
+        return np.unique(ids[ids >= 0])
+
+    def _can_pose(self, store: Store) -> bool:
+        """Whether a device may apply a store's poses: SH would have to be rotated too, and means of another
+        origin would be rounded twice."""
+        offset = store.origin - self.origin
+        return store.poses is not None and self.sh_degree < 0 and not offset.any()
+
+    def _chunk_of(self, number: int, node: int, posed: bool) -> Chunk:
+        store = self.scene.stores[number]
+        place, own = divmod(node, len(store.nodes))
+        key = (number, own if posed else node)
+        pose = store.pose_rows[place] if posed else None
+        return Chunk(key, int(store.nodes["count"][own]), partial(self._arrays, key, posed), pose)
+
+    def _arrays(self, key: tuple[int, int], posed: bool) -> dict[str, np.ndarray]:
+        return self._on_device(self.scene.unplaced_chunk(*key) if posed else self.scene.chunk(*key))
+
+    def _in_memory(self, first: int, end: int) -> dict[str, np.ndarray]:
+        arrays = self.scene.in_memory_arrays
+        return self._on_device({name: array[first:end] for name, array in arrays.items()})
+
+    def _on_device(self, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Arrays with dense indices of coplanar groups and integers for flags."""
+        made = dict(arrays)
+        if "planes" in made:
+            known = np.append(self._plane_ids, np.iinfo(np.int32).max)
+            dense = np.searchsorted(known, made["planes"]).astype(np.int32)
+            made["planes"] = np.where(made["planes"] < 0, np.int32(-1), dense)
+        if "boxes" in made:
+            made["boxes"] = made["boxes"].astype(np.int32)
+        return made

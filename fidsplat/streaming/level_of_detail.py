@@ -1,0 +1,60 @@
+"""Level-of-detail selection of chunks: the visible nodes of a scene's stores, as coarse as allowed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from fidsplat.backends.view import View
+from fidsplat.effects import FeatureSet
+from fidsplat.store.chunked_splats import CellSizes, ChunkedSplats, NodeMasks, Selection
+from fidsplat.streaming.frustum_culling import in_frustum, projected_sizes
+
+
+def select(
+    scene: ChunkedSplats, views: Sequence[View], features: FeatureSet, cell_sizes: CellSizes = 0.0
+) -> Selection:
+    """The nodes that views need. cell_sizes: cells below this size on the image are merged; 0: exact."""
+    return Selection.of(visible_nodes(scene, views, features, cell_sizes))
+
+
+def visible_nodes(
+    scene: ChunkedSplats, views: Sequence[View], features: FeatureSet, cell_sizes: CellSizes = 0.0
+) -> NodeMasks:
+    """Masks of the nodes that views need: visible, and the coarsest that the cell sizes allow."""
+    made = []
+    for number, store in enumerate(scene.stores):
+        sizes = cell_sizes[number] if isinstance(cell_sizes, tuple) else (cell_sizes,) * (store.levels + 1)
+        made.append(_visible_nodes(scene, number, views, features, np.array(sizes)))
+    return tuple(made)
+
+
+def _visible_nodes(
+    scene: ChunkedSplats, number: int, views: Sequence[View], features: FeatureSet, cell_sizes: np.ndarray
+) -> np.ndarray:
+    """(places * nodes,) bool: the nodes of one store. cell_sizes: (levels + 1,) samples."""
+    store, boxes = scene.stores[number], partial(scene.boxes, number)
+    if not len(store.nodes):
+        return np.zeros(0, bool)
+    nodes, places = store.nodes, store.places
+    level = np.tile(nodes["level"], places)
+    reach = np.tile(nodes["reach"].astype(np.float64), places)
+    visible = np.zeros(len(level), bool)
+    for view in views:
+        visible |= in_frustum(view, features, boxes, reach)
+    pinned = scene.pinned[number]
+    if not cell_sizes.any():
+        return (visible | pinned) & (level == 0)
+    parents = np.tile(nodes["parent"].astype(np.int64), places)
+    parents = np.where(parents >= 0, parents + np.repeat(np.arange(places), len(nodes)) * len(nodes), -1)
+    edges = np.tile(nodes["size"].astype(np.float64), places)
+    refined = np.zeros(len(level), bool)
+    for view in views:
+        refined |= projected_sizes(view, boxes, edges) > cell_sizes[level]
+    reached = parents < 0
+    for above in range(int(level.max()), 0, -1):
+        children = np.flatnonzero((level == above - 1) & (parents >= 0))
+        reached[children] = (reached & refined & visible)[parents[children]]
+    return ((reached & visible) | pinned) & (~refined | (level == 0))
