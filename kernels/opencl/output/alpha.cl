@@ -1,3 +1,3 @@
-// alpha (h, w): what the splats cover, 1 - transmittance.
+// alpha (h, w): coverage, 1 - transmittance.
 //@ resolve_end
     alpha_out[out] = 1.0f - t;

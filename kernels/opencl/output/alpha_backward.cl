@@ -1,3 +1,3 @@
-// alpha = 1 - T: light that goes on is worth as much less.
+// Gradient of alpha = 1 - T.
 //@ pixel_gradient_start
         gradient->behind -= pixels_of(by_alpha, 1, 0, x, y, width, height);

@@ -1,4 +1,4 @@
-// blended (h, w) int: number of splats that were blended, those of a layer each by itself; of several samples the most.
+// blended (h, w) int: number of composited fragments, each of a layer counted; the maximum over a pixel's samples.
 //@ state
     vint blended;
 //@ start

@@ -1,4 +1,4 @@
-// depth = sum w z / sum w.
+// Gradient of depth = sum w z / sum w.
 //@ pixel_gradient
     vfloat depth, depth_weight;
 //@ pixel_gradient_start

@@ -1,5 +1,5 @@
-// depth_first (h, w): depth [m] of the first fragment or layer behind which no more light than `first_light` is left; 0 where
-// there is none. Of several samples the nearest.
+// depth_first (h, w): depth [m] of the first fragment or layer behind which transmittance is at most `first_light`; 0 if there is
+// none. The minimum over a pixel's samples.
 //@ state
     vfloat depth_first, first_light;
 //@ start

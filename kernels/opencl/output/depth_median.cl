@@ -1,9 +1,9 @@
-// depth_median (h, w): depth [m] of the last fragment in front of which more than half of the light remains; 0 where less than
-// 1/255 is covered. Fragments that take less light than that count together: the one with which they have taken it stands for
-// them. Of several samples per pixel the lower median of those that hit something.
+// depth_median (h, w): depth [m] of the last fragment with transmittance above 1/2 in front of it; 0 where alpha is below 1/255.
+// Fragments of weight below 1/255 count together, at the depth of the fragment whose cumulative weight reaches it. The lower
+// median over the samples that hit something.
 //@ state
     vfloat depth_median;
-    vfloat median_light;    // left behind the fragment that counted last
+    vfloat median_light;    // transmittance behind the fragment that counted last
 //@ start
     pixel->depth_median = 0.0f;
     pixel->median_light = 1.0f;

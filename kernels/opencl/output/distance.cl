@@ -1,4 +1,4 @@
-// distance (h, w): expected distance along the ray [m], sum w r / sum w; 0 where less than 1/255 is covered.
+// distance (h, w): expected distance along the ray [m], sum w r / sum w; 0 where alpha is below 1/255.
 //@ resolve_start
     float along_ray = 0;
 //@ resolve_sample

@@ -1,4 +1,4 @@
-// distance_first (h, w): distance along the ray [m] of what depth_first sees; of several samples the nearest.
+// distance_first (h, w): distance along the ray [m] of depth_first; the minimum over a pixel's samples.
 //@ resolve_start
     float first_along = INFINITY;
 //@ resolve_sample

@@ -1,4 +1,4 @@
-// distance_median (h, w): distance along the ray [m] of what depth_median sees; of several samples the lower median.
+// distance_median (h, w): distance along the ray [m] of depth_median; the lower median over a pixel's samples.
 //@ resolve_start
     float medians_along[SAMPLES * SAMPLES];
     int medians_hit = 0;

@@ -1,7 +1,7 @@
-// distortion (h, w): how far apart in depth the fragments lie whose light is seen, sum over pairs of w_i w_j (m_i - m_j)^2 with m the
-// depth in a depth buffer from 0.2 to 100 m, as the 2DGS authors have it: m = constant - INVERSE_DEPTH / z. What is nearer counts as at
-// 0.2 m: 1 / z has no bound, and one disk seen along its plane would be all of the loss.
-// It is W sum w m^2 - (sum w m)^2, which does not change with the zero of m: that is the first fragment's, so that little cancels.
+// distortion (h, w): depth distortion of 2DGS, sum over pairs of w_i w_j (m_i - m_j)^2 with m the depth-buffer value for planes at
+// 0.2 and 100 m: m = constant - INVERSE_DEPTH / z. Depths below 0.2 m are clamped: 1 / z is unbounded, and one edge-on disk
+// would dominate the loss. Computed as W sum w m^2 - (sum w m)^2, which does not depend on the origin of m; with the first
+// fragment as origin little cancels.
 //@ compose_types
 #define INVERSE_DEPTH WIDE(0.2004008016032064)  // 0.2 * 100 / (100 - 0.2)
 #define SPREAD_NEAR WIDE(0.2)

@@ -1,4 +1,4 @@
-// distortion = W sum w m^2 - (sum w m)^2: dL / dw = g (sum w m^2 + W m^2 - 2 m sum w m), dL / dm = 2 g w (W m - sum w m).
+// Gradient of W sum w m^2 - (sum w m)^2: dL / dw = g (sum w m^2 + W m^2 - 2 m sum w m), dL / dm = 2 g w (W m - sum w m).
 //@ compose_types
 #define INVERSE_DEPTH WIDE(0.2004008016032064)  // as in distortion.cl
 #define SPREAD_NEAR WIDE(0.2)

@@ -1,8 +1,8 @@
-// Fog of even density: of what is seen at distance r along the ray exp(-density r) is left, the rest is the fog's colour. Exact for
-// each fragment and layer, as each is composited with its own distance. Behind everything is fog alone: its colour is the background.
+// Homogeneous fog: light from distance r along the ray is attenuated by exp(-density r) and mixed with the fog's colour, per
+// fragment and layer. The fog's colour is the background.
 //@ state
     vfloat fog_slope;       // -density, per metre of depth
-    vfloat fogged;          // sum of weights times what the fog hides
+    vfloat fogged;          // sum of weights times absorbed share
 //@ start
     pixel->fogged = 0.0f;
 //@ pixels_start

@@ -1,5 +1,4 @@
-// label (h, w) int: label of the fragment or layer with the largest weight, the nearest of equals; -1 where less
-// than 1/255 is covered.
+// label (h, w) int: label of the fragment or layer of maximum weight, the nearest of equals; -1 where alpha is below 1/255.
 //@ project
     record.label = labels[i];
 //@ state
@@ -13,7 +12,7 @@
 //@ attribute_values
     attributes.label = s->label;
 //@ layer_fields
-    vfloat label_tau;       // greatest optical depth of its fragments: that one's label is the layer's
+    vfloat label_tau;       // maximum optical depth of its fragments, whose label the layer has
 //@ layer_accumulate
     layer->mean.label = VSELECT(layer->mean.label, attributes->label, VMASK(tau > layer->label_tau));
     layer->label_tau = fmax(layer->label_tau, tau);

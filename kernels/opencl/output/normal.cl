@@ -1,8 +1,8 @@
-// normal (h, w, 3): unit normal in the camera frame, towards the camera, of the mean of the splats' normals by weight; 0 where
-// less than 1/255 is covered.
+// normal (h, w, 3): unit vector of the weighted mean of the splats' normals, in the camera frame, towards the camera; 0 where alpha is
+// below 1/255.
 //@ project
 //@@ ellipsoid_normal
-    // the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
+    // one sign per splat, since the camera is on one side of the complete plane
     real towards = offset > 0 ? -1 : 1;
     record.nx = (wide)(facet.x * towards);
     record.ny = (wide)(facet.y * towards);

@@ -1,4 +1,4 @@
-// normal: the direction of sum w n.
+// Gradient of the normalised sum w n.
 //@ pixel_gradient
     vfloat normal_x, normal_y, normal_z;
 //@ pixel_gradient_start

@@ -1,4 +1,4 @@
-// normal_world (h, w, 3): the normal in the axes of the world.
+// normal_world (h, w, 3): the normal in world axes.
 //@ resolve_end
     for (int axis = 0; axis < 3; axis++)
         normal_world_out[3 * out + axis] =

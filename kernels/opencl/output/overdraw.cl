@@ -1,11 +1,11 @@
-// overdraw (h, w) int: fragments that the samples of a pixel draw, those of a layer when it is composited. No output for users:
-// `fidsplat bench` counts with it what a frame must blend.
+// overdraw (h, w) int: number of composited fragments of a pixel's samples, those of a layer included. Internal; `fidsplat bench`
+// reports it as the blending work of a frame.
 //@ state
     vint overdraw;
 //@ start
     pixel->overdraw = 0;
 //@ attributes
-    vint fragments;         // that it is made of
+    vint fragments;         // number of its fragments
 //@ attribute_values
     attributes.fragments = 1;
 //@ layer_accumulate

@@ -1,22 +1,22 @@
-// rounding (h, w): upper bound of what float32 changes in rgb, per unit of colour. Of pictures without a transmittance stop alone: the
-// output `error` is made of it (fidsplat/render/certified_error.py has the derivation). By intervals of each fragment's forms, as
-// fidsplat/backends/reference/error_bounds.py: the opacity lies between `low` and `high`, and the colour moves by no more than the
-// transmittance in front times the distance from the opacity that is blended to the further of them. Fragments that rounding may take
-// away (near plane, horizon, rim) count too, so that all that are listed are asked, not only those that are blended. Each that is
-// blended rounds the transmittance and the sum of colours, together by UNIT, and this sum by half of that.
+// rounding (h, w): upper bound of the float32 rounding error in rgb, per unit of colour, for frames without a transmittance stop;
+// part of the output `error` (fidsplat/render/certified_error.py has the derivation). By interval arithmetic on a fragment's forms,
+// as in fidsplat/backends/reference/error_bounds.py: opacity is between `low` and `high`, and colour changes by at most the
+// transmittance times the difference of the blended opacity from the further bound. Fragments that rounding may discard (near
+// plane, horizon, rim) count, so all listed fragments are evaluated. Each blended fragment rounds transmittance and the colour sum,
+// together by UNIT, and this sum by half of that.
 //@ state
     vfloat rounding;
 //@ start
     pixel->rounding = 0.0f;
 //@ compose_functions
 #define UNIT 0x1p-24f
-#define FORM_ROUNDING (4.0f * UNIT)        // of a form, relative to its terms: three coefficients, and its sums
+#define FORM_ROUNDING (4.0f * UNIT)        // relative rounding of a form: three coefficients, and its sums
 #define FORM_TERMS(n0, nx, ny) (fabs((vfloat)(n0)) + fabs((vfloat)(nx)) * across + fabs((vfloat)(ny)) * down)
 
 static inline vfloat squared(vfloat x) { return x * x; }
 
-// What rounding changes in an opacity of half rho `h`, relative: ln(opacity), rho (a root, a division and a square by OpenCL's
-// bounds), their difference, and the exponential.
+// Relative rounding of an opacity at half rho `h`: of ln(opacity), rho (a root, a division and a square by OpenCL's bounds), their
+// difference, and the exponential.
 static inline vfloat opacity_rounding(const Splat *s, vfloat h) {
     return UNIT * (16.0f + 2.0f * fabs((vfloat)s->log_opacity) + 32.0f * fmin(h, (vfloat)100.0f));
 }

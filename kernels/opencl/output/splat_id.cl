@@ -1,5 +1,5 @@
-// splat_id (h, w) int: index in the cloud of the fragment with the largest weight, of a layer its splat of greatest optical
-// depth, the nearest of equals; -1 where less than 1/255 is covered.
+// splat_id (h, w) int: index in the cloud of the fragment of maximum weight (of a layer its splat of maximum optical depth), the
+// nearest of equals; -1 where alpha is below 1/255.
 //@ project
     record.splat_id = splat_ids[i];
 //@ state
@@ -13,7 +13,7 @@
 //@ attribute_values
     attributes.splat_id = s->splat_id;
 //@ layer_fields
-    vfloat splat_id_tau;    // greatest optical depth of its fragments: that one stands for the layer
+    vfloat splat_id_tau;    // maximum optical depth of its fragments, whose index the layer has
 //@ layer_accumulate
     layer->mean.splat_id = VSELECT(layer->mean.splat_id, attributes->splat_id, VMASK(tau > layer->splat_id_tau));
     layer->splat_id_tau = fmax(layer->splat_id_tau, tau);

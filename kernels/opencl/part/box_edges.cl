@@ -1,5 +1,4 @@
-// Edges of boxes (part/box_cover.cl) where forms are affine in the sample: straight lines, whose distances in samples need
-// one number for each edge of a splat.
+// Edges of boxes (part/box_cover.cl) whose forms are affine in the sample: straight lines with one inverse gradient each.
 //@ footprint_functions
 static inline vfloat slab_coverage(vfloat d, vfloat n, wide edge_0, wide edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
@@ -27,8 +26,8 @@ static inline real box_edge(real3_ k0, real3_ kx, real3_ ky, real facing, real s
     return inverse;
 }
 
-// What of the picture a box can touch: the picture's rectangle, cut at the lines half a sample outside the four edges, at the
-// plane's horizon and at the near plane. Forms, rectangle and result are relative to one point. False if nothing is left.
+// Box of the part of the image that a box can overlap: the image, clipped at lines half a sample outside of the four edges, at
+// the plane's horizon and at the near plane. Forms, image and result are relative to one point. False if nothing is left.
 static inline bool box_touches(real3_ k0, real3_ kx, real3_ ky, real facing, real d_near, real *box) {
     real line[3], x[BOX_CORNERS] = {box[0], box[1], box[1], box[0]}, y[BOX_CORNERS] = {box[2], box[2], box[3], box[3]};
     int count = 4;

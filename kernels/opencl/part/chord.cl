@@ -1,13 +1,13 @@
-// Between which columns some rows of samples meet an ellipse, by its middle and the squares of its half chords (`conic_of`).
+// Chords of an ellipse: the columns in which some rows of samples overlap it (`conic_of`).
 //@ cells_functions
 #define CONIC_SLACK 2e-5f
 
 typedef struct {                        // an ellipse, relative to the splat's anchor
-    bool valid;                            // false: there is none, or the horizon is near, or rows or columns run along the splat
-    float middle, slope;                // middles of chords: middle + slope y
+    bool valid;                            // false: no ellipse, or the horizon is near, or the splat is edge-on to rows or columns
+    float middle, slope;                // midpoints of chords: middle + slope y
     float y, half_height;
-    float square, bend;                 // squares of half chords: square - bend (y - its y)^2
-    float tip;                          // height above y at which it is widest to the right
+    float square, bend;                 // squares of half chords: square - bend (height above y)^2
+    float tip;                          // height above y of the rightmost point
     float pad;
 } Conic;
 
@@ -16,7 +16,7 @@ static inline float conic_half_chord(const Conic *c, float y) {
     return sqrt(fmax(c->square - c->bend * above * above, 0.0f)) + c->pad;
 }
 
-// Of the rows from y0 to y1.
+// Chord of the rows from y0 to y1.
 static inline void conic_chord(const Conic *c, float y0, float y1, float *x0, float *x1) {
     if (!c->valid) return;
     if (y0 - c->y > c->half_height || c->y - y1 > c->half_height) {

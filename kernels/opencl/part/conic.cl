@@ -1,14 +1,14 @@
-// Between which columns some rows of samples meet a disk. Its fragments lie where f = n_u^2 + n_v^2 - h D^2 <= 0, h half the squared
-// radius, and n_u, n_v, D are affine in the sample. So along a row, with a = (n_u, n_v, D) per x and b = (n_u, n_v, D) at x = 0,
+// Culling by the ellipse of a disk: the columns in which some rows of samples overlap it. Fragments are where
+// f = n_u^2 + n_v^2 - h D^2 <= 0, with h half the squared cut-off radius and n_u, n_v, D affine in the sample. Along a row, with
+// a = (n_u, n_v, D) per x and b = (n_u, n_v, D) at x = 0,
 //     f = <a, a> x^2 + 2 <a, b> x + <b, b>,   q = <a, b>^2 - <a, a> <b, b> = h |(a x b)_uD, (a x b)_vD|^2 - (a x b)_uv^2
-// in the product <a, b> = a_u b_u + a_v b_v - h a_D b_D: the row meets it where q >= 0. a x b is affine in y, so that nothing
-// large cancels in q. `slack` is more than rounding can change f by at any sample of the tile, here and where fragments are
-// tested.
+// in the product <a, b> = a_u b_u + a_v b_v - h a_D b_D: the row overlaps the disk where q >= 0. a x b is affine in y, so no large
+// terms cancel in q. The slack exceeds the rounding of f at any sample of the tile, here and in the per-pixel test.
 //@ blocks_functions
-#define BLOCKS_PAD 0.01f                // of distances to a dot, in samples
-#define BLOCKS_SLACK 1e-6f              // of the forms' terms: more than rounding, here and where fragments are tested
+#define BLOCKS_PAD 0.01f                // of distances to the low-pass disc, in samples
+#define BLOCKS_SLACK 1e-6f              // relative to the forms' terms: exceeds rounding, here and in the per-pixel test
 //@ blocks_touched
-    // f >= 0 all over a block where its forms are at least so large, D at most so large
+    // f >= 0 in all of a block for these lower bounds of |n_u| and |n_v| and this upper bound of D
     float conic_h = (float)half_r2;
 //@@ footprint_conic
     const float half_x = 0.5f * (BLOCK_W - 1), half_y = 0.5f * (BLOCK_H - 1);

@@ -1,10 +1,10 @@
-// As conic.cl, where every splat is a disk that faces the camera (ellipsoids_alone): its fragments lie where n_u^2 + n_v^2 <= h, h half
-// the squared radius, and n_u has no part of rows. With a = (n_u, n_v) per x and b the same at x = 0, half the square of a row's chord
-// is (h - (a x b)^2 / <a, a>) / <a, a>, and a x b is affine in y.
+// Variant of conic.cl where every splat is a disk that faces the camera (ellipsoids_only). Fragments are where n_u^2 + n_v^2 <= h, h
+// half the squared cut-off radius, and n_u depends on columns only. With a = (n_u, n_v) per x and b = (n_u, n_v) at x = 0, the squared
+// half chord of a row is (h - (a x b)^2 / <a, a>) / <a, a>, and a x b is affine in y.
 //@ blocks_functions
-#define BLOCKS_SLACK 1e-6f              // of the forms' terms: more than rounding, here and where fragments are tested
+#define BLOCKS_SLACK 1e-6f              // relative to the forms' terms: exceeds rounding, here and in the per-pixel test
 //@ blocks_touched
-    // n_u^2 + n_v^2 >= h all over a block where they are at least so large
+    // n_u^2 + n_v^2 >= h in all of a block for these lower bounds
     const float half_x = 0.5f * (BLOCK_W - 1), half_y = 0.5f * (BLOCK_H - 1);
     float far_x = fmax(fabs(left - s->ax), fabs(left + TILE_W - s->ax)), far_y = fmax(fabs(top - s->ay), fabs(top + TILE_H - s->ay));
     float around_u = fabs(s->nux) * half_x + BLOCKS_SLACK * (fabs(s->nu0) + fabs(s->nux) * far_x);

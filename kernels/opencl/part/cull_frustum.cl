@@ -1,7 +1,6 @@
-// Splats that lie beside the picture, told by the sphere around them: a CPU is spared most of what it would do to find that out (a GPU
-// is not, where a neighbour in step with it is drawn). Sides of the picture are planes through the camera's centre, `margin` samples
-// outside: as far as the low-pass reaches, and bounds are wider than what they bound. Not for boxes: edges that meet at a sharp angle
-// are filtered far beyond their corner.
+// Frustum culling by the bounding sphere of a splat, before the exact bounds (CPUs; it saves a GPU nothing where another splat of
+// the warp is visible). The frustum's side planes are moved outwards by `margin` samples, the reach of the low-pass and the padding
+// of bounds. Not for boxes: edges that meet at a sharp angle are filtered far beyond their corner.
 //@ cull_frustum
 #ifndef BOX_HERE
 #define BOX_HERE false
@@ -11,7 +10,7 @@
     real left = view->center_x + margin, right = view->center_x - view->width - margin;
     real above = view->center_y + margin, below = view->center_y - view->height - margin;
     real to_x = view->focal_x * p.x, to_y = view->focal_y * p.y;
-    // |n_x| + |n_z| >= |n|, and what is not a number is not away
+    // |n_x| + |n_z| >= |n|; a NaN is not culled
     if (!BOX_HERE && opacities[i] <= 1.0f && (to_x + left * p.z < -sphere * (view->focal_x + fabs(left))
                                               || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
                                               || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))

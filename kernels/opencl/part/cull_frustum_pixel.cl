@@ -1,6 +1,6 @@
-// As cull_frustum.cl, under the low-pass `pixel`, which widens a disk by what a sample sees of its plane, in depth too: the disk and the margin
-// larger by 1 / sqrt(1 - (R k)^2), R the cut-off's radius and k = 1/8, hold all of it (fidsplat/streaming/frustum_culling.py has the proof). Of a band of
-// rows, what lies beside those is told as well.
+// Frustum culling under the low-pass `pixel`, which widens a disk by the sample's footprint on its plane, also in depth. A disk and
+// a margin that are larger by 1 / sqrt(1 - (R k)^2), with R the cut-off radius and k = 1/8, contain the widened disk
+// (fidsplat/streaming/frustum_culling.py has the proof). Splats outside of the band of rows are culled too.
 //@ cull_frustum
 #ifndef BOX_HERE
 #define BOX_HERE false
@@ -12,12 +12,12 @@
     real above = view->center_y + margin, below = view->center_y - view->height - margin;
     real above_band = above - view->band, below_band = view->center_y - view->band_end - margin;
     real to_x = view->focal_x * p.x, to_y = view->focal_y * p.y;
-    // |n_x| + |n_z| >= |n|, and what is not a number is not away
+    // |n_x| + |n_z| >= |n|; a NaN is not culled
     if (!BOX_HERE && opacities[i] <= 1.0f) {
         if (to_x + left * p.z < -sphere * (view->focal_x + fabs(left)) || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
             || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))
             || to_y + below * p.z > sphere * (view->focal_y + fabs(below))) return;
-        // not of a picture that is whole: its splats are listed as they are, and its last rows of tiles may reach below it
+        // not for a complete image, whose last row of tiles may reach below it
         if ((view->band > 0 && to_y + above_band * p.z < -sphere * (view->focal_y + fabs(above_band)))
             || (view->band_end < view->height && to_y + below_band * p.z > sphere * (view->focal_y + fabs(below_band)))) {
             keys[at] = OUT_OF_BAND;

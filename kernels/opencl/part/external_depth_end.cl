@@ -1,5 +1,4 @@
-// The opaque surface takes all the light that the splats before it have left, also where they have left so little that splats
-// behind them would not be drawn. Stands behind whatever else ends the walk through a tile's list.
+// Composites the surface of the external depth image with the remaining transmittance, however low, after the last splat.
 //@ pass_end
     const BlendConstants unstopped = {log_cut, ceiling, -1.0f, filter};
     for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++) {

@@ -1,12 +1,12 @@
-// What waits at a pixel, for GPUs (slot/compose_pixel.cl). The furthest are in registers, IN_REGISTERS of them, always full and
-// sorted by depth: one more takes its place among them, and the nearest of all leaves. Nearly always it can be composited; else it goes
-// to a queue in memory, which is short and mostly empty.
+// Per-pixel k-buffer for GPUs: sorts fragments by depth before compositing (slot/compose_pixel.cl). The farthest IN_REGISTERS
+// fragments are in registers, sorted by depth. A new fragment is inserted there, and the nearest is pushed out: it can nearly always be
+// composited, else it enters a queue in memory, which is short and mostly empty.
 //@ compose_types
-#define NO_SPLAT 0xFFFFFFFFu            // a place where nothing waits
+#define NO_SPLAT 0xFFFFFFFFu            // an unused entry
 #define IN_REGISTERS (K_BUFFER_SIZE < 3 ? K_BUFFER_SIZE : 3)
 #define QUEUE_CAPACITY (K_BUFFER_SIZE - IN_REGISTERS)
-typedef struct {                    // apart from what is to stay in registers: an index that is not constant puts all of a struct in memory
-    wide z[QUEUE_CAPACITY + 1], opacity[QUEUE_CAPACITY + 1];    // a ring, sorted by depth
+typedef struct {                    // in memory: an index that is not constant moves a complete struct out of registers
+    wide z[QUEUE_CAPACITY + 1], opacity[QUEUE_CAPACITY + 1];    // ring buffer, sorted by depth
     uint splat[QUEUE_CAPACITY + 1];
 //@@ k_buffer_queue_fields
 } Queue;
@@ -15,9 +15,9 @@ typedef struct {
     uint splat[IN_REGISTERS];
     Queue *queue;
     uint head, count;               // of the queue
-    bool bounded;                   // whether not all fragments are taken, but those between
+    bool bounded;                   // fragments outside of [from, until) are skipped
 //@@ k_buffer_fields
-    wide from, until;               // these depths: at the first from `from_splat` on in the list, at the second those before
+    wide from, until;               // depths; at `from`: splats from `from_splat` on, at `until`: those before
     uint from_splat, until_splat;   // `until_splat`
 } KBuffer;
 
@@ -43,7 +43,7 @@ static inline void k_buffer_start(KBuffer *k_buffer) {
 //@ unfinished
         & VMASK(pixel->k_buffer.from < INFINITY)
 //@ compose_functions
-// Whether a splat comes before another in the list.
+// Order of two splats in the list.
 static inline bool precedes(global const Splat *splats, uint splat, uint other) {
     wide nearest = splats[splat].nearest, than = splats[other].nearest;
     return nearest < than || (nearest == than && splat < other);
@@ -59,13 +59,13 @@ static inline void k_buffer_composite(Pixel *pixel, wide z, wide opacity, uint s
     composite(pixel, &attributes, opacity, VMASK(true), constants);
 }
 
-// Where the k-th of the queue lies.
+// Index of the queue's k-th entry in the ring buffer.
 static inline uint queue_index(const KBuffer *k_buffer, uint k) {
     uint at = k_buffer->head + k;
     return at < QUEUE_CAPACITY ? at : at - QUEUE_CAPACITY;
 }
 
-// Composites what of the queue lies no further than `nearest`.
+// Composites all queued fragments up to depth `nearest`.
 static inline void k_buffer_flush(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     Queue *queue = k_buffer->queue;
@@ -77,7 +77,7 @@ static inline void k_buffer_flush(Pixel *pixel, wide nearest, global const Splat
     }
 }
 
-// A fragment no further than those in registers, to the queue. Where that is full the furthest of all is dropped.
+// Enqueues a fragment that is not behind those in registers. If the queue is full, the farthest fragment of all is dropped.
 static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint splat) {
     KBuffer *k_buffer = &pixel->k_buffer;
     Queue *queue = k_buffer->queue;
@@ -115,11 +115,11 @@ static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint spl
     queue->splat[at] = splat;
 }
 
-// One fragment more, with nothing to come before `nearest`.
+// Inserts a fragment; no later fragment is nearer than `nearest`.
 static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide opacity, uint splat, global const Splat *splats,
                                 const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
-    // a layer that ends may be nearer than what follows it in the list, and than what waits
+    // a completed layer may be nearer than the next splat and than queued fragments
     k_buffer_flush(pixel, fmin(nearest, z), splats, constants);
     bool first = z < k_buffer->z[0];
     wide first_z = first ? z : k_buffer->z[0], first_opacity = first ? opacity : k_buffer->opacity[0];
@@ -139,7 +139,7 @@ static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide opacit
         k_buffer_enqueue(pixel, first_z, first_opacity, first_splat);
 }
 
-// Takes a fragment of a splat of which none is nearer than `nearest`; place: the splat, which says where in the list it stands.
+// Inserts a fragment of a splat, none of whose fragments is nearer than `nearest`. place: index that gives its position in the list.
 static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opacity, const Attributes *attributes, uint splat, uint place,
                                 int mask, global const Splat *splats, const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
@@ -152,7 +152,7 @@ static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opac
 }
 
 //@@ coplanar_functions
-// After the last splat of the list: composites what waits. Returns whether the list is to be gone through again.
+// After the last splat of the list: composites all remaining fragments. Returns true if dropped fragments require another pass.
 static inline int k_buffer_finish(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
 //@@ coplanar_finish
     KBuffer *k_buffer = &pixel->k_buffer;
@@ -165,7 +165,7 @@ static inline int k_buffer_finish(Pixel *pixel, global const Splat *splats, cons
     k_buffer->from = k_buffer->until;
     k_buffer->from_splat = k_buffer->until_splat;
     k_buffer->until = INFINITY;
-    k_buffer->bounded = true;        // where nothing was dropped nothing is taken, if the list is gone through again for others
+    k_buffer->bounded = true;        // if nothing was dropped here, another pass (for other pixels) includes no fragment
     return pixel_unfinished(pixel, constants);
 }
 //@ blend_arguments

@@ -1,39 +1,39 @@
-// What waits at a block of pixels, for CPUs (slot/compose_pixel.cl). At each pixel the furthest is `held`: one more takes its
-// place or leaves again, and what leaves can nearly always be composited; else it goes to a queue, sorted at each pixel. So all
-// fragments go the same way, and branches can be foreseen. An entry has a fragment at each pixel, of any splat; what it shows is
-// kept by value.
+// k-buffer of a block of pixels for CPUs: sorts fragments by depth before compositing (slot/compose_pixel.cl). An entry has one
+// fragment per pixel, each of any splat, with its attributes by value. The farthest fragment of each pixel is in `farthest`. A new
+// fragment replaces it or is pushed out; the fragment pushed out can nearly always be composited, else it enters a queue that is
+// sorted per pixel. All fragments take the same path, so branches are predictable.
 //
-// A tile's list is walked through in chunks, and of a chunk block after block: so what waits at a block stays in the cache, and
-// each block has the chunk's splats in the order of their least depth there, which is mostly that of their fragments. Two things keep
-// fragments from waiting for splats that come near elsewhere only, and cost nothing where splats are small:
-// - Where many of a chunk lie behind what the list has next (large splats, whose nearest points are in other tiles), splats go on to
-//   chunks in the order of their least depths in the tile, as soon as nothing that is still to be read comes nearer.
-// - Where much waits at a block, the splats that follow are looked at before they are drawn: at each pixel the bound is then the very
-//   depth that blending will give them, where they have a fragment.
-// Neither changes the order of fragments, which is by depth and place in the list.
+// A tile's list is processed in chunks, and a chunk block by block: the k-buffer of a block stays in the cache, and each block sorts
+// the chunk's splats by their minimum depth there, which is mostly the order of their fragments. Two measures keep the queue short
+// where splats are large, and cost nothing where they are small:
+// - Deferral: where many splats of a chunk are behind the next splat of the list (their nearest points are in other tiles), they
+//   are deferred and form chunks in the order of their minimum depths in the tile, once no unread splat is nearer.
+// - Lookahead: where many fragments are queued at a block, the depths of the next splats are evaluated before blending, so that
+//   the bound at each pixel is the exact depth of the next fragment.
+// Neither changes the order of fragments, which is by depth, then by position in the list.
 //@ compose_types
-#define CHUNK 128                   // splats, a multiple of 64 and a power of two
-#define DEFERRED_CAPACITY 2048                  // splats that are read and not yet drawn: of more the nearest are drawn sooner, and wait
-#define DEFER_THRESHOLD (CHUNK / 4)            // splats of a chunk behind what follows, for which the rest of the list is put in order
-#define LOOKAHEAD_QUEUE 4                     // fragments in a queue, from which on what follows is looked at
-#define LOOKAHEAD_FACTOR 4                   // times as many splats as must be, so that it is done once for several that leave
-#define EMPTY_Z INFINITY            // the depth where nothing waits in the queue
-#define NO_FRAGMENT (-INFINITY)            // and where nothing is held
+#define CHUNK 128                   // splats; a multiple of 64 and a power of two
+#define DEFERRED_CAPACITY 2048                  // deferred splats; when full, the nearest are processed early
+#define DEFER_THRESHOLD (CHUNK / 4)            // splats of a chunk behind the next one, from which on the tile defers
+#define LOOKAHEAD_QUEUE 4                     // queued fragments of a block, from which on lookahead is used
+#define LOOKAHEAD_FACTOR 4                   // splats evaluated per splat required, to amortise lookahead
+#define EMPTY_Z INFINITY            // depth of an empty lane of the queue
+#define NO_FRAGMENT (-INFINITY)            // depth of an empty lane of `farthest`
 typedef union {
     Attributes attributes;
     vfloat fields[sizeof(Attributes) / sizeof(vfloat)];
 } AttributeFields;
-typedef struct {                    // a fragment in each lane, of any splat
+typedef struct {                    // one fragment per lane
     vfloat z, opacity;
-    vint place;                     // of its splat in the list
+    vint place;                     // position of its splat in the list
     AttributeFields data;
 } Entry;
-typedef struct {                    // apart from what is to stay in registers
-    Entry entries[K_BUFFER_SIZE];         // of K_BUFFER_SIZE - 1
-    uchar order[K_BUFFER_SIZE];           // places in the above: `count` that are taken, the nearest first, then those that are free
+typedef struct {                    // not in registers
+    Entry entries[K_BUFFER_SIZE];         // K_BUFFER_SIZE - 1 are used
+    uchar order[K_BUFFER_SIZE];           // indices of entries: `count` used ones, nearest first, then the free ones
     int count;
-    int bounded;                    // whether not all fragments are taken, but those between
-    vfloat from, until;             // these depths: at the first from `from_place` in the list on, at the second those before
+    int bounded;                    // fragments outside of [from, until) are skipped
+    vfloat from, until;             // depths; at `from`: positions from `from_place` on, at `until`: those before
     vint from_place, until_place;
 } Queue;
 typedef struct {
@@ -42,7 +42,7 @@ typedef struct {
 } KBuffer;
 
 static inline void k_buffer_start(KBuffer *k_buffer) {
-    const Entry none = {(vfloat)NO_FRAGMENT};      // and the rest 0, which shows nothing
+    const Entry none = {(vfloat)NO_FRAGMENT};      // other fields are 0, which contributes nothing
     k_buffer->farthest = none;
 }
 
@@ -54,21 +54,21 @@ static inline void queue_start(Queue *queue) {
     queue->from_place = queue->until_place = 0;
 }
 
-// Bits of a depth as a whole number that is sorted as it is, and back.
+// Bits of a depth as an integer of the same order; its own inverse.
 static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFFF); }
 
-// A depth's sort key, rounded down as depths in blocks are, and back.
+// Sort key of a depth, rounded down like depths in blocks, and its inverse.
 static inline uint rounded_key(wide depth) { return sortable((float)depth) & -CHUNK; }
 static inline wide depth_of_key(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
 
-// The same of a splat whose depths in blocks are `keys`: the least in `blocks`.
+// Rounded sort key of the minimum depth in `blocks`; keys: depths of a splat in each block.
 static inline uint min_key(const int *keys, uint blocks) {
     int min_depth = 0x7FFFFFFF;
     for (; blocks != 0; blocks &= blocks - 1) min_depth = min(min_depth, keys[31 - clz((int)(blocks & -blocks))]);
     return ((uint)min_depth & -CHUNK) ^ 0x80000000u;
 }
 
-// Puts `taken` numbers, at most CHUNK and all different, among the `count` of `early`, the greatest first. Returns how many they are then.
+// Inserts `taken` distinct keys, at most CHUNK, into the `count` sorted keys of `deferred`, largest first. Returns the new count.
 static inline int insert_deferred(ulong *deferred, int count, const ulong *batch, int taken) {
     ulong sorted[CHUNK];
     for (int k = 0; k < taken; k++) {
@@ -95,12 +95,12 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
 //@@ coplanar_blocks_nearest
         VSTORE((in_order(VAS_INT(min_depth)) & -CHUNK) | which, keys + first);
 //@ tile_loop
-    ulong deferred[DEFERRED_CAPACITY];         // splats that are read and not drawn: their least depths in the tile and their places, the furthest first
+    ulong deferred[DEFERRED_CAPACITY];         // (minimum depth in the tile, position), farthest first
     int deferred_count = 0;
-    bool ordered = false;       // whether all go there first
+    bool ordered = false;       // all further splats are deferred
     for (uint read = starts[tile] - base, end = starts[tile + 1] - base; (read < end || deferred_count > 0) && alive;) {
-        uint places[CHUNK], listed[CHUNK], length = 0;      // in the list, and which splats
-        // until what is to come next is known: a chunk of splats before all that is not read
+        uint places[CHUNK], listed[CHUNK], length = 0;      // positions in the list, and splat indices
+        // read a chunk, unless a full chunk of deferred splats is in front of all unread splats
         const bool reads = read < end && deferred_count <= DEFERRED_CAPACITY - CHUNK
                            && (deferred_count < CHUNK || deferred[deferred_count - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
         if (reads)
@@ -111,7 +111,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         wide rest_nearest = read < end ? splats[lists[read]].nearest : INFINITY;
         if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, depth_of_key((uint)(deferred[deferred_count - 1] >> 32)));
         for (uint which = 0; which < length; which++) listed[which] = lists[places[which]];
-        // of each splat its blocks, and its least depth in each of them, rounded down to have its place in the chunk as last bits
+        // per splat: its blocks, and its minimum depth in each block, whose last bits hold its index in the chunk
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
         uint behind = 0;
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
@@ -125,7 +125,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
             touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which]);
         }
-        // what lies behind by its centre is asked where it lies here
+        // splats behind by their centre: test the minimum depth in this tile
         if (reads && (ordered || behind > DEFER_THRESHOLD)) {
             ulong batch[CHUNK];
             int taken = 0, far = 0;
@@ -144,7 +144,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         }
         for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
             const int block = 31 - clz((int)(blocks & -blocks));
-            // its splats, sorted by those numbers: the place of each is how many are less
+            // the block's splats, sorted by these keys: a rank is the number of smaller keys
             int unsorted[CHUNK + LANES] __attribute__((aligned(64))), sorted[CHUNK + 1 + LANES] __attribute__((aligned(64))), count = 0;
             for (int first = 0; first < CHUNK; first += 64) {
                 ulong own = 0;
@@ -160,13 +160,13 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
                 for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&places)[lane]] = unsorted[first + lane];
             }
             sorted[count] = 0x7F800000;         // infinity
-            wide nearest[CHUNK + LANES];        // what follows comes no nearer
+            wide nearest[CHUNK + LANES];        // lower bound of the depths that follow
             for (int first = 0; first < count; first += LANES)
                 VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)rest_nearest), nearest + first);
-            vfloat depths[CHUNK];               // the same at each pixel, of those before `known`
+            vfloat depths[CHUNK];               // per pixel, for splats before `evaluated`
             Pixel pixel = pixels[block];
-            // Where much waits, what follows is looked at first: from `ahead` back to the splat after `next`, until no splat beyond
-            // comes before what may leave, which is no further than what is held.
+            // Lookahead: evaluates depths from `lookahead` back to the splat after `next`, up to the last splat that may be nearer than
+            // `farthest`, the bound of fragments that can be pushed out.
             int evaluated = 0, looks_ahead = 0;
             for (int next = 0, lookahead = 0; next < count;) {
                 const vfloat next_nearest = next < evaluated ? depths[next] : (vfloat)nearest[next], farthest = pixel.k_buffer.farthest.z;
@@ -191,7 +191,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         }
     }
 //@ compose_functions
-// Composites what waits nearer than `nearest`, but what shares an entry with something further.
+// Composites queued fragments nearer than `nearest`, except entries that also hold a farther one.
 static inline void k_buffer_flush(Pixel *pixel, vfloat nearest, const BlendConstants *constants) {
     Queue *queue = pixel->k_buffer.queue;
     int left = 0;
@@ -226,12 +226,12 @@ static inline void swap_entries(Entry *one, Entry *other, vint mask) {
         swap_lanes(&one->data.fields[field], &other->data.fields[field], mask);
 }
 
-// Where one comes before the other: of equal depths the first in the list.
+// Lanes where one fragment precedes the other: by depth, then by position in the list.
 static inline vint entry_before(const Entry *one, const Entry *other) {
     return VMASK(one->z < other->z) | (VMASK(one->z == other->z) & VMASK(one->place < other->place));
 }
 
-// Puts what leaves `held` into the queue. Where that is full, what is held is dropped for it: the furthest of all.
+// Enqueues the fragments pushed out of `farthest`. If the queue is full, the farthest fragments of all are dropped.
 static inline void k_buffer_enqueue(KBuffer *k_buffer, Entry *own) {
     Queue *queue = k_buffer->queue;
     own->z = VSELECT(own->z, (vfloat)EMPTY_Z, VMASK(own->z == NO_FRAGMENT));
@@ -252,7 +252,7 @@ static inline void k_buffer_enqueue(KBuffer *k_buffer, Entry *own) {
     swap_entries(own, &k_buffer->farthest, dropped);
 }
 
-// Takes a fragment of the splat at `place` in the list, with nothing to come before `nearest`.
+// Inserts a fragment of the splat at `place` in the list; no later fragment is nearer than `nearest`.
 static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloat opacity, const Attributes *attributes, uint splat, uint place,
                                 vint mask, global const Splat *splats, const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
@@ -276,7 +276,7 @@ static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloa
 }
 
 //@@ coplanar_functions
-// After the last splat of the list: composites what waits. Returns where the list is to be gone through again.
+// After the last splat of the list: composites all remaining fragments. Returns the lanes that require another pass.
 static inline vint k_buffer_finish(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
 //@@ coplanar_finish
     k_buffer_flush(pixel, INFINITY, constants);
@@ -297,7 +297,7 @@ static inline vint k_buffer_finish(Pixel *pixel, global const Splat *splats, con
                 lookahead--;
                 continue;
             }
-            if (!VANY(mask)) {              // nor is a layer closed for what is not drawn
+            if (!VANY(mask)) {              // a splat without fragments here does not complete a layer either
                 lookahead = ++next;
                 continue;
             }

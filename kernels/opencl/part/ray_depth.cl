@@ -1,15 +1,15 @@
-// Depth along z of a fragment, for those that need it: where the ray meets the splat's plane, within the depth range of the part that can
-// be visible; the centre's where the ray meets no plane beyond `near` (numerics B2, B4). slot/lowpass_screen.cl has that of its dots.
+// Depth along z of a fragment: the ray-plane intersection, clamped to the depth range of the splat's visible part; the depth of the
+// centre where the ray does not intersect the plane beyond `near`. slot/lowpass_screen.cl has the depth of low-pass fragments.
 //@ crossing
 //@@ dot_crossing
 //@ mask
 //@@ dot_mask
 //@ project
-    // of all that is drawn, and of what the low-pass's dot shows whatever the cut-off
+    // range of all fragments, including the low-pass disc at any alpha cut-off
     real depth_center = pz, depth_reach = reach;
 //@@ dot_depth_reach
 //@@ depth_reach
-    if (pz < near) {                // fragments lie beyond `near`
+    if (pz < near) {                // all fragments are beyond `near`
         real furthest = fmax(near, pz + depth_reach);
         depth_center = REAL(0.5) * (furthest + near);
         depth_reach = REAL(0.5) * (furthest - near);

@@ -1,5 +1,5 @@
-// Depth of a fragment: z_numerator / D, the centre's where the ray meets no plane. It leaves the splat's range by rounding alone, and then has
-// the centre's derivative.
+// Backward pass of fragment depth: z_numerator / D, or the depth of the centre where the ray does not intersect the plane. Outside
+// of the splat's depth range, which only rounding leaves, the gradient is that of the centre.
 //@ geometry
     vfloat d, z;
     vint hit;               // the depth is z_numerator / D
@@ -7,14 +7,14 @@
 //@ geometry_make
     g.d = c.d;
     vfloat z_low = s->z_center - s->z_reach, z_high = s->z_center + s->z_reach, depth = s->z_numerator * g.inverse_d;
-    vint flat = g.on_plane;                 // the depth is that on the plane, but for the range
+    vint flat = g.on_plane;                 // the depth is on the plane, if within range
 //@@ dot_geometry_make
     g.hit = flat & VMASK(depth >= z_low) & VMASK(depth <= z_high);
     g.z = clamp(depth, z_low, z_high);
 //@ sums
     vfloat z_numerator, z_center;
 //@ fragment_functions
-// Adds the derivative by a fragment's depth, at (x, y) from the anchor; returns that by D.
+// Adds the gradient by a fragment's depth at (x, y) from the anchor; returns the gradient by D.
 static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vfloat by_z, vfloat screen, vfloat x, vfloat y,
                                vfloat *by_nu, vfloat *by_nv) {
     vfloat by_numerator = VSELECT((vfloat)0.0f, by_z * g->inverse_d, g->hit), by_d = -by_numerator * g->z;
@@ -29,7 +29,7 @@ static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vf
     MOMENT(z_numerator, sums->z_numerator);
     MOMENT(z_center, sums->z_center);
 //@ camera_backward
-        // z_numerator is the determinant of M, with its sign
+        // z_numerator is the signed determinant of M
         real by_volume = facing * total.z_numerator;
         by_tu = add3(by_tu, scaled(by_volume, kx));
         by_tv = add3(by_tv, scaled(by_volume, ky));

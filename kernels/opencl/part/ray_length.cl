@@ -1,4 +1,4 @@
-// Length of the ray through a sample per unit of depth along z: what turns depths into distances. Pinhole rays.
+// Length of a pinhole ray through a sample per unit of depth along z, which converts depth to distance.
 //@ functions
 static inline float ray_length(float x, float y, float fx, float fy, float cx, float cy) {
     float across = (x - cx) / fx, down = (y - cy) / fy;

@@ -1,12 +1,12 @@
-// Where on the picture directions fall. The lens's chart (two coordinates of a direction) is cut into a grid of cells, and
-// `ray_map` holds for each the first and last column and row of the samples whose rays lie in it; coarser grids
-// follow, each of half as many cells a side. So bounds hold for whatever the rays are.
+// Image bounds of a region of ray directions, for lenses. The lens's chart (two coordinates of a direction) is a grid of cells;
+// `ray_map` holds for each cell the first and last column and row of the samples whose rays are inside, followed by coarser grids
+// of half the resolution each. The bounds hold for arbitrary rays.
 //@ camera
-// The samples whose rays lie in [x0, x1] x [y0, y1] of the chart, as bounds; empty ones if there are none.
-// numbers: low corner, cells per unit along x and y, cells a side, the row of the map that is the first of this picture.
+// Bounds of the samples whose rays are in [x0, x1] x [y0, y1] of the chart; empty if there are none. numbers: low corner, cells per
+// unit along x and y, cells per side, first row of this image in the map.
 static inline Bounds mapped_bounds(global const real *numbers, global const short4 *map, real x0, real x1, real y0, real y1) {
     real cells = numbers[4];
-    // 0.02 of a cell for the rounding of the chart
+    // margin of 0.02 cells for the rounding of the chart
     real from_x = (x0 - numbers[0]) * numbers[2] - REAL(0.02), to_x = (x1 - numbers[0]) * numbers[2] + REAL(0.02);
     real from_y = (y0 - numbers[1]) * numbers[3] - REAL(0.02), to_y = (y1 - numbers[1]) * numbers[3] + REAL(0.02);
     short4 box = (short4)(32767, -1, 32767, -1);

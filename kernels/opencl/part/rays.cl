@@ -1,7 +1,7 @@
-// Lenses whose samples each have a ray of their own, in the buffer `rays`: 3 channels X, Y, Z of the padded sample grid, NaN
-// where nothing is seen. A ray r meets the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = r . (b x p, p x a, a x b),
-// at the depth det[a b p] / D in units of r's length: along z if rays have Z = 1, else along the ray. The forms are kept
-// relative to the ray of the sample nearest to the centre, so that nothing cancels (numerics B1).
+// Lenses with one ray per sample, from the buffer `rays`: 3 channels X, Y, Z of the padded sample grid, NaN outside of the field of
+// view. A ray r intersects the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = r . (b x p, p x a, a x b),
+// at depth det[a b p] / D in units of |r|: along z if rays have Z = 1, else along the ray. The forms are relative to the ray
+// of the sample nearest to the centre, so that nothing cancels.
 //@ cross_functions
 static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfloat ray_z, float half_r2
 //@@ ray_cross_parameters
@@ -15,7 +15,7 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     return c;
 }
 //@ camera_forms
-    // any ray will do for an anchor; where that sample sees nothing it is the centre's
+    // any ray can be the anchor; if that sample has none, the direction of the centre
     size_t ray_stride = (width + TILE_W - 1) / TILE_W * TILE_W;
     size_t ray_plane = ray_stride * ((height + TILE_H - 1) / TILE_H * TILE_H);
     float near_x = center_x == center_x ? (float)center_x : bounds.ex, near_y = center_y == center_y ? (float)center_y : bounds.ey;
@@ -59,6 +59,6 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     ray_x = rays[at];
     ray_y = rays[channel_stride + at];
     ray_z = rays[2 * (size_t)channel_stride + at];
-    if (!(ray_x == ray_x)) return;           // nothing is seen there
+    if (!(ray_x == ray_x)) return;           // outside of the field of view
 //@ mask
-    mask &= VMASK(c.d == c.d);               // the low-pass draws nothing where there is no ray
+    mask &= VMASK(c.d == c.d);               // the low-pass renders nothing where there is no ray

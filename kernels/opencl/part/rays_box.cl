@@ -1,8 +1,8 @@
-// Edges of boxes (part/box_cover.cl) where samples have rays of their own: curves, which within a sample are straight. The
-// gradients of the forms come from the ray's derivatives by the sample's position, in the buffer `ray_slopes`: 6 channels
-// dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy.
+// Edges of boxes (part/box_cover.cl) for lenses with one ray per sample: curves, approximated by lines within a sample. Gradients of the
+// forms use the ray's derivatives by the sample's position, from the buffer `ray_slopes`: 6 channels dX/dx, dY/dx, dZ/dx, dX/dy,
+// dY/dy, dZ/dy.
 //@ footprint_functions
-// 1 where a form is half a sample above 0, 0 where it is as much below, by its derivatives along x and y.
+// Ramp of a form over one sample: 1 half a sample inside of the edge, 0 half a sample outside.
 static inline vfloat edge_ramp(vfloat form, vfloat by_x, vfloat by_y) {
     vfloat steep = sqrt(fmax(FMA(by_x, by_x, by_y * by_y), (vfloat)1e-36f));
     return clamp(form / steep + 0.5f, (vfloat)0.0f, (vfloat)1.0f);
@@ -19,7 +19,7 @@ static inline vfloat along_ray(wide x, wide y, wide z, vfloat to_x, vfloat to_y,
     return FMA((vfloat)z, to_z, FMA((vfloat)y, to_y, (vfloat)x * to_x));
 }
 //@ ray_cross_parameters
-    , vfloat xx, vfloat yx, vfloat zx, vfloat xy, vfloat yy, vfloat zy   // the ray's derivatives along x, along y
+    , vfloat xx, vfloat yx, vfloat zx, vfloat xy, vfloat yy, vfloat zy   // derivatives of the ray by x and by y
 //@ ray_cross
     if (IS_BOX(s)) {
         vfloat d_x = along_ray(s->dx, s->dy, s->dz, xx, yx, zx), d_y = along_ray(s->dx, s->dy, s->dz, xy, yy, zy);
@@ -38,10 +38,10 @@ static inline vfloat along_ray(wide x, wide y, wide z, vfloat to_x, vfloat to_y,
         for (int k = 0; k < 6; k++) own_slopes[k][row] = ray_slopes[k * ray_plane + (py + row) * ray_stride + px];
 #define SLOPE(k) own_slopes[k][row]
 //@ footprint_spread
-    // A sample that is partly covered meets the plane at |u| <= 1 + |grad F| / 2 D for the forms F = D -+ n_u, likewise v. With
-    // |grad F| <= |F| ray_step (|F| of its three factors) and D >= su sv |offset| / |P|, the point P on the plane is no further
-    // than |p| + |u| su + |v| sv: a linear inequality, whose solution is a larger box. Without one, near the plane's own horizon,
-    // all of the plane is taken.
+    // A partly covered sample is at |u| <= 1 + |grad F| / 2 D for the forms F = D -+ n_u, likewise for v. With
+    // |grad F| <= |F| ray_step (|F| of its three factors) and D >= su sv |offset| / |P|, the point P on the plane is at most
+    // |p| + |u| su + |v| sv away: a linear inequality whose solution is a larger box. Where it has no solution, near the plane's
+    // horizon, the bounds are the complete plane.
     real3_ box_a = a, box_b = b;
     real box_reach = reach;
     if (BOX_HERE) {

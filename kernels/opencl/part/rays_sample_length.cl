@@ -1,3 +1,3 @@
-// The length of each sample's ray while pixels are resolved, of the ray that the lens gives it.
+// Length of each sample's lens ray, during resolve.
 //@ resolve_sample
             float length_here = length_of_ray(rays, channel_stride, at);

@@ -1,4 +1,4 @@
-// Pixels of one sample each are resolved by who has drawn them, and need no launch of their own.
+// Resolve fused into blend, for one sample per pixel: saves a launch.
 //@ pixel_stored
         if (px < width && py + row < height) {
             const int x = px, y = py + row;

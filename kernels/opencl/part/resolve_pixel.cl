@@ -1,4 +1,4 @@
-// A pixel (x, y) of view `number`, whose samples begin at `first`.
+// Resolve of a pixel (x, y) of view `number`: the mean of its samples, which start at `first`, over the background.
 //@ resolve_pixel
     float r = 0, g = 0, b = 0, t = 0;
 //@@ resolve_start

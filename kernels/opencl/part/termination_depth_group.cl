@@ -1,4 +1,4 @@
-// As part/termination_depth_lanes.cl, for GPUs: lists are looked at in whole batches. The last does not count, since no vote follows it.
+// Termination depths of tiles for GPUs (part/termination_depth_lanes.cl), per batch of splats. The last batch is followed by no vote.
 //@ group_start
     if (item == 0) tile_ends[tile] = UINT_MAX;
 //@ voted

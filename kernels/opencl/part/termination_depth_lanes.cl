@@ -1,7 +1,7 @@
-// For stores (fidsplat/backends/termination_depth.py), by centres: of each tile the sort key at which all of its pixels were finished; UINT_MAX
-// where the list ended before. Whatever else the list may have behind that key, the tile has the same bits: it is not looked at.
+// Termination depth of each tile for occlusion culling (fidsplat/backends/termination_depth.py), in centre order: the sort key at
+// which all its pixels were terminated, or UINT_MAX if the list ended first. Splats behind it cannot change the tile.
 //@ lanes_start
-    uint last_read = UINT_MAX;     // the last place in `lists` that was looked at
+    uint last_read = UINT_MAX;     // last position in `lists` that was processed
 //@ tile_loop_chunk
         last_read = chunk + length - 1;
 //@ pass_end

@@ -1,4 +1,4 @@
-// The end of part/termination_depth_pixel.cl, for GPUs.
+// Maximum over the tile's pixels of part/termination_depth_pixel.cl, for GPUs.
 //@ group_start
     local uint furthest;
     if (item == 0) furthest = 0;

@@ -1,4 +1,4 @@
-// The end of part/termination_depth_pixel.cl, for CPUs.
+// Maximum over the tile's pixels of part/termination_depth_pixel.cl, for CPUs.
 //@ pass_end
     vfloat furthest = -INFINITY;
     for (int block = 0; block < BLOCKS; block++)

@@ -1,4 +1,4 @@
-// Which splats are 3D Gaussians: those with a standard deviation along the normal too.
+// 3D Gaussians among the splats: those with a nonzero standard deviation along the normal.
 //@ footprint_here
 #define THICK_HERE (thickness[i] > 0.0f)
 #define THICKNESS_HERE ((real)fmax(thickness[i], MIN_SCALE))

@@ -1,11 +1,11 @@
-// The way through a tile's list in chunks, for CPUs: of a chunk block after block, so that a block's pixels stay in registers.
+// Loop through a tile's list in chunks, for CPUs: each chunk block by block, so that a block's pixels stay in registers.
 //@ compose_types
 #define CHUNK 64
 //@ tile_loop
     for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base; chunk < end && alive; chunk += CHUNK) {
         const uint length = min(end - chunk, (uint)CHUNK);
 //@@ tile_loop_chunk
-        int touched[CHUNK];                 // of each splat its blocks
+        int touched[CHUNK];                 // blocks of each splat
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
             PREFETCH(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]);
@@ -15,7 +15,7 @@
         }
         for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
             const int block = 31 - clz((int)(blocks & -blocks));
-            ulong own = 0;                  // of the block its splats
+            ulong own = 0;                  // splats of the block
             for (int at = 0; at < CHUNK; at += LANES)
                 own |= (ulong)VBITS(VMASK((VLOAD(touched + at) & (int)(1u << block)) != 0)) << at;
             Pixel pixel = pixels[block];

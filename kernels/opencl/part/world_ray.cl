@@ -1,5 +1,5 @@
-// What is seen behind everything by each sample's own ray: added to the samples of one pose before they become pixels.
-// A lens with rays of its own gives them (part/rays.cl); others have x, y, 1, or parallel rays for an infinite focal length.
+// Background by direction (gradient, panorama): composited behind the samples of one pose before resolve. Lenses have one ray per
+// sample (part/rays.cl); others have (x, y, 1), or parallel rays for an infinite focal length.
 //@ kernels
 // Index space: one work-item per sample (x, y). Reads: raw's transmittances. Writes: raw's colours.
 kernel void backdrop(

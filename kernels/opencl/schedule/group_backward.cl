@@ -197,7 +197,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 ) {
     local Staged staged[CHUNK];
     local float scratch[SCRATCH];
-    local float2 *fragments = (local float2 *)scratch;      // by splat and pixel: transmittance and opacity, then weight and gradient by ln(opacity)
+    local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, opacity; then weight, gradient by ln(opacity)
     local PixelGradient shared[PIXELS];
     local uint slots[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};

@@ -1,15 +1,15 @@
-// Shorter exponentials and logarithms than the library's, of sums and products that every device rounds alike: the same bits
-// wherever FMA is one operation, and bounds that hold everywhere. Over all arguments (tools/fast_bounds.py), in units of the
-// last place, with FMA / without: exp 1.98 / 2.26 of -87 to 0, log 0.89 / 1.07 of 2^-24 to 1; OpenCL promises 3 of its own.
-// Divisions have no substitute: CPUs have an instruction, and OpenCL promises 2.5 ulp of a GPU's.
+// Fast exponential and logarithm of sums and products that every device rounds alike: bit-identical wherever FMA is one operation,
+// with error bounds for all devices. Maximum errors over all arguments (tools/fast_bounds.py), in ulp, with FMA / without: exp
+// 1.98 / 2.26 on -87 to 0, log 0.89 / 1.07 on 2^-24 to 1; OpenCL guarantees 3 for its own.
+// Division has no replacement: CPUs have an instruction, and OpenCL guarantees 2.5 ulp on GPUs.
 //@ arithmetic
-// e^x of x <= 0, as 2^k e^r with |r| <= ln(2) / 2; e^r by a polynomial of degree 5, 1 at 0, whose greatest relative error,
-// 9.2e-8, is the least possible. Below -87 it stays e^-87, 1.6e-38: further down the exponent's bits would run over.
+// e^x for x <= 0, as 2^k e^r with |r| <= ln(2) / 2; e^r by the minimax polynomial of degree 5 that is 1 at 0, with relative error
+// 9.2e-8. Below -87 the result stays e^-87 = 1.6e-38, since the exponent bits would underflow.
 static inline vfloat fast_exp(vfloat x) {
-    const float rounder = 12582912.0f;                  // 1.5 * 2^23: the sum's last bits are the whole number
+    const float rounder = 12582912.0f;                  // 1.5 * 2^23: the last bits of the sum are the integer
     x = fmax(x, (vfloat)-87.0f);
     vfloat sum = FMA(x, (vfloat)1.44269504f, (vfloat)rounder), k = sum - rounder;
-    vfloat r = FMA(k, (vfloat)-0.693359375f, x);        // ln 2 in two words, the first of 9 bits: this is exact
+    vfloat r = FMA(k, (vfloat)-0.693359375f, x);        // ln 2 in two words, the first of 9 bits: exact
     r = FMA(k, (vfloat)2.12194440e-4f, r);
     vfloat p = FMA((vfloat)8.29030946e-3f, r, (vfloat)4.18979935e-2f);
     p = FMA(p, r, (vfloat)1.66676372e-1f);
@@ -21,7 +21,7 @@ static inline vfloat fast_exp(vfloat x) {
 
 // ln x as ln m + k ln 2 with m from sqrt(1/2) to sqrt(2); ln m by the polynomial of Cephes (logf.c).
 static inline vfloat fast_log(vfloat x) {
-    vint bits = VAS_INT(x) - 0x3F3504F3;                // less those of sqrt(1/2)
+    vint bits = VAS_INT(x) - 0x3F3504F3;                // minus the bits of sqrt(1/2)
     vfloat m = VAS_FLOAT((bits & 0x7FFFFF) + 0x3F3504F3) - 1.0f, m2 = m * m;
     vfloat p = FMA((vfloat)7.0376836292e-2f, m, (vfloat)-1.1514610310e-1f);
     p = FMA(p, m, (vfloat)1.1676998740e-1f);

@@ -1,4 +1,4 @@
-// Exponentials and logarithms of the device's library.
+// Exponential and logarithm of the device's library.
 //@ opacity
     return VMIN(exp(s->log_opacity - half_rho), (vfloat)ceiling);
 //@ layer_tau

@@ -1,4 +1,4 @@
-// Behind everything a blend of two colours by the sine of the ray's height above the horizon.
+// Background gradient: two colours blended by the sine of the ray's elevation.
 //@ backdrop
     float sine_elevation = FMA(world_x, up_x, FMA(world_y, up_y, world_z * up_z))
                    / sqrt(FMA(world_x, world_x, FMA(world_y, world_y, world_z * world_z)));

@@ -1,5 +1,5 @@
-// Behind everything an equirectangular picture of the world: its middle column lies towards +z, to the right of it is +x, its
-// top row is -y. Bilinear, around the seam too.
+// Background from an equirectangular panorama: the middle column is +z, to its right is +x, the top row is -y. Bilinear, also across
+// the seam.
 //@ functions
 static inline float panorama_at(global const float *restrict panorama, int width, int height, int x, int y, int channel) {
     x = x < 0 ? x + width : (x >= width ? x - width : x);

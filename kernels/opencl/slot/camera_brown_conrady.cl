@@ -1,7 +1,7 @@
-// Perspective with OpenCV's distortion: radial k1 to k6, tangential p1, p2, thin prism s1 to s4. A splat is enclosed on the
-// ideal pinhole picture, which is the chart of the ray map.
+// Perspective with OpenCV's distortion: radial k1 to k6, tangential p1, p2, thin prism s1 to s4. Splats are bounded in the
+// undistorted pinhole image, which is the chart of the ray map.
 //@ camera
-// Where (x, y) = (X / Z, Y / Z) falls [samples]. Returns whether it is seen: not beyond the fold.
+// Projects (x, y) = (X / Z, Y / Z) [samples]. Returns false beyond the radius where the distortion folds back.
 static inline bool lens_image(global const View *view, real x, real y, real *image_x, real *image_y) {
     global const real *k = view->lens, *p = k + 6, *s = k + 8;
     real q = x * x + y * y;
@@ -15,9 +15,9 @@ static inline bool lens_image(global const View *view, real x, real y, real *ima
 //@ camera_box
     bounds = mapped_bounds(view->map, ray_map, bounds.ex - bounds.hx, bounds.ex + bounds.hx,
                            bounds.ey - bounds.hy, bounds.ey + bounds.hy);
-    if (!(pz >= near && lens_image(view, p.x / pz, p.y / pz, &center_x, &center_y))) center_x = center_y = NAN;   // no dot of a low-pass
+    if (!(pz >= near && lens_image(view, p.x / pz, p.y / pz, &center_x, &center_y))) center_x = center_y = NAN;   // no low-pass disc
 //@ camera_derivative_functions
-// Derivatives of the image coordinates at (x, y) = (X / Z, Y / Z): a_x, a_y, b_x, b_y.
+// Derivatives of the image coordinates by (x, y) = (X / Z, Y / Z): a_x, a_y, b_x, b_y.
 static inline void lens_slopes(global const View *view, real x, real y, real *slopes) {
     global const real *k = view->lens, *p = k + 6, *s = k + 8;
     real q = x * x + y * y;

@@ -1,7 +1,7 @@
-// Panorama: x is the longitude atan2(X, Z), y the latitude. Depths are distances along the ray. A splat is enclosed by a cone
-// about its centre's direction; one that reaches a pole or the edge of longitudes is listed in whole rows.
+// Equirectangular panorama: x is the longitude atan2(X, Z), y the latitude. Depths are distances along the ray. A splat is bounded
+// by a cone about the direction of its centre; at a pole or the seam the bounds are full rows.
 //@ camera
-// Box [samples] of the polygon around the disk.
+// Box [samples] around the projected polygon of the disk.
 static inline Bounds cone_bounds(global const View *view, real3_ a, real3_ b, real3_ p, real radius, real longitude,
                                  real latitude) {
     real pi = REAL(3.14159265358979323846), around = radius / POLYGON_INNER, widest = 0, cu = around, cv = 0;
@@ -14,7 +14,7 @@ static inline Bounds cone_bounds(global const View *view, real3_ a, real3_ b, re
         widest = fmax(widest, dot3(aside, aside) / (along * along));
         next_corner(&cu, &cv);
     }
-    // room for the rounding of rays and of the per-sample test
+    // margin for the rounding of rays and of the per-sample test
     real cone = known ? atan(sqrt(widest)) * REAL(1.0002) + REAL(1e-6) : pi;
     real low = latitude - cone, high = latitude + cone, across = pi;
     if (low > -pi / 2 && high < pi / 2) {
@@ -34,9 +34,9 @@ static inline Bounds cone_bounds(global const View *view, real3_ a, real3_ b, re
     real longitude = atan2(p.x, p.z), latitude = atan2(p.y, sqrt(p.x * p.x + p.z * p.z));
     Bounds bounds = cone_bounds(view, a, b, p, radius, longitude, latitude);
     real center_x = view->focal_x * longitude + view->center_x, center_y = view->focal_y * latitude + view->center_y;
-    if (!(pz >= near)) center_x = center_y = NAN;   // no dot of a low-pass
+    if (!(pz >= near)) center_x = center_y = NAN;   // no low-pass disc
 //@ camera_derivative
-        real polar = p.x * p.x + p.z * p.z < REAL(1e-12) * pz * pz ? 1 : 0;   // where the longitude jumps
+        real polar = p.x * p.x + p.z * p.z < REAL(1e-12) * pz * pz ? 1 : 0;   // at a pole, where longitude is discontinuous
         real around_x = polar > 0 ? 0 : p.x, around_z = polar > 0 ? REAL(1e-6) * pz : p.z;
         real flat = sqrt(around_x * around_x + around_z * around_z);
         real across = view->focal_x / (flat * flat), up = view->focal_y / (pz * pz);

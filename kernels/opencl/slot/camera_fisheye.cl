@@ -1,8 +1,8 @@
-// Kannala-Brandt fisheye, as OpenCV's: a ray at the angle t from the axis falls at the distance
-// t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle. Depths are distances along the ray. The chart of the ray map is the
-// stereographic picture (X, Y) / (|r| + Z), in which arcs of great circles are arcs of circles of radius 1 or more.
+// Kannala-Brandt fisheye, as in OpenCV: a ray at angle t from the axis is at distance
+// t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the image centre. Depths are distances along the ray. The chart of the ray map is the
+// stereographic projection (X, Y) / (|r| + Z), in which arcs of great circles are arcs of circles of radius 1 or more.
 //@ camera
-// Where a point falls [samples]. Returns whether it is seen.
+// Projects a point [samples]. Returns false outside of the field of view.
 static inline bool lens_image(global const View *view, real3_ p, real *image_x, real *image_y) {
     global const real *k = view->lens;
     real across = sqrt(p.x * p.x + p.y * p.y), angle = atan2(across, p.z), q = angle * angle;
@@ -13,14 +13,14 @@ static inline bool lens_image(global const View *view, real3_ p, real *image_x, 
     return angle <= view->lens_limit;
 }
 
-// The disk's part of the chart: the corners of a polygon around it, and the sagitta of the arcs between them. Everything
-// where an arc may be a long one or the disk may hold the pole of the chart, the direction -z.
+// Box of the disk in the chart: the corners of a polygon around it, padded by the sagitta of the arcs between them. The complete
+// chart where an arc may be long or the disk may contain the pole of the chart, direction -z.
 static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real away, real *box) {
     real around = radius / POLYGON_INNER;
     box[0] = box[2] = INFINITY;
     box[1] = box[3] = -INFINITY;
     real3_ u = {a.x * around, a.y * around, a.z * around}, v = {b.x * around, b.y * around, b.z * around};
-    // of the sphere around the polygon; squares, so that no function rounds the wrong way
+    // radius of the sphere around the polygon; squares are compared, so that no rounding is in the wrong direction
     real sphere = sqrt(fmax(dot3(u, u), dot3(v, v))) * REAL(1.000001);
     real x0 = 0, y0 = 0, longest = 0;
     bool known = sphere < away && (p.z > 0 || p.x * p.x + p.y * p.y > sphere * sphere);
@@ -38,7 +38,7 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
         box[3] = fmax(box[3], y1);
     }
     known = known && longest < REAL(0.25);
-    // 1 - sqrt(1 - c^2 / 4) <= c^2 / 7.5 for c <= 1/2; and room for the rounding of the per-sample test
+    // 1 - sqrt(1 - c^2 / 4) <= c^2 / 7.5 for c <= 1/2; and a margin for the rounding of the per-sample test
     real pad = longest / REAL(7.5) + REAL(2e-4) * fmax(box[1] - box[0], box[3] - box[2]) + REAL(1e-6);
     box[0] = known ? box[0] - pad : -INFINITY;
     box[1] = known ? box[1] + pad : INFINITY;
@@ -53,9 +53,9 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
     real chart[4], center_x, center_y;
     chart_box(a, b, p, radius, pz, chart);
     Bounds bounds = mapped_bounds(view->map, ray_map, chart[0], chart[1], chart[2], chart[3]);
-    if (!(pz >= near && lens_image(view, p, &center_x, &center_y))) center_x = center_y = NAN;   // no dot of a low-pass
+    if (!(pz >= near && lens_image(view, p, &center_x, &center_y))) center_x = center_y = NAN;   // no low-pass disc
 //@ camera_derivative
-        // outwards and around, then turned into the picture's axes
+        // radial and tangential derivatives, rotated into image axes
         real across = sqrt(p.x * p.x + p.y * p.y), angle = atan2(across, p.z), q = angle * angle;
         real cosine = across > 0 ? p.x / across : 1, sine = across > 0 ? p.y / across : 0;
         global const real *k = view->lens;

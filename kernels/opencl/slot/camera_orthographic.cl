@@ -1,5 +1,5 @@
-// Parallel rays along z: x = fx X + cx, so the projection's last row is (0, 0, 1) instead of the depths. D is constant, and
-// the depth of a fragment is its own affine form of the pixel, times D.
+// Orthographic camera, parallel rays along z: x = fx X + cx, so the last row of the projection is (0, 0, 1). D is constant, and depth
+// times D is another affine form of the pixel.
 //@ crossing
     vfloat z;               // depth times d
 //@ camera
@@ -9,7 +9,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
     return row;
 }
 //@ camera_offset
-    offset = facet.z;       // which side is seen: the camera is infinitely far away
+    offset = facet.z;       // the visible side: the camera is infinitely far away
 //@ camera_bounds
     real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {0, 0, 1};
     real3_ tu = image_row(view->focal_x, view->center_x, row_x, tw);
@@ -43,7 +43,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
         gx.x = view->focal_x * a.x; gx.y = view->focal_x * b.x;
         gy.x = view->focal_y * a.y; gy.y = view->focal_y * b.y;
 //@ camera_box_near
-        d_near = INFINITY;                   // depths have a form of their own
+        d_near = INFINITY;                   // z_near tests the near plane instead
 //@ camera_ellipsoid
         towards.x = towards.y = 0; towards.z = 1;
         parallel = true;

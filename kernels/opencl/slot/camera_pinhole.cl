@@ -1,21 +1,21 @@
-// Pinhole camera, OpenCV axes.
+// Pinhole camera with OpenCV axes.
 //@ camera_forms
     tu = image_row(view->focal_x, view->center_x - anchor_x, row_x, tw);
     tv = image_row(view->focal_y, view->center_y - anchor_y, row_y, tw);
     real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
     real determinant = view->focal_x * view->focal_y * su * sv * offset;   // of M: exact where tw . k0 cancels
 //@ camera_blocks_nearest
-        // depth is z_numerator / D, within the splat's range, and D at most `d` here; not where D may be 0, nor of what is no disk
+        // depth is z_numerator / D, clamped to the splat's range, with D <= `d`; not valid where D may be 0, nor for other shapes than disks
         vint hit = VMASK(d > 2.0f * around_d) & VMASK((vfloat)s->z_numerator > 0.0f) & VMASK((vfloat)conic_h == (vfloat)(float)half_r2);
         vfloat depth = fmin((1.0f - BLOCKS_SLACK) * s->z_numerator / d, (vfloat)(s->z_center + s->z_reach));
         min_depth = VSELECT(min_depth, fmax(depth, min_depth), hit);
 //@ camera_dot
-        // The dot is never the larger weight of a splat that is wider than it wherever the dot reaches: there D is at least
-        // `min_d`, in front of the near plane, and (n_u^2 + n_v^2) / D^2 at most the squared distance.
+        // The low-pass disc never has the larger weight if the splat is wider than it in all of the disc: there D is at least `min_d`, in
+        // front of the near plane, and (n_u^2 + n_v^2) / D^2 at most the squared distance.
         real spread = sqrt((kx.z * kx.z + ky.z * ky.z) * (half_r2 / view->filter));
         real ahead = (k0.z + kx.z * (center_x - anchor_x) + ky.z * (center_y - anchor_y)) * (determinant < 0 ? -1 : 1);
         real min_d = ahead - spread, steep = kx.x * kx.x + kx.y * kx.y + ky.x * ky.x + ky.y * ky.y;
-        // a margin for the rounding of the record's float32
+        // margin for the rounding of the float32 record
         if (facing != 0 && min_d > 0 && (ahead + spread) * near < REAL(0.999) * fabs(determinant) &&
             steep < REAL(1.99) * view->filter * min_d * min_d)
             record.dot_x = 1e18f;
@@ -26,7 +26,7 @@
         gy = image_row(view->focal_y * ahead, -view->focal_y * p.y * ahead * ahead, in_y, in_z);
         gz.x = a.z * ahead; gz.y = b.z * ahead;
 //@ camera_image
-        // the derivative at most 0.3 half pictures outside the picture
+        // Jacobian clamped to 0.3 half images outside of the image, as in gsplat
         real ahead = 1 / pz, slope_x = fmin(fmax(p.x * ahead, -view->slopes[0]), view->slopes[1]);
         real slope_y = fmin(fmax(p.y * ahead, -view->slopes[2]), view->slopes[3]);
         per_x = view->focal_x * ahead;
@@ -34,8 +34,8 @@
         across.x = per_x * (a.x - slope_x * a.z); across.y = per_x * (b.x - slope_x * b.z); across.z = per_x * (c.x - slope_x * c.z);
         down.x = per_y * (a.y - slope_y * a.z); down.y = per_y * (b.y - slope_y * b.z); down.z = per_y * (c.y - slope_y * c.z);
 //@ camera_ellipsoid_box
-        // All that rays see of an ellipsoid lies on one of half its size, which goes through the camera's centre and its own: what
-        // is beyond the near plane is seen through that one's section at `near`.
+        // The visible contour of an ellipsoid is on an ellipsoid of half its size through the camera centre and its own centre: the part
+        // beyond the near plane projects into the contour's section at `near`.
         real3_ along_x = {a.x, b.x, third.x}, along_y = {a.y, b.y, third.y}, along_z = {a.z, b.z, third.z};
         real zz = dot3(along_z, along_z), ahead = near - pz * REAL(0.5);
         real room = REAL(0.25) / inverse_m2 * (1 + (SETUP_FP64 ? REAL(1e-12) : REAL(1e-4))) - ahead * ahead / zz;

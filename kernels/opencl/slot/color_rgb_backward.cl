@@ -1,4 +1,4 @@
-// One RGB colour per splat: one term, whose derivative has nothing to do with what it is.
+// One RGB colour per splat: one coefficient with derivative 1.
 //@ functions
 #define SH_TERMS 1
 #define PLAIN 1

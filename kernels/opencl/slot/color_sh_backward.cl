@@ -1,9 +1,9 @@
-// Spherical harmonics: by the coefficients and, through the direction, by the centre and the camera's.
+// Spherical harmonics: gradients by the coefficients and, through the direction, by the centre and the camera's position.
 //@ functions
 #define PLAIN 0
 #define CLOUD_TERMS sh
 #define BY_TERMS by_sh
-// Derivatives by the direction of sum_k by[k] Y_k.
+// Gradient of sum_k by[k] Y_k by the direction.
 static inline real3_ sh_basis_backward(real3_ d, const wide *by) {
     wide x = (wide)d.x, y = (wide)d.y, z = (wide)d.z, by_x = 0.0f, by_y = 0.0f, by_z = 0.0f;
 #if SH_DEGREE > 0
@@ -38,7 +38,7 @@ static inline real3_ sh_basis_backward(real3_ d, const wide *by) {
         real length = sqrt(dot3(ray, ray)), inverse = length > 0 ? 1 / length : 0;
         ray = scaled(inverse, ray);
         sh_basis(ray, own.basis);
-        // colours below 0 are clamped, and have no derivative
+        // colours below 0 are clamped and have no gradient
         const Splat s = splats[i];
         own.color[0] = s.r > 0.0f ? (float)total.r : 0.0f;
         own.color[1] = s.g > 0.0f ? (float)total.g : 0.0f;

@@ -1,29 +1,29 @@
-// Splats that are printed on one plane have no order: at a pixel they are one layer, which nothing cuts. Cutting each into
-// ever thinner sheets and shuffling the sheets gives the limit that does not depend on the order: optical depths
-// tau = -ln(1 - opacity) add up, and what the layer shows is the mean of its fragments weighted by tau, its depth too. So a
-// marker does not change when its splats are re-ordered or when a turning camera re-orders their centres (numerics C1).
+// Compositing with coplanar groups: splats of one group have no order, and form one layer per pixel. The layer is the limit of
+// cutting the splats into thin sheets and shuffling them, which is independent of order: optical depths
+// tau = -ln(1 - opacity) add up, and colour, outputs and depth are means weighted by tau. A marker then does not change when its
+// splats are reordered, or when camera rotation reorders the depths of their centres.
 //
-// The splats of a plane stand together in the lists, where the nearest point of the plane puts them (plane_keys). When another
-// splat follows, the layer waits as one fragment, among the others (slot/compose_pixel.cl).
+// Splats of a group are adjacent in the lists, at the nearest depth of the group (plane_keys). When another splat follows, the
+// layer enters the k-buffer as one fragment (slot/compose_pixel.cl).
 //@ project
     record.plane = planes[i];
 //@ functions
-#define COPLANAR_RADIUS REAL(64.0)       // standard deviations; of boxes half sides
+#define COPLANAR_RADIUS REAL(64.0)       // in standard deviations; for boxes in half sides
 //@ coplanar_depth_reach
-    // its fragments lie on the plane as far out as any cut-off and a low-pass let them be drawn: so those that a cut-off leaves
-    // out move no layer, nor do boxes that are a small part of a pixel
+    // depths of the plane as far out as any alpha cut-off and low-pass renders: then a cut-off does not move layers, nor do boxes
+    // much smaller than a pixel
     if (planes[i] >= 0) depth_reach = reach * (BOX_HERE ? COPLANAR_RADIUS : COPLANAR_RADIUS / radius);
 //@ coplanar_nearest
     if (planes[i] >= 0) record.nearest = (wide)plane_keys[planes[i] * get_global_size(1) + number];
 //@ coplanar_blocks_nearest
-        if (s->plane >= 0) min_depth = s->nearest;      // a plane's stand together, in each block
+        if (s->plane >= 0) min_depth = s->nearest;      // adjacent in each block
 //@ coplanar_lookahead
-                if (s.plane >= 0) {                 // its layer may be nearer than its fragment, and be where that is not
+                if (s.plane >= 0) {                 // its layer may be nearer than this fragment, and at other pixels
                     z = s.nearest;
                     mask = -1;
                 }
 //@ chunk_end
-        // and in one chunk, unless they fill several: the next begins with the first of them
+        // in one chunk, unless they fill several: otherwise the next chunk starts with the group's first splat
         const int plane = splats[lists[places[length - 1]]].plane;
         if (plane >= 0 && ((read < end && splats[lists[read]].plane == plane)
                            || (deferred_count > 0 && splats[lists[(uint)deferred[deferred_count - 1]]].plane == plane))) {
@@ -34,33 +34,33 @@
             if (before > 0) length = before;
         }
 //@ coplanar_dot_depth
-        if (s->plane >= 0) on_plane = -1;           // in the dot too
+        if (s->plane >= 0) on_plane = -1;           // also in the low-pass disc
 //@ coplanar_attribute_depth
     attributes.z = fmax(attributes.z, (vfloat)s->nearest);
 //@ compose_types
-#define LAYER_FLAG 0x80000000u       // among indices of splats: none, but a layer
+#define LAYER_FLAG 0x80000000u       // marks an index as that of a layer, not of a splat
 
 typedef struct {
     int plane;                  // -1: no layer
-    wide nearest;               // its splats' key
-    uint place;                 // of the first of its splats in the list
+    wide nearest;               // sort key of its splats
+    uint place;                 // position of its first splat in the list
     vint lanes;                 // where it has fragments
-    vfloat opacity;             // 1 - the product of its fragments' transmittances; itself, so that a faint one stays exact
-    vfloat optical_depth;       // sum of its fragments'
-    Attributes mean;                  // of its fragments by optical depth
+    vfloat opacity;             // 1 - the product of transmittances, accumulated directly to stay exact for faint layers
+    vfloat optical_depth;       // sum over its fragments
+    Attributes mean;                  // of its fragments, weighted by optical depth
 //@@ layer_fields
 } Layer;
 
 static inline Layer no_layer(void) {
-    Layer layer = {-1};         // and the rest 0
+    Layer layer = {-1};         // all other fields 0
     return layer;
 }
 //@ state
-    Layer open_layer;                 // the one that still gathers
+    Layer open_layer;                 // layer that still accumulates fragments
 //@ start
     pixel->open_layer = no_layer();
 //@ k_buffer_queue_fields
-    Attributes layers[K_BUFFER_SIZE + 1];   // an index of a splat that is LAYER_FLAG + k stands for the k-th
+    Attributes layers[K_BUFFER_SIZE + 1];   // splat index LAYER_FLAG + k refers to layer k
     uint layer_splats[K_BUFFER_SIZE + 1];
 //@ k_buffer_fields
     uint free_layers;
@@ -89,7 +89,7 @@ static inline Layer no_layer(void) {
 // Adds a fragment where `mask` is set.
 static inline void layer_add(Layer *layer, const Splat *s, const Attributes *attributes, vfloat opacity, vint mask) {
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
-    // an opaque fragment has the optical depth at which float32 leaves no light
+    // clamped to the optical depth at which float32 transmittance is 0
 //@@ layer_tau
 //@@ footprint_tau
     layer->lanes |= mask;
@@ -103,8 +103,8 @@ static inline void layer_add(Layer *layer, const Splat *s, const Attributes *att
 //@@ layer_accumulate
 }
 //@ coplanar_functions
-// Nothing more comes of the open layer's plane: it waits, nearer by a little more than depths are rounded, so that it lies
-// before splats of no plane that lie in it.
+// Completes the open layer and inserts it into the k-buffer, nearer by slightly more than the rounding of depths, so that it
+// is in front of ungrouped splats in the same plane.
 static inline void layer_close(Pixel *pixel, vfloat nearest, global const Splat *splats, const BlendConstants *constants) {
     const Layer *open_layer = &pixel->open_layer;
     if (open_layer->plane < 0) return;

@@ -1,3 +1,3 @@
-// The paper's compositing formula: every fragment over what lies behind it, in depth order.
+// Alpha compositing in the order of the lists: by the depth of splat centres.
 //@ compose
     composite(pixel, &attributes, opacity, mask, constants);

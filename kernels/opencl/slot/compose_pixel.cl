@@ -1,12 +1,11 @@
-// Every fragment by its own depth, where the ray meets its splat. Lists are sorted by the nearest depth that any fragment of a
-// splat can have, as blending itself rounds it (`nearest`): so nothing that is still to come lies before the splat at hand, and
-// what waits nearer than that is composited, by depth, ties in the order of the list. How fragments wait is the schedule's
-// (part/waiting_*.cl). There is room for K_BUFFER_SIZE at a pixel. Of more the furthest is dropped, with all that lies behind it
-// (`until`), and the list is gone through again for what was dropped (`from`), until nothing is: the picture does not depend
-// on K_BUFFER_SIZE.
+// Alpha compositing by fragment depth at each pixel. Lists are sorted by `nearest`, a lower bound of the depths of a splat's
+// fragments, with the rounding of blending: no later fragment is nearer than the current splat's key, so that all fragments in front of
+// the key are composited by depth, then by position in the list. Other fragments stay in the k-buffer (part/k_buffer_*.cl), which holds
+// K_BUFFER_SIZE per pixel. When it is full, the farthest fragment is dropped, with all behind it (`until`), and another pass
+// through the list composites the dropped fragments (`from`), until none is left: the image does not depend on K_BUFFER_SIZE.
 //
-// What is fainter than 1/255 of its splat lies no nearer and no further than the rest, whatever the cut-off: depths, and with
-// them the order, are the same at every cut-off.
+// Depths are clamped to the range in which the splat has at least 1/255 of its opacity, at any alpha cut-off, so that a cut-off
+// does not change the order.
 //@ functions
 #define RANGE_RADIUS REAL(3.3290429691304455)   // sqrt(2 ln 255)
 #ifndef BOX_HERE

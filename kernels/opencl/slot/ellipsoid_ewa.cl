@@ -1,11 +1,11 @@
-// 3D Gaussians as 3DGS draws them (EWA splatting, Zwicker et al. 2001; Kerbl et al. 2023): the covariance of the Gaussian's image under
-// the camera's derivative at its centre, widened by 0.3 square pixels, and the centre's depth. Constants of gsplat and the authors'
-// rasterizer. What has that image is a disk that faces the camera: so nothing after the set-up knows of it.
+// 3D Gaussians as in 3DGS (EWA splatting, Zwicker et al. 2001; Kerbl et al. 2023): the projected covariance by the Jacobian at the
+// centre, widened by 0.3 square pixels, and the centre's depth, with the constants of gsplat. The projection equals that of a
+// disk that faces the camera, so that only the setup has code for it.
 //@ lowpass_make
     if (THICK_HERE) {
-        if (!(pz >= near)) return;           // as below, where the disk has no depth: what follows is spared
+        if (!(pz >= near)) return;           // early test of the near plane
         real sw = THICKNESS_HERE;
-        real3_ c = {facet.x * sw, facet.y * sw, facet.z * sw}, across, down;    // the axes' images [samples]
+        real3_ c = {facet.x * sw, facet.y * sw, facet.z * sw}, across, down;    // projected axes [samples]
         real per_x, per_y;                                           // samples per metre at the centre
 //@@ camera_image
         const real spread = REAL(0.3) / view->filter;
@@ -24,8 +24,8 @@
     }
 //@ ellipsoid_normal
     if (THICK_HERE) {
-        // The inverse covariance times the direction of the rays at the centre, as ellipsoid_exact.cl has it: the normal of the surface of
-        // the largest values along rays. In units of the least axis, so that nothing overflows.
+        // Inverse covariance times the ray direction at the centre (ellipsoid_exact.cl): the normal of the surface of largest
+        // values along rays. Relative to the shortest axis, so that nothing overflows.
         real3_ first = rotate_to_camera(view, tangent_u), second = rotate_to_camera(view, tangent_v), towards = p;
         bool parallel = false;
 //@@ camera_ellipsoid
@@ -41,9 +41,9 @@
         facet.x = outward.x / length; facet.y = outward.y / length; facet.z = outward.z / length;
     }
 //@ camera_derivative
-        if (THICK_HERE) filtered = false;   // it has a low-pass of its own
+        if (THICK_HERE) filtered = false;   // EWA has its own low-pass
 //@ camera_steepest
-    if (THICK_HERE) steepest = fabs(k0.z);  // which makes D 1, that of all samples
+    if (THICK_HERE) steepest = fabs(k0.z);  // makes D equal to 1 at all samples
 //@ footprint_dot_bounds
         if (THICK_HERE) bounds.pr = -1.0f;
 //@ footprint_dot

@@ -1,4 +1,4 @@
-// The compensation of Mip-Splatting (Yu et al. 2024, eq. 9; gsplat's rasterize_mode "antialiased"): what widening adds in area it takes in opacity.
+// Opacity compensation of Mip-Splatting (Yu et al. 2024, eq. 9; gsplat's rasterize_mode "antialiased") for the area added by widening.
 //@ ewa_opacity
         log_opacity += (wide)(REAL(0.5) * log(determinant2 / grown));
         half_r2 = log_opacity - (wide)view->log_cut;

@@ -1,26 +1,26 @@
-// 3D Gaussians by their largest value along each ray (docs/primitives.md). Let W make a Gaussian's covariance the unit matrix, p
-// be its centre, m = |W p|, and t the angle between W p and W r for a ray r from the camera's centre. The least squared distance
-// on the ray is rho = (m sin t)^2, where the ray meets the disk through p that W makes perpendicular to W p at rho_disk =
-// (m tan t)^2. So a 3D Gaussian is that disk, whose tangents a, b and p / m are conjugate half axes of the ellipsoid, with
-//     rho = rho_disk / (1 + rho_disk / m^2),   depth = depth of the disk / (1 + rho_disk / m^2)
-// and m is all that a record holds beside a disk's. Nothing cancels for needles, for flat ones (whose m is large: disks) or for
-// far ones. The cone around its R-ellipsoid touches the disk of radius R / sqrt(1 - R^2 / m^2).
+// 3D Gaussians by their maximum along each ray (docs/primitives.md). Let W whiten the covariance, p be the centre, m = |W p|, and
+// t the angle between W p and W r for a ray r from the camera. The minimum squared distance on the ray is rho = (m sin t)^2. The
+// ray intersects the disk through p that is perpendicular to W p after whitening at rho_disk = (m tan t)^2. The Gaussian is thus
+// rendered as that disk, whose tangents a, b and p / m are conjugate half axes of the ellipsoid, with
+//     rho = rho_disk / (1 + rho_disk / m^2),   depth = depth of the disk / (1 + rho_disk / m^2).
+// m is the only additional field of the record. Nothing cancels for needles, for flat Gaussians (m large: disks) or at a
+// distance. The cone around the R-ellipsoid touches the disk of radius R / sqrt(1 - R^2 / m^2).
 //@ functions
 // From scaled axes a, b, c of lengths `lengths`: tangents, unit normal and area |a x b| of the disk seen along `towards`. Returns
-// 1 / m, or infinity where there is no such disk.
+// 1 / m, or infinity if there is no such disk.
 static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths, real3_ *a, real3_ *b, real3_ *facet, real *area) {
     real3_ axes[3] = {*a, *b, c};
-    // from the longest, so that no difference of it is taken
+    // starting with the longest axis, which avoids cancellation
     int i0 = lengths[0] >= lengths[1] && lengths[0] >= lengths[2] ? 0 : lengths[1] >= lengths[2] ? 1 : 2;
     int i1 = (i0 + 1) % 3, i2 = (i0 + 2) % 3;
     real3_ e0 = axes[i0], e1 = axes[i1], e2 = axes[i2];
     real s0 = lengths[i0], s1 = lengths[i1], s2 = lengths[i2], min_length = fmin(s1, s2);
     real w0 = min_length / s0, w1 = min_length / s1, w2 = min_length / s2;
-    // `least` times W towards, so that it neither over- nor underflows
+    // W `towards`, scaled by `min_length` against overflow and underflow
     real g0 = dot3(e0, towards) / s0 * w0, g1 = dot3(e1, towards) / s1 * w1, g2 = dot3(e2, towards) / s2 * w2;
     real h = hypot(g1, g2), m = hypot(g0, h);
     if (!(m > 0)) return INFINITY;
-    // straight along the longest axis any two others do
+    // along the longest axis any two perpendicular ones are valid
     real along = h / m, back = g0 / m, k1 = h > 0 ? g1 / h : 1, k2 = h > 0 ? g2 / h : 0;
     real3_ u = {e0.x * along - back * (k1 * e1.x + k2 * e2.x), e0.y * along - back * (k1 * e1.y + k2 * e2.y),
                 e0.z * along - back * (k1 * e1.z + k2 * e2.z)};
@@ -36,7 +36,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
 }
 //@ lowpass_make
     real inverse_m2 = 0;                                // 1 / m^2
-    real3_ third = {0, 0, 0};                           // the half axis to which a and b are conjugate
+    real3_ third = {0, 0, 0};                           // half axis conjugate to a and b
     if (THICK_HERE) {
         real3_ towards = p;
         bool parallel = false;
@@ -44,19 +44,19 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         const real lengths[3] = {su, sv, THICKNESS_HERE};
         real3_ c = {facet.x * lengths[2], facet.y * lengths[2], facet.z * lengths[2]};
         real area, inverse_m = conjugate_disk(towards, c, lengths, &a, &b, &facet, &area);
-        if (!(inverse_m < INFINITY)) return;            // the camera is at its centre: nothing is ahead
+        if (!(inverse_m < INFINITY)) return;            // the camera is at the centre
         third.x = towards.x * inverse_m; third.y = towards.y * inverse_m; third.z = towards.z * inverse_m;
         if (!parallel) inverse_m2 = inverse_m * inverse_m;
         offset = dot3(facet, towards);
-        su = area;                                      // only su * sv is asked for, and what a low-pass multiplies it by
+        su = area;                                      // only su * sv is used, and the low-pass's scaling of it
         sv = 1;
     }
 //@ footprint_reach
-    const real own_radius = radius;                     // the cone's is for bounds alone
+    const real own_radius = radius;                     // without the cone's widening, which is for bounds
     if (THICK_HERE) {
         reach = radius * sqrt(a.z * a.z + b.z * b.z + third.z * third.z);
 //@@ camera_ellipsoid_reach
-        // from within, all rays ahead; less than rounding leaves
+        // clamped for a camera inside; the margin exceeds rounding
         radius /= sqrt(fmax(1 - radius * radius * inverse_m2 - (SETUP_FP64 ? REAL(1e-15) : REAL(1e-6)), REAL(1e-12)));
     }
 //@ camera_box
@@ -66,19 +66,19 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
 //@ footprint_bounds
     radius = own_radius;
 //@ footprint_dot
-        // the disk's rule for dots that never count knows nothing of fragments that `near` cuts off the ellipsoid
+        // the test of the disk ignores fragments that `near` removes from the ellipsoid
         if (THICK_HERE && pz >= near && pz - reach < near) record.dot_x = (wide)(center_x - anchor_x);
 //@ footprint_cross
     if (s->bulge > 0.0f) {
         vfloat squared = FMA((vfloat)s->bulge, c.q, c.d * c.d);      // D^2 (1 + rho_disk / m^2)
         c.inside = VMASK(c.q <= half_r2 * squared) & VMASK(c.d > 0.0f) & VMASK(squared <= s->d_near * c.d);
-        // in the terms of a disk's fragment: rho / 2 = q / d^2, depth = z_numerator / d
+        // expressed as a disk's fragment: rho / 2 = q / d^2, depth = z_numerator / d
         vfloat inverse = 1.0f / c.d;
         c.d = squared * inverse;
         c.q = c.q * c.d * inverse;
     }
 //@ footprint_conic
-    // q <= h (D^2 + bulge q); near 1 the difference is rounding more than CONIC_SLACK has room for
+    // q <= h (D^2 + bulge q); near 1 the rounding of the difference exceeds CONIC_SLACK
     if (s->bulge > 0.0f) conic_h = (float)s->bulge * conic_h < 0.95f ? conic_h / (1.0f - (float)s->bulge * conic_h) : INFINITY;
 //@ project
     record.bulge = (wide)(2 * inverse_m2);

@@ -1,5 +1,5 @@
-// Every splat is a disk that faces the camera, whose first half axis' image is the only one that has columns (ellipsoid_ewa): D is 1
-// throughout, and n_u has no part of rows. With others among them they are drawn with the same bits.
+// Clouds of EWA-projected 3D Gaussians only: all splats are disks that face the camera, with D = 1 and n_u independent of rows.
+// Bit-identical to the general code.
 //@ footprint_cross
     c.d = 1.0f;
     c.q = FMA(nu_x, nu_x, nv * nv);

@@ -1,7 +1,7 @@
-// A picture with depths from another renderer, as one opaque surface among the splats: of a fragment at its depth or behind it
-// nothing is seen. It is composited itself after the last splat (part/external_depth_end.cl).
+// External RGB-D image, composited as an opaque surface: fragments at or behind its depth are discarded. The surface itself is
+// composited after the last splat (part/external_depth_end.cl).
 //@ state
-    vfloat opaque_z;        // depth of the surface; infinite where there is none
+    vfloat opaque_z;        // infinite where there is no surface
 //@ pixels_start
     for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++)
         for (int lane = 0; lane < LANES; lane++) {
@@ -16,7 +16,7 @@
                       ? external_depth[(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES] : INFINITY;
         }
 //@ empty
-                       && false         // the surface is drawn everywhere
+                       && false         // the surface covers all pixels
 //@ compose
     mask &= VMASK(attributes.z < pixel->opaque_z);
     if (!VANY(mask)) return;

@@ -1,4 +1,4 @@
-// Every splat is a box (part/box_edges.cl).
+// All splats are boxes (part/box_edges.cl).
 //@ footprint
 #define IS_BOX(s) true
 //@ footprint_here

@@ -1,4 +1,4 @@
-// Some splats are boxes (part/box_edges.cl), the others Gaussians: the choice is made for each splat.
+// Boxes (part/box_edges.cl) and Gaussians: selected per splat.
 //@ footprint
 #define IS_BOX(s) ((s)->box)
 //@ footprint_here

@@ -1,4 +1,4 @@
-// No low-pass: the exact splat.
+// No low-pass filter.
 //@ fragment_mask
 static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y, wide half_r2, wide filter,
                                  vfloat *screen) {

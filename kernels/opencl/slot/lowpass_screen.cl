@@ -1,6 +1,6 @@
-// The screen-space low-pass of 2DGS (Huang et al. 2024, eq. 11, sigma = sqrt(1/2) px): rho = min(rho_3d, 2 d^2) with d
-// the distance in pixels from the projected centre (numerics A6). The dot belongs to the centre: it is drawn if the centre
-// lies beyond the near plane, whatever the ray through the pixel does (numerics B2).
+// Screen-space low-pass of 2DGS (Huang et al. 2024, eq. 11, sigma = sqrt(1/2) px): rho = min(rho_3d, 2 d^2) with d the distance in
+// pixels from the projected centre. It adds a disc around the centre (dot_*), rendered if the centre is beyond the near plane,
+// independently of the ray-plane intersection.
 //@ bounds_make
         bounds.px = (float)center_x;
         bounds.py = (float)center_y;
@@ -25,7 +25,7 @@
 //@@ camera_dot
 //@@ footprint_dot
 //@ cells_start
-    const float dot_square = s->dot_x < 1e17f ? (float)(half_r2 / filter) * (1.0f + 1e-4f) : -1.0f;   // none counts
+    const float dot_square = s->dot_x < 1e17f ? (float)(half_r2 / filter) * (1.0f + 1e-4f) : -1.0f;   // -1: no disc
 //@ cells_dot
             float dot_y = clamp((float)s->dot_y, y0, y1) - (float)s->dot_y, dot_rest = dot_square - dot_y * dot_y;
             if (dot_rest >= 0.0f) {
@@ -40,8 +40,8 @@
             outside &= VMASK(FMA(dot_x, dot_x, dot_y * dot_y) * filter > half_r2);
         }
 //@ fragment_mask
-// A splat without a dot has it far away, or at NaN where the lens does not see the centre. Vectors of pixels skip it; for single pixels the
-// test costs what it saves.
+// A splat without a disc has it far away, or at NaN where the lens does not image the centre. Vectors of pixels skip it; for single
+// pixels the test costs as much as it saves.
 #define HAS_DOT(s) ((s)->dot_x < 1e17f)
 #if LANES > 1
 #define SKIPS_DOT(s) (!HAS_DOT(s))
@@ -64,13 +64,14 @@ static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat invers
     return SKIPS_DOT(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
 }
 //@ dot_crossing
-    vfloat screen;              // rho / 2 of the dot
+    vfloat screen;              // rho / 2 of the low-pass disc
 //@ dot_mask
             c.screen = screen;
 //@ dot_attribute_depth
-    // In the dot the ray may meet the plane far outside of the splat. What lies beyond the circle of rho = 2 ln 255, within which a splat is
-    // 1/255 of its opacity or more, is mirrored at it: the way from the centre's depth is multiplied by 2 ln 255 / rho, and so goes to
-    // 0 at the plane's horizon. Where the dot's rho is larger it is the circle, so that nothing jumps where the dot takes over (docs/order.md).
+    // In the disc, the ray-plane intersection may be far outside of the splat. Beyond the circle rho = 2 ln 255, inside of which a splat
+    // has at least 1/255 of its opacity, depths are reflected at the circle: the difference from the centre's depth is multiplied by
+    // 2 ln 255 / rho and tends to 0 at the plane's horizon. Where the disc's rho is larger it defines the circle, which makes depth
+    // continuous at the disc's border (docs/correctness.md).
     if (HAS_DOT(s)) {
         vfloat circle = VMAX(c.screen, (vfloat)WIDE(5.5412635451584261));
         vint on_plane = VMASK((c.q * inverse_d) * inverse_d <= circle), beyond_near = VMASK(c.d <= s->d_near);

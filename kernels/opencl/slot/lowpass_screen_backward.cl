@@ -1,10 +1,10 @@
-// The low-pass `screen`: derivatives go through the larger of the two weights, by the dot's place where that is the dot's.
+// Backward pass of the low-pass `screen`: through the larger of the two weights, that of the plane or that of the disc.
 //@ fragment_branch
 static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho, vfloat screen) {
     return HAS_DOT(s) ? c.inside & VMASK(half_rho <= screen) : c.inside;
 }
 //@ dot_geometry
-    vint dot;               // the depth is mirrored at `circle`: z_center + circle (z_numerator - z_center D) D / q
+    vint dot;               // depth reflected at `circle`: z_center + circle (z_numerator - z_center D) D / q
     vfloat circle;
 //@ dot_geometry_make
     g.circle = HAS_DOT(s) ? max(screen, (vfloat)WIDE(5.5412635451584261)) : (vfloat)1e30f;
@@ -34,7 +34,7 @@ static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho
     MOMENT(dot_x, 2.0f * constants->filter * sums->dot_x);
     MOMENT(dot_y, 2.0f * constants->filter * sums->dot_y);
 //@ camera_backward
-        // the dot's place is tu.z / pz
+        // the disc's position is tu.z / pz
         by_tu.z += total.dot_x / pz;
         by_tv.z += total.dot_y / pz;
         by_tw.z -= (total.dot_x * tu.z + total.dot_y * tv.z) / (pz * pz);

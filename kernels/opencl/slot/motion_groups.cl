@@ -1,4 +1,4 @@
-// Splats that move by themselves, by their label: each group has a view of its own, behind those of the groups before.
+// Groups of splats with their own motion, by label: a group's views follow those of preceding groups.
 //@ splat_view
     for (int group = 0; group < moving[0]; group++)
         if (labels[i] == moving[1 + group]) view += (group + 1) * get_global_size(1);

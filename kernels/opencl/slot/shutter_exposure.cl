@@ -1,7 +1,7 @@
-// A picture of several poses: sub-pictures are blended one after another, and their samples gathered in the picture's.
+// Exposure of several poses: sub-frames are blended one after another, and their samples accumulated.
 //@ kernels
-// Adds a sub-picture's light (colours and transmittances, or fog's one channel), weighted, to that of its rows.
-// Index space: one work-item per sample of the sub-picture (x, y). Reads: raw. Writes: exposed.
+// Accumulates a sub-frame's light (colours and transmittance, or the fog channel), weighted, in its rows.
+// Index space: one work-item per sample of the sub-frame (x, y). Reads: raw. Writes: exposed.
 kernel void expose(
 //@@ arguments expose
 ) {
@@ -14,7 +14,7 @@ kernel void expose(
     }
 }
 
-// Copies the sample buffers that are not averaged. Index space as above; 32 bits of any kind each.
+// Copies sample buffers that are not averaged, of any 32-bit type. Index space as above.
 kernel void expose_middle(
 //@@ arguments expose_middle
 ) {

@@ -1,5 +1,5 @@
-// As gsplat and the 2DGS authors do: the fragment that would take the transmittance to the stop or below is dropped, and
-// the pixel is finished. For parity only: it leaks up to 1 % of the background through opaque splats (numerics D1).
+// Termination as in gsplat and the 2DGS authors' code: the fragment that would lower the transmittance to the stop or below is
+// dropped, and the pixel is terminated. For parity only: up to 1 % of the background leaks through opaque splats.
 //@ state
     vint finished;
 //@ start

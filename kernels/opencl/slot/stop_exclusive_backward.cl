@@ -1,3 +1,3 @@
-// A pixel that is finished stays so from one chunk of a list to the next: no light goes on.
+// A terminated pixel stays terminated in the next chunk of a list: transmittance 0.
 //@ transmittance
     transmittance = VSELECT(transmittance, (vfloat)0.0f, pixel->finished);
