@@ -12,9 +12,8 @@ from training_scene import QUICK, scene
 import fidsplat as fs
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.opencl import gradients_again
+from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.gradients import OpenCLGradients
-from fidsplat.backends.opencl.launches import Launches
-from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.prepare import prepare
 from fidsplat.train import Trainer, TrainingError
 from fidsplat.train.losses import Loss
@@ -49,8 +48,8 @@ def test_steps_are_launched_again_with_the_same_bits(on_groups, dataset, monkeyp
     launched = []
     for _ in range(8):
         again.step()
-    launch = Program.launch
-    monkeypatch.setattr(Program, "launch", lambda *given: launched.append(given[2]) or launch(*given))
+    record = CommandList.record
+    monkeypatch.setattr(CommandList, "record", lambda *given: launched.append(given[1]) or record(*given))
     for _ in range(6):  # not to iteration 16, where the degree grows
         again.step()
     assert not launched
@@ -64,21 +63,22 @@ def test_steps_are_launched_again_with_the_same_bits(on_groups, dataset, monkeyp
     assert not launched
     again.run()
     monkeypatch.setattr(gradients_again.Again, "keep", lambda *_: None)
-    monkeypatch.setattr(Launches, "put", put_all)
+    monkeypatch.setattr(CommandList, "set", set_all)
     planned.run()
     assert splats_of(again) == splats_of(planned)
     for name, array in planned.history.items():
         np.testing.assert_array_equal(again.history[name], array)
 
 
-put = Launches.put
+set_changed = CommandList.set
 
 
-def put_all(self, given):
-    """Sets every argument, whatever it was."""
-    for place in self._places.values():
-        place.mark = None
-    put(self, given)
+def set_all(self, values):
+    """Set every argument, whatever it was."""
+    self._named = {}
+    for command in self._commands:
+        command._marks = [object()] * len(command._marks)
+    set_changed(self, values)
 
 
 def test_a_picture_with_more_pairs_than_there_is_room_for_is_not_launched_as_the_last(on_groups, monkeypatch):

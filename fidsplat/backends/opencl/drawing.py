@@ -61,7 +61,7 @@ def draw(
 
 def _buffers_of(picture: Picture) -> list[tuple[str, int, bool]]:
     """Of each sample buffer the name, its channels, and whether it is light."""
-    return [_RAW, *((one.name, one.channels, averaged) for one, averaged in picture.program.source.samples)]
+    return [_RAW, *((one.name, one.channels, averaged) for one, averaged in picture.source.samples)]
 
 
 def _blended(picture: Picture) -> Iterator[None]:
@@ -71,9 +71,10 @@ def _blended(picture: Picture) -> Iterator[None]:
     way while the host waits, and what comes last counts.
     """
     view, shape = picture.view, picture.shape
+    picture.commands.clear()
     for name, channels, _ in _buffers_of(picture):
         picture.take(name, 4 * picture.held["channel_stride"] * channels)
-    if any(one.name == "tile_ends" for one in picture.program.source.arguments["blend"]):
+    if any(one.name == "tile_ends" for one in picture.source.arguments["blend"]):
         ends = picture.lease("tile_ends", 4 * picture.tiles)
         if view.band is not None:  # beside which nothing is finished
             cl.enqueue_fill_buffer(
@@ -85,7 +86,7 @@ def _blended(picture: Picture) -> Iterator[None]:
     for first, end in lists.bands():
         picture.launch("blend", "blend", (end - first) * group, group, band_first=first)
         if end == lists.end:
-            if "backdrop" in picture.program.source.arguments:
+            if "backdrop" in picture.source.arguments:
                 picture.launch_grid("resolve", "backdrop", view.width, view.height)
             yield
     picture.stats = lists.stats()
@@ -94,7 +95,7 @@ def _blended(picture: Picture) -> Iterator[None]:
 def _resolve(picture: Picture) -> None:
     """The last stage: pixels from samples, unless who drew them has done so."""
     view = picture.view
-    if "resolve" not in picture.program.source.arguments:
+    if "resolve" not in picture.source.arguments:
         return
     size = view.width // view.samples, view.height // view.samples
     picture.launch_grid("resolve", "resolve", *size)
@@ -102,7 +103,7 @@ def _resolve(picture: Picture) -> None:
 
 def _expose(start: Callable[[View], Picture], picture: Picture) -> None:
     """Blends the shots of a picture of several poses one after another, and gathers their samples."""
-    channel_stride, arguments = picture.rows * picture.stride, picture.program.source.arguments
+    channel_stride, arguments = picture.rows * picture.stride, picture.source.arguments
     for name, channels, _ in _buffers_of(picture):
         # names of scratch buffers that no shot's own have
         picture.held[name] = picture.pool.scratch(f"exposed {name}", 4 * channel_stride * channels)

@@ -25,10 +25,10 @@ from fidsplat.backends.opencl.assemble import (
     backward_chunk,
     backward_items,
 )
+from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import pairs_of
 from fidsplat.backends.opencl.gradients_again import Again
 from fidsplat.backends.opencl.images import OpenCLImages
-from fidsplat.backends.opencl.launches import Launches
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
@@ -108,8 +108,10 @@ class OpenCLGradients:
         self._cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
         self._pairs = 0
         """for which there is room"""
+        self._commands = CommandList(self.program)
+        """of `sum_up`"""
         self._again = Again(pipeline.workspace, pipeline.program, self.program)
-        self._step: tuple[int, Launches] | None = None
+        self._step: tuple[int, CommandList] | None = None
         """number of splats, and what was launched for so many"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
@@ -120,7 +122,7 @@ class OpenCLGradients:
         with self._pipeline.workspace.lock:
             found = self._pipeline.drawn_by(lambda: again.draw(resident, view, self._pairs), view)
             if found is None:
-                found = self._pipeline.drawn(resident, view, self._pairs)
+                found = self._pipeline.drawn(resident, view, self._pairs, again.record())
                 again.keep(found[0])
         return OpenCLDifferentiable(*found)
 
@@ -141,8 +143,8 @@ class OpenCLGradients:
     def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> Picture:
         if drawn.counted is not None and self._again.take_back(drawn, gradients, lambda: self._ask(drawn)):
             return self._with_slots(drawn)
-        first = len(drawn.launched)
         picture = self._with_slots(drawn)
+        picture.commands = self._again.record_back()
         view, shape, count = picture.view, self._pipeline.shape, picture.resident.count
         self._take_gradients(picture, gradients)
         tile = shape.tile_width * shape.tile_height
@@ -170,7 +172,7 @@ class OpenCLGradients:
         self._ask(drawn)
         if drawn.counted is not None:
             wanted = {f"by_{name}" for name in GRADIENT_OUTPUTS} & self._wanted
-            self._again.keep_back(picture, first, gradients, wanted)
+            self._again.keep_back(picture, gradients, wanted)
         return picture
 
     def _tape_bytes(self) -> int:
@@ -184,7 +186,7 @@ class OpenCLGradients:
     def _with_slots(self, drawn: Picture) -> Picture:
         """The picture with the kernels of the way back, and what those leave that go through tiles."""
         picture = copy(drawn)
-        picture.program = self.program
+        picture.commands = self._commands
         picture.take("splat_slots", 4 * picture.resident.count)
         picture.take("moments", self.source.records["Moments"].itemsize * picture.pairs)
         picture.take("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * picture.tiles)
@@ -192,6 +194,9 @@ class OpenCLGradients:
 
     def sum_up(self, picture: Picture) -> dict[str, Any]:
         """The derivatives of a picture that was taken back."""
+        picture = copy(picture)
+        picture.commands = self._commands
+        self._commands.clear()
         count, real = picture.resident.count, self.source.scalars.dtype("real").itemsize
         posed = -(-count // _GROUP)  # work-groups that sum up the pose
         picture.take("group_sums", 6 * real * posed)
@@ -210,23 +215,24 @@ class OpenCLGradients:
         """Compiles what `step` launches, which those do not need who only ask for derivatives."""
         if self._step is None:
             source = assemble_step(self._pipeline.features, self._pipeline.shape)
-            self._step = 0, Launches(Program(self._pipeline.workspace, source))
+            self._step = 0, CommandList(Program(self._pipeline.workspace, source))
 
     def step(self, picture: Picture, given: Mapping[str, Any]) -> None:
         """The step of a training by a picture that was taken back, with arguments that are its own."""
         assert self._step is not None  # `prepare_step`
-        known, launches = self._step
+        known, commands = self._step
         count = picture.resident.count
-        arguments = launches.arguments("project_step")
+        arguments = commands.program.source.arguments["project_step"]
         every = {**given, "count": count}
         values = {one.name: every[one.name] if one.name in every else picture.value(one) for one in arguments}
         if known != count:
-            self._step = 0, launches  # an interrupt on the way leaves none
+            self._step = 0, commands  # an interrupt on the way leaves none
+            commands.clear()
             size = (max(1, -(-count // _GROUP)) * _GROUP,)
-            launches.keep([("project_step", size, (_GROUP,), list(values.values()))], values)
-            self._step = count, launches
-        launches.put(values)
-        (event,) = launches.launch(picture.queue)
+            commands.record("project_step", size, (_GROUP,), list(values.values()))
+            self._step = count, commands
+        commands.set(values)
+        (event,) = commands.submit(picture.queue)
         picture.events.append(("project backward", event))
 
     def _ask(self, drawn: Picture) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
+from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.images import stats_later
-from fidsplat.backends.opencl.launches import Launches
 from fidsplat.backends.opencl.picture import Picture, numbers_of
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
@@ -62,13 +62,25 @@ class Again:
 
     def __init__(self, workspace: Workspace, forward: Program, backward: Program) -> None:
         self._workspace = workspace
-        self._forward, self._backward = Launches(forward), Launches(backward)
+        self._forward, self._backward = CommandList(forward), CommandList(backward)
         self._kind: _Kind | None = None
         self._back: _Back | None = None
         self._last: tuple[Any, ...] = ()
         self._views: dict[int, tuple[View, cl.Buffer]] = {}
         """with their records on the device; views are held, so that no other is found by its number"""
         self._records: dict[bytes, cl.Buffer] = {}
+
+    def record(self) -> CommandList:
+        """An empty command list for the next picture, which `keep` may remember."""
+        self._kind = None
+        self._forward.clear()
+        return self._forward
+
+    def record_back(self) -> CommandList:
+        """An empty command list for the next way back, which `keep_back` may remember."""
+        self._back = None
+        self._backward.clear()
+        return self._backward
 
     def keep(self, picture: Picture) -> None:
         """Remembers a picture that was drawn, if the next can be launched as it was."""
@@ -78,10 +90,9 @@ class Again:
         # what was no other a picture ago may stay so
         if self._last != last or picture.counted is None or picture.arrays.keys() != {"view", "slots"}:
             return
-        pool, launched = self._workspace.pool, picture.launched
-        kernels = [kernel for _, kernel, *_ in launched]
+        pool, kernels = self._workspace.pool, self._forward.kernels
         of_views = ("uniform", "array")
-        every = [one for name in kernels for one in picture.program.source.arguments[name]]
+        every = [one for name in kernels for one in picture.source.arguments[name]]
         if len(set(kernels)) < len(kernels) or any(one.source in of_views for one in every):
             return
         leased = dict(picture.leased)
@@ -89,9 +100,8 @@ class Again:
         names = [name for name in picture.held if name not in numbers and name not in {"view", *leased}]
         if not self._there(names, picture):
             return
-        self._forward.keep([one[1:] for one in launched], {"view", *leased, *numbers_of(picture.view)})
         base = copy(picture)
-        base.held, base.launched, base.events, base.leased, base.uploads = numbers, [], [], [], []
+        base.held, base.events, base.leased, base.uploads = numbers, [], [], []
         base.arrays, base.counted, base.stats = {}, None, dict
         base.resident = None  # pyright: ignore[reportAttributeAccessIssue]
         budgets = self._workspace.memory_budget, self._workspace.pair_budget
@@ -102,7 +112,7 @@ class Again:
             pool.state,
             names,
             [(name, buffer.size) for name, buffer in picture.leased],
-            [stage for stage, *_ in launched],
+            self._forward.stages,
             kernels.index("tile_starts"),
             picture.arrays["slots"],
         )
@@ -116,15 +126,15 @@ class Again:
         workspace.pictures += 1
         picture = copy(kind.picture)
         picture.resident, picture.view = resident, view
-        picture.arrays, picture.uploads, picture.launched = {}, [], []
+        picture.arrays, picture.uploads = {}, []
         picture.leased = [(name, pool.lease(name, size)) for name, size in kind.leases]
         given = {"view": self._record(picture), **dict(picture.leased), **numbers_of(view)}
         picture.held = kind.picture.held | {name: pool.known(name) for name in kind.names} | given
         picture.put("slots", kind.slots)  # pictures of other kinds have theirs in the same buffer
         tallies = pool.scratch("tallies", 0)  # which are not left as zeros
         cl.enqueue_fill_buffer(queue, tallies, _ZERO, 0, tallies.size)
-        self._forward.put(given)
-        events = self._forward.launch(queue)
+        self._forward.set(given)
+        events = self._forward.submit(queue)
         queue.flush()
         picture.events = list(zip(kind.stages, events, strict=True))
         picture.counted = events[kind.counted]
@@ -134,14 +144,12 @@ class Again:
     def keep_back(
         self,
         picture: Picture,
-        first: int,
         given: Mapping[str, Any],
         wanted: Set[str],
     ) -> None:
         """Remembers how a picture was taken back.
 
         Args:
-            first: of its launches those from this one on.
             given: the outputs' derivatives.
             wanted: names of the arguments that they are.
         """
@@ -152,14 +160,11 @@ class Again:
         # the picture's own scratch buffers are where they were, unless somebody has let go of all
         if not self._is_like(kind, picture) or not self._there(kind.names, picture):
             return
-        row = picture.launched[first:]
-        kernels = [kernel for _, kernel, *_ in row]
+        kernels = self._backward.kernels
         if len(set(kernels)) < len(kernels):
             return
-        changing = {"view", "log_ceiling", *numbers_of(picture.view), *(name for name, _ in kind.leases)}
-        self._backward.keep([one[1:] for one in row], {*changing, *wanted})
         kind.state = self._workspace.pool.state
-        self._back = _Back(kind, frozenset(given), [stage for stage, *_ in row])
+        self._back = _Back(kind, frozenset(given), self._backward.stages)
 
     def take_back(self, picture: Picture, given: Mapping[str, Any], ask: Callable[[], None]) -> bool:
         """Launches the way back of a picture as that which was kept; whether it fits.
@@ -175,10 +180,10 @@ class Again:
             return False
         held = {name: picture.held[name] for name in ("view", *(name for name, _ in back.kind.leases))}
         held |= numbers_of(picture.view) | {"log_ceiling": math.log(picture.view.ceiling)}
-        self._backward.put(held | {f"by_{name}": array.data for name, array in given.items()})
+        self._backward.set(held | {f"by_{name}": array.data for name, array in given.items()})
         queue = picture.queue
         cl.enqueue_fill_buffer(queue, pool.scratch("reserved", 4), _ZERO, 0, 4)
-        events = self._backward.launch(queue)
+        events = self._backward.submit(queue)
         picture.events += zip(back.stages, events, strict=True)
         ask()
         return True

@@ -45,7 +45,7 @@ class Lists:
         self.big = max(needed * 5 // 4, picture.pool.size("big") // 4, BIG)
         picture.held["big_capacity"] = self.big
         picture.take("big", 4 * self.big)
-        picture.take("big_bounds", picture.program.source.records["Bounds"].itemsize * self.big)
+        picture.take("big_bounds", picture.source.records["Bounds"].itemsize * self.big)
         if picture.repeats:
             picture.held["tallies"] = picture.pool.zeroed("tallies", 4 * words, picture.queue)
             return
@@ -60,7 +60,7 @@ class Lists:
     def project(self, first: int, end: int) -> None:
         """Records, keys and windows of splats [first, end)."""
         picture, count = self.picture, end - first
-        source, places = picture.program.source, self.room(count)
+        source, places = picture.source, self.room(count)
         picture.take("splats", places * source.records["Splat"].itemsize)
         picture.take("keys", KEYS * places)
         windows = picture.take("windows", WINDOWS * places)
@@ -216,7 +216,7 @@ class ChunkedLists(OrderedLists):
         picture.put_view(top * height, end * height)
         self.make_room(_TALLIES)
         sizes = {
-            "splats": picture.program.source.records["Splat"].itemsize,
+            "splats": picture.source.records["Splat"].itemsize,
             **{"keys": KEYS, "windows": WINDOWS},
         }
         packed = {

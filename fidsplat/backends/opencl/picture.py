@@ -9,9 +9,10 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.opencl.assemble import Source
+from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.declare import Argument
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
-from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import Workspace
@@ -27,7 +28,7 @@ class Picture:
     def __init__(
         self,
         workspace: Workspace,
-        program: Program,
+        commands: CommandList,
         shape: DeviceShape,
         resident: Resident,
         view: View,
@@ -38,13 +39,14 @@ class Picture:
     ) -> None:
         """
         Args:
+            commands: records what is launched.
             queue: where it is drawn without waiting for the device, as one of its kind was drawn before; None
                 for the first of its kind.
             stack: many views instead of one, with all in common that they do not say.
             trusted: pairs of splats and tiles for which room is made without asking the device how many there
                 are, if there is room for so many anyway (`TiledLists`); 0: it is asked.
         """
-        self.workspace, self.program, self.shape = workspace, program, shape
+        self.workspace, self.commands, self.shape = workspace, commands, shape
         self.resident, self.view, self.plan, self.repeats = resident, view, plan, queue is not None
         self.stack, self.views = stack, 1 if stack is None else len(stack)
         self.queue = workspace.turn_to(workspace.queue) if queue is None else queue
@@ -65,8 +67,6 @@ class Picture:
         }
         """buffers and numbers by the names of the arguments that take them"""
         self.events: list[tuple[str, cl.Event]] = []
-        self.launched: list[tuple[str, str, tuple[int, ...], tuple[int, ...], list[Any]]] = []
-        """stage, kernel, size, work-group and values of the arguments of each launch"""
         self.arrays: dict[str, np.ndarray] = {}
         """what was put on the device for this view"""
         self.uploads: list[cl.Event] = []
@@ -80,6 +80,11 @@ class Picture:
         """of splats and tiles that were listed, where the host has been told; else for which there is room"""
         self.stats: Callable[[], dict[str, int]] = dict
         self._uniforms: dict[str, tuple[Any, ...]] = {}
+
+    @property
+    def source(self) -> Source:
+        """The source of the program whose kernels are launched."""
+        return self.commands.program.source
 
     def launch(
         self, stage: str, kernel: str, items: int, group: int, views: int = 1, **given: Any
@@ -105,11 +110,10 @@ class Picture:
     def _launch(
         self, stage: str, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: dict[str, Any]
     ) -> cl.Event:
-        arguments = self.program.source.arguments[kernel]
+        arguments = self.source.arguments[kernel]
         values = [given[one.name] if one.name in given else self.value(one) for one in arguments]
-        event = self.program.launch(self.queue, kernel, size, group, values)
+        event = self.commands.launch(self.queue, kernel, size, group, values, stage)
         self.events.append((stage, event))
-        self.launched.append((stage, kernel, size, group, values))
         return event
 
     def is_of_view(self, argument: Argument) -> bool:
@@ -118,7 +122,7 @@ class Picture:
 
     def put_arrays(self) -> None:
         """The view's arrays that kernels take."""
-        for arguments in self.program.source.arguments.values():
+        for arguments in self.source.arguments.values():
             for one in arguments:
                 if one.source == "array":
                     self.value(one)
@@ -178,12 +182,12 @@ class Picture:
 
     def record(self, row: int, end: int) -> np.ndarray:
         """The record `View` for rows of samples [row, end)."""
-        return packed(self.stack or self.view, row, end, self.program.source.records["View"])
+        return packed(self.stack or self.view, row, end, self.source.records["View"])
 
     def put_rays(self) -> None:
         """What the kernels read of a lens: rays of the samples, and the map of directions."""
         if self.view.raster is not None:
-            slopes = any(one.name == "ray_slopes" for one in self.program.source.arguments["blend"])
+            slopes = any(one.name == "ray_slopes" for one in self.source.arguments["blend"])
             self.held |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)
 
 

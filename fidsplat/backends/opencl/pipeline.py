@@ -13,6 +13,7 @@ import pyopencl as cl
 from fidsplat.backends.batched_views import ViewBatch, ViewStack
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers, parts
+from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.drawing import Slots, draw
 from fidsplat.backends.opencl.images import Drawn, OpenCLImages, Repeat, stats_later
 from fidsplat.backends.opencl.lists import GatheredLists, TiledLists
@@ -70,6 +71,8 @@ class OpenCLPipeline:
     ) -> None:
         self.workspace, self.source, self.features, self.shape = workspace, source, features, shape
         self.program = Program(workspace, source)
+        self._commands = CommandList(self.program)
+        """of frames that are not replayed"""
         arguments = source.arguments
         self._cloud_arrays = [one.name for one in arguments["project"] if one.source == "cloud"]
         self._view_arrays = {one.name for each in arguments.values() for one in each if one.source == "array"}
@@ -106,16 +109,19 @@ class OpenCLPipeline:
         except DeviceError:  # too little memory for any part of it
             return False
 
-    def drawn(self, resident: Resident, view: View, trusted: int = 0) -> tuple[Picture, OpenCLImages]:
+    def drawn(
+        self, resident: Resident, view: View, trusted: int = 0, commands: CommandList | None = None
+    ) -> tuple[Picture, OpenCLImages]:
         """One picture with all that its stages have left on the device, until another is drawn.
 
-        trusted: as `Picture` has it; `pairs_of` then says whether all was drawn.
+        trusted: as `Picture` has it; `pairs_of` then says whether all was drawn. commands: records what is
+        launched, for replay.
 
         Raises:
             DeviceError: as `render`.
         """
         with self.workspace.lock:
-            picture = self._tried(self._whole, resident, view, trusted)
+            picture = self._tried(self._whole, resident, view, trusted, commands)
             return picture, self._images(view, Drawn.of(picture))
 
     def drawn_by(
@@ -125,10 +131,12 @@ class OpenCLPipeline:
         picture = self._tried(launch)
         return None if picture is None else (picture, self._images(view, Drawn.of(picture)))
 
-    def _whole(self, resident: Resident, view: View, trusted: int) -> Picture:
+    def _whole(self, resident: Resident, view: View, trusted: int, commands: CommandList | None) -> Picture:
         """A picture that is drawn at once, not in chunks or bands."""
         plan = self._plan(resident, view)
-        picture = None if plan.chunk else self._first(resident, view, plan, trusted=trusted)
+        picture = None
+        if not plan.chunk:
+            picture = self._first(resident, view, plan, trusted=trusted, commands=commands)
         if picture is None or picture.pairs > self.workspace.pair_budget:
             raise DeviceError(
                 f"{resident.count:,} splats are drawn in chunks or bands within the memory budget, and such "
@@ -158,7 +166,9 @@ class OpenCLPipeline:
             pool.make_way((pipeline, "views", resident.room, plan), workspace.memory_budget - plan.held)
 
             def start(view: View, pipeline=pipeline, stack=stack, plan=plan) -> Picture:
-                return Picture(workspace, pipeline.program, pipeline.shape, resident, view, plan, stack=stack)
+                return Picture(
+                    workspace, pipeline._commands, pipeline.shape, resident, view, plan, stack=stack
+                )
 
             into = Slots(batch.slots[first:end].copy(), buffers.held())
             drawn.append(Drawn.of(draw(start, batch.one(first), outputs, into)))
@@ -250,6 +260,7 @@ class OpenCLPipeline:
         plan: MemoryPlan,
         key: tuple[Any, ...] | None = None,
         trusted: int = 0,
+        commands: CommandList | None = None,
     ) -> Picture:
         """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
         pool = self.workspace.pool
@@ -257,7 +268,7 @@ class OpenCLPipeline:
         kind = self, view.width, view.height, alike or (resident.room, plan)
         # what this picture takes besides is planned for; that of its own kind is there already
         pool.make_way(kind, self.workspace.memory_budget - plan.held, resident.room)
-        picture = self._draw(resident, view, plan, trusted)
+        picture = self._draw(resident, view, plan, trusted, commands)
         whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
         if key is not None and whole and self.shape.lists != "ordered" and resident.count:
             rasters = {each.raster for each in resident.kept.values()} - {None, view.raster}
@@ -275,14 +286,17 @@ class OpenCLPipeline:
         queue, recording = workspace.turn_to(workspace.repeat_queue), kept.recording
         workspace.pictures += 1
 
+        commands = CommandList(self.program) if recording is None else recording.commands
+
         def undrawn(view: View) -> Picture:
-            return Picture(workspace, self.program, self.shape, resident, view, plan, queue)
+            return Picture(workspace, commands, self.shape, resident, view, plan, queue)
 
         if recording is not None and recording.fits(view, undrawn, queue):
-            leased, last, _ = recording.launch(queue)
-            stats = stats_later(workspace, dict(leased)["counts"], last, resident.count)
-            drawn = Drawn(queue, leased, stats, last)
+            leased, events = recording.launch(queue)
+            stats = stats_later(workspace, dict(leased)["counts"], events[-1], resident.count)
+            drawn = Drawn(queue, leased, stats, events[-1])
         else:
+            kept.recording = None  # an interrupt leaves a part of one
             picture = draw(undrawn, view, self.features.images)
             drawn = Drawn.of(picture, timed=False)
             recording = kept.recording = Recording(picture)
@@ -302,11 +316,13 @@ class OpenCLPipeline:
         workspace.pictures += 1
 
         def undrawn(view: View) -> Picture:
-            return Picture(workspace, self.program, self.shape, resident, view, MemoryPlan(0, 0, 0), queue)
+            plan = MemoryPlan(0, 0, 0)
+            return Picture(workspace, recording.commands, self.shape, resident, view, plan, queue)
 
         if recording.fits(view, undrawn, queue):
-            leased, last, events = recording.launch(queue, timed=True)
-            drawn = Drawn(queue, leased, dict, last, events)
+            leased, events = recording.launch(queue)
+            stages = recording.commands.stages
+            drawn = Drawn(queue, leased, dict, events[-1], list(zip(stages, events, strict=True)))
         else:
             drawn = self._redrawn(resident, view)
         workspace.finish()
@@ -317,9 +333,18 @@ class OpenCLPipeline:
         """The picture drawn again, whatever it takes, and its time."""
         return Drawn.of(self._tried(self._first, resident, view, self._plan(resident, view)))
 
-    def _draw(self, resident: Resident, view: View, plan: MemoryPlan, trusted: int = 0) -> Picture:
+    def _draw(
+        self,
+        resident: Resident,
+        view: View,
+        plan: MemoryPlan,
+        trusted: int = 0,
+        commands: CommandList | None = None,
+    ) -> Picture:
+        commands = self._commands if commands is None else commands
+
         def start(view: View) -> Picture:
-            return Picture(self.workspace, self.program, self.shape, resident, view, plan, trusted=trusted)
+            return Picture(self.workspace, commands, self.shape, resident, view, plan, trusted=trusted)
 
         return draw(start, view, self.features.images)
 

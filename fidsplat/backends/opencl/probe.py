@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import build_options, check_kernels
 from fidsplat.backends.opencl.workspace import BufferPool, Workspace
@@ -173,7 +174,8 @@ class OpenCLProbe:
                 "slot": 4,
             }
         arguments = pipeline.source.arguments[kernel]
-        pipeline.program.launch(workspace.queue, kernel, items, items, [given[one.name] for one in arguments])
+        values = [given[one.name] for one in arguments]
+        CommandList(pipeline.program).launch(workspace.queue, kernel, items, items, values)
         places = contents(workspace, starts).view(np.uint32)
         words = contents(workspace, sums).view(np.uint32)
         return places, int(words[place]) | int(words[place + 1]) << 32

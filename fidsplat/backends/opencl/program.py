@@ -1,4 +1,4 @@
-"""Kernels that are compiled, and launched with arguments bound by the names that layout.py declares."""
+"""Compiled kernels of one source, with the types of their arguments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fidsplat.backends.opencl.assemble import Source, assemble_check
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl
 from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_program
 from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
-from fidsplat.backends.opencl.workspace import Workspace, token_of
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util import interrupts
 from fidsplat.util.errors import DeviceError
 
@@ -97,62 +97,14 @@ class Program:
             kernel: [None if one.access else source.scalars.dtype(one.ctype).type for one in arguments]
             for kernel, arguments in source.arguments.items()
         }
-        self._bound: dict[str, list[object]] = {}
 
-    @property
-    def kernels(self) -> dict[str, cl.Kernel]:
-        """All of them, by name."""
-        return self._kernels
+    def own_kernel(self, name: str) -> cl.Kernel:
+        """A new kernel object, whose arguments nobody else binds."""
+        return cl.Kernel(self._kernels[name].program, name)
 
-    def launch(
-        self,
-        queue: cl.CommandQueue,
-        name: str,
-        size: tuple[int, ...],
-        group: tuple[int, ...],
-        values: Sequence[Any],
-        first: int = 0,
-    ) -> cl.Event:
-        """Launches a kernel with buffers and numbers in the order of its arguments. first: work-item, of the
-        first dimension.
-
-        Only those are set that have changed since its last launch: from picture to picture hardly any do, and
-        setting them takes the host longer than a small stage takes a GPU. A buffer is remembered by its
-        token, so that a cloud or a picture that nobody has any more is let go.
-        """
-        kernel, types = self._kernels[name], self._types[name]
-        nothing: list[object] = [None] * len(types)
-        bound = self._bound.pop(name, nothing)
-        for index, (value, scalar) in enumerate(zip(values, types, strict=True)):
-            if scalar is not None:
-                mark: object = value
-            else:
-                mark = token_of(value)
-            if mark is not bound[index] and (type(mark) is not type(bound[index]) or mark != bound[index]):
-                put_argument(kernel, index, value, scalar)
-                bound[index] = mark
-        self._bound[name] = bound
-        offset = (first, *(0 for _ in size[1:])) if first else None
-        return cl.enqueue_nd_range_kernel(queue, kernel, size, group, offset)
-
-    def bound(self, name: str, values: Sequence[Any]) -> cl.Kernel:
-        """A kernel of one's own whose arguments are these, and stay so."""
-        kernel = cl.Kernel(self._kernels[name].program, name)
-        for index, (value, scalar) in enumerate(zip(values, self._types[name], strict=True)):
-            put_argument(kernel, index, value, scalar)
-        return kernel
-
-    def type_of(self, name: str, index: int) -> Callable[[Any], Any] | None:
-        """The NumPy type of a kernel's argument; None for a buffer."""
-        return self._types[name][index]
-
-
-def put_argument(kernel: cl.Kernel, index: int, value: Any, scalar: Callable[[Any], Any] | None) -> None:
-    """Sets an argument: a buffer, or a number of a type."""
-    if scalar is None:
-        kernel.set_arg(index, value)
-    else:  # as set_arg, which takes 20 times as long to find out that it is a number
-        kernel._set_arg_buf(index, scalar(value))  # pyright: ignore[reportAttributeAccessIssue]
+    def types(self, name: str) -> list[Callable[[Any], Any] | None]:
+        """The NumPy type of each argument of a kernel; None for a buffer."""
+        return self._types[name]
 
 
 def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -13,7 +13,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.opencl.assemble import assemble_training
-from fidsplat.backends.opencl.launches import Launch, Launches
+from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.loss_sums import LATE, LossSums
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.workspace import Workspace
@@ -45,6 +45,10 @@ class _Truth(NamedTuple):
     masked: bool
     counted: int
     """values that matter"""
+
+
+Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
+"""kernel, size, work-group, and values of the arguments"""
 
 
 class ResidentArrays:
@@ -91,6 +95,8 @@ class OpenCLTraining:
         self._lanes = lanes
         source = assemble_training(lanes, workspace.info.float64, workspace.shape.fast_fma)
         self._program = Program(workspace, source)
+        self._commands = CommandList(self._program)
+        """of kernels that are launched once"""
         self._held: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._count = 0
@@ -101,7 +107,7 @@ class OpenCLTraining:
         """by numbers of work-groups"""
         self._version = object()
         """another one whenever splats are held in other buffers"""
-        self._kept: dict[str, tuple[tuple[Any, ...], Launches, Any]] = {}
+        self._kept: dict[str, tuple[tuple[Any, ...], CommandList, Any]] = {}
         """launches of a step that are made again, with what they hold for"""
         self._sights: WeakKeyDictionary[Camera, tuple[np.ndarray, dict[str, float]]] = WeakKeyDictionary()
         """numbers by which kernels know what a camera sees, each with the origin that they are of"""
@@ -291,9 +297,8 @@ class OpenCLTraining:
     def _launch_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> None:
         self._enqueue(self._of_rows(kernel, items, rows, given))
 
-    def _items(self, kernel: str, items: int, given: Mapping[str, Any], first: int = 0) -> Launch:
-        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
-        return *self._one(kernel, (size,), (_GROUP,), given), first
+    def _items(self, kernel: str, items: int, given: Mapping[str, Any]) -> Launch:
+        return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP),), (_GROUP,), given)
 
     def _of_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> Launch:
         return self._one(kernel, (max(_GROUP, -(-items // _GROUP) * _GROUP), rows), (_GROUP, 1), given)
@@ -307,7 +312,8 @@ class OpenCLTraining:
 
     def _enqueue(self, launch: Launch) -> None:
         with self._workspace.failing("training"):
-            self._program.launch(self._queue, *launch)
+            self._commands.clear()
+            self._commands.launch(self._queue, *launch)
 
     def _again(
         self,
@@ -324,12 +330,14 @@ class OpenCLTraining:
         known = self._kept.pop(name, None)  # an interrupt on the way leaves none
         with self._workspace.failing("training"):
             if known is None or known[0] != (kind, self._version, self._workspace.pool.state):
-                launches = Launches(self._program) if known is None else known[1]
+                commands = CommandList(self._program) if known is None else known[1]
                 row, made = plan()
-                launches.keep(row, given.keys())
-                known = (kind, self._version, self._workspace.pool.state), launches, made
-            known[1].put(given)
-            events = known[1].launch(self._queue)
+                commands.clear()
+                for launch in row:
+                    commands.record(*launch)
+                known = (kind, self._version, self._workspace.pool.state), commands, made
+            known[1].set(given)
+            events = known[1].submit(self._queue)
         self._kept[name] = known
         return events, known[2]
 

@@ -1,0 +1,154 @@
+"""Command lists: kernels with bound arguments that are recorded once and submitted many times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import pyopencl as cl
+
+from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.opencl.workspace import token_of
+
+_UNKNOWN = object()
+"""the mark of an argument that is not bound, or whose binding was interrupted"""
+
+
+class Command:
+    """One kernel launch: a kernel object of its own, its size, and the arguments that are bound to it."""
+
+    __slots__ = ("_marks", "_types", "group", "kernel", "name", "size", "stage")
+
+    def __init__(self, kernel: cl.Kernel, name: str, types: Sequence[Callable[[Any], Any] | None]) -> None:
+        """types: the NumPy type of each argument; None for a buffer."""
+        self.kernel, self.name, self._types = kernel, name, types
+        self._marks: list[object] = [_UNKNOWN] * len(types)
+        self.stage = ""
+        self.size: tuple[int, ...] = ()
+        self.group: tuple[int, ...] = ()
+
+    def bind(self, index: int, value: Any) -> None:
+        """Set an argument unless it already has this value: setting one takes the host longer than comparing.
+
+        A buffer is recognised by its identity token, so that the list keeps no buffer alive.
+        """
+        scalar = self._types[index]
+        mark: object = token_of(value) if scalar is None else value
+        bound = self._marks[index]
+        if mark is bound or (type(mark) is type(bound) and mark == bound):
+            return
+        self._marks[index] = _UNKNOWN  # an interrupt between the next two lines leaves the argument unknown
+        if scalar is None:
+            self.kernel.set_arg(index, value)
+        else:  # set_arg takes 20 times as long to find the type of a number
+            self.kernel._set_arg_buf(index, scalar(value))  # pyright: ignore[reportAttributeAccessIssue]
+        self._marks[index] = mark
+
+    def submit(self, queue: cl.CommandQueue) -> cl.Event:
+        """Enqueue the kernel with the arguments that are bound."""
+        return cl.enqueue_nd_range_kernel(queue, self.kernel, self.size, self.group)
+
+
+class _NamedArgument:
+    """The places of one argument in all commands, and the value that was set there last."""
+
+    __slots__ = ("mark", "places")
+
+    def __init__(self, places: list[tuple[Command, int]]) -> None:
+        self.places = places
+        self.mark: object = _UNKNOWN
+
+
+class CommandList:
+    """Kernel launches of one program, in order.
+
+    `record` appends a launch, `launch` appends and submits it, `set` changes arguments by name in all
+    commands, and `submit` replays the list. `clear` starts another recording. It reuses the kernel objects
+    and sets only arguments that differ: the n-th launch of a kernel is compared with its n-th launch in the
+    previous recording. The list keeps no buffer alive: its owner compares `BufferPool.state` before a replay.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self._commands: list[Command] = []
+        self._reusable: dict[str, list[Command]] = {}
+        self._used: dict[str, int] = {}
+        """launches of each kernel in this recording"""
+        self._named: dict[str, _NamedArgument] = {}
+
+    @property
+    def stages(self) -> list[str]:
+        """The stage of each command."""
+        return [command.stage for command in self._commands]
+
+    @property
+    def kernels(self) -> list[str]:
+        """The name of each command's kernel."""
+        return [command.name for command in self._commands]
+
+    def clear(self) -> None:
+        """Start another recording."""
+        self._commands, self._used, self._named = [], {}, {}
+
+    def record(
+        self,
+        kernel: str,
+        size: tuple[int, ...],
+        group: tuple[int, ...],
+        values: Sequence[Any],
+        stage: str = "",
+    ) -> Command:
+        """Append a launch. values: buffers and numbers in the order of the kernel's arguments."""
+        number = self._used.get(kernel, 0)
+        same = self._reusable.setdefault(kernel, [])
+        if number == len(same):
+            same.append(Command(self.program.own_kernel(kernel), kernel, self.program.types(kernel)))
+        command = same[number]
+        command.stage, command.size, command.group = stage, size, group
+        for index, value in enumerate(values):
+            command.bind(index, value)
+        self._used[kernel] = number + 1
+        self._commands.append(command)
+        if self._named:
+            self._named = {}
+        return command
+
+    def launch(
+        self,
+        queue: cl.CommandQueue,
+        kernel: str,
+        size: tuple[int, ...],
+        group: tuple[int, ...],
+        values: Sequence[Any],
+        stage: str = "",
+    ) -> cl.Event:
+        """Append a launch as `record`, and submit it."""
+        return self.record(kernel, size, group, values, stage).submit(queue)
+
+    def set(self, values: Mapping[str, Any]) -> None:
+        """Change arguments by name, in all commands that have one of that name."""
+        for name, value in values.items():
+            argument = self._named.get(name)
+            if argument is None:
+                argument = self._named[name] = _NamedArgument(self._places(name))
+            mark = token_of(value) if isinstance(value, cl.Buffer) else value
+            if mark is argument.mark or (type(mark) is type(argument.mark) and mark == argument.mark):
+                continue
+            argument.mark = _UNKNOWN
+            for command, index in argument.places:
+                command.bind(index, value)
+            argument.mark = mark
+
+    def submit(self, queue: cl.CommandQueue) -> list[cl.Event]:
+        """Enqueue all commands in their order."""
+        return [command.submit(queue) for command in self._commands]
+
+    def _places(self, name: str) -> list[tuple[Command, int]]:
+        """Commands and argument indices of a name."""
+        arguments = self.program.source.arguments
+        return [
+            (command, index)
+            for command in self._commands
+            for index, argument in enumerate(arguments[command.name])
+            if argument.name == name
+        ]
