@@ -66,13 +66,7 @@ _STEP = (
     *("prelude", "math", "splat", "bounds", "moments", "set_up_backward"),
     *("train/activation_functions", "train/adam", "project_step"),
 )
-_TRAINING = (
-    "train/surface",
-    "train/activation_functions",
-    "train/activate",
-    "train/gather_rows",
-    "train/position_noise",
-)
+_TRAINING = ("surface", "activation_functions", "activate", "gather_rows", "position_noise")
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _SECTION = re.compile(r"//@ (\w+)[ \t]*")
 # both begin with a word itself, which re finds 20 times as fast as a boundary
