@@ -25,17 +25,40 @@ MOST_CROSSINGS = 5_000
 """Places where the pieces of outlines cross."""
 
 
+MOST_NEIGHBORS = 20_000_000
+"""Pairs of straight pieces of outlines whose bounds overlap, 2 to 3 s of processor time."""
+
+
 def refuse_tangles(rings: Rings, name: str | None) -> None:
     """Raise InputError where outlines cross in more places than polygons should be made of."""
-    pieces = [np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings]
-    lines = np.array(shapely.linestrings(np.concatenate([np.zeros((0, 2, 2)), *pieces])))
-    tree, crossings = shapely.STRtree(list(lines)), 0
+    pieces = np.concatenate(
+        [np.zeros((0, 2, 2)), *(np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings)]
+    )
+    lines = np.array(shapely.linestrings(pieces))
+    tree, neighbors, crossings = shapely.STRtree(list(lines)), 0, 0
     for start in range(0, len(lines), 256):  # few at a time, as each may cross all
-        crossings += tree.query(lines[start : start + 256], predicate="crosses").shape[1]
-        if crossings > 2 * MOST_CROSSINGS:  # each from both sides
+        one, other = tree.query(lines[start : start + 256])
+        neighbors += len(one) / 2  # each pair comes from both sides
+        crossings += int(_crosses(pieces[start + one], pieces[other]).sum()) / 2
+        if crossings > MOST_CROSSINGS:
             raise InputError(
                 f"{name} has outlines that cross in over {MOST_CROSSINGS} places: simplify the drawing"
             )
+        if neighbors > MOST_NEIGHBORS:
+            raise InputError(
+                f"{name} must have outlines with at most {MOST_NEIGHBORS:,} pairs of pieces near each other; "
+                "simplify the drawing"
+            )
+
+
+def _crosses(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(n,) whether the insides of segments (n, 2 ends, 2) meet in a point."""
+
+    def sides(segments: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        along, to = segments[:, 1] - segments[:, 0], ends - segments[:, :1]
+        return along[:, None, 0] * to[..., 1] - along[:, None, 1] * to[..., 0]
+
+    return (np.sign(sides(one, other)).prod(axis=1) < 0) & (np.sign(sides(other, one)).prod(axis=1) < 0)
 
 
 def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:

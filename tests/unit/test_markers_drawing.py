@@ -1,5 +1,7 @@
 """Drawings: SVG outlines, the rectangles that cover them, their colours, and what is refused."""
 
+import time
+
 import numpy as np
 import pytest
 import shapely
@@ -11,7 +13,7 @@ from fidsplat.markers import marker
 from fidsplat.markers.cover import _met, turned
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.markers.paths import circle_rings, path_rings
-from fidsplat.markers.shapes import filled
+from fidsplat.markers.shapes import _crosses, filled
 from fidsplat.markers.styles import COLORS
 from fidsplat.scenes import PlacedMarker
 
@@ -293,6 +295,22 @@ def test_scribbles_are_refused(tmp_path):
     places = " ".join(f"{7919 * i % 400 / 10} {104729 * i % 200 / 10}" for i in range(300))
     with pytest.raises(fs.InputError, match="cross in over 5000 places: simplify"):
         drawn(tmp_path, f'<path d="M{places}z"/>')
+
+
+@pytest.mark.parametrize("copies", [800, 2500])
+def test_one_outline_many_times_over_is_refused_soon(tmp_path, copies):
+    """Without crossings, but each piece of it has all others near."""
+    begun = time.process_time()
+    with pytest.raises(fs.InputError, match=r"pairs of (pieces|shapes) .*simplify"):
+        drawn(tmp_path, copies * '<circle cx="9" cy="9" r="5"/>')
+    assert time.process_time() - begun < 10
+
+
+def test_crossing_segments_are_those_of_geos():
+    ends = np.random.default_rng(8).integers(0, 7, (2, 20_000, 2, 2)).astype(float)
+    one, other = ends[:, (ends[:, :, 0] != ends[:, :, 1]).any(axis=2).all(axis=0)]
+    wanted = shapely.crosses(shapely.linestrings(one), shapely.linestrings(other))
+    np.testing.assert_array_equal(_crosses(one, other), wanted)
 
 
 def test_which_modules_a_region_meets():
