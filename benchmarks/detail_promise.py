@@ -19,8 +19,8 @@ import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
+from fidsplat.accuracy.detail_errors import measure_detail
 from fidsplat.accuracy.error import TRUTH_CUTOFF
-from fidsplat.accuracy.level_of_detail import measure_detail
 from fidsplat.worlds.city import City
 
 ERRORS = (1 / 255, 4 / 255)

@@ -18,7 +18,7 @@ from measuring import PROGRESS, facts, keep, options
 from store_views import path_of, placed
 
 import fidsplat as fs
-from fidsplat.accuracy.level_of_detail import measure_detail
+from fidsplat.accuracy.detail_errors import measure_detail
 from fidsplat.streaming.occlusion_culling import OcclusionCulling
 from fidsplat.worlds.city import City
 
@@ -80,7 +80,7 @@ def main() -> None:
         fs.build_store([city.source], path)
     renderer = fs.Renderer(asked.device, int(asked.memory_budget))
     store = fs.Store(path)
-    if any("detail_error" in quality for quality in asked.qualities) and not store.details:
+    if any("detail_error" in quality for quality in asked.qualities) and not store.detail_errors:
         measure_detail(store, renderer)
     store = placed(fs.Store(path), city, asked.places, folder)
     width, height = map(int, asked.size.split("x"))

@@ -23,8 +23,8 @@ import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
+from fidsplat.accuracy.detail_errors import measure_detail
 from fidsplat.accuracy.error import TRUTH_CUTOFF
-from fidsplat.accuracy.level_of_detail import measure_detail
 from fidsplat.backends.prepare import prepare
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.streaming.level_of_detail import select
@@ -157,11 +157,11 @@ def main() -> None:
         built = {"s": time.perf_counter() - begun, "cpu_s": time.process_time() - cpu}
         PROGRESS.print(f"built: {built}")
     store = fs.Store(path)
-    if not store.details:
+    if not store.detail_errors:
         measure_detail(store, renderer, asked.measured)
     rows, paths = [], []
     about = {**facts(renderer), "built": built, "bytes": store.nbytes, "size": asked.size}
-    about["details"] = [vars(one) for one in store.details]
+    about["details"] = [vars(one) for one in store.detail_errors]
     for places in asked.places:
         whole = placed(store, city, places, folder)
         rows += measure(whole, renderer, asked)

@@ -43,10 +43,10 @@ def store_fixtures() -> tuple[Any, Any, Any]:
     @pytest.fixture(scope="module", autouse=True)
     def cut():
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(build_plan, "_LEAST_MEMORY", 0)
-            patch.setattr(build_plan, "_MERGING", (0, 0.01))
+            patch.setattr(build_plan, "_MIN_MEMORY", 0)
+            patch.setattr(build_plan, "_MERGE_BYTES", (0, 0.01))
             patch.setattr(build_plan, "WINDOW", WINDOW)
-            patch.setattr(build, "_NOTED", NOTED)
+            patch.setattr(build, "_SAVE_EVERY", NOTED)
             yield
 
     @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ def made_store(folder, cloud, name):
 def made_stores(folder):
     """Disks, 3D Gaussians, disks with SH, and a wall of many disks."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build_plan, "_LEAST_MEMORY", 0)
+        patch.setattr(build_plan, "_MIN_MEMORY", 0)
         clouds = {"disks": splats(1), "thick": splats(2, thick=True), "sh": splats(3, sh_degree=2)}
         clouds["wall"] = random_splats(3 * COUNT, 5, depth=(3, 3.2), scale=(7e-3, 0.02), across=3.0)
         return {name: made_store(folder, cloud, name) for name, cloud in clouds.items()}

@@ -169,7 +169,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "Store.load": lambda folder: (_store(folder).load, {"number": 0, "placed": True}, None),
     "Store.counts": lambda folder: (_store(folder).counts, {"numbers": np.array([0])}, None),
     "Store.first_of": lambda folder: (_store(folder).first_of, {"numbers": np.array([0])}, None),
-    "Store.pixels_of": lambda folder: (_store(folder).pixels_of, {"quality": fs.Quality()}, None),
+    "Store.cell_sizes": lambda folder: (_store(folder).cell_sizes, {"quality": fs.Quality()}, None),
     "Store.verify": lambda folder: (_store(folder).verify, {"progress": None}, None),
     "build_store": lambda folder: (
         fs.build_store,

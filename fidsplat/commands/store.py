@@ -247,7 +247,7 @@ class Measure:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.accuracy.level_of_detail import measure_detail
+        from fidsplat.accuracy.detail_errors import measure_detail
 
         store, names = fs.Store(self.store), [name.strip() for name in self.lowpass.split(",")]
         with late_progress(console(True)) as progress:
@@ -291,8 +291,8 @@ class StoreDemo:
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.accuracy.detail_errors import measure_detail
         from fidsplat.accuracy.error import TRUTH_CUTOFF
-        from fidsplat.accuracy.level_of_detail import measure_detail
         from fidsplat.worlds.city import City, flight
 
         if not (math.isfinite(self.splats) and self.splats == int(self.splats)):
@@ -311,7 +311,7 @@ class StoreDemo:
             if self.views and len(store.nodes) > store.chunks:
                 measure_detail(store, fs.Renderer(self.device), self.views, progress=progress)
         camera, motion = flight(city)
-        error = DEMO_ERROR if store.details else 0.0
+        error = DEMO_ERROR if store.detail_errors else 0.0
         quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
         scene = folder / "city.toml"
         poses = city.marker_poses(self.markers)

@@ -1,8 +1,7 @@
-"""Building a store out of core: inputs are read once, in parts, and spread over buckets by their place in the
-spatial order; each bucket is sorted and written; then levels of detail are made from the bottom up.
+"""Out-of-core build of a store: a bucket sort by Morton code, then levels of detail from the bottom up.
 
-What is done is noted beside what is written, so that a build that was stopped goes on where it was. Memory
-follows `Plan.memory`, not the inputs.
+Inputs are read once, in parts, and distributed over bucket files; each bucket is sorted and written. Progress
+is saved, so that an interrupted build resumes. Memory follows `BuildPlan.memory`, not the inputs.
 """
 
 from __future__ import annotations
@@ -21,21 +20,21 @@ from typing import Any
 import numpy as np
 
 from fidsplat.formats.collect import Progress
-from fidsplat.store.build_plan import ON_PLANE, Plan, plan_of
-from fidsplat.store.columns import Columns, nodes_of
-from fidsplat.store.folders import emptied, filled, refuse_existing, store_folder
+from fidsplat.store.build_plan import ON_PLANE, BuildPlan, plan_build
+from fidsplat.store.columns import ColumnFiles, node_record
 from fidsplat.store.layout import CHUNK, NODE, Header, npy_header, write_nodes
 from fidsplat.store.merge import REDUCTION, merged
 from fidsplat.store.sources import Source, open_sources, splats_of
+from fidsplat.store.staging import clear, refuse_existing, staged, store_folder
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback
 from fidsplat.util.errors import InputError, bytes_words
 from fidsplat.util.files import atomic_write, from_json, read_input
 
-_NOTED = 16
-"""parts of the work after which it is noted what is done"""
-_ROOT = 64
-"""splats at which nothing is gained by fewer"""
+_SAVE_EVERY = 16
+"""parts of the work after which progress is saved"""
+_MIN_ROOT = 64
+"""splats below which another level of detail is of no use"""
 
 
 def build_store(
@@ -50,100 +49,100 @@ def build_store(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Build a store of files of splats, and return its folder. The same call goes on with one that was
-    stopped.
+    """Build a store from splat files and return its folder. The same call resumes an interrupted build.
 
     Args:
         inputs: PLY files of any size, which are read in parts; files of other formats, which are loaded; or
-            `Source`s, rows that somebody makes.
+            `Source` objects.
         out: the store's folder; its name ends with .fss.
-        chunk: splats of a chunk. memory: bytes to take at most, roughly.
-        levels: whether levels of detail are made.
-        sh_degree: the highest degree of SH to keep; None: that of the inputs.
-        colors: what colours and SH are stored as, float32 or float16.
-        overwrite: whether a store that is there is replaced, once the new one is whole.
-        progress: called now and then with what is being done and the share of it that is done, 0 to 1.
+        chunk: splats of a chunk. memory: approximate maximum bytes of memory.
+        levels: whether to build levels of detail.
+        sh_degree: highest degree of SH to store; None: that of the inputs.
+        colors: storage type of colours and SH, float32 or float16.
+        overwrite: whether to replace an existing store when the new one is complete.
+        progress: called with the current step and its share done, 0 to 1.
 
     Raises:
-        InputError: an input that cannot be used, a store that is there or that another process builds, a disk
-            without room.
+        InputError: an invalid input, an existing store or one that another process builds, too little disk
+            space.
     """
     progress = callback("progress", progress)
     folder = store_folder(out)
     refuse_existing(folder, overwrite)
-    plan = plan_of(open_sources(inputs), chunk, memory, levels, sh_degree, colors)
-    with filled(folder) as part:
+    plan = plan_build(open_sources(inputs), chunk, memory, levels, sh_degree, colors)
+    with staged(folder) as part:
         _Build(plan, part, progress or (lambda words, share: None)).run()
     return folder
 
 
 class _Build:
-    """One build, in a folder of its own."""
+    """State of one build in its staging folder."""
 
-    def __init__(self, plan: Plan, folder: Path, progress: Progress) -> None:
+    def __init__(self, plan: BuildPlan, folder: Path, progress: Progress) -> None:
         self.plan, self.folder, self.progress = plan, folder, progress
-        self.buckets = len(plan.splitters) + 2  # the last for splats on planes
+        self.buckets = len(plan.splitters) + 2  # the last for coplanar groups
         self.workers = min(4, os.cpu_count() or 1)
-        self.state = self._begun()
-        self.columns: Columns
+        self.state = self._saved_state()
+        self.columns: ColumnFiles
 
     @property
     def pinned(self) -> int:
-        """The first row of splats on planes."""
+        """First row of the splats of coplanar groups."""
         return sum(self.state["lengths"][:-1])
 
     def run(self) -> None:
-        """All that is left to do."""
+        """Run the remaining steps."""
         with ThreadPoolExecutor(self.workers) as pool:
             self._scatter(pool)
             kinds = dict(self.plan.columns)
-            if not self.state["thick"]:  # files with three scales may hold disks alone
+            if not self.state["thick"]:  # files with three scales may contain only disks
                 kinds.pop("thickness", None)
-            with Columns(self.folder, kinds, self.plan.shapes) as self.columns:
+            with ColumnFiles(self.folder, kinds, self.plan.shapes) as self.columns:
                 self._sort(pool)
                 self._levels(pool)
                 self._finish()
 
-    def _begun(self) -> dict[str, Any]:
-        """What is done; nothing, if it was begun from other inputs or not at all."""
+    def _saved_state(self) -> dict[str, Any]:
+        """Saved progress; a fresh state if there is none for these inputs."""
         try:
             state = from_json(read_input(self.folder / "state.json"))
-            if state["plan"] == self.plan.digest and self._there(state):
+            if state["plan"] == self.plan.digest and self._is_on_disk(state):
                 return state
         except (OSError, ValueError, KeyError, TypeError):
             pass
-        emptied(self.folder)
+        clear(self.folder)
         free, needed = shutil.disk_usage(self.folder).free, self.plan.disk_bytes
         if needed > free:
             raise InputError(
-                f"building takes up to {bytes_words(needed)} beside {self.folder}, and {bytes_words(free)} "
-                "are free; make room, or build elsewhere"
+                f"a build in {self.folder} needs up to {bytes_words(needed)} of disk space, got "
+                f"{bytes_words(free)}; free some space, or build elsewhere"
             )
         fresh = {"plan": self.plan.digest, "lengths": [0] * self.buckets, "dropped": {}}
         return fresh | dict.fromkeys(("windows", "thick", "sorted", "nodes", "level", "merged"), 0)
 
-    def _there(self, state: dict[str, Any]) -> bool:
-        """Whether what is noted is on disk: after a power cut it need not be. Raises OSError for a file that
-        is missing."""
+    def _is_on_disk(self, state: dict[str, Any]) -> bool:
+        """Whether all files that a state describes are complete, which a power cut can prevent.
+
+        Raises OSError for a missing file.
+        """
         left = list(enumerate(state["lengths"]))[state["sorted"] :]
         needed = [(self._bucket(number), count * self.plan.record.itemsize) for number, count in left]
         needed += [(self.folder / "nodes", state["nodes"] * NODE.itemsize)] if state["nodes"] else []
         return all(file.stat().st_size >= size for file, size in needed)
 
-    def _note(self, **done: Any) -> None:
+    def _save(self, **done: Any) -> None:
         self.state |= done
         with atomic_write(self.folder / "state.json") as stream:
             stream.write(json.dumps(self.state).encode())
 
-    def _in_turn(
+    def _in_order(
         self,
         pool: ThreadPoolExecutor,
         work: Callable[[Any], Any],
         given: Iterable[Any],
         most: int | None = None,
     ) -> Iterator[Any]:
-        """Results in the order of what is given, worked out by threads a little ahead. most: how many at
-        once; None: one for each thread, and results that wait."""
+        """Results of threads in the order of inputs. most: limit on concurrent results; None: threads + 1."""
         waiting: deque[Future] = deque()
         for one in given:
             waiting.append(pool.submit(work, one))
@@ -166,11 +165,11 @@ class _Build:
             files = []
             for number in range(self.buckets):
                 stream = stack.enter_context(self._bucket(number).open("ab"))
-                stream.truncate(lengths[number] * plan.record.itemsize)  # of a part that was not noted
+                stream.truncate(lengths[number] * plan.record.itemsize)
                 files.append(stream)
             first = state["windows"]
             for done, (parts, why) in enumerate(
-                self._in_turn(pool, self._spread, plan.windows[first:]), first + 1
+                self._in_order(pool, self._spread, plan.windows[first:]), first + 1
             ):
                 for number, records in parts:
                     files[number].write(records.data)
@@ -178,16 +177,16 @@ class _Build:
                     if "thickness" in plan.columns:
                         thick += int(np.count_nonzero(records["thickness"]))
                 dropped.update(why)
-                if done % _NOTED == 0 or done == len(plan.windows):
+                if done % _SAVE_EVERY == 0 or done == len(plan.windows):
                     for stream in files:
                         stream.flush()
-                    self._note(windows=done, lengths=lengths, dropped=dict(dropped), thick=thick)
+                    self._save(windows=done, lengths=lengths, dropped=dict(dropped), thick=thick)
                 self.progress("reading splats", done / len(plan.windows))
 
     def _spread(
         self, window: tuple[int, tuple[int, int]]
     ) -> tuple[list[tuple[int, np.ndarray]], dict[str, int]]:
-        """The splats of a part of an input by their buckets, each in the order of the input."""
+        """Records of a part of an input by bucket, in the order of the input."""
         plan, (number, span) = self.plan, window
         arrays, dropped = splats_of(plan.sources[number], span, plan.origin, plan.columns, plan.sh_degree)
         codes = plan.grid.codes(arrays["means"])
@@ -210,14 +209,14 @@ class _Build:
         lengths, done = self.state["lengths"], self.state["sorted"]
         firsts = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
         work = [(number, int(firsts[number])) for number in range(done, self.buckets)]
-        for number, nodes in enumerate(self._in_turn(pool, self._sorted, work), done):
+        for number, nodes in enumerate(self._in_order(pool, self._sorted, work), done):
             self._add_nodes(nodes)
-            self._note(sorted=number + 1)
+            self._save(sorted=number + 1)
             self._bucket(number).unlink(missing_ok=True)
             self.progress("sorting", (number + 1) / self.buckets)
 
     def _sorted(self, work: tuple[int, int]) -> np.ndarray:
-        """Writes a bucket's splats in their order, and returns the records of its chunks."""
+        """Sort and write a bucket's splats, and return the records of its chunks."""
         (number, first), plan = work, self.plan
         count = self.state["lengths"][number]
         if not count:
@@ -228,7 +227,7 @@ class _Build:
         for part in np.array_split(order, -(-count // plan.chunk)):
             taken = rows[part]
             splats = {name: np.ascontiguousarray(taken[name]) for name in self.columns.kinds}
-            made.append(nodes_of(splats, first))
+            made.append(node_record(splats, first))
             self.columns.write(first, splats)
             first += len(part)
         return np.concatenate(made)
@@ -247,36 +246,36 @@ class _Build:
         self.state["nodes"] += len(nodes)
 
     def _levels(self, pool: ThreadPoolExecutor) -> None:
-        """Nodes above nodes, four to one, until one of a few splats stands for all."""
+        """Build levels of detail, four nodes to one, up to a single node of few splats."""
         while self.plan.levels:
             nodes, level, done = self._nodes(), self.state["level"], self.state["merged"]
             groups = _groups(nodes, level, self.pinned)
-            if not groups or (len(groups[0]) == 1 and _settled(nodes, level)):
+            if not groups or (len(groups[0]) == 1 and _is_root(nodes, level)):
                 return
             rows = int(nodes["first"][-1] + nodes["count"][-1])
             most = min(self.workers, max(1, self.plan.memory // self.plan.merge_bytes))
-            work = self._in_turn(pool, self._merged, (nodes[group] for group in groups[done:]), most)
+            work = self._in_order(pool, self._merged, (nodes[group] for group in groups[done:]), most)
             for number, (made, size) in enumerate(work, done + 1):
-                node = nodes_of(made, rows)
+                node = node_record(made, rows)
                 node["level"], node["size"] = level + 1, size
                 _enclose(node, nodes[groups[number - 1]])
                 self.columns.write(rows, made)
                 rows += len(made["means"])
                 self._add_nodes(node)
-                if number % _NOTED == 0:
-                    self._note(merged=number)
+                if number % _SAVE_EVERY == 0:
+                    self._save(merged=number)
                 self.progress(f"level of detail {level + 1}", number / len(groups))
-            self._note(level=level + 1, merged=0)
+            self._save(level=level + 1, merged=0)
 
     def _merged(self, children: np.ndarray) -> tuple[dict[str, np.ndarray], float]:
-        """Splats that stand for those of the nodes (records), and the edge [m] of their cells."""
+        """Merged splats of nodes (records), and the edge [m] of their cells."""
         first, end = int(children["first"][0]), int(children["first"][-1] + children["count"][-1])
         return merged(self.columns.read(first, end), self.plan.grid)
 
     # all together
 
     def _finish(self) -> None:
-        """Headers, the index, and no trace of the work."""
+        """Write headers and the index, and remove temporary files."""
         plan, kinds, nodes = self.plan, self.columns.kinds, self._nodes()
         for level in range(int(nodes["level"].max(initial=0))):
             above = np.flatnonzero(nodes["level"] == level + 1)
@@ -301,22 +300,21 @@ class _Build:
             dropped=dict(self.state["dropped"]),
             sources=tuple(source.rows.path.name for source in plan.sources),
         ).save(self.folder)
-        # the note first: what it says is done must be there
+        # first, since the state must not describe files that are removed
         (self.folder / "state.json").unlink()
         for file in (self.folder / "nodes", *map(self._bucket, range(self.buckets))):
             file.unlink(missing_ok=True)
 
 
 def _groups(nodes: np.ndarray, level: int, pinned: int) -> list[np.ndarray]:
-    """Which nodes (numbers) of a level one node of the next stands for, in their order. Chunks from row
-    `pinned` on have none."""
+    """Numbers of the nodes of a level that are merged into each node of the next, in order. Chunks from row
+    `pinned` on are never merged."""
     below = np.flatnonzero((nodes["level"] == level) & ((level > 0) | (nodes["first"] < pinned)))
     return np.array_split(below, -(-len(below) // REDUCTION)) if len(below) else []
 
 
 def _enclose(node: np.ndarray, children: np.ndarray) -> None:
-    """Makes a node reach as far as those that it stands for: where it is not looked for, they are not, and it
-    is as near and as coarse as any of them."""
+    """Extend a node's box and sizes to those of its children: if it is culled, so are they."""
     node["size"] = max(float(node["size"][0]), float(children["size"].max()))
     for name in ("low", "far_low"):
         node[name] = np.minimum(node[name], children[name].min(axis=0))
@@ -325,7 +323,7 @@ def _enclose(node: np.ndarray, children: np.ndarray) -> None:
     node["reach"] = max(float(node["reach"][0]), float(children["reach"].max()))
 
 
-def _settled(nodes: np.ndarray, level: int) -> bool:
-    """Whether little is gained by a node above the only one of this level: not half of its splats."""
+def _is_root(nodes: np.ndarray, level: int) -> bool:
+    """Whether another level would save less than half of the splats of the only node of this one."""
     counts = [int(nodes["count"][nodes["level"] == at].sum()) for at in (level - 1, level)]
-    return counts[1] <= _ROOT or (level > 0 and 2 * counts[1] > counts[0])
+    return counts[1] <= _MIN_ROOT or (level > 0 and 2 * counts[1] > counts[0])

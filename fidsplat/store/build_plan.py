@@ -1,5 +1,4 @@
-"""What a store will be, decided before a byte of it is written: the same for the same inputs, so that a build
-that was stopped can go on."""
+"""Plan of a build: columns, order and parts of a store, deterministic so that a build can be resumed."""
 
 from __future__ import annotations
 
@@ -20,31 +19,31 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import printable
 
 COLORS = ("float32", "float16")
-_MOST_BUCKETS = 1000
-_LEAST_MEMORY = 256 * 2**20
-_MERGING = 400, 6
-"""bytes of a splat that is merged, and how many times its own beside them: 610 in all were measured with
-plain colours, 1,530 with harmonics of degree 3"""
+_MAX_BUCKETS = 1000
+_MIN_MEMORY = 256 * 2**20
+_MERGE_BYTES = 400, 6
+"""memory to merge a splat: bytes, and a multiple of its own size (measured in all: 610 bytes with plain
+colours, 1,530 with SH of degree 3)"""
 ON_PLANE = np.uint64(1 << 63)
-"""code of splats that are printed on planes: they stand last, in chunks of their own, which every picture
-has, since a plane is placed as a whole"""
+"""code of splats of coplanar groups: they are last, in their own chunks, which are part of every frame, since
+a group is sorted as one"""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The columns of a store, its order, and the parts in which it is built."""
+class BuildPlan:
+    """Columns, order and parts of a build."""
 
     sources: tuple[Source, ...]
     chunk: int
     memory: int
-    """bytes that building may take, roughly"""
+    """approximate bytes that the build may use"""
     levels: bool
     sh_degree: int
     columns: dict[str, str]
     origin: np.ndarray
     grid: Grid
     splitters: np.ndarray
-    """(buckets - 1,) uint64: first codes of all buckets but the first"""
+    """(buckets - 1,) uint64: first code of each bucket except the first"""
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -59,13 +58,13 @@ class Plan:
 
     @property
     def merge_bytes(self) -> int:
-        """Bytes that it takes to make one node of those below it, at most."""
-        each, share = _MERGING
+        """Maximum memory to merge nodes into one of the next level."""
+        each, share = _MERGE_BYTES
         return int(REDUCTION * min(self.chunk, self.rows) * (each + share * self.splat_bytes))
 
     @cached_property
     def record(self) -> np.dtype:
-        """A splat on its way to its bucket."""
+        """Record of a splat in a bucket file."""
         parts = [(name, kind, self.shapes[name]) for name, kind in self.columns.items()]
         return np.dtype([("code", "<u8"), *parts])
 
@@ -76,7 +75,7 @@ class Plan:
 
     @cached_property
     def windows(self) -> list[tuple[int, tuple[int, int]]]:
-        """The parts in which inputs are read: which input, and its rows [first, end)."""
+        """Parts in which inputs are read: (number of the input, rows [first, end))."""
         step = max(1, self.memory // (24 * self.record.itemsize) // WINDOW) * WINDOW
         step = min(step, 4 * WINDOW)
         parts = [spans(source.rows.count, step) for source in self.sources]
@@ -84,13 +83,13 @@ class Plan:
 
     @property
     def disk_bytes(self) -> int:
-        """Bytes that a build takes of the disk at most, roughly: records in buckets, columns, levels."""
-        whole = self.splat_bytes * 4 // 3 if self.levels else self.splat_bytes
-        return self.rows * (self.record.itemsize + whole) + self.rows // self.chunk * 2 * NODE.itemsize
+        """Approximate maximum disk space of a build: bucket records, columns, levels of detail."""
+        columns = self.splat_bytes * 4 // 3 if self.levels else self.splat_bytes
+        return self.rows * (self.record.itemsize + columns) + self.rows // self.chunk * 2 * NODE.itemsize
 
     @cached_property
     def digest(self) -> str:
-        """Hexadecimal digits of all that decides what is built."""
+        """Hexadecimal digest of everything that the store depends on."""
         sha = hashlib.sha256()
         for source in self.sources:
             sha.update(printable(f"{source.stamp} {source.rows.count} {source.first_plane}\n").encode())
@@ -99,22 +98,22 @@ class Plan:
         return sha.hexdigest()
 
 
-def plan_of(
+def plan_build(
     sources: Sequence[Source],
     chunk: int = CHUNK,
     memory: int = 2 * 2**30,
     levels: bool = True,
     sh_degree: int | None = None,
     colors: str = "float32",
-) -> Plan:
-    """Raises InputError for a number that cannot be used."""
+) -> BuildPlan:
+    """Plan a build. Raises InputError for an invalid option."""
     if isinstance(chunk, bool) or not isinstance(chunk, int) or not 64 <= chunk <= 1 << 22:
-        raise InputError(f"chunk is {chunk!r}; it must be a whole number of splats from 64 to {1 << 22}")
-    if isinstance(memory, bool) or not isinstance(memory, int) or memory < _LEAST_MEMORY:
-        raise InputError(f"memory is {memory!r}; building takes at least {_LEAST_MEMORY >> 20} MiB")
+        raise InputError(f"chunk must be a whole number of splats from 64 to {1 << 22}, got {chunk!r}")
+    if isinstance(memory, bool) or not isinstance(memory, int) or memory < _MIN_MEMORY:
+        raise InputError(f"memory must be at least {_MIN_MEMORY >> 20} MiB, got {memory!r}")
     flag("levels", levels)
     if not isinstance(colors, str) or colors not in COLORS:
-        raise InputError(f"colors is {colors!r}; known: {', '.join(COLORS)}")
+        raise InputError(f"colors must be one of {', '.join(COLORS)}, got {colors!r}")
     if sh_degree is not None:
         whole_number("sh_degree", sh_degree, 0, 3)
     degree = max(map(degree_of, sources))
@@ -128,19 +127,19 @@ def plan_of(
     kinds |= {name: "<i4" for name in ("labels", "planes") if any(name in rows.columns for rows in given)}
     means, origin = sample(sources)
     grid = grid_around(means)
-    wide = sum(row_bytes(kind, shapes_of(degree)[name]) for name, kind in kinds.items()) + 8
+    splat_bytes = sum(row_bytes(kind, shapes_of(degree)[name]) for name, kind in kinds.items()) + 8
     rows = sum(each.count for each in given)
     if rows > MAX_SPLATS:
-        raise InputError(f"{rows:,} splats are too many for a store: a scene has at most {MAX_SPLATS:,}")
-    buckets = int(np.clip(-(-rows * wide // (memory // 16)), 1, _MOST_BUCKETS))
+        raise InputError(f"a store must have at most {MAX_SPLATS:,} splats, got {rows:,}")
+    buckets = int(np.clip(-(-rows * splat_bytes // (memory // 16)), 1, _MAX_BUCKETS))
     codes = np.sort(grid.codes(means))
     splitters = codes[len(codes) * np.arange(1, buckets) // buckets] if len(codes) else codes
     splitters = np.unique(splitters)
-    plan = Plan(tuple(sources), chunk, memory, levels, degree, kinds, origin, grid, splitters)
+    plan = BuildPlan(tuple(sources), chunk, memory, levels, degree, kinds, origin, grid, splitters)
     if levels and plan.merge_bytes > memory:
         most, needed = memory * min(chunk, rows) // plan.merge_bytes, plan.merge_bytes / 2**20
         raise InputError(
-            f"chunk is {chunk:,}; levels of detail of so large ones take {needed:,.0f} MiB to make, and "
-            f"memory is {memory / 2**20:,.0f} MiB; take {most:,} at most, more memory, or no levels"
+            f"chunk must be at most {most:,} for levels of detail in {memory / 2**20:,.0f} MiB of memory, "
+            f"got {chunk:,}, which takes {needed:,.0f} MiB; allow more memory, or no levels"
         )
     return plan

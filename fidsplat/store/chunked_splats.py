@@ -117,7 +117,7 @@ class ChunkedSplats:
         """
         if not all(quality.detail_error for quality in qualities):
             return 0.0
-        each = ([store.pixels_of(quality) for quality in qualities] for store in self.stores)
+        each = ([store.cell_sizes(quality) for quality in qualities] for store in self.stores)
         return tuple(tuple(np.min(sizes, axis=0).tolist()) for sizes in each)
 
     # index: boxes, counts and subchunks of nodes

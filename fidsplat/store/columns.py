@@ -1,4 +1,4 @@
-"""The columns of a store while it is built, and the records of its nodes."""
+"""Column files of a store that is being built, and records of its nodes."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from fidsplat.store.layout import FAR, NODE, NPY_HEADER, checksum, column_file, row_bytes
 
 
-class Columns:
-    """Files of arrays, whose rows are written in any order; threads may share them."""
+class ColumnFiles:
+    """Files of arrays whose rows are written in any order. Threads may share them."""
 
     def __init__(self, folder: Path, kinds: dict[str, str], shapes: dict[str, tuple[int, ...]]) -> None:
         self._folder, self.kinds, self._shapes = folder, kinds, shapes
         self._files: dict[str, int] = {}
 
-    def __enter__(self) -> Columns:
+    def __enter__(self) -> ColumnFiles:
         for name in self.kinds:
             file = column_file(self._folder, name)
             self._files[name] = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
@@ -28,7 +28,7 @@ class Columns:
             os.close(self._files.popitem()[1])
 
     def write(self, first: int, splats: dict[str, np.ndarray]) -> None:
-        """Put splats at rows from `first` on."""
+        """Write splats to rows from `first` on."""
         for name, descriptor in self._files.items():
             data = np.ascontiguousarray(splats[name]).view(np.uint8).reshape(-1).data
             at = NPY_HEADER + first * self._row(name)
@@ -37,7 +37,7 @@ class Columns:
                 data, at = data[written:], at + written
 
     def read(self, first: int, end: int) -> dict[str, np.ndarray]:
-        """The splats of rows [first, end)."""
+        """Read the splats of rows [first, end)."""
         made = {}
         for name, descriptor in self._files.items():
             row = self._row(name)
@@ -52,7 +52,7 @@ class Columns:
         return made
 
     def finish(self, name: str, header: bytes, rows: int) -> None:
-        """Put the header of a column before its rows, and cut off what follows them."""
+        """Write the header of a column and truncate the file after its rows."""
         os.pwrite(self._files[name], header, 0)
         os.ftruncate(self._files[name], NPY_HEADER + rows * self._row(name))
 
@@ -60,8 +60,8 @@ class Columns:
         return row_bytes(self.kinds[name], self._shapes[name])
 
 
-def nodes_of(splats: dict[str, np.ndarray], first: int) -> np.ndarray:
-    """(1,) of `NODE`: the record of a chunk of these splats, whose first is the row `first`."""
+def node_record(splats: dict[str, np.ndarray], first: int) -> np.ndarray:
+    """(1,) of `NODE`: the record of a chunk whose splats begin at row `first`."""
     node = np.zeros(1, NODE)
     means, largest = splats["means"], splats["scales"].max(axis=1)
     if "thickness" in splats:

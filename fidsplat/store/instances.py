@@ -1,4 +1,4 @@
-"""Stores of places: another store's splats many times, without their bytes."""
+"""Instanced stores: the splats of another store at many poses, without copies."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.splats.rotations import check_similarity
-from fidsplat.store.folders import emptied, filled, refuse_existing, store_folder
 from fidsplat.store.layout import MAX_SPLATS, PLACES
+from fidsplat.store.staging import clear, refuse_existing, staged, store_folder
 from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
@@ -26,43 +26,43 @@ def place_store(
     *,
     overwrite: bool = False,
 ) -> Path:
-    """Write a store that has another's splats at many places, and return its folder: it holds the poses
-    alone, and names the other by the way to it.
+    """Write a store that shows another store's splats at many poses, and return its folder.
+
+    It contains the poses and the relative path of the other store.
 
     Args:
-        store: what stands there; no store of places itself.
+        store: the store to repeat; it must not be instanced itself.
         out: the new store's folder; its name ends with .fss.
-        poses: (p, 4, 4), rigid: the motion of the world that takes the store's splats to each place.
-        overwrite: whether a store that is there is replaced.
+        poses: (p, 4, 4), rigid: world motion from the store's own pose to each instance.
+        overwrite: whether an existing store is replaced.
 
     Raises:
-        InputError: a pose that is not rigid; no pose; a store of places, or with printed planes; a store that
-            is there.
+        InputError: a pose that is not rigid; no pose; an instanced store, or one with coplanar groups; an
+            existing store.
     """
     source = store if isinstance(store, Store) else Store(store)
     if source.poses is not None:
-        raise InputError(f"{source.path} is a store of places itself; place {source.header.store} instead")
+        raise InputError(f"{source.path} is instanced itself; place {source.header.store} instead")
     if source.has_planes:
         raise InputError(
-            f"{source.path} has splats that are printed on planes, which are placed once; put markers into a "
-            "scene file"
+            f"{source.path} has coplanar groups, which cannot be instanced; put markers into a scene file"
         )
     try:
         given = np.stack([real_array("a pose", pose) for pose in poses])
     except (TypeError, ValueError):
         given = np.empty(0)
     if given.ndim != 3 or not len(given):
-        raise InputError("poses must be a list of rigid 4x4 matrices, one at least")
+        raise InputError("poses must be a list of at least one rigid 4x4 matrix")
     for number, pose in enumerate(given):
         check_similarity(pose, f"pose {number}", rigid=True)
     if len(given) * len(source) > MAX_SPLATS:
         raise InputError(
-            f"{len(given)} places of {len(source):,} splats are too many: a scene has at most {MAX_SPLATS:,}"
+            f"a scene must have at most {MAX_SPLATS:,} splats, got {len(given)} times {len(source):,}"
         )
     folder = store_folder(out)
     refuse_existing(folder, overwrite)
-    with filled(folder) as part:
-        emptied(part)  # of a build that was stopped
+    with staged(folder) as part:
+        clear(part)
         with atomic_write(part / PLACES) as stream:
             np.save(stream, given)
         header = replace(

@@ -1,12 +1,13 @@
-"""Levels of detail: fewer splats that stand for those of neighbouring nodes.
+"""Merging splats for levels of detail.
 
-Splats of a cell whose normals have the same main axis become one by moments in its plane: weighted by opacity
-times area, it has their mean, their covariance without the direction in which that is least, their mean
-colour, and the opacity with which its area has theirs. So far away, where cells are smaller than pixels, it
-takes the same light; what it gets wrong is measured (fidsplat/accuracy/level_of_detail.py).
+The splats of a cell whose normals have the same main axis are merged into one disk by moment matching,
+weighted by opacity times area: their mean, their covariance without its smallest axis, their mean colour, and
+an opacity that preserves opacity times area. At a distance, where cells are smaller than pixels, the merged
+splat covers the same share of a pixel. The error is measured (fidsplat/accuracy/detail_errors.py).
 
-That opacity may be above 1: below a pixel, where alone it is drawn, the low-pass makes a small alpha of it.
-Across an edge of brightness a cell has two splats: one would move the edge by up to an eighth of the cell.
+The opacity can exceed 1: merged splats are only rendered smaller than a pixel, where the low-pass reduces
+alpha. A cell that contains an edge of brightness has two splats: one would move the edge by up to an eighth
+of the cell.
 """
 
 from __future__ import annotations
@@ -17,23 +18,25 @@ from fidsplat.splats.harmonics import C0
 from fidsplat.store.morton import BITS, Grid
 
 REDUCTION = 4
-"""how many splats become one, in the mean: what halving the resolution leaves of a surface"""
+"""mean number of splats that are merged into one, as for a surface at half the resolution"""
 MAX_OPACITY = 4.0
-"""most opacity of a splat that stands for others; where they lie closer on top of each other several do"""
+"""highest opacity of a merged splat; where more is needed, several copies are stored"""
 EDGE = 0.06
-"""standard deviation of the brightness of a cell's splats from which on bright and dark ones stay apart"""
+"""standard deviation of brightness in a cell above which bright and dark splats are merged separately"""
 _CLASSES = 3
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndarray], float]:
-    """Splats that stand for these, at most a quarter as many where cells allow it, and the edge [m] of the
-    cells. `labels` is that of the heaviest. splats: columns as a store has them."""
+    """Merged splats, at most a quarter as many where cells allow it, and the edge [m] of the cells.
+
+    `labels` is that of the splat with the largest weight. splats: in a store's columns.
+    """
     u, v, normal = _frames(splats["quats"])
     sides = np.abs(normal)
     classes = np.where(sides[0] > sides[1], np.where(sides[0] > sides[2], 0, 2), 1 + (sides[2] > sides[1]))
     keys, shift = _cells(grid.codes(splats["means"]), classes.astype(np.uint64))
-    keys = _apart(keys, splats)
+    keys = _split_edges(keys, splats)
     order, starts = _runs(keys)
     given = {name: array[order] for name, array in splats.items()}
     made = _by_moments(given, (u[:, order], v[:, order], normal[:, order]), starts)
@@ -41,14 +44,14 @@ def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndar
 
 
 def _runs(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The order by keys (n,), and where in it each key's run starts."""
+    """Sorting order of keys (n,), and the first index of each run of equal keys."""
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     return order, np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
 
 
-def _apart(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
-    """(n,) other keys, two in the place of one where an edge of brightness goes through its splats."""
+def _split_edges(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
+    """(n,) new keys, two for each cell that contains an edge of brightness."""
     colors = splats["colors"] if "colors" in splats else C0 * splats["sh"][:, 0]
     order, starts = _runs(keys)
     light = colors.astype(np.float64).mean(axis=1)[order]
@@ -70,14 +73,13 @@ def _frames(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
-    """(n,) a key for each splat, the same for those that become one, and how many levels of the grid's cells
-    are gone in it."""
+    """(n,) key of the cell and class of each splat, and the number of grid levels that the cells combine."""
     target = max(1, len(codes) // REDUCTION)
     ordered = np.sort(codes)
-    # where neighbours in order differ: at how many levels at least
+    # number of levels at which neighbours in the order differ
     _, exponents = np.frexp((ordered[1:] ^ ordered[:-1]).astype(np.float64))
     differing = np.bincount((exponents + 2) // 3, minlength=BITS + 2)
-    cells = 1 + np.cumsum(differing[::-1])[::-1]  # at [s + 1]: cells where s levels are gone
+    cells = 1 + np.cumsum(differing[::-1])[::-1]  # [s + 1]: number of cells that combine s levels
     shift = int(np.argmax(np.append(cells[1:], 0) <= target))
     while True:
         keys = (codes >> np.uint64(3 * min(shift, BITS))) * np.uint64(_CLASSES) + classes
@@ -92,20 +94,20 @@ def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
 def _by_moments(
     splats: dict[str, np.ndarray], frames: tuple[np.ndarray, np.ndarray, np.ndarray], starts: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """One splat for each run of splats, or some where they lie on top of each other; a run of one stays as it
-    is. frames: as `_frames`."""
+    """One splat for each run of splats, or copies where its opacity would be too high; a run of one is
+    unchanged. frames: tangents and normal."""
     count = len(splats["means"])
     lengths = np.diff(np.append(starts, count))
     scales = splats["scales"].T.astype(np.float64)
     thickness = splats.get("thickness")
     area = scales[0] * scales[1]
     third = np.zeros(count) if thickness is None else thickness.astype(np.float64)
-    # what a 3D Gaussian covers, in the mean over directions, is near this
+    # approximate area of a 3D Gaussian, averaged over directions
     area = np.maximum(area, third * np.maximum(scales[0], scales[1]))
     light = splats["opacities"] * area
     weights = np.maximum(light, 1e-300)
     total = np.add.reduceat(weights, starts)
-    # from a run's first splat, so that nothing cancels
+    # relative to the first splat of the run, against cancellation
     base = splats["means"][starts].astype(np.float64).T
     away = splats["means"].T - np.repeat(base, lengths, axis=1)
     u, v = frames[0] * scales[0], frames[1] * scales[1]
@@ -135,26 +137,26 @@ def _by_moments(
         made[name] = mean(flat).T.reshape(-1, *splats[name].shape[1:])
     if thickness is not None:
         made["thickness"] = np.where(np.logical_or.reduceat(thickness > 0, starts), sigma[:, 2], 0.0)
-    alone, heaviest = lengths == 1, _first_of_largest(weights, starts, lengths)
+    single, heaviest = lengths == 1, _first_of_largest(weights, starts, lengths)
     result = {}
     for name, array in splats.items():
         if name not in made:  # labels, planes
             result[name] = array[heaviest]
             continue
         result[name] = made[name].astype(array.dtype)
-        result[name][alone] = array[starts[alone]]
+        result[name][single] = array[starts[single]]
     return {name: np.repeat(array, copies, axis=0) for name, array in result.items()}
 
 
 def _first_of_largest(weights: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Of each run the first index of its largest weight."""
+    """First index of the largest weight of each run."""
     largest = np.repeat(np.maximum.reduceat(weights, starts), lengths)
     places = np.where(weights == largest, np.arange(len(weights)), len(weights))
     return np.minimum.reduceat(places, starts)
 
 
 def quaternions_of(frames: np.ndarray) -> np.ndarray:
-    """(n, 4) float64 unit quaternions w x y z of rotations (n, 3, 3), as `matrix_to_quaternion` of each."""
+    """(n, 4) float64 unit quaternions w x y z of rotations (n, 3, 3)."""
     r = frames
     xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
     a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]

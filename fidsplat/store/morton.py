@@ -1,4 +1,4 @@
-"""A spatial order: Morton codes of splats on a cubic grid of 2^21 cells a side."""
+"""Morton codes of splats on a cubic grid of 2^21 cells a side."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 BITS = 21
-"""of a code per axis"""
+"""bits of a code per axis"""
 
 
 def _spread(bits: int) -> np.ndarray:
@@ -25,7 +25,7 @@ _TABLE = _spread(_LOW_BITS)
 
 @dataclass(frozen=True)
 class Grid:
-    """A cube that is cut into cells; what lies outside counts to the cells at its sides."""
+    """Cube divided into cells; points outside belong to the nearest cell at its sides."""
 
     low: tuple[float, float, float]
     """metres from the origin"""
@@ -33,7 +33,7 @@ class Grid:
     """metres"""
 
     def codes(self, means: np.ndarray) -> np.ndarray:
-        """(n,) uint64 of centres (n, 3), by which neighbours stand near each other."""
+        """(n,) uint64 Morton codes of centres (n, 3)."""
         scale = (1 << BITS) / self.side
         codes = np.zeros(len(means), np.uint64)
         for axis in range(3):
@@ -44,12 +44,12 @@ class Grid:
         return codes
 
     def size(self, shift: int) -> float:
-        """Metres: edge of the cells whose codes agree but for their last 3 `shift` bits."""
+        """Edge [m] of cells whose codes agree except for their last 3 `shift` bits."""
         return self.side / (1 << BITS) * (1 << shift)
 
 
 def grid_around(means: np.ndarray) -> Grid:
-    """A grid for centres (n, 3) like these: a sample of them."""
+    """Grid around a sample of centres (n, 3)."""
     if not len(means):
         return Grid((0.0, 0.0, 0.0), 1.0)
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)

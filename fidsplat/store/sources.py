@@ -1,5 +1,4 @@
-"""What a store is built of: files of splats, PLY files mapped and all others loaded, as rows that are read in
-parts and brought to one set of columns."""
+"""Sources of a store: splat files as rows that are read in parts and converted to the store's columns."""
 
 from __future__ import annotations
 
@@ -21,31 +20,31 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
 
 _SAMPLES, _SAMPLE = 64, 4096
-"""parts of each source, and rows of each, by which bounds and the spread of splats are judged"""
+"""number of parts of each source, and rows of a part, that are sampled for bounds"""
 
 
 @dataclass(frozen=True)
 class Source:
-    """One input: its rows, and the origin (3,) float64 [m] that they are relative to."""
+    """One input: its rows, relative to an origin (3,) float64 [m]."""
 
     rows: Rows
     origin: np.ndarray
     stamp: str
-    """what tells this state of the input from a later one"""
+    """path, size and time of the file, to detect a later change"""
     first_plane: int = 0
-    """what its planes' ids are raised by, so that planes of different inputs stay different"""
+    """offset added to its coplanar group ids, so that groups of different inputs stay different"""
 
 
 def open_sources(inputs: Sequence[str | os.PathLike[str] | Source]) -> list[Source]:
-    """Raises InputError for no input, and as `load_splats` for a path of no file of splats."""
+    """Open splat files. Raises InputError for an empty list or a file that cannot be read."""
     if isinstance(inputs, (str, os.PathLike)):
         inputs = [inputs]
     if not isinstance(inputs, Sequence):
-        raise invalid("inputs", "a list of files of splats", inputs)
+        raise invalid("inputs", "a list of splat files", inputs)
     opened = [one if isinstance(one, Source) else _open(path_of(one)) for one in inputs]
     if not opened:
-        raise InputError("a store is built of files of splats; give one at least")
-    return with_planes_apart(opened)
+        raise InputError("inputs must be at least one splat file, got none")
+    return with_distinct_groups(opened)
 
 
 def _open(file: Path) -> Source:
@@ -63,7 +62,7 @@ def _open(file: Path) -> Source:
 def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
     """A cloud in memory as a source."""
     if cloud.boxes is not None:
-        raise InputError("a store holds no boxes; put markers into a scene file beside it")
+        raise InputError("a store cannot contain box footprints; put markers into a scene file next to it")
     arrays = {"means": cloud.means, "quats": cloud.quats, "opacities": cloud.opacities}
     scales = cloud.scales
     if cloud.thickness is not None:
@@ -80,8 +79,8 @@ def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
     return Source(Rows(name, len(cloud), columns, fill), cloud.origin, stamp)
 
 
-def with_planes_apart(sources: list[Source]) -> list[Source]:
-    """The sources, with ids of planes that no two have in common."""
+def with_distinct_groups(sources: list[Source]) -> list[Source]:
+    """The sources, with distinct coplanar group ids."""
     made, free = [], 0
     for source in sources:
         made.append(Source(source.rows, source.origin, source.stamp, free))
@@ -92,12 +91,12 @@ def with_planes_apart(sources: list[Source]) -> list[Source]:
 
 
 def spans(count: int, size: int) -> list[tuple[int, int]]:
-    """Ranges [first, end) of at most `size` that together are [0, count)."""
+    """Ranges [first, end) of at most `size` that cover [0, count)."""
     return [(first, min(first + size, count)) for first in range(0, count, size)]
 
 
 def degree_of(source: Source) -> int:
-    """SH degree of a source; -1 for plain colours, which SH of degree 0 are as well."""
+    """SH degree of a source; -1 for plain colours and for SH of degree 0."""
     if "sh" not in source.rows.columns:
         return -1
     terms = source.rows.columns["sh"][0][0]
@@ -105,8 +104,10 @@ def degree_of(source: Source) -> int:
 
 
 def sample(sources: Sequence[Source]) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (n, 3) float32 [m] of some splats of all sources, and the origin (3,) float64 that they are
-    relative to: that of all sources where they agree, else one that is near."""
+    """Sampled centres (n, 3) float32 [m] of all sources, relative to the returned origin (3,) float64.
+
+    The origin is that of all sources if they agree, else a point near the splats.
+    """
     means, single, scales = [], [], []
     for source in sources:
         count = source.rows.count
@@ -128,8 +129,8 @@ def sample(sources: Sequence[Source]) -> tuple[np.ndarray, np.ndarray]:
 def splats_of(
     source: Source, span: tuple[int, int], origin: np.ndarray, columns: dict[str, str], sh_degree: int
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """The splats of a range of rows in the columns of a store, relative to its origin (3,) float64, and how
-    many cannot be drawn for each reason."""
+    """Splats of a range of rows, in a store's columns and relative to its origin (3,) float64; and the number
+    of invalid splats by reason."""
     part, dropped = window(source.rows, *span)
     count = len(part["means"])
     means = part["means"]

@@ -1,4 +1,4 @@
-"""Store: splats on disk, opened."""
+"""Store: splats on disk, memory-mapped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fidsplat.splats.arrays import find_defects
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.store import layout
-from fidsplat.store.detail import Detail, load_details, pixels
+from fidsplat.store.detail_errors import DetailErrors, allowed_cell_size, load_detail_errors
 from fidsplat.store.partial_cloud import PartialCloud, concatenated, transformed
 from fidsplat.util.arguments import callback, flag, instance, invalid, whole_number
 from fidsplat.util.arguments import number as checked_number
@@ -28,32 +28,33 @@ from fidsplat.util.summaries import Summarised, point
 
 
 class Store(Summarised):
-    """A store that `fidsplat store build` made, or one of places at which another stands. Nothing of its
-    splats is read before it is drawn, and then what a view needs.
+    """Splats on disk, built by `fidsplat store build` or instanced by `fidsplat store place`.
 
-    A store of places (`fidsplat store place`) has the splats of the other as many times, the first place's
-    first. Threads may share one; it is pickled by its path.
+    Splats are read when a view needs them. An instanced store shows another store's splats at several poses,
+    those of the first pose first. Threads may share a store; it is pickled by its path.
 
     Args:
         path: its folder, e.g. city.fss.
 
     Raises:
-        InputError: it is no store, not whole, damaged, or of a newer version.
+        InputError: the folder is not a store, or incomplete, damaged or of a newer version.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = path_of(path)
         if not self.path.is_dir():
-            raise InputError(f"{self.path} is not a store: there is no such folder")
+            raise InputError(f"{self.path} is not a store: the folder does not exist")
         header = self.header = layout.read_header(self.path)
         self.poses: np.ndarray | None = None
-        """(p, 4, 4) float64 places, of a store of places"""
+        """(p, 4, 4) float64 poses of an instanced store"""
         self._folder, own = self.path, header
         if header.store is not None:
             self._folder = self.path / header.store
             own = layout.read_header(self._folder)
             if own.identity != header.identity or own.store is not None:
-                raise InputError(f"{self._folder} is not what {self.path} was made of; place the store again")
+                raise InputError(
+                    f"{self._folder} has changed since {self.path} was placed; place the store again"
+                )
             self.poses = _read_poses(self.path, header.places_crc)
             if (
                 replace(
@@ -65,10 +66,12 @@ class Store(Summarised):
                 )
                 != header
             ):
-                raise InputError(f"{self.path / layout.HEADER} does not fit its poses; place the store again")
+                raise InputError(
+                    f"{self.path / layout.HEADER} does not match its poses; place the store again"
+                )
         self._own = own
         self.nodes = layout.read_nodes(self._folder, own)
-        """(n,) records of `layout.NODE`: chunks and the nodes above them, of one place"""
+        """(n,) records of `layout.NODE`: chunks and nodes of levels of detail, of one instance"""
         self._columns = self._mapped()
         if self.has_planes:  # the coplanar groups are prepared on the host, and belong to every frame
             rows = self._rows(own.pinned, own.splats, None)
@@ -90,7 +93,7 @@ class Store(Summarised):
         return f"Store({str(self.path)!r}, {len(self):,} splats{places})"
 
     def summary(self) -> dict[str, str]:
-        """What it holds, in words."""
+        """Its content in words."""
         rows = {"splats": f"{len(self):,}", "chunks": f"{self.chunks:,}"}
         rows["colours"] = "plain" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
         if self.poses is not None:
@@ -99,7 +102,7 @@ class Store(Summarised):
             rows["bounds"] = " to ".join(map(point, self.bounds())) + " m"
         return rows | {f"left out: {why}": f"{n:,}" for why, n in self.header.dropped.items()}
 
-    # traits, as those of a cloud
+    # traits, like those of a cloud
 
     @property
     def sh_degree(self) -> int:
@@ -108,12 +111,12 @@ class Store(Summarised):
 
     @property
     def has_planes(self) -> bool:
-        """Whether some splats are printed on planes."""
+        """Whether some splats belong to coplanar groups."""
         return "planes" in self._own.columns
 
     @property
     def footprint(self) -> str:
-        """gaussian: a store holds no boxes."""
+        """Always `gaussian`: a store cannot contain box footprints."""
         return "gaussian"
 
     @property
@@ -128,23 +131,23 @@ class Store(Summarised):
 
     @property
     def identity(self) -> str:
-        """Hexadecimal digits that tell its content from that of every other store."""
+        """Hexadecimal digest of its content."""
         places = "" if self.poses is None else self.poses.tobytes().hex()
         return self.header.identity + places
 
     @property
     def places(self) -> int:
-        """How many times its chunks are drawn: 1 for a store of its own splats."""
+        """Number of instances: 1 for a store with its own splats."""
         return 1 if self.poses is None else len(self.poses)
 
     @property
     def chunks(self) -> int:
-        """Chunks of all places."""
+        """Number of chunks of all instances."""
         return self.places * int(np.count_nonzero(self.nodes["level"] == 0))
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its files; of a store of places those of the store that stands there."""
+        """Bytes of its files; for an instanced store those of the other store."""
         return sum(file.stat().st_size for file in self._folder.iterdir() if file.is_file())
 
     @property
@@ -155,7 +158,7 @@ class Store(Summarised):
 
     def bounds(self, sigmas: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
         """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats to that many standard
-        deviations; somewhat larger than that of a cloud, since it is made of the boxes of chunks.
+        deviations. It is the union of the chunks' boxes, so somewhat larger than that of a cloud.
 
         Raises InputError for an empty store.
         """
@@ -166,34 +169,35 @@ class Store(Summarised):
         return low[leaves].min(axis=0) + self.origin, high[leaves].max(axis=0) + self.origin
 
     @cached_property
-    def details(self) -> list[Detail]:
-        """What its levels of detail were measured to cost; those of a store that is placed are its own."""
-        return load_details(self._folder, self.header.identity)
+    def detail_errors(self) -> list[DetailErrors]:
+        """Measured errors of its levels of detail; for an instanced store those of the other store."""
+        return load_detail_errors(self._folder, self.header.identity)
 
     @property
     def levels(self) -> int:
-        """Levels of detail above the chunks."""
+        """Number of levels of detail above the chunks."""
         return int(self.nodes["level"].max(initial=0))
 
-    def pixels_of(self, quality: Quality) -> tuple[float, ...]:
-        """Of each level, from 0, how small [samples] its cells must be to be drawn, by a quality's
-        `detail_error`; 0: never.
+    def cell_sizes(self, quality: Quality) -> tuple[float, ...]:
+        """Size on the image [samples] below which cells of each level, from 0, are rendered; 0: never.
 
-        Raises InputError where it was not measured.
+        It follows from the quality's `detail_error`. Raises InputError if the error was not measured.
         """
         instance("quality", quality, Quality)
         if not self.levels:
-            return (0.0,)  # nothing stands for others: always exact
-        measured = [detail for detail in self.details if detail.lowpass == quality.lowpass]
+            return (0.0,)  # no levels of detail: always exact
+        measured = [one for one in self.detail_errors if one.lowpass == quality.lowpass]
         if measured:
-            return tuple(pixels(measured, level, quality.detail_error) for level in range(self.levels + 1))
+            return tuple(
+                allowed_cell_size(measured, level, quality.detail_error) for level in range(self.levels + 1)
+            )
         raise InputError(
-            f"detail_error is {quality.detail_error:g}, but what levels of detail cost {self.path} with "
-            f"lowpass={quality.lowpass} was not measured; run `fidsplat store measure {self._folder} "
-            f"--lowpass {quality.lowpass}`, or draw with detail_error=0"
+            f"detail_error must be 0 for {self.path}, whose levels of detail were not measured with "
+            f"lowpass={quality.lowpass}, got {quality.detail_error:g}; run `fidsplat store measure "
+            f"{self._folder} --lowpass {quality.lowpass}`"
         )
 
-    # nodes of all places: node i of place p has the number p * len(nodes) + i
+    # nodes of all instances: node i of instance p has the number p * len(nodes) + i
 
     def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corners, (places * nodes, 3) float64 [m] from the origin, of boxes around the
@@ -201,7 +205,7 @@ class Store(Summarised):
         sigmas = checked_number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         nodes, share = self.nodes, min(sigmas / layout.FAR, 1.0)
         beyond = np.maximum(sigmas - layout.FAR, 0.0) * nodes["reach"].astype(np.float64)[:, None]
-        # what a box reaches is convex in the number of standard deviations: below its chord
+        # the extent of a box is a convex function of the number of standard deviations: below its chord
         low = (1 - share) * nodes["low"].astype(np.float64) + share * nodes["far_low"] - beyond
         high = (1 - share) * nodes["high"].astype(np.float64) + share * nodes["far_high"] + beyond
         if self.poses is None:
@@ -215,7 +219,7 @@ class Store(Summarised):
     def placed_boxes(
         self, low: np.ndarray, high: np.ndarray, places: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes (k, 3) of the store that is placed, each at its place (k,)."""
+        """Boxes (k, 3) of the other store, each at the pose of an instance (k,)."""
         assert self.poses is not None
         turns = self.poses[places, :3, :3]
         center, half = (low + high) / 2, (high - low) / 2
@@ -224,32 +228,33 @@ class Store(Summarised):
 
     @cached_property
     def _moves(self) -> np.ndarray:
-        """(p, 3) float64 metres: where each place has the zero of the placed store's means."""
+        """(p, 3) float64 metres: translation of the other store's means to each instance."""
         assert self.poses is not None
         inner, outer = np.array(self._own.origin), self.origin
         return self.poses[:, :3, :3] @ inner + self.poses[:, :3, 3] - outer
 
     def first_of(self, numbers: np.ndarray) -> np.ndarray:
-        """(k,) int64: the index in the whole scene of the first splat of chunks, by their numbers; -1 for
-        nodes that stand for others."""
+        """(k,) int64: index of the first splat of chunks, by number; -1 for nodes of levels of detail."""
         place, node = np.divmod(self._checked(numbers), max(len(self.nodes), 1))
         own = self.nodes[node]
         return np.where(own["level"] == 0, own["first"] + place * self._own.splats, -1)
 
     def counts(self, numbers: np.ndarray) -> np.ndarray:
-        """(k,) splats of nodes, by their numbers."""
+        """(k,) number of splats of nodes, by their numbers."""
         return self.nodes["count"][self._checked(numbers) % max(len(self.nodes), 1)]
 
     def _checked(self, numbers: np.ndarray) -> np.ndarray:
-        """Numbers of nodes, (k,). Raises InputError for others."""
+        """Validated numbers of nodes, (k,)."""
         given, count = real_array("numbers", numbers), self.places * len(self.nodes)
         if not ((given == np.rint(given)) & (given >= 0) & (given < count)).all():
             raise invalid("numbers", f"whole numbers of nodes, 0 to {count - 1}", numbers)
         return given.astype(np.int64)
 
     def load(self, number: int, placed: bool = True) -> dict[str, np.ndarray]:
-        """The splats of a node, by its number: arrays as a cloud has them, relative to `origin`. placed:
-        whether where the node is placed, or as the store has them that stands there."""
+        """Splats of a node, by its number: arrays like those of a cloud, relative to `origin`.
+
+        placed: whether to apply the pose of the instance.
+        """
         last = self.places * len(self.nodes) - 1
         flag("placed", placed)
         place, node = divmod(whole_number("the number of a node", number, 0, last), len(self.nodes))
@@ -258,7 +263,7 @@ class Store(Summarised):
 
     @cached_property
     def pose_rows(self) -> np.ndarray:
-        """(p, 16) float64: each place as `Chunk.pose` says it; (0, 16) of a store of its own splats."""
+        """(p, 16) float64: poses in the layout of `Chunk.pose`; (0, 16) if it is not instanced."""
         if self.poses is None:
             return np.empty((0, 16))
         turns = self.poses[:, :3, :3]
@@ -266,30 +271,29 @@ class Store(Summarised):
         return np.concatenate([turns.reshape(-1, 9), self._moves, quats], axis=1)
 
     def labels(self) -> set[int]:
-        """The labels that its splats have; all of that column is read."""
+        """Labels of its splats. Reads the complete column."""
         if "labels" not in self._columns:
             return {0} if len(self) else set()
         made: set[int] = set()
-        for node in self.nodes[self.nodes["level"] == 0]:  # a chunk at a time: all may not fit
+        for node in self.nodes[self.nodes["level"] == 0]:  # by chunks, for bounded memory
             rows = self._columns["labels"][node["first"] : node["first"] + node["count"]]
             made.update(np.unique(rows).tolist())
         return made
 
     def last_plane(self) -> int:
-        """The largest id of its planes; -1 without."""
+        """Largest id of its coplanar groups; -1 without."""
         if not self.has_planes:
             return -1
         return int(self._columns["planes"][self._own.pinned : self._own.splats].max(initial=-1))
 
     def cloud(self) -> SplatCloud:
-        """All of its splats in one cloud, mapped where the files have them as they are drawn, else in memory:
-        the scene that its pictures are bit for bit those of."""
+        """All splats in one cloud, mapped from the files where possible. Frames of the store are
+        bit-identical to frames of this cloud."""
         parts = [self._rows(0, self._own.splats, place) for place in range(self.places)]
         return PartialCloud.of(concatenated(parts), self, self.header.dropped)
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """What is damaged, in words: every chunk is read, compared with its checksum, and searched for
-        values that cannot be rendered. Empty: it is whole."""
+        """Check every chunk's checksum and values, and return a description of each damage."""
         callback("progress", progress)
         wrong = []
         for number, node in enumerate(self.nodes):
@@ -297,9 +301,7 @@ class Store(Summarised):
             rows = {name: array[first:end] for name, array in self._columns.items()}
             kind = "chunk" if node["level"] == 0 else "node"
             if layout.checksum(rows) != node["crc"]:
-                wrong.append(
-                    f"{kind} {number}, rows {first} to {end - 1}, is damaged: its checksum is another"
-                )
+                wrong.append(f"{kind} {number}, rows {first} to {end - 1}, is damaged: its checksum differs")
             elif values := _unrenderable(rows, merged=node["level"] > 0):
                 wrong.append(f"{kind} {number}, rows {first} to {end - 1}, has splats with {values}")
             if progress is not None:
@@ -314,7 +316,7 @@ class Store(Summarised):
         }
 
     def _rows(self, first: int, end: int, place: int | None) -> dict[str, np.ndarray]:
-        """Splats of rows [first, end) at a place; None: as they are stored."""
+        """Splats of rows [first, end) at the pose of an instance; None: as stored."""
         made = {name: array[first:end] for name, array in self._columns.items()}
         for name in {"sh", "colors"} & set(made):
             made[name] = made[name].astype(np.float32, copy=False)
@@ -338,8 +340,7 @@ def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:
 
 
 def _rounded(middles: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corners of placed boxes, with room for the rounding of placed centres to float32: a
-    millionth of the way."""
+    """Lowest and highest corners of placed boxes, padded by 1e-6 for the rounding of centres to float32."""
     around = around + 1e-6 * (np.abs(middles) + around)
     return middles - around, middles + around
 

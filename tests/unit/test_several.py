@@ -13,7 +13,7 @@ from fidsplat.store import build_plan
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build_plan, "_LEAST_MEMORY", 0)
+        patch.setattr(build_plan, "_MIN_MEMORY", 0)
         return made_store(tmp_path_factory.mktemp("several"), splats(1), "disks")
 
 

@@ -108,11 +108,11 @@ def test_chunks_whose_levels_take_more_than_the_memory_are_refused(files, tmp_pa
             with lock:
                 under_way -= 1
 
-    monkeypatch.setattr(build_plan, "_MERGING", (400, 6))
+    monkeypatch.setattr(build_plan, "_MERGE_BYTES", (400, 6))
     monkeypatch.setattr(build, "merged", merged)
-    with pytest.raises(fs.InputError, match=r"chunk is 500; .* and memory is 1 MiB") as refused:
+    with pytest.raises(fs.InputError, match=r"at most .* in 1 MiB of memory, got 500") as refused:
         fs.build_store(files, tmp_path / "both.fss", **SMALL)
-    fitting = int(re.findall("take ([0-9]+) at most", str(refused.value))[0])
+    fitting = int(re.findall("at most ([0-9]+) for", str(refused.value))[0])
     fs.build_store(files, tmp_path / "both.fss", **SMALL | {"chunk": fitting})
     assert (64 < fitting < 500, most) == (True, 1)
     fs.build_store(files, tmp_path / "plain.fss", levels=False, **SMALL)
@@ -157,7 +157,7 @@ def test_what_is_begun_from_other_files_is_begun_anew(files, store, tmp_path):
 def test_a_full_disk_is_said_and_gone_on_with(files, store, tmp_path):
     with (
         small_files(100_000),
-        pytest.raises(fs.InputError, match="make room, then give the same command again"),
+        pytest.raises(fs.InputError, match="free some space, then run the same command"),
     ):
         fs.build_store(files, tmp_path / "both.fss", **SMALL)
     assert not (tmp_path / "both.fss").exists()
@@ -167,5 +167,5 @@ def test_a_full_disk_is_said_and_gone_on_with(files, store, tmp_path):
 
 def test_a_disk_without_room_is_said_first(files, tmp_path, monkeypatch):
     monkeypatch.setattr(build.shutil, "disk_usage", lambda folder: type("", (), {"free": 10_000})())
-    with pytest.raises(fs.InputError, match="make room, or build elsewhere"):
+    with pytest.raises(fs.InputError, match="free some space, or build elsewhere"):
         fs.build_store(files, tmp_path / "both.fss", **SMALL)

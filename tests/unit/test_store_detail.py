@@ -9,15 +9,21 @@ import pytest
 from test_store_drawing import splats
 
 import fidsplat as fs
+from fidsplat.accuracy.detail_errors import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.accuracy.error import truth
-from fidsplat.accuracy.level_of_detail import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.accuracy.price_list import load as load_prices
 from fidsplat.accuracy.quality_within import Choice
 from fidsplat.backends.prepare import prepare
 from fidsplat.cli import main
 from fidsplat.store import build_plan
 from fidsplat.store.chunked_splats import ChunkedSplats
-from fidsplat.store.detail import MARGIN, Detail, load_details, pixels, save_details
+from fidsplat.store.detail_errors import (
+    MARGIN,
+    DetailErrors,
+    allowed_cell_size,
+    load_detail_errors,
+    save_detail_errors,
+)
 from fidsplat.store.sources import sample, splats_of
 from fidsplat.streaming.frustum_culling import projected_sizes
 from fidsplat.streaming.level_of_detail import select
@@ -30,7 +36,7 @@ QUALITY = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8)
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build_plan, "_LEAST_MEMORY", 0)
+        patch.setattr(build_plan, "_MIN_MEMORY", 0)
         city = City(6000, houses=2)
         return fs.Store(fs.build_store([city.source], tmp_path_factory.mktemp("city") / "c.fss", chunk=128))
 
@@ -123,17 +129,17 @@ def test_errors_grow_with_the_size_of_cells_and_are_kept_beside_the_store(store,
     assert len(met) >= 4
     assert met[-1][1] > 0.02 > 1.5 * met[0][1]
     again = fs.Store(store.path)
-    assert again.details == [made, *coarser]
+    assert again.detail_errors == [made, *coarser]
     allowed = MARGIN * met[0][1] + 1e-9
-    limits = again.pixels_of(QUALITY.with_(detail_error=allowed))
+    limits = again.cell_sizes(QUALITY.with_(detail_error=allowed))
     assert limits[0] == 0.0
     assert limits[1] >= met[0][0]
-    assert set(again.pixels_of(QUALITY.with_(detail_error=1e-9))) == {0.0}
+    assert set(again.cell_sizes(QUALITY.with_(detail_error=1e-9))) == {0.0}
     loose, tight = QUALITY.with_(detail_error=0.3), QUALITY.with_(detail_error=allowed)
     assert ChunkedSplats([again]).cell_sizes(loose, tight) == (limits,)
     assert ChunkedSplats([again]).cell_sizes(QUALITY) == 0.0
     with pytest.raises(fs.InputError, match=r"store measure .* --lowpass none"):
-        again.pixels_of(fs.Quality(lowpass="none", detail_error=0.1))
+        again.cell_sizes(fs.Quality(lowpass="none", detail_error=0.1))
 
 
 @pytest.mark.parametrize("device", ["opencl", "warp:cpu"])
@@ -159,12 +165,12 @@ def test_a_picture_at_no_allowed_error_is_exact(store, renderer):
 
 
 def measured(level, sizes, errors):
-    return Detail("pixel", level, sizes, errors, 3, "here", "today")
+    return DetailErrors("pixel", level, sizes, errors, 3, "here", "today")
 
 
 def test_the_view_that_needs_most_decides_the_levels_of_a_batch(store, renderer):
     sizes, errors = (0.05, 0.5, 4.0), (1e-4, 1e-3, 1e-2)
-    save_details(store.path, store.identity, [measured(level, sizes, errors) for level in range(1, 9)])
+    save_detail_errors(store.path, store.identity, [measured(level, sizes, errors) for level in range(1, 9)])
     resident, quality = renderer.upload(fs.Store(store.path)), QUALITY.with_(detail_error=0.05)
 
     def batch_of(*away, quality=quality):
@@ -189,27 +195,35 @@ def test_the_view_that_needs_most_decides_the_levels_of_a_batch(store, renderer)
 
 def test_sizes_that_no_view_met_are_not_promised():
     one = measured(1, (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1))
-    assert pixels([one], 1, 0.001) == 0.0
-    assert pixels([one], 1, MARGIN * 0.002) == 0.2
-    assert pixels([one], 1, 0.1) == 0.2
-    assert pixels([one], 1, MARGIN * 0.1) == 0.8
+    assert allowed_cell_size([one], 1, 0.001) == 0.0
+    assert allowed_cell_size([one], 1, MARGIN * 0.002) == 0.2
+    assert allowed_cell_size([one], 1, 0.1) == 0.2
+    assert allowed_cell_size([one], 1, MARGIN * 0.1) == 0.8
     # what was worse at a smaller size counts at a larger one
-    assert pixels([measured(1, (0.1, 0.2), (0.5, 0.001))], 1, 0.01) == 0.0
+    assert allowed_cell_size([measured(1, (0.1, 0.2), (0.5, 0.001))], 1, 0.01) == 0.0
 
 
 def test_what_the_levels_beside_it_err_by_counts_for_a_level():
     errors = {1: (0.001, None), 2: (None, 0.003), 3: (0.1, 0.2), 5: (0.001, 0.002)}
     every = [measured(level, (0.1, 0.2), own) for level, own in errors.items()]
-    assert [pixels(every, level, 0.01) for level in range(7)] == [0.0, 0.2, 0.0, 0.0, 0.0, 0.2, 0.0]
+    assert [allowed_cell_size(every, level, 0.01) for level in range(7)] == [
+        0.0,
+        0.2,
+        0.0,
+        0.0,
+        0.0,
+        0.2,
+        0.0,
+    ]
 
 
 def test_what_was_measured_with_another_store_does_not_count(tmp_path):
-    details = [Detail(name, 1, (0.1,), (0.2,), 1, "here", "today") for name in ("pixel", "screen")]
-    save_details(tmp_path, "a", details)
-    save_details(tmp_path, "a", [Detail("pixel", 1, (0.3,), (None,), 1, "here", "today")])
-    kept = load_details(tmp_path, "a")
+    details = [DetailErrors(name, 1, (0.1,), (0.2,), 1, "here", "today") for name in ("pixel", "screen")]
+    save_detail_errors(tmp_path, "a", details)
+    save_detail_errors(tmp_path, "a", [DetailErrors("pixel", 1, (0.3,), (None,), 1, "here", "today")])
+    kept = load_detail_errors(tmp_path, "a")
     assert [(one.lowpass, one.sizes) for one in kept] == [("pixel", (0.3,)), ("screen", (0.1,))]
-    assert load_details(tmp_path, "b") == []
+    assert load_detail_errors(tmp_path, "b") == []
     whole = (tmp_path / "detail.json").read_bytes()
     for damage in (
         b"{",
@@ -219,21 +233,21 @@ def test_what_was_measured_with_another_store_does_not_count(tmp_path):
     ):
         (tmp_path / "detail.json").write_bytes(damage)
         with pytest.raises(fs.InputError, match="store measure"):
-            load_details(tmp_path, "a")
+            load_detail_errors(tmp_path, "a")
 
 
 def test_what_cannot_be_measured_is_said(store, renderer, tmp_path):
     placed = fs.Store(fs.place_store(store, tmp_path / "p.fss", [np.eye(4)]))
-    with pytest.raises(fs.InputError, match="a store of places; measure"):
+    with pytest.raises(fs.InputError, match="is instanced; measure"):
         measure_detail(placed, renderer)
-    with pytest.raises(fs.InputError, match="views is 0"):
+    with pytest.raises(fs.InputError, match=r"views must be .* got 0"):
         measure_detail(store, renderer, views=0)
-    with pytest.raises(fs.InputError, match="known: screen, pixel, none"):
+    with pytest.raises(fs.InputError, match="among screen, pixel, none"):
         measure_detail(store, renderer, lowpass=("box",))
     flat = fs.Store(fs.build_store([City(300).source], tmp_path / "flat.fss", levels=False))
     with pytest.raises(fs.InputError, match="no levels of detail"):
         measure_detail(flat, renderer)
-    assert flat.pixels_of(QUALITY.with_(detail_error=0.1)) == (0.0,)  # beside others it stays exact
+    assert flat.cell_sizes(QUALITY.with_(detail_error=0.1)) == (0.0,)  # beside others it stays exact
     with pytest.raises(fs.InputError, match="detail_error is 1"):
         fs.Quality(detail_error=1.0)
 

@@ -320,8 +320,8 @@ def test_a_scene_has_no_more_splats_than_indices(stores, monkeypatch):
     with pytest.raises(fs.InputError, match="at most 5,999 splats, got 6,000"):
         ChunkedSplats([stores["disks"], stores["thick"]])
     monkeypatch.setattr(build_plan, "MAX_SPLATS", COUNT - 1)
-    with pytest.raises(fs.InputError, match="3,000 splats are too many for a store"):
-        build_plan.plan_of([source_of(splats(1), stores["disks"].path, "test")])
+    with pytest.raises(fs.InputError, match="at most 2,999 splats, got 3,000"):
+        build_plan.plan_build([source_of(splats(1), stores["disks"].path, "test")])
 
 
 def test_planes_of_stores_are_always_whole(tmp_path, reference):

@@ -40,8 +40,8 @@ def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("values")
     fs.save_ply(cloud, made / "a.ply")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build_plan, "_LEAST_MEMORY", 0)
-        patch.setattr(build_plan, "_MERGING", (0, 0.01))
+        patch.setattr(build_plan, "_MIN_MEMORY", 0)
+        patch.setattr(build_plan, "_MERGE_BYTES", (0, 0.01))
         return fs.build_store([made / "a.ply"], made / "a.fss", chunk=100, memory=1 << 20)
 
 
@@ -65,7 +65,7 @@ def crafted(folder, target, column, rows, value):
 @pytest.mark.parametrize("column", list(VALUES))
 def test_damaged_splats_are_harmless_when_rendered(folder, tmp_path, monkeypatch, renderer, column):
     monkeypatch.setattr(
-        fs.Store, "pixels_of", lambda store, quality: (0.0, *[1e9 * quality.detail_error] * store.levels)
+        fs.Store, "cell_sizes", lambda store, quality: (0.0, *[1e9 * quality.detail_error] * store.levels)
     )
     store = fs.Store(folder)
     assert store.levels

@@ -1,5 +1,4 @@
-"""Measuring what levels of detail cost: pictures of a store with its cells merged up to a size, against the
-exact ones, from many places."""
+"""Measurement of the error of a store's levels of detail: merged against exact frames, from many poses."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import LOWPASS, Quality
 from fidsplat.render.renderer import Renderer
 from fidsplat.store.chunked_splats import ChunkedSplats
-from fidsplat.store.detail import Detail, load_details, save_details
+from fidsplat.store.detail_errors import DetailErrors, load_detail_errors, save_detail_errors
 from fidsplat.store.store import Store
 from fidsplat.streaming.level_of_detail import select
 from fidsplat.util.errors import InputError
@@ -33,43 +32,42 @@ def measure_detail(
     lowpass: Sequence[str] = ("pixel",),
     seed: int = 0,
     progress: Callable[[str, float], object] = lambda words, share: None,
-) -> list[Detail]:
-    """Measure errors by sizes with pictures from random places around and inside a store, and keep them
-    beside it, for `Quality.detail_error`.
+) -> list[DetailErrors]:
+    """Measure errors by cell size from random poses around and inside a store, for `Quality.detail_error`.
+
+    The errors are saved in the store's folder.
 
     Args:
-        views: places, by turns for each level. lowpass: those of `Quality.lowpass` to measure.
-        seed: of the places.
-        progress: called with what is being done and the share of it that is done, 0 to 1.
+        views: number of poses, each for one level in turn.
+        lowpass: values of `Quality.lowpass` to measure.
+        seed: seed of the poses.
+        progress: called with the current step and its share done, 0 to 1.
 
     Raises:
-        InputError: a store of places (measure what is placed), one without levels of detail or without
-            splats, or numbers that cannot be used.
+        InputError: an instanced store, one without levels of detail or splats, or an invalid option.
     """
     if store.poses is not None:
-        raise InputError(
-            f"{store.path} is a store of places; measure {store.header.store}, which stands there"
-        )
+        raise InputError(f"{store.path} is instanced; measure {store.header.store} instead")
     if not len(store) or not store.nodes["level"].any():
-        raise InputError(f"{store.path} has no levels of detail; build it with them, and of more splats")
+        raise InputError(f"{store.path} has no levels of detail; build it with them, from more splats")
     if isinstance(views, bool) or not isinstance(views, int) or not 1 <= views <= 10_000:
-        raise InputError(f"views is {views!r}; it must be a whole number from 1 to 10,000")
+        raise InputError(f"views must be a whole number from 1 to 10,000, got {views!r}")
     if unknown := set(lowpass) - set(LOWPASS):
-        raise InputError(f"lowpass is {min(unknown)!r}; known: {', '.join(LOWPASS)}")
+        raise InputError(f"lowpass must be among {', '.join(LOWPASS)}, got {min(unknown)!r}")
     made, levels = [], range(1, store.levels + 1)
     for number, one in enumerate(lowpass):
         worst: dict[int, list[float | None]] = {level: [None] * len(SIZES) for level in levels}
         for done, camera in enumerate(cameras_around(store, views, seed)):
             level = levels[done % len(levels)]
-            # a cut-off leaves out more of small splats than of those that stand for them
+            # a cut-off omits a larger share of small splats than of merged ones
             capture = Capture(camera, quality=Quality(lowpass=one, alpha_cutoff=TRUTH_CUTOFF))
             found = errors_of(store, renderer, capture, SIZES, level)
             worst[level] = [_larger(*pair) for pair in zip(worst[level], found, strict=True)]
             progress("measuring levels of detail", (number + (done + 1) / views) / len(lowpass))
         about = -(-views // len(levels)), renderer.device.title, date.today().isoformat()
-        made += [Detail(one, level, SIZES, tuple(errors), *about) for level, errors in worst.items()]
-    save_details(store.path, store.identity, made)
-    store.details = load_details(store.path, store.identity)
+        made += [DetailErrors(one, level, SIZES, tuple(errors), *about) for level, errors in worst.items()]
+    save_detail_errors(store.path, store.identity, made)
+    store.detail_errors = load_detail_errors(store.path, store.identity)
     return made
 
 
@@ -80,12 +78,14 @@ def _larger(one: float | None, other: float | None) -> float | None:
 def errors_of(
     store: Store, renderer: Renderer, capture: Capture, sizes: Sequence[float], level: int
 ) -> list[float | None]:
-    """The largest difference of rgb from the exact picture for each size [samples], rising, with nodes up to
-    a level; None where no cells are merged that smaller sizes would leave apart, or none that shows."""
+    """Largest rgb difference from the exact frame for each size [samples], rising, with nodes up to a level.
+
+    None where a size merges no more cells than the one below it, or none that are visible.
+    """
     splats = ChunkedSplats([store])
     features, view = prepare(splats, capture)
-    before, exact = select(splats, [view], features), None
-    whole = before
+    complete = before = select(splats, [view], features)
+    exact = None
     worst: list[float | None] = [None] * len(sizes)
     for number, size in enumerate(sizes):
         limits = tuple(size if 0 < at <= level else 0.0 for at in range(store.levels + 1))
@@ -93,16 +93,16 @@ def errors_of(
         if selection == before:
             continue
         if exact is None:
-            exact = renderer.render(splats.part(whole), capture)["rgb"].astype(np.float64)
-        picture = renderer.render(splats.part(selection), capture)["rgb"]
-        # what is merged where nobody sees it says nothing about this size
-        worst[number], before = float(np.abs(picture - exact).max()) or None, selection
+            exact = renderer.render(splats.part(complete), capture)["rgb"].astype(np.float64)
+        merged = renderer.render(splats.part(selection), capture)["rgb"]
+        # cells that are merged without a visible change give no error
+        worst[number], before = float(np.abs(merged - exact).max()) or None, selection
     return worst
 
 
 def cameras_around(store: Store, count: int, seed: int = 0) -> Iterator[Camera]:
-    """Cameras that look at random chunks, from where the cells of each level in turn are of all sizes of
-    `SIZES` on the picture."""
+    """Cameras that look at random chunks, at distances where the cells of each level in turn have the sizes
+    `SIZES` on the image."""
     generator = np.random.default_rng(seed)
     nodes = store.nodes
     chunks = nodes[nodes["level"] == 0]
@@ -113,7 +113,7 @@ def cameras_around(store: Store, count: int, seed: int = 0) -> Iterator[Camera]:
     for number in range(count):
         chunk = chunks[generator.integers(len(chunks))]
         target = (chunk["low"] + chunk["high"]).astype(np.float64) / 2 + store.origin
-        # spread over the sizes, so that each is met
+        # stratified over the sizes
         share = (number // len(edges) + generator.random()) / rounds
         size = SIZES[0] * (SIZES[-1] / SIZES[0]) ** share
         away = edges[number % len(edges)] * focal / size

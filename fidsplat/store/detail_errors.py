@@ -1,5 +1,4 @@
-"""What levels of detail were measured to cost: of each low-pass the largest error of pictures by the size on
-the picture below which cells are not told apart."""
+"""Measured errors of a store's levels of detail, by low-pass, level and cell size on the image."""
 
 from __future__ import annotations
 
@@ -15,53 +14,51 @@ from fidsplat.util.files import atomic_write, from_json, read_input
 
 FILE = "detail.json"
 MARGIN = 3.0
-"""how many times below the requested error the largest measured one must be: other views exceed the measured
-ones, and a few exceed the requested error too"""
+"""factor between the requested error and the largest measured one: other views have larger errors than the
+measured views, and a few still exceed the requested error"""
 
 
 @dataclass(frozen=True)
-class Detail:
-    """Errors by sizes, as they were measured with a store."""
+class DetailErrors:
+    """Measured errors of one level of detail, by cell size."""
 
     lowpass: str
-    """of the pictures"""
+    """low-pass of the frames"""
     level: int
-    """of the nodes that were drawn, and those below it"""
+    """highest level of the rendered nodes"""
     sizes: tuple[float, ...]
-    """samples, rising: cells that are smaller are not told apart"""
+    """samples, rising: cells below this size on the image are merged"""
     errors: tuple[float | None, ...]
-    """largest difference of rgb from the exact picture over all views, of each size; None where no view had
+    """largest difference of rgb from the exact frame over all views, for each size; None where no view had
     cells of about this size"""
     views: int
     device: str
     date: str
 
 
-def pixels(details: Iterable[Detail], level: int, error: float) -> float:
-    """The largest size [samples] at which cells of a level may stand for those below them, so that the
-    measured views are off by at most `error` / `MARGIN`; 0: none. Other views may exceed `error`. Sizes that
-    no measured view met are not used.
+def allowed_cell_size(measured: Iterable[DetailErrors], level: int, error: float) -> float:
+    """Largest cell size [samples] of a level whose error in the measured views is at most `error` / `MARGIN`.
 
-    The level above and the one below count too: cells of a size err alike, but few views meet a level's cells
-    where they err most, in the gaps between what they are of.
+    0: none. Other views may exceed `error`. Sizes that no measured view contained are not used. The adjacent
+    levels count too: cells of equal size have similar errors, but few views contain a level's cells where
+    their error is largest, in the gaps between surfaces.
     """
-    near = [one for one in details if abs(one.level - level) <= 1]
+    near = [one for one in measured if abs(one.level - level) <= 1]
     if not any(one.level == level for one in near):
         return 0.0
-    met = [pair for one in near for pair in zip(one.sizes, one.errors, strict=True)]
+    pairs = [pair for one in near for pair in zip(one.sizes, one.errors, strict=True)]
     largest, found = 0.0, 0.0
-    for size in sorted({size for size, _ in met}):
-        measured = [wrong for at, wrong in met if at == size and wrong is not None]
-        if measured:
-            largest = max(largest, *measured)
+    for size in sorted({size for size, _ in pairs}):
+        errors = [own for at, own in pairs if at == size and own is not None]
+        if errors:
+            largest = max(largest, *errors)
             found = size if largest * MARGIN <= error else found
     return found
 
 
-def save_details(folder: Path, identity: str, details: Sequence[Detail]) -> None:
-    """Write what was measured beside a store; of low-passes that were measured before what is not replaced
-    stays."""
-    every = [*load_details(folder, identity), *details]
+def save_detail_errors(folder: Path, identity: str, measured: Sequence[DetailErrors]) -> None:
+    """Write measured errors into a store's folder; earlier ones of other low-passes and levels stay."""
+    every = [*load_detail_errors(folder, identity), *measured]
     known = {(one.lowpass, one.level): one for one in every}
     rows = [vars(one) for _, one in sorted(known.items())]
     with atomic_write(folder / FILE) as stream:
@@ -69,9 +66,9 @@ def save_details(folder: Path, identity: str, details: Sequence[Detail]) -> None
         stream.write(json.dumps(said | {"crc": header_crc(said)}, indent=1).encode())
 
 
-def load_details(folder: Path, identity: str) -> list[Detail]:
-    """What was measured with a store; nothing, if it was another one then. Raises InputError for a file that
-    is damaged."""
+def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
+    """The measured errors of a store; empty if they are of other content. Raises InputError for a damaged
+    file."""
     file = folder / FILE
     if not file.exists():
         return []
@@ -83,7 +80,7 @@ def load_details(folder: Path, identity: str) -> list[Detail]:
         if said["identity"] != identity:
             return []
         rows = [row | {name: tuple(row[name]) for name in ("sizes", "errors")} for row in said["details"]]
-        made = [Detail(**row) for row in rows]
+        made = [DetailErrors(**row) for row in rows]
         for one in made:
             if len(one.sizes) != len(one.errors) or list(one.sizes) != sorted(map(float, one.sizes)):
                 raise ValueError
