@@ -300,7 +300,7 @@ def test_scribbles_are_refused(tmp_path):
 def test_one_outline_many_times_over_is_refused_soon(tmp_path):
     """Without crossings, but each piece of it has all others near."""
     begun = time.process_time()
-    with pytest.raises(fs.InputError, match=r"at most 20,000,000 pairs of pieces near each other; simplify"):
+    with pytest.raises(fs.InputError, match=r"at most 5,000,000 pairs of pieces near each other; simplify"):
         drawn(tmp_path, 3000 * '<rect width="9" height="9"/>')
     assert time.process_time() - begun < 10
 
