@@ -28,7 +28,7 @@ from rich.progress import Progress
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.util.timing import Clock, Timer, quartiles, ratios, take_turns
 
-ARRAYS = ("means", "quats", "scales", "opacities", "colors", "boxes", "planes")
+ARRAYS = ("means", "quats", "scales", "opacities", "colors", "boxes", "coplanar_groups")
 ROOT = Path(__file__).resolve().parent.parent
 CHILD = """
 import hashlib, json, sys, time
@@ -37,10 +37,11 @@ import fidsplat as fs
 scene = np.load(sys.argv[1])
 given = {name: scene[name] for name in scene.files}
 width, height, focal = given.pop("camera")
-boxes, planes = given.pop("boxes", None), given.pop("planes", None)
+boxes, groups = given.pop("boxes", None), given.pop("coplanar_groups", None)
 cloud = fs.SplatCloud(**given)
 cloud = cloud if boxes is None else cloud.with_boxes(boxes)
-cloud = cloud if planes is None else cloud.with_planes(planes)
+grouped = getattr(cloud, "with_coplanar_groups", None) or cloud.with_planes
+cloud = cloud if groups is None else grouped(groups)
 camera = fs.Camera.pinhole(int(width), int(height), focal, focal, width / 2, height / 2)
 renderer = fs.Renderer(sys.argv[2])
 resident = renderer.upload(cloud)

@@ -62,7 +62,7 @@ def random_scene(seed: int, crossing: bool = False) -> RandomScene:
     camera = Camera.pinhole(width, height, focal, focal, cx, cy, near=near)
     r, g, b = generator.uniform(0, 1, 3) * generator.integers(0, 2)
     background = (float(r), float(g), float(b))
-    return RandomScene(cloud.with_planes(planes) if printed else cloud, camera, background)
+    return RandomScene(cloud.with_coplanar_groups(planes) if printed else cloud, camera, background)
 
 
 def _count(generator: np.random.Generator, most: int) -> int:

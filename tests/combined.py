@@ -72,7 +72,9 @@ _FIXED = {
     "rolling shutter": Switch("readout", shutter={"readout": 0.4, "rows_per_band": 8}),
     "moving group": Switch("groups", arguments={"groups": {0: sliding}}),
     "spherical harmonics": Switch("colour"),
-    "planes": Switch("planes", cloud=lambda cloud: cloud.with_planes(np.arange(len(cloud)) // 4 - 1)),
+    "planes": Switch(
+        "planes", cloud=lambda cloud: cloud.with_coplanar_groups(np.arange(len(cloud)) // 4 - 1)
+    ),
     "boxes": Switch("footprint", cloud=lambda cloud: cloud.with_boxes()),
     "boxes and Gaussians": Switch(
         "footprint", cloud=lambda cloud: cloud.with_boxes(np.arange(len(cloud)) // 4 % 2 == 0)

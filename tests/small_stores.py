@@ -18,7 +18,7 @@ WINDOW, NOTED = 1000, 3
 def two_files(folder: Path) -> list[Path]:
     """Files of COUNT splats each: with SH of degree 1 and planes, and with labels and 3D Gaussians."""
     first = random_splats(COUNT, 1, sh_degree=1).with_labels(0)
-    first = first.with_planes(np.where(np.arange(COUNT) % 1000 < 3, np.arange(COUNT) // 3000, -1))
+    first = first.with_coplanar_groups(np.where(np.arange(COUNT) % 1000 < 3, np.arange(COUNT) // 3000, -1))
     fs.save_ply(first, folder / "a.ply")
     other = random_splats(COUNT, 2)
     third = (

@@ -8,6 +8,6 @@ class Traits:
     """In place of a SplatCloud, for `select`."""
 
     sh_degree: int = -1
-    has_planes: bool = False
+    has_coplanar_groups: bool = False
     footprint: str = "gaussian"
     ellipsoids: str = "none"

@@ -279,7 +279,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         lambda a, b: fs.SplatCloud.concatenate([a, b]), {"a": CLOUD, "b": CLOUD}, draw
     ),
     "SplatCloud.with_labels": lambda _: (CLOUD.with_labels, {"labels": 3}, draw),
-    "SplatCloud.with_planes": lambda _: (CLOUD.with_planes, {"planes": 3}, draw),
+    "SplatCloud.with_coplanar_groups": lambda _: (CLOUD.with_coplanar_groups, {"groups": 3}, draw),
     "SplatCloud.with_boxes": lambda _: (CLOUD.with_boxes, {"boxes": True}, draw),
     "SplatCloud.transformed": lambda _: (CLOUD.transformed, {"matrix": np.eye(4)}, draw),
     "Camera.pinhole": lambda _: (

@@ -180,7 +180,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
         sh=np.random.default_rng(73).normal(0, 0.3, (len(around), 16, 3)),
     )
     far = splats([[1e6, 0, 2], [-3e9, 1e9, 1], [0, 0, 1e9], [0, 0, 1e-3]], (1, 0.2, 0.3, 0), (2e6, 1e6), 0.8)
-    planes = crowded.with_planes(np.arange(90) % 4 - 1)
+    planes = crowded.with_coplanar_groups(np.arange(90) % 4 - 1)
     plain = fs.Quality(lowpass="none", samples=2)
     for name, shape in shapes.items():
         yield f"{name}: splats around the camera, all outputs", task(shape, around, small, ALL_OUTPUTS)

@@ -23,7 +23,8 @@ class Chunk:
     """the same for the same splats, wherever they are placed"""
     count: int
     load: Callable[[], Mapping[str, np.ndarray]]
-    """their arrays by the names of a cloud's, float32 or int32; `planes` by the index of a `PlaneTable`"""
+    """their arrays by the names of a cloud's, float32 or int32; `coplanar_groups` by the index
+    of a `PlaneTable`"""
     pose: np.ndarray | None = None
     """(16,) float64: where they are placed, the rotation by rows, where it puts the means' zero [m], and its
     quaternion; None: where they are"""
@@ -40,8 +41,8 @@ class WholeScene(Traits, Protocol):
         ...
 
     @property
-    def planes(self) -> PlaneTable | None:
-        """Of its splats that are printed on planes."""
+    def group_table(self) -> PlaneTable | None:
+        """Coplanar groups of its splats."""
         ...
 
     def distinct(self, places: bool) -> int:

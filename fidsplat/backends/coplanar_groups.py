@@ -29,7 +29,7 @@ class PlaneTable:
     """(n,) int32: which plane each splat is printed on, from 0; -1 for none"""
 
     def __init__(self, cloud: SplatCloud) -> None:
-        ids = np.full(len(cloud), -1, np.int32) if cloud.planes is None else cloud.planes
+        ids = np.full(len(cloud), -1, np.int32) if cloud.coplanar_groups is None else cloud.coplanar_groups
         on_plane = np.flatnonzero(ids >= 0)
         on_plane = on_plane[np.lexsort((*cloud.quats[on_plane].T, *cloud.means[on_plane].T))]
         known, first, which = np.unique(ids[on_plane], return_index=True, return_inverse=True)

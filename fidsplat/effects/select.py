@@ -71,7 +71,7 @@ class Traits(Protocol):
         ...
 
     @property
-    def has_planes(self) -> bool:
+    def has_coplanar_groups(self) -> bool:
         """Whether splats are printed on planes."""
         ...
 
@@ -153,7 +153,7 @@ def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
     Where every fragment has its centre's depth as float32, as the lists' keys are, both orders are the same,
     and nothing need wait.
     """
-    if cloud.has_planes:
+    if cloud.has_coplanar_groups:
         return "compose_ordered" if order == "centre" else "compose_coplanar"
     return "compose_pixel" if order == "pixel" and not one_depth_each else "compose_ordered"
 

@@ -31,17 +31,17 @@ class Format:
     save: Callable[[SplatCloud, Path], None] | None
     """None: it is read only"""
     labels: bool = False
-    planes: bool = False
+    coplanar_groups: bool = False
     harmonics: bool = True
     origin: bool = False
     rounds: str = ""
     """what it keeps with fewer bits than float32"""
 
 
-_USD = Format("OpenUSD ParticleField", load_usd, save_usd, labels=True, planes=True)
-_GLTF = Format("glTF KHR_gaussian_splatting", load_gltf, save_gltf, labels=True, planes=True)
+_USD = Format("OpenUSD ParticleField", load_usd, save_usd, labels=True, coplanar_groups=True)
+_GLTF = Format("glTF KHR_gaussian_splatting", load_gltf, save_gltf, labels=True, coplanar_groups=True)
 FORMATS = {
-    ".ply": Format("PLY", load_ply, save_ply, labels=True, planes=True, origin=True),
+    ".ply": Format("PLY", load_ply, save_ply, labels=True, coplanar_groups=True, origin=True),
     ".splat": Format(
         ".splat", load_splat, save_splat, harmonics=False, rounds="colours, opacities and rotations to 8 bits"
     ),
@@ -107,8 +107,8 @@ def losses(cloud: SplatCloud, path: str | os.PathLike[str]) -> list[str]:
         found.append(f"SH of degree {cloud.sh_degree}: colours do not change with the view")
     if cloud.labels.any() and not known.labels:
         found.append(f"labels ({len(np.unique(cloud.labels))} different)")
-    if cloud.planes is not None and not known.planes:
-        found.append("planes: splats printed on one are ordered by their depth alone")
+    if cloud.coplanar_groups is not None and not known.coplanar_groups:
+        found.append("coplanar groups: their splats are ordered by depth alone")
     if cloud.origin.any() and not known.origin:
         means = cloud.world_means()
         off = float(np.abs(means - means.astype(np.float32)).max(initial=0.0))

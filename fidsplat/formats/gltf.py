@@ -78,7 +78,10 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
     for k in range(sh.shape[1]):
         degree = int(np.sqrt(k))
         arrays[f"{prefix}SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = sh[:, k]
-    for name, whole in (("label", cloud.labels if cloud.labels.any() else None), ("plane", cloud.planes)):
+    for name, whole in (
+        ("label", cloud.labels if cloud.labels.any() else None),
+        ("plane", cloud.coplanar_groups),
+    ):
         if whole is None:
             continue
         if np.abs(whole.astype(np.int64)).max() >= 2**24:
@@ -213,11 +216,18 @@ class _Reader:
         count = sum(name.startswith(f"{prefix}SH_DEGREE_") for name in arrays)
         names = [f"{prefix}SH_DEGREE_{(d := int(np.sqrt(k)))}_COEF_{k - d * d}" for k in range(count)]
         sh = np.stack([arrays[name] for name in names], axis=1)
-        labels, planes = (self._whole(arrays, name) for name in ("_LABEL", "_PLANE"))
+        labels, groups = (self._whole(arrays, name) for name in ("_LABEL", "_PLANE"))
         quats = arrays[f"{prefix}ROTATION"][:, [3, 0, 1, 2]]
         scales, opacities = arrays[f"{prefix}SCALE"], arrays[f"{prefix}OPACITY"][:, 0]
         return cloud_of(
-            self._path, arrays["POSITION"], quats, scales, opacities, sh, labels=labels, planes=planes
+            self._path,
+            arrays["POSITION"],
+            quats,
+            scales,
+            opacities,
+            sh,
+            labels=labels,
+            coplanar_groups=groups,
         )
 
     def _admit(self, primitives: list[dict[str, Any]]) -> None:

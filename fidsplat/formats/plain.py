@@ -55,28 +55,38 @@ def plain_colors(cloud: SplatCloud) -> np.ndarray:
 
 
 def cloud_of(
-    path: Path, means, quats, scales, opacities, sh, disk: float = float(PADDED), labels=None, planes=None
+    path: Path,
+    means,
+    quats,
+    scales,
+    opacities,
+    sh,
+    disk: float = float(PADDED),
+    labels=None,
+    coplanar_groups=None,
 ) -> SplatCloud:
     """The cloud of a file's arrays, scales (n, 3) in metres; what cannot be drawn is left out and counted.
 
     disk: third scales up to this, but for rounding, are those of disks.
 
-    Raises InputError for arrays that make no splats, or planes that cannot be.
+    Raises InputError for arrays that make no splats, or unusable coplanar groups.
     """
     interrupts.check()
     scales = np.array(scales, np.float32)
     scales[scales[:, 2] <= np.float32(disk * (1 + 1e-5)), 2] = 0
     cloud = SplatCloud(means, quats, scales, opacities, sh=sh, labels=labels, source=str(path))
-    if planes is None:
+    if coplanar_groups is None:
         return cloud
-    if planes.shape != (len(means),):
-        raise InputError(f"{path}: its planes have the shape {planes.shape}, for {len(means)} splats")
+    if coplanar_groups.shape != (len(means),):
+        raise InputError(
+            f"{path}: coplanar groups must have the shape ({len(means)},), got {coplanar_groups.shape}"
+        )
     if cloud.dropped:
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
         kept, _ = find_defects({name: np.asarray(array, np.float32) for name, array in given.items()})
-        planes = planes[kept]
+        coplanar_groups = coplanar_groups[kept]
     try:
-        return cloud.with_planes(planes)
+        return cloud.with_coplanar_groups(coplanar_groups)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -41,9 +41,9 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
     arrays, dropped = collect(rows, progress)
     if dropped:
         warnings.warn(drop_report(dropped, rows.count, rows.path), stacklevel=2)
-    planes = arrays.pop("planes", None)
+    groups = arrays.pop("coplanar_groups", None)
     cloud = SplatCloud.of_checked(**arrays, origin=origin, dropped=dropped)
-    return cloud if planes is None else cloud.with_planes(planes)
+    return cloud if groups is None else cloud.with_coplanar_groups(groups)
 
 
 def ply_rows(path: str | os.PathLike[str]) -> tuple[Rows, np.ndarray | None]:
@@ -80,9 +80,9 @@ def _plain_rows(header: Header) -> Rows:
         f"f_rest_{c * (k - 1) + i}": ("sh", slice(None), 1 + i, c) for c in range(3) for i in range(k - 1)
     }
     filtered = scales == 3 and FILTER in names and element.dtype[FILTER].kind == "f"
-    for name in ("label", "plane"):
+    for name, array in (("label", "labels"), ("plane", "coplanar_groups")):
         if name in names and np.can_cast(element.dtype[name], np.int32):
-            columns[f"{name}s"], places[name] = ((), np.int32), (f"{name}s",)
+            columns[array], places[name] = ((), np.int32), (array,)
 
     def fill(first: int, arrays: dict[str, np.ndarray]) -> None:
         rows = header.rows("vertex", first, first + len(arrays["means"]))
@@ -94,7 +94,7 @@ def _plain_rows(header: Header) -> Rows:
         _sigmoid(arrays["opacities"])
         if filtered:
             _widen(arrays["scales"], arrays["opacities"], rows[FILTER])
-        if "planes" in arrays and (least := arrays["planes"].min(initial=-1)) < -1:
+        if "coplanar_groups" in arrays and (least := arrays["coplanar_groups"].min(initial=-1)) < -1:
             raise InputError(
                 f"{header.path}: the property plane holds {least}; it must be an id of at least 0, or -1 for "
                 "a splat of no plane"

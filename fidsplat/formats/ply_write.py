@@ -59,8 +59,8 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
         *(f"rot_{i}" for i in range(4)),
     ]
     whole = {"label": cloud.labels} if cloud.labels.any() else {}
-    if cloud.planes is not None:
-        whole["plane"] = cloud.planes
+    if cloud.coplanar_groups is not None:
+        whole["plane"] = cloud.coplanar_groups
     column = {name: i for i, name in enumerate(names)}
     lines = ["ply", "format binary_little_endian 1.0"]
     if cloud.origin.any():

@@ -1,8 +1,8 @@
 """OpenUSD: ParticleField with the Gaussian surflet kernel, which is a 2D splat as ours, or of 3D Gaussians as
 ParticleField3DGaussianSplat (extra `usd`). Schemas: openusd.org, usdVol.
 
-USD stages here have y up: the splats are written as they are, under a half turn about x. Labels and planes
-stand in attributes of our own, fidsplat:labels and fidsplat:planes.
+USD stages here have y up: the splats are written as they are, under a half turn about x. Labels and
+coplanar groups are in the attributes fidsplat:labels and fidsplat:planes.
 
 Damaged files crash usd-core, or make it run for ever or use gigabytes: a child process with limits of memory
 and processor time reads them.
@@ -69,7 +69,7 @@ def load_usd(path: Path) -> SplatCloud:
             found = dict(stored)
     clouds = []
     for k in range(len([name for name in found if name.startswith("matrix")])):
-        names = ("means", "quats", "scales", "opacities", "sh", "labels", "planes")
+        names = ("means", "quats", "scales", "opacities", "sh", "labels", "coplanar_groups")
         fields: dict[str, Any] = {name: found.get(f"{name} {k}") for name in names}
         cloud = cloud_of(path, **fields)
         matrix = found[f"matrix {k}"]
@@ -173,7 +173,7 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)
-    whole = {"labels": cloud.labels if cloud.labels.any() else None, "planes": cloud.planes}
+    whole = {"labels": cloud.labels if cloud.labels.any() else None, "planes": cloud.coplanar_groups}
     for name, numbers in whole.items():
         if numbers is not None:
             made = prim.CreateAttribute(f"fidsplat:{name}", pxr.Sdf.ValueTypeNames.IntArray, True)
@@ -218,8 +218,8 @@ def _field(prim: Any) -> dict[str, np.ndarray]:
         raise InputError(f"{prim.GetPath()} has {len(sh)} SH coefficients for {n} splats of {k}")
     found = {"means": means, "scales": scales, "sh": sh.reshape(n, k, 3), "opacities": array("opacities")}
     found["quats"] = array("orientations", 4)[:, [3, 0, 1, 2]]  # USD's have the imaginary parts first
-    for name in ("labels", "planes"):
-        if (numbers := prim.GetAttribute(f"fidsplat:{name}").Get()) is not None:
+    for name, attribute in (("labels", "labels"), ("coplanar_groups", "planes")):
+        if (numbers := prim.GetAttribute(f"fidsplat:{attribute}").Get()) is not None:
             found[name] = np.array(numbers, np.int32)
     return found
 

@@ -70,7 +70,7 @@ def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
         np.ones(COPIES * len(x)),
         colors=np.repeat(printed.palette[value], COPIES, 0),
     )
-    return cloud.with_planes(np.repeat(np.arange(len(x)), COPIES))
+    return cloud.with_coplanar_groups(np.repeat(np.arange(len(x)), COPIES))
 
 
 def _lines(edge: int) -> np.ndarray:

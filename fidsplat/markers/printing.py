@@ -165,7 +165,7 @@ def _cloud(
     cloud = SplatCloud.of_checked(
         means, quats, scales, opacities, colors=colors, origin=np.zeros(3), dropped={}
     )
-    return cloud.with_planes(0)
+    return cloud.with_coplanar_groups(0)
 
 
 def _parts(ends: np.ndarray) -> Iterator[tuple[int, int]]:

@@ -54,7 +54,7 @@ def d1(renderer: Renderer) -> Found:
     yield Picture(stack([1.0, 0.999, 0.5], stripes[:3]), SMALL, Quality.named("surfel"))
     # on one plane: opaque splats share what they cover
     yield Picture(
-        stack([1.0, 1.0, 0.5, 1.0], stripes, step=0.0, size=0.3).with_planes(0), camera(61, 45, 48.0)
+        stack([1.0, 1.0, 0.5, 1.0], stripes, step=0.0, size=0.3).with_coplanar_groups(0), camera(61, 45, 48.0)
     )
 
     def light(n: int, quality) -> float:
@@ -113,11 +113,13 @@ def d3(renderer: Renderer) -> Found:
         layers = stack([opacity] * 400, colors, step=0.01)
         yield Picture(layers, SMALL, unending)
     yield Picture(
-        stack([0.6] * 200, colors[:200], step=0.01).with_planes(np.arange(200) // 40), SMALL, unending
+        stack([0.6] * 200, colors[:200], step=0.01).with_coplanar_groups(np.arange(200) // 40),
+        SMALL,
+        unending,
     )
     # transmittance runs into the denormals and to 0, in layers and in runs of coplanar splats
     layers = stack([0.9] * 400, [1.0, 0.5, 0.0], step=0.001)
-    for cloud, name in ((layers, "layers"), (layers.with_planes(0), "coplanar splats")):
+    for cloud, name in ((layers, "layers"), (layers.with_coplanar_groups(0), "coplanar splats")):
         rgb = renderer.render(cloud, SMALL, quality="reference")["rgb"][MIDDLE]
         error = float(np.abs(rgb - (1.0, 0.5, 0.0)).max())
         yield Finding(f"error of the colour of 400 {name} whose light underflows", error, 2e-5)
@@ -200,8 +202,8 @@ def d5(renderer: Renderer) -> Found:
     fire = splats([[0.0, 0.0, 2.0]], FACING, (0.05, 0.05), 0.9, (1e15, 1e15, 1e15))
     for marked in (False, True):
         both = SplatCloud.concatenate([cloud, fire])
-        both = both.with_planes(0) if marked else both
-        alone = cloud.with_planes(0) if marked else cloud
+        both = both.with_coplanar_groups(0) if marked else both
+        alone = cloud.with_coplanar_groups(0) if marked else cloud
         frame = renderer.render(both, camera(), names)
         touched = renderer.render(fire, camera(), names)["alpha"] > 0
         without = renderer.render(alone, camera(), names)

@@ -57,4 +57,6 @@ def taken(cloud: SplatCloud, index) -> SplatCloud:
     if cloud.thickness is not None:
         arrays["scales"] = np.column_stack([arrays["scales"], cloud.thickness[index]])
     chosen = SplatCloud(**arrays, origin=cloud.origin)
-    return chosen if cloud.planes is None else chosen.with_planes(cloud.planes[index])
+    return (
+        chosen if cloud.coplanar_groups is None else chosen.with_coplanar_groups(cloud.coplanar_groups[index])
+    )

@@ -91,7 +91,7 @@ def scene_of(seed: int) -> Picture:
         generator.choice(OPACITIES, count),
         colors=generator.uniform(0, 1, (count, 3)),
         labels=generator.integers(0, 9, count),
-    ).with_planes(planes)
+    ).with_coplanar_groups(planes)
     cx, cy = generator.uniform(-0.2, 1.2, 2) * [width, height]
     camera = Camera.pinhole(width, height, focal, focal, cx, cy, pose, near=near)
     quality = QUALITIES[int(generator.choice(len(QUALITIES), p=SHARES))]

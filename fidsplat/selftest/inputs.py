@@ -236,7 +236,7 @@ def e5(renderer: Renderer) -> Found:
     if not isinstance(backend, Probed):
         return
     different = 0
-    for cloud in (crowd(), crowd().with_planes(0), SplatCloud.empty()):
+    for cloud in (crowd(), crowd().with_coplanar_groups(0), SplatCloud.empty()):
         for width, height in ((60, 45), (33, 1), (1, 1)):
             for quality in (Quality(), Quality(samples=2)):
                 clean = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, quality)

@@ -45,7 +45,7 @@ def tag(side: int = 8, seed: int = 0) -> SplatCloud:
     rows, columns = (grid.ravel() for grid in np.mgrid[0:side, 0:side])
     means = np.column_stack([(columns + 0.5) / side - 0.5, (rows + 0.5) / side - 0.5, np.zeros(side**2)])
     grey = np.repeat(bits.ravel()[:, None], 3, axis=1)
-    return splats(means, (1, 0, 0, 0), 0.45 / side, 0.9, grey).with_planes(0)
+    return splats(means, (1, 0, 0, 0), 0.45 / side, 0.9, grey).with_coplanar_groups(0)
 
 
 def wall(count: int = 2000, away: float = 0.05, seed: int = 1) -> SplatCloud:
@@ -124,7 +124,7 @@ def faint_between(opacity: float) -> Picture:
     along = quaternion_to_matrix(turn)[:, 0]
     means = [(0, 0, 2) - 0.1 * along, (0, 0, 2) + 0.1 * along, (0, 0, 2)]
     colors = [(0, 0, 0), (1, 1, 1), (0.5, 0.5, 0.5)]
-    cloud = splats(means, turn, 0.15, [0.9, 0.9, opacity], colors).with_planes([0, 0, -1])
+    cloud = splats(means, turn, 0.15, [0.9, 0.9, opacity], colors).with_coplanar_groups([0, 0, -1])
     return Picture(cloud, Camera.pinhole(33, 33, 60.0, 60.0, 16.5, 16.5), outputs=("rgb",))
 
 

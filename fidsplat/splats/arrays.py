@@ -186,15 +186,14 @@ def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
     return quats, np.take_along_axis(scales, _CYCLES[thin], axis=1)
 
 
-def check_one_footprint(planes: np.ndarray | None, boxes: np.ndarray | None) -> None:
-    """Raises InputError for a plane (n,) of both kinds."""
-    if planes is None or boxes is None:
+def check_one_footprint(groups: np.ndarray | None, boxes: np.ndarray | None) -> None:
+    """Refuse a coplanar group that has both boxes and Gaussians, with InputError."""
+    if groups is None or boxes is None:
         return
-    both = np.intersect1d(planes[(planes >= 0) & boxes], planes[~boxes])
+    both = np.intersect1d(groups[(groups >= 0) & boxes], groups[~boxes])
     if len(both):
         raise InputError(
-            f"plane {both[0]} has boxes and Gaussians, whose coverage follows different rules; "
-            "give each kind a plane"
+            f"coplanar group {both[0]} must hold only boxes or only Gaussians; give each kind its own group"
         )
 
 
@@ -207,9 +206,9 @@ def joined_arrays(clouds: Sequence[Any], name: str, kind) -> np.ndarray | None:
     return np.concatenate([np.zeros(len(cloud), kind) if a is None else a for a, cloud in pairs])
 
 
-def joined_planes(clouds: Sequence[Any]) -> np.ndarray | None:
-    """The same of `planes`, whose ids in different clouds are different planes; -1 where a cloud has None."""
-    given = [cloud.planes for cloud in clouds]
+def joined_groups(clouds: Sequence[Any]) -> np.ndarray | None:
+    """Coplanar groups of several clouds, with ids that no two clouds share; -1 for no group."""
+    given = [cloud.coplanar_groups for cloud in clouds]
     if all(ids is None for ids in given):
         return None
     joined, first_free = [], 0

@@ -18,7 +18,7 @@ from fidsplat.splats.arrays import (
     drop_report,
     find_defects,
     joined_arrays,
-    joined_planes,
+    joined_groups,
     real_numbers,
     rows_beyond,
     unit_quaternions,
@@ -61,9 +61,9 @@ class SplatCloud(PickledByFields, Summarised):
     """(n,) int32"""
     origin: np.ndarray
     """(3,) float64, metres, world position of the means' zero"""
-    planes: np.ndarray | None = None
-    """(n,) int32, or None: splats with the same id >= 0 are printed on one plane, where their order means
-    nothing (`with_planes`); -1 for splats of no plane"""
+    coplanar_groups: np.ndarray | None = None
+    """(n,) int32, or None: splats with the same id >= 0 are coplanar and composited without an order
+    (`with_coplanar_groups`); -1 for splats in no group"""
     boxes: np.ndarray | None = None
     """(n,) bool, or None if all are False: True for a box, whose opacity is the same all over |u|, |v| <= 1
     and whose ``scales`` are half sides (`with_boxes`); False for a Gaussian"""
@@ -170,7 +170,14 @@ class SplatCloud(PickledByFields, Summarised):
         else:  # after the defects, so that a splat that is left out has no say in it
             single["means"], new_origin = choose_origin(given, single["means"], single["scales"])
         self._set(
-            **{"colors": None, "sh": None, "planes": None, "boxes": None, "thickness": None, **single},
+            **{
+                "colors": None,
+                "sh": None,
+                "coplanar_groups": None,
+                "boxes": None,
+                "thickness": None,
+                **single,
+            },
             labels=labels,
             origin=new_origin,
             dropped=dropped,
@@ -220,9 +227,9 @@ class SplatCloud(PickledByFields, Summarised):
         return np.maximum(np.float32(C0) * self.sh[:, 0, :] + np.float32(0.5), np.float32(0))
 
     @property
-    def has_planes(self) -> bool:
-        """Whether some splats are printed on planes."""
-        return self.planes is not None
+    def has_coplanar_groups(self) -> bool:
+        """Whether some splats are in coplanar groups."""
+        return self.coplanar_groups is not None
 
     @property
     def ellipsoids(self) -> str:
@@ -320,28 +327,31 @@ class SplatCloud(PickledByFields, Summarised):
             means=means, quats=quats, scales=scales, thickness=thickness, sh=sh, origin=origin
         )
 
-    def with_planes(self, planes) -> "SplatCloud":
-        """The same splats, printed on planes: one id or (n,) ids, -1 for none.
+    def with_coplanar_groups(self, groups) -> "SplatCloud":
+        """A copy with coplanar groups: one id or (n,) ids, -1 for no group.
 
-        A renderer draws the splats of one plane as one layer: where they meet in a pixel, the result does not
-        depend on their order. They must be coplanar, as those of a marker are. Raises InputError for anything
-        but ints of at least -1.
+        Renderers composite the splats of a group as one layer, so the result does not depend on their order.
+        The splats of a group must be coplanar, as those of a marker are. Raises InputError for anything but
+        ints of at least -1.
         """
-        ids = whole_numbers(planes, len(self), "planes")
+        ids = whole_numbers(groups, len(self), "coplanar_groups")
         if (ids < -1).any():
-            raise InputError(f"planes must be ids of at least 0, or -1 for none, not {int(ids.min())}")
+            raise InputError(
+                f"coplanar groups must be ids of at least 0, or -1 for none, got {int(ids.min())}"
+            )
         check_one_footprint(ids, self.boxes)
         if self.thickness is not None and ((ids >= 0) & (self.thickness > 0)).any():
-            raise InputError("3D Gaussians lie in no plane; give their planes as -1, or a thickness of 0")
-        return self._replaced(planes=ids if (ids >= 0).any() else None)
+            raise InputError(
+                "splats in coplanar groups must have a thickness of 0; give 3D Gaussians the group -1"
+            )
+        return self._replaced(coplanar_groups=ids if (ids >= 0).any() else None)
 
     def with_boxes(self, boxes: bool | np.ndarray = True) -> "SplatCloud":
         """The same splats with box footprints where ``boxes``, one bool or (n,) bools, is True.
 
         A box is a rectangle of even opacity: its scales are half sides in metres, its edges are filtered by
-        the pixel. On a plane (`with_planes`) boxes lie side by side: what they cover of a pixel adds up, so
-        those of a partition, their sides parallel, leave no seam. Raises InputError for anything but bools,
-        and for a plane of both kinds.
+        the pixel. In a coplanar group the coverage of boxes adds up, so a partition into boxes with parallel
+        sides has no seams. Raises InputError for anything but bools, and for a group of both kinds.
         """
         try:
             mask = np.asarray(boxes)
@@ -350,7 +360,7 @@ class SplatCloud(PickledByFields, Summarised):
         if mask.dtype != bool or mask.shape not in ((), (len(self),)):
             raise InputError(f"boxes must be one bool or have the shape ({len(self)},) and the type bool")
         mask = np.full(len(self), mask) if mask.ndim == 0 else mask.copy()
-        check_one_footprint(self.planes, mask)
+        check_one_footprint(self.coplanar_groups, mask)
         if self.thickness is not None and (self.thickness[np.flatnonzero(mask)] > 0).any():
             raise InputError("a box has no thickness, but some of these splats are 3D Gaussians")
         return self._replaced(boxes=mask if mask.any() else None)
@@ -361,7 +371,7 @@ class SplatCloud(PickledByFields, Summarised):
 
         When any has SH, all get SH of the highest degree (colours become degree 0, missing bands 0). Clouds
         that share an origin keep their bits; otherwise a common one is chosen as in the constructor.
-        Planes of different clouds stay different planes. ``dropped`` adds up.
+        Coplanar groups of different clouds stay different. ``dropped`` adds up.
         """
         try:
             clouds = list(clouds)
@@ -390,7 +400,7 @@ class SplatCloud(PickledByFields, Summarised):
             colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None
         else:
             colors, sh = None, np.concatenate([_sh_of_degree(cloud, degree) for cloud in filled])
-        joined |= {"planes": joined_planes(filled), "boxes": joined_arrays(filled, "boxes", bool)}
+        joined |= {"coplanar_groups": joined_groups(filled), "boxes": joined_arrays(filled, "boxes", bool)}
         joined["thickness"] = joined_arrays(filled, "thickness", F32)
         return first._replaced(**joined, colors=colors, sh=sh, dropped=dropped)
 

@@ -190,8 +190,8 @@ class _Build:
         plan, (number, span) = self.plan, window
         arrays, dropped = splats_of(plan.sources[number], span, plan.origin, plan.columns, plan.sh_degree)
         codes = plan.grid.codes(arrays["means"])
-        if "planes" in arrays:
-            codes[arrays["planes"] >= 0] = ON_PLANE
+        if "coplanar_groups" in arrays:
+            codes[arrays["coplanar_groups"] >= 0] = ON_PLANE
         buckets = np.searchsorted(plan.splitters, codes, side="right").astype(np.uint16)
         buckets[codes == ON_PLANE] = self.buckets - 1
         order = np.argsort(buckets, kind="stable")

@@ -124,7 +124,9 @@ def plan_build(
     given = [source.rows for source in sources]
     if any(rows.thick for rows in given):
         kinds["thickness"] = "<f4"
-    kinds |= {name: "<i4" for name in ("labels", "planes") if any(name in rows.columns for rows in given)}
+    kinds |= {
+        name: "<i4" for name in ("labels", "coplanar_groups") if any(name in rows.columns for rows in given)
+    }
     means, origin = sample(sources)
     grid = grid_around(means)
     splat_bytes = sum(row_bytes(kind, shapes_of(degree)[name]) for name, kind in kinds.items()) + 8

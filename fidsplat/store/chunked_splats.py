@@ -70,7 +70,7 @@ class ChunkedSplats:
         self.sh_degree = max(max(part.sh_degree for part in parts), -1)
         if self.sh_degree == 0:
             self.sh_degree = -1
-        self.has_planes = any(part.has_planes for part in parts)
+        self.has_coplanar_groups = any(part.has_coplanar_groups for part in parts)
         footprints = {part.footprint for part in parts if len(part)} or {"gaussian"}
         self.footprint = footprints.pop() if len(footprints) == 1 else "mixed"
         ellipsoids = {part.ellipsoids for part in parts if len(part)} or {"none"}
@@ -209,7 +209,7 @@ class ChunkedSplats:
         cloud = self.in_memory
         arrays = {name: getattr(cloud, name) for name in ("means", "quats", "scales", "opacities", "labels")}
         arrays = self._relative(arrays, cloud.origin)
-        optional = {"sh": cloud.sh, "colors": cloud.colors, "planes": cloud.planes}
+        optional = {"sh": cloud.sh, "colors": cloud.colors, "coplanar_groups": cloud.coplanar_groups}
         optional |= {"thickness": cloud.thickness, "boxes": cloud.boxes}
         arrays |= {name: array for name, array in optional.items() if array is not None}
         return self._with_columns(arrays, self._first_planes[-1])
@@ -234,9 +234,9 @@ class ChunkedSplats:
         count = len(arrays["means"])
         made = {name: arrays[name] for name in ("means", "quats", "scales", "opacities", "labels")}
         made |= colors_of_degree(arrays, self.sh_degree)
-        if self.has_planes:
-            ids = arrays.get("planes", np.full(count, -1, np.int32))
-            made["planes"] = np.where(ids >= 0, ids + np.int32(first_plane), np.int32(-1))
+        if self.has_coplanar_groups:
+            ids = arrays.get("coplanar_groups", np.full(count, -1, np.int32))
+            made["coplanar_groups"] = np.where(ids >= 0, ids + np.int32(first_plane), np.int32(-1))
         if self.ellipsoids != "none":
             made["thickness"] = arrays.get("thickness", np.zeros(count, np.float32))
         if self.footprint != "gaussian":

@@ -44,7 +44,7 @@ NPY_HEADER = 128
 _MAX_ROWS = 2**32
 """limit on the rows of a store: its splats and those of all levels of detail, which are fewer"""
 _TYPES = dict.fromkeys(("means", "quats", "scales", "opacities", "thickness"), ("<f4",))
-_TYPES |= dict.fromkeys(("labels", "planes"), ("<i4",))
+_TYPES |= dict.fromkeys(("labels", "coplanar_groups"), ("<i4",))
 """allowed NumPy types of each column"""
 
 NODE = np.dtype(
@@ -166,7 +166,7 @@ def _check(header: Header) -> None:
         if kind not in types.get(name, ()):
             raise ValueError(f"the column {name} of the type {kind}")
     # all but three columns are in every store
-    if missing := types.keys() - {"labels", "planes", "thickness"} - header.columns.keys():
+    if missing := types.keys() - {"labels", "coplanar_groups", "thickness"} - header.columns.keys():
         raise ValueError(f"no column {min(missing)}")
     if header.ellipsoids not in ("none", "some", "all"):
         raise ValueError("ellipsoids must be none, some or all")
@@ -179,7 +179,7 @@ def _check(header: Header) -> None:
 def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
     """Shape of one splat in each possible column."""
     shapes: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": ()}
-    shapes |= {"labels": (), "planes": (), "thickness": ()}
+    shapes |= {"labels": (), "coplanar_groups": (), "thickness": ()}
     return shapes | ({"colors": (3,)} if sh_degree < 0 else {"sh": ((sh_degree + 1) ** 2, 3)})
 
 

@@ -20,7 +20,7 @@ class SceneTraits(Protocol):
     def sh_degree(self) -> int: ...
 
     @property
-    def has_planes(self) -> bool: ...
+    def has_coplanar_groups(self) -> bool: ...
 
     @property
     def footprint(self) -> str: ...
@@ -43,7 +43,13 @@ class PartialCloud(SplatCloud):
     ) -> PartialCloud:
         """A cloud of valid arrays, without a copy. dropped: number of omitted splats by the reason."""
         made = object.__new__(cls)
-        given: dict[str, Any] = {"colors": None, "sh": None, "planes": None, "boxes": None, "thickness": None}
+        given: dict[str, Any] = {
+            "colors": None,
+            "sh": None,
+            "coplanar_groups": None,
+            "boxes": None,
+            "thickness": None,
+        }
         made._set(**given | dict(arrays), origin=scene.origin, dropped=dict(dropped or {}))
         object.__setattr__(made, "_scene", scene)
         return made
@@ -53,9 +59,9 @@ class PartialCloud(SplatCloud):
         return _cloud_of, ({each.name: getattr(self, each.name) for each in fields(self)},)
 
     @property
-    def has_planes(self) -> bool:
+    def has_coplanar_groups(self) -> bool:
         """Whether the complete scene has coplanar groups."""
-        return self._scene.has_planes
+        return self._scene.has_coplanar_groups
 
     @property
     def footprint(self) -> str:

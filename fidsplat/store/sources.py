@@ -68,7 +68,7 @@ def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
     if cloud.thickness is not None:
         scales = np.column_stack([scales, cloud.thickness])
     arrays |= {"scales": scales, "labels": cloud.labels}
-    some = {"colors": cloud.colors, "sh": cloud.sh, "planes": cloud.planes}
+    some = {"colors": cloud.colors, "sh": cloud.sh, "coplanar_groups": cloud.coplanar_groups}
     arrays |= {key: array for key, array in some.items() if array is not None}
     columns = {name: (array.shape[1:], array.dtype.type) for name, array in arrays.items()}
 
@@ -84,8 +84,10 @@ def with_distinct_groups(sources: list[Source]) -> list[Source]:
     made, free = [], 0
     for source in sources:
         made.append(Source(source.rows, source.origin, source.stamp, free))
-        if "planes" in source.rows.columns:
-            parts = (window(source.rows, *span)[0]["planes"] for span in spans(source.rows.count, WINDOW))
+        if "coplanar_groups" in source.rows.columns:
+            parts = (
+                window(source.rows, *span)[0]["coplanar_groups"] for span in spans(source.rows.count, WINDOW)
+            )
             free += 1 + max((int(ids.max(initial=-1)) for ids in parts), default=-1)
     return made
 
@@ -143,7 +145,7 @@ def splats_of(
         made["thickness"] = part.get("thickness", np.zeros(count, np.float32))
     if "labels" in columns:
         made["labels"] = part.get("labels", np.zeros(count, np.int32))
-    if "planes" in columns:
-        ids = part.get("planes", np.full(count, -1, np.int32))
-        made["planes"] = np.where(ids >= 0, ids + source.first_plane, -1).astype(np.int32)
+    if "coplanar_groups" in columns:
+        ids = part.get("coplanar_groups", np.full(count, -1, np.int32))
+        made["coplanar_groups"] = np.where(ids >= 0, ids + source.first_plane, -1).astype(np.int32)
     return {name: made[name].astype(kind, copy=False) for name, kind in columns.items()}, dropped

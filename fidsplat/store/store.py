@@ -73,13 +73,15 @@ class Store(Summarised):
         self.nodes = layout.read_nodes(self._folder, own)
         """(n,) records of `layout.NODE`: chunks and nodes of levels of detail, of one instance"""
         self._columns = self._mapped()
-        if self.has_planes:  # the coplanar groups are prepared on the host, and belong to every frame
+        if (
+            self.has_coplanar_groups
+        ):  # the coplanar groups are prepared on the host, and belong to every frame
             rows = self._rows(own.pinned, own.splats, None)
             if wrong := _unrenderable(rows):
                 raise InputError(
                     f"{self._folder} must have coplanar splats that can be rendered, got {wrong}"
                 )
-            if (rows["planes"] < 0).any():
+            if (rows["coplanar_groups"] < 0).any():
                 raise InputError(f"{self._folder} must have coplanar splats with group ids of at least 0")
 
     def __reduce__(self):
@@ -110,9 +112,9 @@ class Store(Summarised):
         return self.header.sh_degree
 
     @property
-    def has_planes(self) -> bool:
+    def has_coplanar_groups(self) -> bool:
         """Whether some splats belong to coplanar groups."""
-        return "planes" in self._own.columns
+        return "coplanar_groups" in self._own.columns
 
     @property
     def footprint(self) -> str:
@@ -282,9 +284,9 @@ class Store(Summarised):
 
     def last_plane(self) -> int:
         """Largest id of its coplanar groups; -1 without."""
-        if not self.has_planes:
+        if not self.has_coplanar_groups:
             return -1
-        return int(self._columns["planes"][self._own.pinned : self._own.splats].max(initial=-1))
+        return int(self._columns["coplanar_groups"][self._own.pinned : self._own.splats].max(initial=-1))
 
     def cloud(self) -> SplatCloud:
         """All splats in one cloud, mapped from the files where possible. Frames of the store are
@@ -330,7 +332,7 @@ class Store(Summarised):
 def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:
     """Defects of splats that cannot be rendered, with their counts; empty without. merged: of splats that
     stand for several, whose opacities may exceed 1."""
-    names = rows.keys() - {"labels", "planes"}
+    names = rows.keys() - {"labels", "coplanar_groups"}
     _, found = find_defects({name: rows[name].astype(np.float32, copy=False) for name in names})
     if merged:
         found.pop("opacity outside [0, 1]", None)

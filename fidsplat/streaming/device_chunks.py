@@ -19,7 +19,7 @@ class DeviceChunks:
 
     def __init__(self, scene: ChunkedSplats) -> None:
         self.scene, self.origin = scene, scene.origin
-        self.sh_degree, self.has_planes = scene.sh_degree, scene.has_planes
+        self.sh_degree, self.has_coplanar_groups = scene.sh_degree, scene.has_coplanar_groups
         self.footprint, self.ellipsoids = scene.footprint, scene.ellipsoids
         self._chunks: dict[tuple[int, bool], dict[int, Chunk]] = {}
         """(number of the store, posed by the device) -> chunks, by node"""
@@ -57,9 +57,9 @@ class DeviceChunks:
         return sum(each) + -(-len(self.scene.in_memory) // self.largest_chunk)
 
     @cached_property
-    def planes(self) -> PlaneTable | None:
+    def group_table(self) -> PlaneTable | None:
         """Coplanar groups of all splats; their chunks are part of every frame."""
-        return PlaneTable(self._pinned_part) if self.has_planes else None
+        return PlaneTable(self._pinned_part) if self.has_coplanar_groups else None
 
     @cached_property
     def _pinned_part(self) -> PartialCloud:
@@ -68,7 +68,7 @@ class DeviceChunks:
 
     @cached_property
     def _plane_ids(self) -> np.ndarray:
-        ids = self._pinned_part.planes
+        ids = self._pinned_part.coplanar_groups
         assert ids is not None
         return np.unique(ids[ids >= 0])
 
@@ -95,10 +95,10 @@ class DeviceChunks:
     def _on_device(self, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Arrays with dense indices of coplanar groups and integers for flags."""
         made = dict(arrays)
-        if "planes" in made:
+        if "coplanar_groups" in made:
             known = np.append(self._plane_ids, np.iinfo(np.int32).max)
-            dense = np.searchsorted(known, made["planes"]).astype(np.int32)
-            made["planes"] = np.where(made["planes"] < 0, np.int32(-1), dense)
+            dense = np.searchsorted(known, made["coplanar_groups"]).astype(np.int32)
+            made["coplanar_groups"] = np.where(made["coplanar_groups"] < 0, np.int32(-1), dense)
         if "boxes" in made:
             made["boxes"] = made["boxes"].astype(np.int32)
         return made

@@ -14,7 +14,7 @@ class _Disks(NamedTuple):
     """What of splats in training decides the kernels."""
 
     sh_degree: int
-    has_planes: bool = False
+    has_coplanar_groups: bool = False
     footprint: str = "gaussian"
     ellipsoids: str = "none"
 

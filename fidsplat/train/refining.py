@@ -114,7 +114,7 @@ def refine(
     return replace(
         made,
         mixture="refined",
-        cloud=splats.cloud(made.module).with_planes(0),
+        cloud=splats.cloud(made.module).with_coplanar_groups(0),
         seconds=made.seconds + time.perf_counter() - start,
     )
 

@@ -103,7 +103,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         place: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
-        planes: wp.array(dtype=wp.int32),
+        coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
     ):
         """The sample after the splat at `place` in the list."""
@@ -118,7 +118,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
             if wp.static(asking):
                 p = met(p, s, c, x, y, view)
             if c.drawn:
-                p = blend_one(p, s, c, place, lines, lists, planes, view)
+                p = blend_one(p, s, c, place, lines, lists, coplanar_groups, view)
         return p
 
     # so many threads at once: at most 64 registers, which is what two samples take that keep only their light
@@ -131,7 +131,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         views: wp.array(dtype=View),
         rays: Rays,
         lines: wp.array(dtype=wp.vec4),
-        planes: wp.array(dtype=wp.int32),
+        coplanar_groups: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
         samples: Samples,  # out
@@ -198,9 +198,11 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                             continue
                     x, y = float(x0) - s.d[3], float(y0) - s.c[0]
                     row = wp.vec3(row_of(s.u, y), row_of(s.v, y), row_of(s.d, y))
-                    p = drawn(p, s, row, ray, slopes, x, y, k + which, lines, lists, planes, view)
+                    p = drawn(p, s, row, ray, slopes, x, y, k + which, lines, lists, coplanar_groups, view)
                     if wp.static(pair):
-                        q = drawn(q, s, row, ray, slopes, x + 1.0, y, k + which, lines, lists, planes, view)
+                        q = drawn(
+                            q, s, row, ray, slopes, x + 1.0, y, k + which, lines, lists, coplanar_groups, view
+                        )
                 open = unfinished(p, view)
                 if wp.static(pair):
                     open = open or unfinished(q, view)
@@ -227,7 +229,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         views: wp.array(dtype=View),
         rays: Rays,
         lines: wp.array(dtype=wp.vec4),
-        planes: wp.array(dtype=wp.int32),
+        coplanar_groups: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
         samples: Samples,  # out
@@ -280,7 +282,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                             at = state_first + (row - y0) * view.tile_w + column - x0
                             p = state[at]
                             if unfinished(p, view):
-                                p = blend_one(p, s, c, k - 1, lines, lists, planes, view)
+                                p = blend_one(p, s, c, k - 1, lines, lists, coplanar_groups, view)
                                 if not unfinished(p, view):
                                     alive -= 1
                                 state[at] = p

@@ -147,7 +147,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         place: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
-        planes: wp.array(dtype=wp.int32),
+        coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
     ):
         """The pixel after a fragment that is drawn of the splat at `place` in the list, of a pixel that is
@@ -158,7 +158,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         opacity = opacity_of(s, c, inverse_d, view)
         z, plane = float(0.0), int(-1)
         if wp.static(layered):
-            plane = planes[index % view.splats]
+            plane = coplanar_groups[index % view.splats]
         if wp.static(has_depth):
             z = depth_of(lines, index, s, c, inverse_d, plane >= 0)
         if wp.static(opaque):

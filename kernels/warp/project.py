@@ -88,10 +88,10 @@ def make_project(
         scales: wp.array(dtype=wp.vec2),  # (n) [m]
         opacities: wp.array(dtype=wp.float32),  # (n)
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
-        planes: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
+        coplanar_groups: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
         plane_keys: wp.array(
             dtype=wp.float32
-        ),  # (views planes) depth at which a plane's splats are sorted [m]
+        ),  # (views groups) depth at which a group's splats are sorted [m]
         plane_count: int,
         boxes: wp.array(dtype=wp.int32),  # (n) 1: a box, of a cloud that has boxes and others
         thickness: wp.array(dtype=wp.float32),  # (n) [m], of a cloud that has 3D Gaussians; 0: a disk
@@ -285,7 +285,7 @@ def make_project(
         if wp.static(has_depth):
             plane = int(-1)
             if wp.static(layers):
-                plane = planes[i]
+                plane = coplanar_groups[i]
             middle, depth_reach = placing.depth_range(depth, reach, radius, near, plane, boxed)
             record[at_depth + 1] = float(middle)
             record[at_depth + 2] = float(depth_reach)
@@ -293,8 +293,8 @@ def make_project(
         if wp.static(waits):
             key = float(middle) - float(depth_reach)  # as blending bounds depths
             if wp.static(layers):
-                if planes[i] >= 0:
-                    key = plane_keys[number * plane_count + planes[i]]
+                if coplanar_groups[i] >= 0:
+                    key = plane_keys[number * plane_count + coplanar_groups[i]]
             record[at_nearest] = key
         if wp.static(surfaced):
             if thick:

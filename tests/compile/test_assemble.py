@@ -64,7 +64,7 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "arithmetic_fast",
     }
     of_knobs = ("wide", "WIDE")
-    of_layers = ("planes", "plane_keys", "layer", "Layer", "open_layer", "optical_depth")
+    of_layers = ("coplanar_groups", "plane_keys", "layer", "Layer", "open_layer", "optical_depth")
     of_order = (*of_layers, "k_buffer", "KBuffer", "K_BUFFER_SIZE", "nearest")
     for name in (*absent, *FURTHER, "sh", "finished", *of_order, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
@@ -98,10 +98,12 @@ def test_only_splats_on_planes_bring_layers(outputs):
     words = ("Layer", "layer_close", "layer_add", "plane_keys", "label_tau", "share")
     plain = assemble(select(COLORS, fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
     layered = assemble(
-        select(Traits(has_planes=True), fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE
+        select(Traits(has_coplanar_groups=True), fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE
     ).text
     in_order = assemble(
-        select(Traits(has_planes=True), fs.Capture(outputs=outputs, quality=PLAIN.with_(order="centre"))),
+        select(
+            Traits(has_coplanar_groups=True), fs.Capture(outputs=outputs, quality=PLAIN.with_(order="centre"))
+        ),
         SHAPE,
     ).text
     for word in words:
@@ -113,7 +115,7 @@ def test_only_splats_on_planes_bring_layers(outputs):
 
 def test_only_a_scene_of_both_footprints_pays_for_the_choice():
     features = {
-        kind: select(Traits(has_planes=True, footprint=kind), fs.Capture(outputs=("depth", "label")))
+        kind: select(Traits(has_coplanar_groups=True, footprint=kind), fs.Capture(outputs=("depth", "label")))
         for kind in ("gaussian", "box", "mixed")
     }
     texts = {kind: assemble(each, SHAPE).text for kind, each in features.items()}
@@ -135,7 +137,7 @@ def test_record_sizes_are_what_the_effects_declare():
     assert record(("rgb",), fs.Quality()) == record(("label",)) == 80
     assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 96
     assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
-    assert record_bytes(select(Traits(has_planes=True), fs.Capture(quality=PLAIN))) == 96
+    assert record_bytes(select(Traits(has_coplanar_groups=True), fs.Capture(quality=PLAIN))) == 96
 
 
 def test_scenes_without_3d_gaussians_have_the_text_that_they_have_without_such_a_thing():
@@ -266,7 +268,7 @@ KNOBS = {
 @pytest.mark.parametrize("name", KNOBS)
 @pytest.mark.parametrize("outputs", [("rgb",), ("rgb", *FURTHER)], ids=["rgb", "all"])
 def test_knobs_compile_and_run_with_every_output_and_none(renderer, name, outputs):
-    cloud = random_splats(20, seed=1, depth=(1, 4)).with_planes(np.arange(20) // 2 - 1)
+    cloud = random_splats(20, seed=1, depth=(1, 4)).with_coplanar_groups(np.arange(20) // 2 - 1)
     if name == "double" and not renderer.device.float64:
         pytest.skip("the device has no float64")
     if name == "double":

@@ -100,7 +100,7 @@ def test_what_lenses_take():
 def test_every_lens_builds_with_everything_but_a_shutter(renderer, kind):
     """All outputs, layers, colours that depend on the view, moving groups; test_matrix.py has a shutter
     too."""
-    cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=1).with_planes(np.repeat([-1, 0], 10))
+    cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=1).with_coplanar_groups(np.repeat([-1, 0], 10))
     motion = fs.Motion(None, {1: lambda time: np.eye(4)})
     frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *OUTPUTS), None, motion=motion)
     assert all(np.isfinite(frame[name]).all() for name in frame)

@@ -178,7 +178,7 @@ def coplanar_cloud(seed, count=60, planes=2):
             generator.uniform(0.02, 0.3, (count, 2)),
             generator.choice([0.1, 0.6, 0.95, 1.0], count),
             colors=generator.uniform(0, 1, (count, 3)),
-        ).with_planes(0)
+        ).with_coplanar_groups(0)
         pose = np.eye(4)
         axis = generator.normal(size=3) * 0.4
         pose[:3, :3] = rotation_about(axis)
@@ -198,7 +198,7 @@ def rotation_about(axis):
 @pytest.mark.parametrize(("samples", "camera"), [(1, CAMERA), (2, SMALL)], ids=["1 sample", "2 x 2 samples"])
 def test_coplanar_splats_are_one_layer(renderer, seed, samples, camera):
     cloud = coplanar_cloud(seed)
-    assert cloud.has_planes
+    assert cloud.has_coplanar_groups
     assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples))
     assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples, order="centre"))
 
@@ -216,5 +216,5 @@ def test_the_order_of_coplanar_splats_means_nothing(renderer):
             cloud.opacities[shuffle],
             colors=cloud.colors[shuffle],
             origin=cloud.origin,
-        ).with_planes(cloud.planes[shuffle])
+        ).with_coplanar_groups(cloud.coplanar_groups[shuffle])
         assert np.abs(renderer.render(again, CAMERA, ALL_OUTPUTS)["rgb"] - first).max() < 2e-5

@@ -139,7 +139,11 @@ def boxes_of(middle, half):
     n = len(middle)
     means = np.column_stack([middle, np.zeros(n)])
     quats = np.tile([1.0, 0, 0, 0], (n, 1))
-    return fs.SplatCloud(means, quats, half, np.ones(n), colors=np.ones((n, 3))).with_boxes().with_planes(0)
+    return (
+        fs.SplatCloud(means, quats, half, np.ones(n), colors=np.ones((n, 3)))
+        .with_boxes()
+        .with_coplanar_groups(0)
+    )
 
 
 def test_light_is_conserved(renderer):

@@ -153,7 +153,7 @@ def thick_scene_of(seed: int) -> Picture:
     third = cloud.scales.max(axis=1) * log_uniform(generator, 1e-6, 1e2, count)
     needle = generator.random(count) < 0.2
     third[needle] = cloud.scales.min(axis=1)[needle]
-    loose = np.ones(count, bool) if cloud.planes is None else cloud.planes < 0
+    loose = np.ones(count, bool) if cloud.coplanar_groups is None else cloud.coplanar_groups < 0
     chosen = (generator.random(count) < 0.8) & loose
     scales = np.column_stack([cloud.scales, np.where(chosen, np.clip(third, 1e-7, 1e3), 0)])
     away = 1 + np.where(loose, generator.uniform(0, 1e-3, count), 0)  # from the camera, at the origin
@@ -161,8 +161,8 @@ def thick_scene_of(seed: int) -> Picture:
     thick = fs.SplatCloud(
         means, cloud.quats, scales, cloud.opacities, colors=cloud.colors, labels=cloud.labels
     )
-    if cloud.planes is not None:
-        thick = thick.with_planes(cloud.planes)
+    if cloud.coplanar_groups is not None:
+        thick = thick.with_coplanar_groups(cloud.coplanar_groups)
     way = str(generator.choice(ELLIPSOID))
     return replace(flat, cloud=thick, quality=flat.quality.with_(ellipsoid=way))
 

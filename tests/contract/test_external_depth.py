@@ -35,7 +35,7 @@ def a_cloud():
 CASES = {
     "centre": (a_cloud(), {}),
     "planes, fog, 2 x 2 samples": (
-        a_cloud().with_planes(np.arange(24) // 4 - 1),
+        a_cloud().with_coplanar_groups(np.arange(24) // 4 - 1),
         {"quality": "standard,samples=2", "fog": fs.Fog(0.2, (0.6, 0.65, 0.7))},
     ),
     "pixel": (a_cloud(), {"quality": "standard,order=pixel"}),

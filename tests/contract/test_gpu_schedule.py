@@ -38,7 +38,9 @@ def scene_of_layers():
     pose[:3, 3] = (-0.4, 0.1, 2.5)
     fitted = fs.marker("aruco:4x4_50:7", size=0.8, mixture="fitted").cloud.transformed(pose)
     crossing = random_splats(40, seed=6, depth=(1.0, 3.0), scale=(0.2, 0.8), across=0.5)
-    return fs.SplatCloud.concatenate([exact, fitted, MIXED, crossing.with_planes(np.arange(40) // 4)])
+    return fs.SplatCloud.concatenate(
+        [exact, fitted, MIXED, crossing.with_coplanar_groups(np.arange(40) // 4)]
+    )
 
 
 PICTURES = {

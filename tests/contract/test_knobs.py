@@ -69,7 +69,7 @@ def test_double_has_every_output_and_footprint(opencl):
     if not opencl.device.float64:
         pytest.skip("the device has no float64")
     cloud = coplanar_cloud(1)
-    cloud = cloud.with_boxes(cloud.planes == 0)
+    cloud = cloud.with_boxes(cloud.coplanar_groups == 0)
     camera = fs.Camera.orthographic(41, 30, 4.0)
     assert_agrees(opencl, cloud, camera, tuple(OUTPUTS), DOUBLE)
 

@@ -33,7 +33,11 @@ def test_kernels_see_new_buffers_at_old_addresses(opencl):
 def test_a_picture_is_launched_again_for_each_view(opencl):
     """Of its kind, on a GPU: other poses, groups, colours and sizes come between, and frames are kept."""
     machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
-    some = random_splats(300, seed=4).with_labels(np.arange(300) % 2).with_planes(np.arange(300) // 250 - 1)
+    some = (
+        random_splats(300, seed=4)
+        .with_labels(np.arange(300) % 2)
+        .with_coplanar_groups(np.arange(300) // 250 - 1)
+    )
     resident, places = machine.upload(some), (-0.3, 0.0, 0.2)
     moved = [np.eye(4) + 0.1 * k * np.eye(4, k=3) for k in range(3)]
     captures = [
@@ -115,7 +119,7 @@ def test_threads_share_launches_that_are_kept(opencl):
 def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine):
     """Several views at a time, with planes, groups that move, a mask, and pictures of other kinds between."""
     own, some = machine(opencl), random_splats(300, seed=4, scale=(1e-2, 2.0)).with_labels(np.arange(300) % 3)
-    some = some.with_planes(np.arange(300) // 250 - 1)
+    some = some.with_coplanar_groups(np.arange(300) // 250 - 1)
     capture = fs.Capture(fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)), ("rgb", "label"))
     poses = np.random.default_rng(0).normal(0, 0.05, (2, 7, 7))
     poses[..., 3] += 1

@@ -40,7 +40,7 @@ def small(renderer, mebibytes, cloud=None):
             cloud.opacities,
             cloud.colors,
             cloud.sh,
-            cloud.planes,
+            cloud.coplanar_groups,
             cloud.thickness,
         )
         budget += sum(array.nbytes for array in arrays if array is not None)
@@ -72,7 +72,7 @@ def cloud():
     number = np.arange(len(made))
     third = np.where((number >= 200) & (number % 3 == 0), 0.05, 0)
     made = some_thick(made, third)
-    return made.with_planes(np.where(number < 200, 0, -1))
+    return made.with_coplanar_groups(np.where(number < 200, 0, -1))
 
 
 def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole, monkeypatch):

@@ -41,7 +41,7 @@ def test_outputs_of_layers(renderer, mixture):
 def test_a_layer_shows_the_mean_of_what_its_splats_show(renderer):
     """Splats that are called a plane and are turned every way."""
     cloud = random_splats(40, seed=6, depth=(1.0, 3.0), scale=(0.2, 0.8), across=0.5)
-    assert_agrees(renderer, cloud.with_planes(np.arange(40) // 4), CAMERA, ALL)
+    assert_agrees(renderer, cloud.with_coplanar_groups(np.arange(40) // 4), CAMERA, ALL)
 
 
 @in_turn()
@@ -124,7 +124,7 @@ def test_of_equal_splats_in_a_layer_and_equal_samples_of_a_pixel_the_first_is_na
     """Two copies in one plane; and two disks that each cover two of a pixel's four samples, with exactly half
     of the light: the left one's are read first. Of its samples a pixel takes the nearest first hit, and of
     their medians the lower."""
-    twice = layers_of([0.5, 0.5, 0.5], step=0.0).with_planes([0, 0, 0])
+    twice = layers_of([0.5, 0.5, 0.5], step=0.0).with_coplanar_groups([0, 0, 0])
     frame = renderer.render(twice, POINT, ALL)
     assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
 
@@ -159,7 +159,7 @@ def test_a_layer_of_a_thousand_faint_splats(renderer):
         opacities,
         colors=colors,
     )
-    rgb = renderer.render(wall.with_planes(np.zeros(count + 1, int)), POINT, ALL)["rgb"][2, 2]
+    rgb = renderer.render(wall.with_coplanar_groups(np.zeros(count + 1, int)), POINT, ALL)["rgb"][2, 2]
     red, green = -count * math.log1p(-9.9e-4), -math.log(0.4)
     assert rgb[0] / rgb[1] == pytest.approx(red / green, rel=1e-4)
     assert rgb[0] + rgb[1] == pytest.approx(1 - math.exp(-red - green), rel=1e-4)
@@ -169,7 +169,7 @@ def test_a_cutoff_below_all_floats(renderer):
     """Opacities that are 0 as float32 are in no layer's mean, which would be 0 / 0."""
     disk = fs.SplatCloud([(0, 0, 2)], [(1, 0, 0, 0)], [(0.05, 0.05)], [0.9], colors=[(1, 0.5, 0)])
     faint, fainter = (
-        renderer.render(disk.with_planes([0]), CAMERA, ("rgb", "blended"), quality)
+        renderer.render(disk.with_coplanar_groups([0]), CAMERA, ("rgb", "blended"), quality)
         for quality in (fs.Quality(alpha_cutoff=cutoff, arithmetic="precise") for cutoff in (1e-20, 1e-300))
     )
     assert fainter["rgb"] == pytest.approx(faint["rgb"], abs=1e-6)

@@ -46,7 +46,7 @@ def test_refined_gaussians_are_nearer_to_the_print_and_leak_less(renderer):
     assert after.mixture == "refined"
     assert len(after.cloud) == len(before.cloud)
     assert after.gaussians is after.cloud
-    assert after.cloud.planes is not None
+    assert after.cloud.coplanar_groups is not None
     assert 0 <= after.cloud.colors.min() <= after.cloud.colors.max() <= 1
     (old_error, old_alpha), (error, alpha) = shown(renderer, before), shown(renderer, after)
     assert old_alpha.min() < 0.6

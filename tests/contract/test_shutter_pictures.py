@@ -81,7 +81,7 @@ def test_shutters_before_every_lens(renderer, camera, shutter):
 @pytest.mark.parametrize("samples", [1, 2])
 def test_moving_layers(renderer, samples):
     cloud = coplanar_cloud(1)
-    labels = np.where(cloud.planes < 0, 0, cloud.planes + 3)
+    labels = np.where(cloud.coplanar_groups < 0, 0, cloud.coplanar_groups + 3)
     motion = fs.Motion(None, {3: turned, 4: lambda time: turned(-time)})
     shutter = fs.Shutter(exposure_time=0.5, sub_poses=3)
     camera = CAMERAS["pinhole"]

@@ -179,7 +179,7 @@ def test_what_another_kind_took_anew_is_not_replayed(renderer, replayed):
 
 def test_what_moves_is_replayed(renderer, replayed):
     """Groups, planes and what resolving reads are filled for each picture."""
-    cloud = CLOUD.with_labels(np.arange(3000) % 2).with_planes(np.arange(3000) // 2900 - 1)
+    cloud = CLOUD.with_labels(np.arange(3000) % 2).with_coplanar_groups(np.arange(3000) // 2900 - 1)
     resident, places = renderer.upload(cloud), (0.0, 0.1, 0.2, 0.3, 0.4)
 
     def capture(place):

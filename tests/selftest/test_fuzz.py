@@ -57,8 +57,12 @@ def test_the_scenes_are_hard():
         reach = 3.33 * np.hypot(*(axes[:, 2, :2] * cloud.scales).T)
         edge_on += (np.abs(sine) < 1.5e-6).sum()
         near += (np.abs(p[:, 2] - view.near) < reach).sum()
-        total, grouped = total + len(cloud), grouped + cloud.has_planes
-        tilted += (np.abs(axes[:, 2, 2])[cloud.planes >= 0] < 0.9).any() if cloud.has_planes else 0
+        total, grouped = total + len(cloud), grouped + cloud.has_coplanar_groups
+        tilted += (
+            (np.abs(axes[:, 2, 2])[cloud.coplanar_groups >= 0] < 0.9).any()
+            if cloud.has_coplanar_groups
+            else 0
+        )
         largest, smallest = max(largest, cloud.scales.max()), min(smallest, cloud.scales.min())
         flat = max(flat, float((cloud.scales.max(1) / cloud.scales.min(1)).max()))
         counts.append(len(cloud))

@@ -99,7 +99,7 @@ def _near_elsewhere() -> dict[str, fs.SplatCloud]:
     edge_on = _faint(300, 5, (2, 3), (2.0, 3.0), across=0.3)
     edge_on = splats(edge_on.means, nearly_edge_on, edge_on.scales, 0.3, edge_on.colors)
     planes = np.where(generator.random(400) < 0.5, generator.integers(0, 40, 400), -1)
-    printed = _faint(160, 6, (2.2, 2.2001), (0.02, 0.1), across=0.1).with_planes(0)
+    printed = _faint(160, 6, (2.2, 2.2001), (0.02, 0.1), across=0.1).with_coplanar_groups(0)
     return {
         "crossing": _faint(400, 3, (0.5, 4.0), (0.2, 0.8)),
         "behind a fisheye": _faint(300, 3, (0.5, 4.0), (0.2, 0.8)),
@@ -110,7 +110,7 @@ def _near_elsewhere() -> dict[str, fs.SplatCloud]:
         "through the camera": _faint(300, 9, (-0.5, 1.5), (0.5, 4.0), 0.05),
         "huge": _faint(300, 10, (1.0, 30.0), (50.0, 1000.0), 0.05),
         # as layers lie nearer than what of them is looked at
-        "bent sheets": _faint(400, 13, (1.0, 3.0), (0.2, 0.8)).with_planes(planes),
+        "bent sheets": _faint(400, 13, (1.0, 3.0), (0.2, 0.8)).with_coplanar_groups(planes),
         "through a sheet": fs.SplatCloud.concatenate(
             [_faint(100, 7, (1.5, 4.0), (0.3, 1.5), 0.1), printed, _faint(200, 11, (2.5, 4.0), (0.3, 1.5))]
         ),
@@ -185,7 +185,7 @@ def test_a_cutoff_moves_no_layer(renderer):
     tilted, along = (math.cos(math.pi / 6), 0, math.sin(math.pi / 6), 0), np.array([0.5, 0, -(0.75**0.5)])
     spot = splats([(0, 0, 2)], tilted, 0.05, 0.5, (1, 0, 0))
     tails = splats([np.array([0, 0, 2]) - 4 * along] * 20, tilted, 1.0, 1.0, (1, 0, 0))
-    sheet = fs.SplatCloud.concatenate([spot, tails]).with_planes(0)
+    sheet = fs.SplatCloud.concatenate([spot, tails]).with_coplanar_groups(0)
     cloud = fs.SplatCloud.concatenate([sheet, splats([(0, 0, 2.002)], tilted, 0.05, 0.9, (0, 1, 0))])
     view = Camera.pinhole(5, 5, 100.0, 100.0, 2.5, 2.5)
     few, all_of_them = (
@@ -200,7 +200,8 @@ def test_any_number_of_layers_wait(renderer):
     """Three sheets one behind the other, and a big splat between whose centre is nearer than all."""
     colors = np.eye(3)
     sheets = [
-        splats([(0, 0, z)], (1, 0, 0, 0), 0.5, 0.6, colors[k]).with_planes(0) for k, z in enumerate((2, 4, 6))
+        splats([(0, 0, z)], (1, 0, 0, 0), 0.5, 0.6, colors[k]).with_coplanar_groups(0)
+        for k, z in enumerate((2, 4, 6))
     ]
     view = Camera.pinhole(17, 17, 20.0, 20.0, 8.5, 8.5)
     got, wanted = layered(renderer, [*sheets, splats([(0, 0, 5)], (1, 0, 0, 0), 2.0, 0.5)], view)
@@ -211,7 +212,7 @@ def test_any_number_of_layers_wait(renderer):
 def test_planes_that_cross_each_other(renderer, seed):
     """More layers wait at a pixel than a backend may have room for, and one that ends lies before others."""
     cloud = random_splats(24, seed, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
-    cloud = cloud.with_planes(np.arange(24) // 4 - 1)
+    cloud = cloud.with_coplanar_groups(np.arange(24) // 4 - 1)
     assert_agrees(renderer, cloud, Camera.pinhole(37, 22, 30.0, 30.0, 18.0, 11.0), ("rgb", "depth"))
 
 

@@ -64,7 +64,7 @@ def plain(n, generator, folder, degree, native, marked=False):
         origin=(4.5e6, 0.0, 300.0) if marked else None,
     )
     if marked:
-        cloud = cloud.with_planes(generator.integers(-1, 3, n))
+        cloud = cloud.with_coplanar_groups(generator.integers(-1, 3, n))
     fs.save_ply(cloud, folder / "good.ply", native_2dgs=native)
     return (folder / "good.ply").read_bytes()
 
@@ -213,7 +213,9 @@ def assert_good(cloud):
     assert (cloud.scales > 0).all()
     assert ((cloud.opacities >= 0) & (cloud.opacities <= 1)).all()
     assert np.allclose((cloud.quats.astype(float) ** 2).sum(1), 1, atol=1e-6)
-    assert cloud.planes is None or (len(cloud.planes) == len(cloud) and (cloud.planes >= -1).all())
+    assert cloud.coplanar_groups is None or (
+        len(cloud.coplanar_groups) == len(cloud) and (cloud.coplanar_groups >= -1).all()
+    )
     assert np.isfinite(cloud.origin).all()
 
 

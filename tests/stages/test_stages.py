@@ -214,7 +214,7 @@ def test_the_bounds_of_a_box_are_its_corners(backend):
 def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
     """Four planes whose layers wait for one another, and splats of none."""
     planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
-    cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_planes(planes)
+    cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_coplanar_groups(planes)
     base, _ = traced(backend, cloud, fs.Quality())
     other, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
@@ -228,15 +228,15 @@ def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
 def test_splats_of_a_plane_share_its_key(backend):
     """They arrive together, whatever lies between their centres."""
     generator = np.random.default_rng(2)
-    cloud = random_splats(200, seed=2, depth=(2.0, 4.0)).with_planes(generator.integers(-1, 3, 200))
+    cloud = random_splats(200, seed=2, depth=(2.0, 4.0)).with_coplanar_groups(generator.integers(-1, 3, 200))
     trace, view = traced(backend, cloud, fs.Quality())
     for plane, key in enumerate(PlaneTable(cloud).keys(view)):
-        keys = trace["keys"][cloud.planes == plane]
+        keys = trace["keys"][cloud.coplanar_groups == plane]
         bits = np.array([key]).view(np.uint32)
         wanted = ~bits if bits[0] & 0x80000000 else bits | 0x80000000
         assert (keys[keys != CULLED] == wanted).all()
         for start, end in pairwise(trace["starts"]):
-            places = np.flatnonzero(cloud.planes[trace["lists"][start:end]] == plane)
+            places = np.flatnonzero(cloud.coplanar_groups[trace["lists"][start:end]] == plane)
             assert len(places) == 0 or len(places) == np.ptp(places) + 1
 
 

@@ -115,7 +115,7 @@ def test_drawn_fragments_are_counted_exactly(renderer):
     assert stack[24, 32] == 2
     assert stack.max() == 5  # towards the rim every layer lets light through
     # a layer is made of as many fragments as lie in it
-    printed = facing([2.0, 2.0, 2.0], 0.5).with_planes(0)
+    printed = facing([2.0, 2.0, 2.0], 0.5).with_coplanar_groups(0)
     np.testing.assert_array_equal(count(printed), 3 * drawn)
     assert count(one, samples=2).sum() == pytest.approx(4 * drawn.sum(), rel=0.02)
 

@@ -105,7 +105,7 @@ def test_a_capture_and_its_parts_draw_the_same():
 ROLLING = {"motion": MOVING, "shutter": fs.Shutter(readout=0.1, rows_per_band=4)}
 
 
-OF_PLANES, OF_BOXES = Traits(has_planes=True), Traits(footprint="box")
+OF_PLANES, OF_BOXES = Traits(has_coplanar_groups=True), Traits(footprint="box")
 ORDERED, FLOAT64 = fs.Quality(order="centre"), fs.Quality(blend_precision="float64")
 BY_PIXEL, THICK = fs.Quality(order="pixel"), Traits(ellipsoids="all")
 GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})

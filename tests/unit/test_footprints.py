@@ -38,13 +38,13 @@ def test_boxes_are_bools(boxes):
         cloud().with_boxes(boxes)
 
 
-def test_a_plane_has_one_footprint():
+def test_a_coplanar_group_has_one_footprint():
     mask = np.array([True, False, True, False])
-    with pytest.raises(fs.InputError, match="plane 0 has boxes and Gaussians"):
-        cloud().with_planes(0).with_boxes(mask)
-    with pytest.raises(fs.InputError, match="plane 5 has boxes and Gaussians"):
-        cloud().with_boxes(mask).with_planes([1, -1, 5, 5])
-    assert cloud().with_boxes(mask).with_planes([1, 2, 1, -1]).has_planes
+    with pytest.raises(fs.InputError, match="coplanar group 0 must hold only boxes"):
+        cloud().with_coplanar_groups(0).with_boxes(mask)
+    with pytest.raises(fs.InputError, match="coplanar group 5 must hold only boxes"):
+        cloud().with_boxes(mask).with_coplanar_groups([1, -1, 5, 5])
+    assert cloud().with_boxes(mask).with_coplanar_groups([1, 2, 1, -1]).has_coplanar_groups
 
 
 def test_an_exact_marker_is_its_partition():

@@ -37,7 +37,7 @@ def need(suffix):
 
 
 def assert_same_bits(a: fs.SplatCloud, b: fs.SplatCloud):
-    for name in ("means", "scales", "opacities", "labels", "sh", "thickness", "planes"):
+    for name in ("means", "scales", "opacities", "labels", "sh", "thickness", "coplanar_groups"):
         one, other = getattr(a, name), getattr(b, name)
         assert (one is None) == (other is None), name
         if one is not None:
@@ -170,7 +170,7 @@ def test_a_usd_file_says_what_the_schema_wants(tmp_path):
     need(".usda")
     from pxr import Usd, UsdGeom
 
-    cloud = some(degree=1, thick=False).with_planes(3)
+    cloud = some(degree=1, thick=False).with_coplanar_groups(3)
     fs.save_splats(cloud, tmp_path / "a.usda")
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     prim = stage.GetDefaultPrim()
@@ -343,12 +343,12 @@ def test_what_cannot_be_written(tmp_path):
 
 
 def test_what_a_format_cannot_hold_is_said():
-    cloud = some(labels=3, thick=False).with_planes(1).transformed(rigid_matrix((1e6, 0, 0)))
+    cloud = some(labels=3, thick=False).with_coplanar_groups(1).transformed(rigid_matrix((1e6, 0, 0)))
     words = " ".join(losses(cloud, "a.splat"))
     for part in (
         "SH of degree 2",
         "labels (1 different)",
-        "planes",
+        "coplanar groups",
         "the origin: positions",
         "rounds colours",
     ):

@@ -58,7 +58,7 @@ def test_frame_size_and_corners():
     assert np.array_equal(cloud.quats, np.tile(np.float32([1, 0, 0, 0]), (len(cloud), 1)))
     assert np.abs(cloud.means).max() < 0.1
     assert set(np.unique(cloud.colors)) == {0, 1}
-    assert (cloud.planes == 0).all()
+    assert (cloud.coplanar_groups == 0).all()
     assert not cloud.dropped
     assert (cloud.labels == 0).all()
     assert made.seconds > 0

@@ -315,18 +315,18 @@ def test_a_third_scale_of_1e_6_is_padding(tmp_path, monkeypatch, window, third, 
 @pytest.mark.parametrize("labels", [0, 7])
 def test_planes_come_back(tmp_path, labels):
     planes = np.arange(50, dtype=np.int32) % 4 - 1
-    cloud = cloud_of(labels=labels).with_planes(planes)
+    cloud = cloud_of(labels=labels).with_coplanar_groups(planes)
     fs.save_ply(cloud, tmp_path / "a.ply")
     read = fs.load_ply(tmp_path / "a.ply")
     assert_same(read, cloud)
-    assert np.array_equal(read.planes, planes)
+    assert np.array_equal(read.coplanar_groups, planes)
     assert b"property int plane\n" in (tmp_path / "a.ply").read_bytes()
 
 
 def test_a_cloud_without_planes_has_none_in_its_file(tmp_path):
     fs.save_ply(cloud_of(), tmp_path / "a.ply")
     assert b"plane" not in (tmp_path / "a.ply").read_bytes()
-    assert fs.load_ply(tmp_path / "a.ply").planes is None
+    assert fs.load_ply(tmp_path / "a.ply").coplanar_groups is None
 
 
 def test_planes_and_labels_stay_with_their_splats_when_others_are_left_out(tmp_path):
@@ -335,14 +335,14 @@ def test_planes_and_labels_stay_with_their_splats_when_others_are_left_out(tmp_p
     path = write(tmp_path / "a.ply", columns, 4, {"plane": "<i4", "label": "|u1"})
     with pytest.warns(UserWarning, match="1 of 4 splats left out"):
         read = fs.load_ply(path)
-    assert read.planes.tolist() == [5, -1, 8]
+    assert read.coplanar_groups.tolist() == [5, -1, 8]
     assert read.labels.tolist() == [1, 3, 4]
     assert read.dropped == {"opacities not finite": 1}
 
 
 def test_a_plane_that_is_not_an_int32_is_someone_elses(tmp_path):
     columns = {name: 1.0 for name in PLAIN} | {"plane": 3}
-    assert fs.load_ply(write(tmp_path / "a.ply", columns, 2, {"plane": "<f4"})).planes is None
+    assert fs.load_ply(write(tmp_path / "a.ply", columns, 2, {"plane": "<f4"})).coplanar_groups is None
 
 
 def test_a_plane_below_minus_one_is_an_error_that_names_the_file(tmp_path):

@@ -30,7 +30,7 @@ def clouds():
         "splats": cloud,
         "ellipsoids": fs.SplatCloud(cloud.means, cloud.quats, thick, cloud.opacities, colors=cloud.colors),
         "boxes": lines.with_boxes(),
-        "planes": cloud.with_boxes(group % 2 == 0).with_planes(np.maximum(group % 8 - 2, -1)),
+        "planes": cloud.with_boxes(group % 2 == 0).with_coplanar_groups(np.maximum(group % 8 - 2, -1)),
     }
 
 

@@ -302,9 +302,9 @@ def test_concatenate_different_origins():
 
 def test_planes_of_different_clouds_stay_different():
     one = fs.SplatCloud(**parts())
-    printed = one.with_planes([0, 0, 2, 2, -1, -1])
+    printed = one.with_coplanar_groups([0, 0, 2, 2, -1, -1])
     joined = fs.SplatCloud.concatenate([printed, one, printed])
-    assert joined.planes.tolist() == [0, 0, 2, 2, -1, -1, *[-1] * 6, 3, 3, 5, 5, -1, -1]
+    assert joined.coplanar_groups.tolist() == [0, 0, 2, 2, -1, -1, *[-1] * 6, 3, 3, 5, 5, -1, -1]
 
 
 @pytest.mark.parametrize(("away", "own"), [(50.0, False), (100.0, True)])

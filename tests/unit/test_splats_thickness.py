@@ -103,11 +103,11 @@ def test_an_ellipsoid_is_no_box_and_lies_in_no_plane():
     cloud = cloud_of(thickness=[0, 1, 1, 1, 1, 1])
     first = np.arange(6) == 0
     assert cloud.with_boxes(first).boxes.tolist() == first.tolist()
-    assert cloud.with_planes(np.where(first, 0, -1)).has_planes
+    assert cloud.with_coplanar_groups(np.where(first, 0, -1)).has_coplanar_groups
     with pytest.raises(fs.InputError, match="no thickness"):
         cloud.with_boxes()
-    with pytest.raises(fs.InputError, match="lie in no plane"):
-        cloud.with_planes(0)
+    with pytest.raises(fs.InputError, match="must have a thickness of 0"):
+        cloud.with_coplanar_groups(0)
 
 
 def test_pickling_keeps_it():

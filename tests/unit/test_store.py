@@ -32,9 +32,9 @@ def test_a_store_holds_the_splats_of_its_files_and_nothing_else(files, store):
     for name, array in theirs.items():
         assert np.array_equal(ours[name], array), name
     # planes of both files stay apart, and stand last
-    assert np.array_equal(np.unique(made.planes), np.unique(given.planes))
-    assert (made.planes[store.header.pinned :] >= 0).all()
-    assert (made.planes[: store.header.pinned] < 0).all()
+    assert np.array_equal(np.unique(made.coplanar_groups), np.unique(given.coplanar_groups))
+    assert (made.coplanar_groups[store.header.pinned :] >= 0).all()
+    assert (made.coplanar_groups[: store.header.pinned] < 0).all()
 
 
 def test_neighbours_stand_near_each_other(store):

@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
     third[:PLANAR] = 0.0
     scales = np.column_stack([cloud.scales, third])
     cloud = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, sh=cloud.sh, labels=3)
-    cloud = cloud.with_planes(np.where(np.arange(COUNT) < PLANAR, np.arange(COUNT) // 3, -1))
+    cloud = cloud.with_coplanar_groups(np.where(np.arange(COUNT) < PLANAR, np.arange(COUNT) // 3, -1))
     made = tmp_path_factory.mktemp("values")
     fs.save_ply(cloud, made / "a.ply")
     with pytest.MonkeyPatch.context() as patch:

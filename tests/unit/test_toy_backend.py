@@ -32,7 +32,7 @@ class Cloud:
 
     def __init__(self, cloud):
         self.count, self.origin, self.sh_degree = len(cloud), cloud.origin, cloud.sh_degree
-        self.has_planes, self.footprint = cloud.has_planes, cloud.footprint
+        self.has_coplanar_groups, self.footprint = cloud.has_coplanar_groups, cloud.footprint
         self.ellipsoids = cloud.ellipsoids
 
 

@@ -181,7 +181,7 @@ def test_a_resident_cloud_tells_what_it_takes(renderer):
     assert renderer.upload(CLOUD).memory_bytes == 4 * words * len(CLOUD)
     arrays = arrays_of(CLOUD, renderer.backend.device)
     assert renderer.adopt(**arrays).memory_bytes == 4 * words * len(CLOUD)
-    harmonic = random_splats(10, seed=3, sh_degree=2).with_planes(np.arange(10) // 2)
+    harmonic = random_splats(10, seed=3, sh_degree=2).with_coplanar_groups(np.arange(10) // 2)
     assert renderer.upload(harmonic).memory_bytes == 4 * (words + 24 + 1) * 10
 
 

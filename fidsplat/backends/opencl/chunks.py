@@ -258,8 +258,16 @@ class GatheredChunks:
         self.count = int(self._ends[-1])
         self.room = _roomy(self.count)
         """splats for which pictures have buffers: those of the next view, of about as many, are the same"""
-        self.origin, self.sh_degree, self.has_planes = whole.origin, whole.sh_degree, whole.has_planes
-        self.footprint, self.ellipsoids, self.planes = whole.footprint, whole.ellipsoids, whole.planes
+        self.origin, self.sh_degree, self.has_coplanar_groups = (
+            whole.origin,
+            whole.sh_degree,
+            whole.has_coplanar_groups,
+        )
+        self.footprint, self.ellipsoids, self.group_table = (
+            whole.footprint,
+            whole.ellipsoids,
+            whole.group_table,
+        )
         self.kept: dict[Hashable, Any] = {}
         """as that of a Resident"""
         self.fixed = True

@@ -78,8 +78,8 @@ LAYOUTS: dict[str, Layout] = {
         parts=("compose_pixel",),
         splat=(member("int plane"),),
         project=takes(
-            "cloud int planes  // (n) index of the splat's plane; -1: none",
-            "in float plane_keys  // (planes, views) depth at which its splats are sorted in [m]",
+            "cloud int coplanar_groups  // (n) index of the splat's group; -1: none",
+            "in float plane_keys  // (groups, views) depth at which its splats are sorted in [m]",
         ),
     ),
     "footprint_gaussian": Layout(),

@@ -174,10 +174,10 @@ class Picture:
         if view.groups:
             moving = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
             self.put("moving", _kept(moving))
-        if self.resident.planes is not None:
-            planes, stack = self.resident.planes, self.stack
-            # (planes, views), in memory of its own
-            keys = planes.keys(view) if stack is None else planes.keys_of(stack).T.copy()
+        if self.resident.group_table is not None:
+            table, stack = self.resident.group_table, self.stack
+            # (groups, views), in memory of its own
+            keys = table.keys(view) if stack is None else table.keys_of(stack).T.copy()
             self.put("plane_keys", _kept(keys))
 
     def record(self, row: int, end: int) -> np.ndarray:

@@ -35,9 +35,9 @@ class Resident:
         """its splats, and those for which pictures have buffers"""
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
-        self.has_planes = cloud.planes is not None
+        self.has_coplanar_groups = cloud.coplanar_groups is not None
         self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
-        self.planes = PlaneTable(cloud) if self.has_planes else None
+        self.group_table = PlaneTable(cloud) if self.has_coplanar_groups else None
         self._arrays = {
             "means": cloud.means,
             "quats": cloud.quats,
@@ -45,8 +45,8 @@ class Resident:
             "opacities": cloud.opacities,
             "labels": cloud.labels,
         }
-        if self.planes is not None:
-            self._arrays["planes"] = self.planes.index
+        if self.group_table is not None:
+            self._arrays["coplanar_groups"] = self.group_table.index
         if cloud.boxes is not None:
             self._arrays["boxes"] = cloud.boxes.astype(np.int32)
         if cloud.thickness is not None:

@@ -54,7 +54,7 @@ Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
 class ResidentArrays:
     """Splats in arrays of the device, as pictures read them: disks without labels and planes."""
 
-    has_planes, footprint, ellipsoids, planes = False, "gaussian", "none", None
+    has_coplanar_groups, footprint, ellipsoids, group_table = False, "gaussian", "none", None
     streamed = fixed = False
 
     def __init__(

@@ -103,7 +103,7 @@ class ReferenceCloud:
         self.origin = cloud.origin
         self.memory_bytes = 0  # it reads the cloud's own arrays
         self.sh_degree = cloud.sh_degree
-        self.has_planes = cloud.planes is not None
+        self.has_coplanar_groups = cloud.coplanar_groups is not None
         self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
 
     def color_range(self) -> tuple[float, float]:

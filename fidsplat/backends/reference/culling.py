@@ -60,9 +60,9 @@ def may_see(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
             1 + sum(np.abs(_ends(at) - to).max(0) for at, to in ((x, s.anchor_x), (y, s.anchor_y)))
         )
         seen |= np.maximum(np.hypot(across, down) / view.samples - off, 0) ** 2 <= r2 / 2
-    if s.planes is not None:
-        planes, first = np.unique(s.planes, return_index=True)
-        seen[first[(planes >= 0) & np.isin(planes, s.planes[seen])]] = True
+    if s.coplanar_groups is not None:
+        planes, first = np.unique(s.coplanar_groups, return_index=True)
+        seen[first[(planes >= 0) & np.isin(planes, s.coplanar_groups[seen])]] = True
     return seen
 
 

@@ -82,7 +82,7 @@ def by_center(s: Setup, f: Fragments, span: Span) -> Stack:
 def by_depth(s: Setup, f: Fragments, span: Span) -> Stack:
     """Fragments, and those of each printed plane as one layer, by their own depths at each sample; of equals
     the first of the splats' order. What is not drawn there is left out."""
-    planes = np.full(f.alpha.shape[1], -1) if s.planes is None else s.planes
+    planes = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
     plain = np.flatnonzero(planes < 0)
     members = [np.flatnonzero(planes == plane) for plane in np.unique(planes[planes >= 0])]
     columns = _side_by_side([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])

@@ -69,12 +69,14 @@ class Setup:
         if self.by_depth:
             # depths are the same at every cut-off
             radius = np.full(len(cloud), _RANGE_RADIUS)
-            if cloud.planes is not None:
-                radius[cloud.planes >= 0] = _PLANE_RADIUS
+            if cloud.coplanar_groups is not None:
+                radius[cloud.coplanar_groups >= 0] = _PLANE_RADIUS
             with np.errstate(divide="ignore", invalid="ignore"):
                 further = radius / np.sqrt(2 * half_r2)
                 further[box] = (
-                    1 if cloud.planes is None else np.where(cloud.planes[box] >= 0, _PLANE_RADIUS, 1)
+                    1
+                    if cloud.coplanar_groups is None
+                    else np.where(cloud.coplanar_groups[box] >= 0, _PLANE_RADIUS, 1)
                 )
                 within = reach * further
         z_low, z_high = depth - within, depth + within
@@ -132,8 +134,10 @@ class Setup:
         self.normal = shape.surface[order] * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
-        self.planes = None if planes is None else planes[order]
-        self.printed = np.zeros(len(order), bool) if self.planes is None else self.planes >= 0
+        self.coplanar_groups = None if planes is None else planes[order]
+        self.printed = (
+            np.zeros(len(order), bool) if self.coplanar_groups is None else self.coplanar_groups >= 0
+        )
         self.nearest = nearest[order]
         """depth before which none of a printed plane lies; -inf for splats of none"""
 
@@ -148,8 +152,8 @@ class Setup:
             setattr(part, name, getattr(self, name)[:, chosen])
         if self.depth_forms is not None:
             part.depth_forms = self.depth_forms[:, chosen]
-        if self.planes is not None:
-            part.planes = self.planes[chosen]
+        if self.coplanar_groups is not None:
+            part.coplanar_groups = self.coplanar_groups[chosen]
         return part
 
 

@@ -187,7 +187,7 @@ class Picture:
         drawn, places = self._exact("drawn", n, wp.int32), self._exact("places", n, wp.int32)
         # not read where all are of one kind
         cloud = {"boxes": drawn, "thickness": self.resident.arrays["opacities"]} | self.resident.arrays
-        cloud |= {name: self.held[name] for name in ("planes", "plane_keys")}
+        cloud |= {name: self.held[name] for name in ("coplanar_groups", "plane_keys")}
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
         wp.utils.array_scan(drawn, places, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)
@@ -200,13 +200,17 @@ class Picture:
 
     def _planes(self) -> dict[str, Any]:
         """Each splat's plane, and the planes' sort keys in these views."""
-        wp, table = self.wp, self.resident.planes
+        wp, table = self.wp, self.resident.group_table
         if table is None or not self.program.layered:
             none = self.pool.scratch("no planes", 1, wp.int32), self.pool.scratch("no keys", 1, wp.float32)
-            return {"planes": none[0], "plane_keys": none[1], "plane_count": 0}
+            return {"coplanar_groups": none[0], "plane_keys": none[1], "plane_count": 0}
         keys = table.keys_of(self.stack)
         filled = self.inputs.filled("plane keys", keys.ravel(), wp.float32)
-        return {"planes": self.resident.arrays["planes"], "plane_keys": filled, "plane_count": keys.shape[1]}
+        return {
+            "coplanar_groups": self.resident.arrays["coplanar_groups"],
+            "plane_keys": filled,
+            "plane_count": keys.shape[1],
+        }
 
     def _sort(self, visible: int) -> None:
         """Splats that are drawn by depth, ties by index."""
@@ -285,8 +289,10 @@ class Picture:
     def _blend(self, first: int, end: int, samples: Any) -> None:
         """Draws the tiles of one band."""
         program, shape = self.program, self.program.shape
-        planes = self.resident.arrays.get("planes", self.held["lists"])  # not read where there are none
-        given = {**self.held, "rays": self._rays, "samples": samples, "planes": planes}
+        planes = self.resident.arrays.get(
+            "coplanar_groups", self.held["lists"]
+        )  # not read where there are none
+        given = {**self.held, "rays": self._rays, "samples": samples, "coplanar_groups": planes}
         area = shape.tile_width * shape.tile_height
         if shape.schedule == "group":
             count = (end - first) * program.blend_block

@@ -24,12 +24,16 @@ class Resident:
         count: int,
         origin: np.ndarray,
         sh_degree: int,
-        planes: PlaneTable | None = None,
+        group_table: PlaneTable | None = None,
         footprint: str = "gaussian",
         ellipsoids: str = "none",
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
-        self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
+        self.sh_degree, self.group_table, self.has_coplanar_groups = (
+            sh_degree,
+            group_table,
+            group_table is not None,
+        )
         self.footprint, self.ellipsoids = footprint, ellipsoids
         self.adopted = False
         """whether somebody else may change the arrays"""
@@ -60,16 +64,16 @@ class Resident:
             "colors": colors,
             "labels": cloud.labels,
         }
-        planes = None if cloud.planes is None else PlaneTable(cloud)
-        if planes is not None:
-            arrays["planes"] = planes.index
+        table = None if cloud.coplanar_groups is None else PlaneTable(cloud)
+        if table is not None:
+            arrays["coplanar_groups"] = table.index
         if cloud.footprint == "mixed" and cloud.boxes is not None:
             arrays["boxes"] = cloud.boxes.astype(np.int32)
         if cloud.thickness is not None:
             arrays["thickness"] = cloud.thickness
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
         kinds = cloud.footprint, cloud.ellipsoids
-        return cls(device, len(cloud), cloud.origin, cloud.sh_degree, planes, *kinds)
+        return cls(device, len(cloud), cloud.origin, cloud.sh_degree, table, *kinds)
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:
@@ -116,7 +120,7 @@ def _dtype(name: str) -> Any:
         "colors": wp.vec3,
         "sh": wp.vec3,
         "labels": wp.int32,
-        "planes": wp.int32,
+        "coplanar_groups": wp.int32,
         "boxes": wp.int32,
         "thickness": wp.float32,
     }[name]

@@ -87,4 +87,6 @@ def _cloud(recipe: Recipe, count: int) -> SplatCloud:
     scales = np.column_stack([flat.scales, np.where(kind == CAPTURE, 0.002, 0.0)])
     cloud = SplatCloud(flat.means, flat.quats, scales, flat.opacities, colors=flat.colors, sh=flat.sh)
     printed = kind == MARKER
-    return cloud.with_planes(np.where(printed, 0, -1)).with_boxes(printed) if printed.any() else cloud
+    return (
+        cloud.with_coplanar_groups(np.where(printed, 0, -1)).with_boxes(printed) if printed.any() else cloud
+    )

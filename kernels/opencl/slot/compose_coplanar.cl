@@ -6,15 +6,15 @@
 // Splats of a group are adjacent in the lists, at the nearest depth of the group (plane_keys). When another splat follows, the
 // layer enters the k-buffer as one fragment (slot/compose_pixel.cl).
 //@ project
-    record.plane = planes[i];
+    record.plane = coplanar_groups[i];
 //@ functions
 #define COPLANAR_RADIUS REAL(64.0)       // in standard deviations; for boxes in half sides
 //@ coplanar_depth_reach
     // depths of the plane as far out as any alpha cut-off and low-pass renders: then a cut-off does not move layers, nor do boxes
     // much smaller than a pixel
-    if (planes[i] >= 0) depth_reach = reach * (BOX_HERE ? COPLANAR_RADIUS : COPLANAR_RADIUS / radius);
+    if (coplanar_groups[i] >= 0) depth_reach = reach * (BOX_HERE ? COPLANAR_RADIUS : COPLANAR_RADIUS / radius);
 //@ coplanar_nearest
-    if (planes[i] >= 0) record.nearest = (wide)plane_keys[planes[i] * get_global_size(1) + number];
+    if (coplanar_groups[i] >= 0) record.nearest = (wide)plane_keys[coplanar_groups[i] * get_global_size(1) + number];
 //@ coplanar_blocks_nearest
         if (s->plane >= 0) min_depth = s->nearest;      // adjacent in each block
 //@ coplanar_lookahead

@@ -1,4 +1,4 @@
-"""Splats that are printed on planes, through files beside PLY that keep them."""
+"""Coplanar groups in splat files other than PLY."""
 
 import math
 from pathlib import Path
@@ -17,17 +17,17 @@ def test_splats_of_planes_come_back_on_them(tmp_path, suffix):
     """Those that cannot be drawn are left out, and the others keep their planes."""
     need(suffix)
     planes = np.arange(40) % 4 - 1
-    cloud = some(thick=False).with_planes(planes)
+    cloud = some(thick=False).with_coplanar_groups(planes)
     fs.save_splats(cloud, tmp_path / f"a{suffix}")
     assert_same_bits(fs.load_splats(tmp_path / f"a{suffix}"), cloud)
     assert losses(cloud, f"a{suffix}") == []
     spoilt = some(thick=False)
     spoilt.opacities.flags.writeable = True
     spoilt.opacities[[3, 17]] = 2.0
-    fs.save_splats(spoilt.with_planes(planes), tmp_path / f"b{suffix}")
+    fs.save_splats(spoilt.with_coplanar_groups(planes), tmp_path / f"b{suffix}")
     with pytest.warns(UserWarning, match="left out"):
         read = fs.load_splats(tmp_path / f"b{suffix}")
-    np.testing.assert_array_equal(read.planes, np.delete(planes, [3, 17]))
+    np.testing.assert_array_equal(read.coplanar_groups, np.delete(planes, [3, 17]))
 
 
 @pytest.mark.parametrize(
@@ -35,8 +35,8 @@ def test_splats_of_planes_come_back_on_them(tmp_path, suffix):
     [
         (False, 0.5, "_PLANE must hold whole numbers"),
         (False, math.nan, "_PLANE must hold whole numbers"),
-        (False, -2.0, "planes must be ids of at least 0"),
-        (True, 1.0, "3D Gaussians lie in no plane"),
+        (False, -2.0, "coplanar groups must be ids of at least 0"),
+        (True, 1.0, "must have a thickness of 0"),
     ],
 )
 def test_planes_that_cannot_be(tmp_path, thick, plane, words):
@@ -57,5 +57,5 @@ def test_planes_of_other_splats_than_the_files(shape, opacity):
     cloud, opacities = some(5, thick=False), np.full(5, 0.5, np.float32)
     opacities[0] = opacity
     arrays = cloud.means, cloud.quats, np.pad(cloud.scales, [(0, 0), (0, 1)]), opacities, cloud.sh
-    with pytest.raises(fs.InputError, match=r"a.usda: its planes have the shape"):
-        cloud_of(Path("a.usda"), *arrays, planes=np.zeros(shape, np.int32))
+    with pytest.raises(fs.InputError, match=r"a.usda: coplanar groups must have the shape"):
+        cloud_of(Path("a.usda"), *arrays, coplanar_groups=np.zeros(shape, np.int32))

@@ -29,7 +29,7 @@ def some_planes(seed=0, ids=(7, 3, 2_000_000_000)):
         means = generator.uniform(-0.5, 0.5, (20, 2)) @ axes[:, :2].T + generator.uniform(-0.5, 0.5, 3)
         parts.append(splats(means.astype(np.float32), turn, generator.uniform(0.01, 0.2, (20, 2))))
     parts.append(splats(generator.uniform(-1, 1, (10, 3)), (1, 0, 0, 0), 0.1))
-    cloud = fs.SplatCloud.concatenate(parts).with_planes(np.repeat([*ids, -1], [20, 20, 20, 10]))
+    cloud = fs.SplatCloud.concatenate(parts).with_coplanar_groups(np.repeat([*ids, -1], [20, 20, 20, 10]))
     return taken(cloud, generator.permutation(len(cloud)))
 
 
@@ -44,7 +44,7 @@ def test_a_key_is_a_diameter_before_every_point_of_the_splats(cutoff, away):
     radius = np.sqrt(2 * np.log(1 / cutoff))
     angle = np.linspace(0, 2 * np.pi, 60)
     for number, plane in enumerate((3, 7, 2_000_000_000)):
-        own = cloud.planes == plane
+        own = cloud.coplanar_groups == plane
         axes = quaternion_to_matrix(cloud.quats[own])[:, :, :2] * cloud.scales[own][:, None, :]
         rim = cloud.means[own][:, None] + radius * np.einsum(
             "nij,jk->nki", axes, np.stack([np.cos(angle), np.sin(angle)])
@@ -60,7 +60,7 @@ def test_a_key_is_a_diameter_before_every_point_of_the_splats(cutoff, away):
 def test_the_key_of_boxes_is_before_their_corners():
     """Whatever the cut-off, at which a Gaussian would end within."""
     turn = turned((0, 1, 0), 60)
-    cloud = splats([(0, 0, 3)], turn, [(0.5, 0.2)]).with_boxes().with_planes(0)
+    cloud = splats([(0, 0, 3)], turn, [(0.5, 0.2)]).with_boxes().with_coplanar_groups(0)
     view = view_of(cloud, quality=fs.Quality(alpha_cutoff=0.9))
     axes = quaternion_to_matrix(cloud.quats)[0, :, :2] * cloud.scales[0]
     corners = cloud.means + np.array([(u, v) for u in (-1, 1) for v in (-1, 1)]) @ axes.T
@@ -73,9 +73,9 @@ def test_index_is_dense_whatever_the_ids():
     cloud = some_planes()
     index = PlaneTable(cloud).index
     assert index.dtype == np.int32
-    assert np.array_equal(index < 0, cloud.planes < 0)
+    assert np.array_equal(index < 0, cloud.coplanar_groups < 0)
     for number, plane in enumerate((3, 7, 2_000_000_000)):
-        assert np.array_equal(index == number, cloud.planes == plane)
+        assert np.array_equal(index == number, cloud.coplanar_groups == plane)
 
 
 def test_keys_do_not_depend_on_the_order_of_splats():
@@ -86,7 +86,7 @@ def test_keys_do_not_depend_on_the_order_of_splats():
 
 def test_planes_at_one_place_have_different_keys():
     one = splats([(0, 0, 1), (0.1, 0, 1)], (1, 0, 0, 0), 0.1)
-    cloud = fs.SplatCloud.concatenate([one, one, one]).with_planes([0, 0, 1, 1, 2, 2])
+    cloud = fs.SplatCloud.concatenate([one, one, one]).with_coplanar_groups([0, 0, 1, 1, 2, 2])
     keys = PlaneTable(cloud).keys(view_of(cloud))
     assert keys.dtype == np.float32
     assert len(np.unique(keys)) == 3
@@ -104,7 +104,7 @@ def test_a_cloud_without_planes_has_none():
 def test_keys_of_many_views_are_those_of_each(camera):
     """Bit for bit, also of planes that move by themselves."""
     cloud = some_planes()
-    cloud = cloud.with_labels(np.where(cloud.planes == 3, 1, 0))
+    cloud = cloud.with_labels(np.where(cloud.coplanar_groups == 3, 1, 0))
     poses = np.random.default_rng(1).normal(0, 0.3, (20, 7)) + np.eye(7)[3]
     views = views_of([fs.Capture(camera)], poses, {1: poses[::-1].copy()})
     each = [moved_view_of(views.capture(k), cloud.origin) for k in range(20)]
