@@ -15,7 +15,7 @@ from fidsplat.experiments.settings import ImageSettings, ViewSettings
 from fidsplat.experiments.sweep import Key, Record, Results
 from fidsplat.remote.queue import Engine, drain
 from fidsplat.render.renderer import Renderer
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import FidsplatError, InputError
 
 
 @dataclass(frozen=True)
@@ -73,4 +73,13 @@ def measure(
         kept.run["machine"] = f"a Ray cluster, {workers} workers"
     left = [(name, points[name].index(key)) for name in points for key in results[name].left(points[name])]
     for (name, number), result in drain(engine, left, workers):
-        yield name, results[name].append(points[name][number], result)
+        try:
+            if not isinstance(result, dict):
+                raise TypeError(f"{type(result).__name__}")
+            record = results[name].append(points[name][number], result)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise FidsplatError(
+                f"the reply of a worker must be a result of {name} that JSON can hold, got {error}; install "
+                "the same fidsplat there"
+            ) from error
+        yield name, record

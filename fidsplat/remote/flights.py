@@ -5,16 +5,17 @@ from __future__ import annotations
 import pickle
 import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from fidsplat.images.output_files import save_output
+from fidsplat.images.output_files import save_output, suffixes_of
 from fidsplat.remote.queue import Engine, drain
 from fidsplat.render.flight import Flight, FlightFolder
 from fidsplat.render.renderer import Renderer
 from fidsplat.store.store import Store
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import atomic_write
 
 Files = dict[tuple[str, str], bytes]
@@ -97,7 +98,19 @@ def draw(folder: FlightFolder, engine: Engine, workers: int) -> Iterator[int]:
     """Let workers draw what is left of a flight; yields the number of each picture once its files are whole
     here. Raises FidsplatError as `drain` does."""
     for k, files in drain(engine, folder.left(), workers):
-        for (name, suffix), content in files.items():
+        for (name, suffix), content in _checked(files, k, folder.flight.capture.outputs).items():
             with atomic_write(folder.file(k, name, suffix)) as stream:
                 stream.write(content)
         yield k
+
+
+def _checked(files: Any, k: int, outputs: Sequence[str]) -> Files:
+    """What a worker sent of picture k. Raises FidsplatError for anything but the files of its outputs."""
+    wanted = {(name, suffix) for name in outputs for suffix in suffixes_of(name)}
+    whole = isinstance(files, dict) and files.keys() == wanted
+    if not whole or not all(isinstance(content, bytes) and content for content in files.values()):
+        raise FidsplatError(
+            f"the reply of a worker must be the files of the outputs of image {k}, got something else; "
+            "install the same fidsplat there"
+        )
+    return files

@@ -106,6 +106,40 @@ def test_pictures_come_back_as_the_files_that_one_process_writes(tmp_path):
     assert list(draw(folder, Here(work), 2)) == []
 
 
+@pytest.mark.parametrize(
+    "reply",
+    [
+        None,
+        [],
+        {},
+        {("rgb", ".png"): b"x"},
+        {("../../rgb", ".png"): b"x", ("depth", ".npy"): b"x"},
+        {("rgb", ".png"): "text", **{("depth", end): b"x" for end in (".npy", ".png", "-turbo.png")}},
+        {("rgb", ".png"): b"", **{("depth", end): b"x" for end in (".npy", ".png", "-turbo.png")}},
+        {(name, end): b"x" for name in ("rgb", "depth") for end in (".npy", ".png", "-turbo.png", "/../x")},
+    ],
+    ids=range(8),
+)  # fmt: skip
+def test_replies_that_are_no_files_of_the_image(tmp_path, reply):
+    folder = FlightFolder(tmp_path / "flight", flight(), "a device")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(fs.FidsplatError, match="reply of a worker must be the files of the outputs of image"):
+        list(draw(folder, Here(lambda _: reply), 2))
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("reply", [None, [1], {"a": float("nan")}, {"a": object()}, {"a": b"bytes"}])
+def test_replies_that_are_no_results(tmp_path, reply):
+    from fidsplat.experiments.sweep import Results
+    from fidsplat.remote.experiments import measure
+
+    points = {"views": [{"category": "aruco", "index": 0}]}
+    results = Results(tmp_path / "views.jsonl", {"device": None})
+    with pytest.raises(fs.FidsplatError, match="must be a result of views that JSON can hold"):
+        list(measure(points, {"views": results}, Here(lambda _: reply), 2))
+    assert not results.file.exists()
+
+
 def test_workers_read_stores_where_they_are_here(tmp_path):
     cloud = fs.marker("aruco:4x4_50:7", size=0.4, mixture="fitted").cloud
     fs.save_ply(cloud, tmp_path / "a.ply")
