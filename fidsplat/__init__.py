@@ -45,6 +45,7 @@ _HOME = {
     "Renderer": "fidsplat.render.renderer",
     "SeveralDevices": "fidsplat.render.multi_device",
     "Frame": "fidsplat.render.frame",
+    "DifferentiableFrame": "fidsplat.render.differentiable_frame",
     "FrameBatch": "fidsplat.render.batch",
     "devices": "fidsplat.backends",
     "FidsplatError": "fidsplat.util.errors",

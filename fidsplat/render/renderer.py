@@ -10,6 +10,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.interface import (
     Adopts,
     DeviceInfo,
@@ -26,8 +27,10 @@ from fidsplat.capture.capture import Capture, CaptureParts, output_names
 from fidsplat.capture.environment import background_of
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.views import Views, views_of
+from fidsplat.effects.differentiable import check_gradients, with_distortion
 from fidsplat.render.batch import FrameBatch, ViewByView
 from fidsplat.render.certified_error import ErrorImage, ideal_of
+from fidsplat.render.differentiable_frame import DifferentiableFrame
 from fidsplat.render.frame import Frame, check_process, stacked
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
@@ -38,7 +41,7 @@ from fidsplat.streaming.bands import BandData
 from fidsplat.streaming.residency import Residency
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import whole_number
-from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.errors import DeviceError, InputError, unknown
 
 _PLAIN = Capture()
 
@@ -163,6 +166,54 @@ class Renderer:
         """
         asked = _asked(scene, capture, outputs=outputs, quality=quality, **parts)
         return self._draw(self._resident(scene), asked)
+
+    def render_differentiable(
+        self,
+        scene: Scene | SplatCloud | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        *,
+        distortion: bool = False,
+        **parts: Unpack[CaptureParts],
+    ) -> DifferentiableFrame:
+        """Render one frame whose `backward` returns gradients; the images are bit-identical to `render`.
+
+        ```python
+        frame = renderer.render_differentiable(resident, capture)
+        gradients = frame.backward({"rgb": 2 * (frame["rgb"] - photograph)})
+        gradients["means"]                                                    # (n, 3) float32
+        ```
+
+        Args:
+            scene: disks with colours or spherical harmonics; no store.
+            capture, outputs, quality, and the other parts by name: as in `render`. Outputs are some of `rgb`,
+                `alpha`, `depth` and `normal`; docs/gradients.md lists the supported effects.
+            distortion: render the image `distortion` (h, w) too: sum over pairs of a pixel's splats of
+                w_i w_j (m_i - m_j)^2, m the depth in a depth buffer, the depth distortion of 2DGS.
+
+        Raises:
+            InputError: as `render`; an effect or an output without a gradient.
+            DeviceError: the device has no gradients, fails, or lacks the memory to render in one piece.
+        """
+        asked = _asked(scene, capture, outputs=outputs, quality=quality, **parts)
+        if not isinstance(self.backend, Differentiates):
+            raise DeviceError(
+                f"device must have gradients, got {self.device.name}; use 'opencl', 'warp' or 'reference'"
+            )
+        resident = self._resident(scene)
+        if isinstance(resident.data, Residency):
+            raise InputError(
+                "scene must be a SplatCloud or a Scene without stores to be differentiated, got a store; "
+                "load its splats first"
+            )
+        interrupts.check()
+        features, view = prepare(resident.data, asked)
+        check_gradients(features, asked.outputs)
+        with self._lock:
+            pipeline = self.backend.differentiate(with_distortion(features) if distortion else features)
+            images = pipeline.forward(resident.data, view)
+        return DifferentiableFrame(images, asked, pipeline, self._lock, distortion)
 
     def render_every(
         self,

@@ -22,7 +22,6 @@ from fidsplat.capture.quality import Quality
 from fidsplat.markers import Marker
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.train.derivatives import drawn
 from fidsplat.util.arguments import as_float, callback, instance, invalid, whole_number
 from fidsplat.util.errors import InputError
 
@@ -106,9 +105,9 @@ def refine(
     for iteration in range(1, iterations + 1):
         camera, grey = sheet.camera(rng), np.full(3, rng.random())
         capture = Capture(camera, outputs=("rgb", "alpha"), quality=QUALITY, background=tuple(grey))
-        images, backward = drawn(renderer, splats.cloud(), capture)
-        slopes, psnr, through = sheet.slopes(camera, images["rgb"], images["alpha"], grey)
-        splats.step(backward(slopes), iteration, _share(iteration / iterations))
+        frame = renderer.render_differentiable(splats.cloud(), capture)
+        slopes, psnr, through = sheet.slopes(camera, frame["rgb"], frame["alpha"], grey)
+        splats.step(frame.backward(slopes), iteration, _share(iteration / iterations))
         if progress is not None:
             progress(RefineStep(iteration, psnr, through))
     return replace(

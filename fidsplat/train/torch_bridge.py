@@ -14,7 +14,7 @@ from fidsplat.capture.capture import Capture
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
-from fidsplat.train.derivatives import by_pose, drawn, moved
+from fidsplat.train.pose_offset import offset_camera, offset_gradient
 from fidsplat.util.errors import InputError
 
 try:
@@ -85,14 +85,14 @@ class _Picture(torch.autograd.Function):
         if pose is not None:
             if capture.camera is None or pose.shape != (6,):
                 raise InputError(f"pose must be 6 numbers, for a capture with a camera, not {pose!r}")
-            capture = replace(capture, camera=moved(capture.camera, pose.astype(np.float64)))
+            capture = replace(capture, camera=offset_camera(capture.camera, pose.astype(np.float64)))
         # which row a splat came from: those that cannot be drawn are left out
         cloud = SplatCloud(**arrays, labels=np.arange(len(np.atleast_1d(arrays["means"]))))
-        images, ctx.derivatives = drawn(renderer, cloud, capture)
+        frame = ctx.frame = renderer.render_differentiable(cloud, capture)
         ctx.outputs, ctx.pose, ctx.rows, ctx.count = capture.outputs, pose, cloud.labels, len(tensors[0])
         ctx.like = [None if tensor is None else (tensor.device, tensor.dtype) for tensor in tensors]
         ctx.set_materialize_grads(False)
-        return tuple(torch.from_numpy(np.array(image)).to(tensors[0].device) for image in images.values())
+        return tuple(torch.from_numpy(np.array(image)).to(tensors[0].device) for image in frame.values())
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -100,9 +100,9 @@ class _Picture(torch.autograd.Function):
         given = {
             name: by.cpu().numpy() for name, by in zip(ctx.outputs, by_images, strict=True) if by is not None
         }
-        found = ctx.derivatives(given)
+        found = ctx.frame.backward(given)
         if ctx.pose is not None:
-            found["pose"] = by_pose(found["pose"].astype(np.float64), ctx.pose.astype(np.float64))
+            found["pose"] = offset_gradient(found["pose"].astype(np.float64), ctx.pose.astype(np.float64))
         gradients: list[Any] = [None, None]  # of the renderer and the capture
         for name, like, wanted in zip(_INPUTS, ctx.like, ctx.needs_input_grad[2:], strict=True):
             if like is None or not wanted:

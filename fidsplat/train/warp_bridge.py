@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.gradients import on_host
-from fidsplat.backends.prepare import prepare
 from fidsplat.backends.warp.device import WarpBackend
 from fidsplat.backends.warp.gradients import add_to, flat_of
 from fidsplat.backends.warp.runtime import load
 from fidsplat.capture.capture import Capture
-from fidsplat.effects.differentiable import check_gradients
 from fidsplat.render.renderer import Renderer
-from fidsplat.train.derivatives import by_pose, moved
+from fidsplat.train.pose_offset import offset_camera, offset_gradient
 from fidsplat.util.errors import DeviceError, InputError
 
 
@@ -63,36 +61,33 @@ def draw(
     """
     wp, backend = load(), renderer.backend
     if not isinstance(backend, WarpBackend):
-        raise DeviceError(f"a tape records pictures of Warp devices, not of {renderer.device.name}")
-    if (colors is None) == (sh is None):
-        raise InputError("give either colors or sh")
+        raise DeviceError(
+            f"renderer must be of a Warp device, got {renderer.device.name}; use 'warp:cpu' or 'warp:cuda'"
+        )
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    given |= {"sh": sh} if colors is None else {"colors": colors}
-    known = given | {"background": background, "pose": pose}
-    wanted = {name: array for name, array in known.items() if getattr(array, "requires_grad", False)}
+    given |= {name: array for name, array in (("colors", colors), ("sh", sh)) if array is not None}
+    inputs = given | {"background": background, "pose": pose}
+    with_grad = {name: array for name, array in inputs.items() if getattr(array, "requires_grad", False)}
     if background is not None:
         capture = replace(capture, background=tuple(_numbers("background", background, 3).tolist()))
-    motion = None if pose is None else _numbers("pose", pose, 6)
-    if motion is not None:
+    offset = None if pose is None else _numbers("pose", pose, 6)
+    if offset is not None:
         if capture.camera is None:
-            raise InputError("a pose needs a capture with a camera")
-        capture = replace(capture, camera=moved(capture.camera, motion))
-    resident = backend.adopt(given, np.zeros(3))
-    features, view = prepare(resident, capture)
-    check_gradients(features, capture.outputs)
-    pipeline = backend.differentiate(features)
-    drawn = pipeline.forward(resident, view)
-    images = {name: wp.clone(drawn.device_array(name), requires_grad=True) for name in capture.outputs}
+            raise InputError("capture must have a camera for a pose, got none; give fs.Capture(camera)")
+        capture = replace(capture, camera=offset_camera(capture.camera, offset))
+    frame = renderer.render_differentiable(renderer.adopt(**given), capture)
+    images = {name: wp.clone(frame.device_array(name), requires_grad=True) for name in capture.outputs}
 
     def backward() -> None:
-        found = pipeline.backward(drawn, {name: image.grad for name, image in images.items()})
-        if motion is not None:
-            of_pose = by_pose(on_host(found["pose"]).astype(np.float64), motion)
-            found["pose"] = wp.array(of_pose, dtype=wp.float32, device=backend.device)
-        for name, array in wanted.items():
+        by_images = {name: image.grad for name, image in images.items()}
+        found = frame.backward(by_images, on_device=True)
+        if offset is not None:
+            by_offset = offset_gradient(on_host(found["pose"]).astype(np.float64), offset)
+            found["pose"] = wp.array(by_offset, dtype=wp.float32, device=backend.device)
+        for name, array in with_grad.items():
             add_to(flat_of(array.grad), flat_of(found[name]))
 
-    tape.record_func(backward, [*wanted.values(), *images.values()])
+    tape.record_func(backward, [*with_grad.values(), *images.values()])
     return images
 
 
@@ -100,5 +95,5 @@ def _numbers(name: str, array: Any, count: int) -> np.ndarray:
     """So many numbers, float64, of an array."""
     numbers = on_host(array).astype(np.float64)
     if numbers.shape != (count,):
-        raise InputError(f"{name} has the shape {numbers.shape}; it must be {count} numbers")
+        raise InputError(f"{name} must be {count} numbers, got the shape {numbers.shape}")
     return numbers

@@ -136,6 +136,23 @@ def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
     assert all(np.array_equal(drawn[name], frame[name]) for name in drawn)
 
 
+def test_a_differentiable_frame_has_the_bits_of_render_and_of_the_backends_gradients(backend, renderer):
+    cloud, capture = random_picture(5)
+    expected = derivatives(backend, cloud, capture, distorted=False)
+    weights = random_loss(*prepare(cloud, capture))
+    frame = renderer.render_differentiable(cloud, capture)
+    found = frame.backward(weights)
+    images, rendered = dict(frame), renderer.render(cloud, capture)
+    assert all(np.array_equal(images[name], rendered[name]) for name in rendered)
+    assert all(found[name].tobytes() == array.tobytes() for name, array in expected.items())
+    assert found.keys() == expected.keys()
+    resident = renderer.upload(cloud)
+    on_device = renderer.render_differentiable(resident, capture).backward(weights, on_device=True)
+    assert all(np.array_equal(on_host(array), found[name]) for name, array in on_device.items())
+    with pytest.raises(fs.InputError, match="made last"):
+        frame.backward(weights)
+
+
 def test_pictures_that_nobody_waits_for_have_the_same_derivatives(backend, renderer):
     """Where lists are made before their length is known, one that had too little room says so when it is
     taken back, and the next has enough."""

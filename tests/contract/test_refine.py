@@ -90,6 +90,7 @@ def test_what_cannot_be_refined_is_said(renderer, tmp_path):
         refine(made(), renderer, leak=-1)
     with pytest.raises(InputError, match=r"fs\.train\.refine"):
         fs.marker(SPEC, mixture="refined")
-    nobody = SimpleNamespace(backend=None, device=SimpleNamespace(name="abacus"))
-    with pytest.raises(DeviceError, match="abacus has no gradients"):
+    nobody = fs.Renderer.__new__(fs.Renderer)
+    nobody.backend = SimpleNamespace(info=SimpleNamespace(name="abacus"))
+    with pytest.raises(DeviceError, match="must have gradients, got abacus"):
         refine(made(), nobody)

@@ -1,4 +1,4 @@
-"""Pictures and their derivatives for loops of one's own; a pose as six numbers, and PyTorch's tensors."""
+"""Public gradients: `Renderer.render_differentiable`, camera pose offsets and the PyTorch bridge."""
 
 import sys
 from importlib import import_module
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.train.derivatives import by_pose, drawn, moved
+from fidsplat.train.pose_offset import offset_camera, offset_gradient
 
 CAMERA = fs.Camera.look_at(24, 18, 0.9, (0.2, 0.1, -2.0), (0.0, 0.0, 0.0))
 OUTPUTS = ("rgb", "alpha", "depth")
@@ -33,7 +33,7 @@ def arrays(degree=None):
 def motion(pose):
     """(4, 4)."""
     still = fs.Camera.pinhole(4, 4, 4, 4, 2, 2)
-    return moved(still, pose).world_to_camera
+    return offset_camera(still, pose).world_to_camera
 
 
 def screw(matrix):
@@ -47,7 +47,7 @@ def test_derivatives_by_a_pose_are_those_of_central_differences(pose):
     """Of what follows a motion, by the motion's own numbers."""
     by_motion, step = np.array([0.3, -1.2, 0.7, 2.0, 0.5, -0.9]), 1e-6
     back = np.linalg.inv(motion(pose))
-    for k, found in enumerate(by_pose(by_motion, pose)):
+    for k, found in enumerate(offset_gradient(by_motion, pose)):
         ends = [screw(motion(pose + sign * step * np.eye(6)[k]) @ back) for sign in (1, -1)]
         assert found == pytest.approx(by_motion @ (ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-8)
 
@@ -61,23 +61,49 @@ def test_a_picture_goes_back_to_a_pose_that_is_not_0():
     """Central differences of the float32 images: what they round is 1e-4 of these derivatives."""
     renderer, cloud, pose = fs.Renderer("reference"), fs.SplatCloud(**arrays()), np.array(POSES[2] / 10)
 
-    def seen(at):
-        return drawn(renderer, cloud, fs.Capture(moved(CAMERA, at), OUTPUTS[:1]))
+    def rendered(at):
+        return renderer.render_differentiable(cloud, offset_camera(CAMERA, at))
 
-    images, backward = seen(pose)
-    weights = np.random.default_rng(1).normal(size=images["rgb"].shape)
-    found = by_pose(backward({"rgb": weights})["pose"], pose)
+    frame = rendered(pose)
+    weights = np.random.default_rng(1).normal(size=frame["rgb"].shape)
+    found = offset_gradient(frame.backward({"rgb": weights})["pose"], pose)
     for k in range(6):
-        ends = [(weights * seen(pose + sign * 1e-3 * np.eye(6)[k])[0]["rgb"]).sum() for sign in (1, -1)]
+        ends = [(weights * rendered(pose + sign * 1e-3 * np.eye(6)[k])["rgb"]).sum() for sign in (1, -1)]
         assert found[k] == pytest.approx((ends[0] - ends[1]) / 2e-3, abs=5e-3 * np.abs(found).max())
 
 
-def test_what_has_no_gradient_is_said_before_it_is_drawn():
+def test_an_effect_without_a_gradient_is_an_error_before_rendering():
     renderer, cloud = fs.Renderer("reference"), fs.SplatCloud(**arrays())
     with pytest.raises(fs.InputError, match="the output 'label' has no gradient"):
-        drawn(renderer, cloud, fs.Capture(CAMERA, ("rgb", "label")))
+        renderer.render_differentiable(cloud, CAMERA, ("rgb", "label"))
     with pytest.raises(fs.InputError, match="samples=1"):
-        drawn(renderer, cloud, fs.Capture(CAMERA, quality="samples=2"))
+        renderer.render_differentiable(cloud, CAMERA, quality="samples=2")
+
+
+def test_gradients_are_named_arrays_in_the_shapes_of_the_cloud():
+    renderer, cloud = fs.Renderer("reference"), fs.SplatCloud(**arrays(degree=1))
+    frame = renderer.render_differentiable(renderer.upload(cloud), CAMERA, OUTPUTS, distortion=True)
+    assert isinstance(frame, fs.Frame)
+    assert list(frame) == [*OUTPUTS, "distortion"]
+    np.testing.assert_array_equal(frame["depth"], renderer.render(cloud, CAMERA, OUTPUTS)["depth"])
+    found = frame.backward({"rgb": ONES, "distortion": ONES[..., 0]})
+    shapes = {"means": (6, 3), "quats": (6, 4), "scales": (6, 2), "opacities": (6,), "sh": (6, 4, 3)}
+    shapes |= {"background": (3,), "pose": (6,), "screen": (6,)}
+    assert {name: (array.shape, array.dtype) for name, array in found.items()} == {
+        name: (shape, np.float32) for name, shape in shapes.items()
+    }
+    precise = frame.backward({"rgb": ONES, "distortion": ONES[..., 0]}, on_device=True)
+    assert all(np.array_equal(array.astype(np.float32), found[name]) for name, array in precise.items())
+    assert not any(array.any() for array in frame.backward({}).values())
+    with pytest.raises(fs.InputError, match="the output 'normal' was not drawn"):
+        frame.backward({"normal": ONES})
+
+
+def test_a_store_has_no_gradients(tmp_path):
+    fs.save_ply(fs.SplatCloud(**arrays()), str(tmp_path / "cloud.ply"))
+    store = fs.build_store([str(tmp_path / "cloud.ply")], str(tmp_path / "cloud.fss"))
+    with pytest.raises(fs.InputError, match=r"scene must be a SplatCloud .* got a store"):
+        fs.Renderer("reference").render_differentiable(store, CAMERA)
 
 
 def test_without_torch_the_extra_is_named(monkeypatch):
@@ -140,14 +166,12 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     context.needs_input_grad[3] = False  # quats
     back = bridge._Picture.backward(context, None, None, Tensor(by_depth))
 
-    wanted_images, backward = drawn(
-        renderer, fs.SplatCloud(**given), fs.Capture(moved(CAMERA, pose), OUTPUTS)
-    )
-    wanted = backward({"depth": by_depth})
-    wanted["pose"] = by_pose(wanted["pose"], pose)
+    frame = renderer.render_differentiable(fs.SplatCloud(**given), offset_camera(CAMERA, pose), OUTPUTS)
+    wanted = frame.backward({"depth": by_depth})
+    wanted["pose"] = offset_gradient(wanted["pose"], pose)
     assert np.abs(wanted["pose"]).min() > 0
     for name, image in images.items():
-        np.testing.assert_array_equal(image.numpy(), wanted_images[name])
+        np.testing.assert_array_equal(image.numpy(), frame[name])
     assert [each is None for each in back] == [True, True, False, True, *[False] * 3, True, True, False]
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors"), (9, "pose")):
         np.testing.assert_array_equal(back[place].numpy(), wanted[name])
@@ -155,9 +179,8 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     with pytest.warns(UserWarning, match="1 of 6 splats left out"):
         bridge.draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
     kept = {name: array[[0, 2, 3, 4, 5]] for name, array in given.items()}
-    wanted = drawn(renderer, fs.SplatCloud(**kept), fs.Capture(moved(CAMERA, pose), OUTPUTS))[1](
-        {"rgb": ONES}
-    )
+    frame = renderer.render_differentiable(fs.SplatCloud(**kept), offset_camera(CAMERA, pose), OUTPUTS)
+    wanted = frame.backward({"rgb": ONES})
     back = bridge._Picture.backward(bridge._Picture.context, Tensor(ONES), None, None)
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors")):
         np.testing.assert_array_equal(np.delete(back[place].numpy(), 1, 0), wanted[name])
@@ -181,17 +204,17 @@ def test_tensors_have_the_gradients_of_the_backend(degree):
     sum((torch.tensor(weights[name]) * images[name]).sum() for name in weights).backward()
 
     background, pose = given.pop("background"), given.pop("pose")
-    capture = fs.Capture(moved(CAMERA, pose), OUTPUTS, background=tuple(background))
-    wanted_images, backward = drawn(renderer, fs.SplatCloud(**given), capture)
-    wanted = backward(weights)
-    wanted["pose"] = by_pose(wanted["pose"], pose)
+    capture = fs.Capture(offset_camera(CAMERA, pose), OUTPUTS, background=tuple(background))
+    frame = renderer.render_differentiable(fs.SplatCloud(**given), capture)
+    wanted = frame.backward(weights)
+    wanted["pose"] = offset_gradient(wanted["pose"], pose)
     if degree == 0:
         shade = 0.28209479177387814 * given["sh"][:, 0] + 0.5
         wanted["sh"] = 0.28209479177387814 * (wanted.pop("colors") * (shade > 0))[:, None]
     length = np.linalg.norm(given["quats"], axis=1, keepdims=True)
     wanted["quats"] = wanted["quats"] / length  # a cloud's are unit
     for name, image in images.items():
-        np.testing.assert_allclose(image.detach().numpy(), wanted_images[name], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(image.detach().numpy(), frame[name], rtol=1e-5, atol=1e-6)
     for name, tensor in tensors.items():
         np.testing.assert_allclose(tensor.grad.numpy(), wanted[name], rtol=1e-4, atol=1e-5)
 

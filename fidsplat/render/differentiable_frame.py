@@ -1,0 +1,63 @@
+"""DifferentiableFrame: a rendered frame with gradients."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+from fidsplat.backends.derivatives import DifferentiablePipeline
+from fidsplat.backends.gradients import DifferentiableImages, on_host
+from fidsplat.backends.interface import Images
+from fidsplat.capture.capture import Capture
+from fidsplat.render.frame import Frame
+from fidsplat.util import interrupts
+
+
+class DifferentiableFrame(Frame):
+    """A frame of `Renderer.render_differentiable`: a Frame with `backward`."""
+
+    def __init__(
+        self,
+        images: Images,
+        capture: Capture,
+        pipeline: DifferentiablePipeline,
+        lock: threading.Lock,
+        distortion: bool = False,
+    ) -> None:
+        super().__init__(images.images if isinstance(images, DifferentiableImages) else images, capture)
+        self._forward, self._pipeline, self._lock = images, pipeline, lock
+        if distortion:
+            self.outputs = (*capture.outputs, "distortion")
+
+    def backward(self, gradients: Mapping[str, Any], on_device: bool = False) -> dict[str, Any]:
+        """Differentiate a loss by the splats, the background and the camera pose.
+
+        Call it before the next frame of this device. Results are bit-identical on every run. Decisions of the
+        forward pass (alpha cut-off, transmittance stop, near plane, order of splats) have no derivative.
+
+        Args:
+            gradients: derivatives of the loss by outputs, float32 arrays in the shape of the output, by name:
+                `rgb` (h, w, 3), `alpha` (h, w), `depth` (h, w) [1/m], `normal` (h, w, 3), `distortion`
+                (h, w). NumPy arrays, or arrays of the device (pyopencl, Warp), which are not copied.
+                Outputs without an entry have a gradient of 0.
+            on_device: return arrays of the device (pyopencl, Warp; NumPy float64 of the reference), which are
+                valid until the next call, instead of NumPy float32.
+
+        Returns:
+            Derivatives of the loss by what the cloud holds, n splats: `means` (n, 3) [1/m]; `quats` (n, 4),
+            w x y z, not normalised; `scales` (n, 2) [1/m]; `opacities` (n,); `colors` (n, 3) or `sh`
+            (n, k, 3). Furthermore `background` (3,); `pose` (6,), a rotation vector [1/rad] and a translation
+            [1/m] applied after `world_to_camera`, in camera axes; `screen` (n,), the densification statistic
+            of 2DGS trainers, the norm of the derivative by the projected centre in half images. Splats that
+            are not rendered have zeros.
+
+        Raises:
+            InputError: the device has rendered another frame since; a gradient of an output that was not
+                rendered, that has no gradient, or of another shape or type.
+            DeviceError: the device fails or lacks memory.
+        """
+        interrupts.check()
+        with self._lock:
+            found = self._pipeline.backward(self._forward, gradients)
+            return found if on_device else {name: on_host(array) for name, array in found.items()}

@@ -1,0 +1,41 @@
+"""Camera pose offset: a rigid motion (6,) of the camera, and the gradient by its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.splats.rotations import quaternion_to_matrix
+
+_SMALL_ANGLE = 1e-3
+"""radians, below which the first term of the series is as accurate as the formula"""
+
+
+def offset_camera(camera: Camera, offset: np.ndarray) -> Camera:
+    """The camera after a motion (6,) in its own axes: rotation vector [rad], then translation [m]."""
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = _rotation(offset[:3]), offset[3:]
+    return replace(camera, world_to_camera=motion @ camera.world_to_camera, position=None)
+
+
+def offset_gradient(by_pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """The gradient (6,) by an offset, from the gradient `pose` of a frame of the offset camera.
+
+    `pose` is the gradient by a second motion that follows the offset: R(w + dw) = R(J dw) R(w), so it is
+    multiplied by the transpose of J, the left Jacobian of SO(3).
+    """
+    rotation, translation = offset[:3], offset[3:]
+    by_rotation = by_pose[:3] - np.cross(translation, by_pose[3:])
+    angle = float(np.linalg.norm(rotation))
+    first = np.sinc(angle / (2 * np.pi)) ** 2 / 2
+    second = 1 / 6 if angle < _SMALL_ANGLE else (1 - np.sinc(angle / np.pi)) / angle**2
+    crossed = np.cross(rotation, by_rotation)
+    return np.concatenate([by_rotation - first * crossed + second * np.cross(rotation, crossed), by_pose[3:]])
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """The matrix (3, 3) of a rotation vector (3,)."""
+    half = float(np.linalg.norm(vector)) / 2
+    return quaternion_to_matrix(np.concatenate([[np.cos(half)], np.sinc(half / np.pi) / 2 * vector]))
