@@ -23,7 +23,7 @@ VALUES = {
     "thickness": (np.nan, np.inf, -1.0, 1e30),
     "sh": (np.nan, np.inf, -np.inf, 1e30, -1e30),
     "labels": (-(2**31), 2**31 - 1),
-    "planes": (-(2**31), -5, 10**6, 2**31 - 1),
+    "coplanar_groups": (-(2**31), -5, 10**6, 2**31 - 1),
 }
 CAMERA = fs.Camera.look_at(32, 24, 1.0, position=(0.3, 0.2, -6.0), target=(0.0, 0.0, 0.0))
 
@@ -110,7 +110,7 @@ def test_damaged_splats_are_reported_with_their_chunk(folder, tmp_path, column, 
         ("means", np.inf, "that can be rendered, got means not finite: 1"),
         ("quats", 0.0, "that can be rendered, got zero quaternion: 1"),
         ("scales", np.inf, "that can be rendered, got scales not finite: 1"),
-        ("planes", -3, "with group ids of at least 0"),
+        ("coplanar_groups", -3, "with group ids of at least 0"),
     ],
 )
 def test_damaged_coplanar_splats_are_refused(folder, tmp_path, column, value, words):
@@ -124,5 +124,5 @@ def test_large_ids_of_coplanar_groups_are_rendered(folder, tmp_path, renderer, v
         scene = fs.Scene([], CAMERA, stores=(fs.Store(path),))
         return renderer.render(scene, outputs=("alpha",))["alpha"]
 
-    path = crafted(folder, tmp_path / "a.fss", "planes", COUNT - 1, value)
+    path = crafted(folder, tmp_path / "a.fss", "coplanar_groups", COUNT - 1, value)
     np.testing.assert_allclose(alpha(path), alpha(folder), atol=1e-5)
