@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from fidsplat.images.files import read_image
-from fidsplat.images.output_files import load_output, suffixes_of
 from fidsplat.render.flight import FlightFolder
+from fidsplat.render.output_files import load_output, suffixes_of
 from fidsplat.vision.coco import CocoAnnotations
 from fidsplat.vision.truth import truth_of
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import indent
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -21,6 +22,7 @@ from fidsplat.commands.output import (
     option,
     tell,
 )
+from fidsplat.effects.catalogue import outputs_help
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import path_of, writable_folder
 
@@ -45,12 +47,7 @@ class Render:
     (colours); labels, ids and counts as .npy and .png (colours).
 
     Outputs:
-      rgb alpha label splat_id            splat_id: index of the heaviest splat; label: its label
-      depth depth_median depth_first      metres along z; first: where opacity reaches the quality's first_hit
-      distance distance_median distance_first            the same along the ray
-      normal normal_world                 towards the camera, in its axes or the world's
-      blended                             number of splats that made the pixel
-      error                               upper bound of what rgb is off from the ideal (docs/quality.md)
+    {outputs}
 
     Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and
     change standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are
@@ -100,7 +97,7 @@ class Render:
     def run(self) -> int:
         import fidsplat as fs
         from fidsplat.accuracy.quality_within import check_bounds
-        from fidsplat.images.output_files import save_output
+        from fidsplat.render.output_files import save_output
 
         names = names_of(self.outputs)
         check_words(names, self.quality)
@@ -170,6 +167,9 @@ class Render:
                 )
         with console(self.json).status("drawing"):
             return renderer.render(scene, outputs=names, quality=quality)
+
+
+Render.__doc__ = (Render.__doc__ or "").replace("    {outputs}", indent(outputs_help(), "    "))
 
 
 @contextmanager

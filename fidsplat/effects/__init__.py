@@ -1,6 +1,15 @@
-"""What a scene may call for, as data, and the one place that decides what it does call for."""
+"""Effects and outputs as data, and the selection of those that a frame requires."""
 
-from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
-from fidsplat.effects.select import IMAGES, OUTPUTS, FeatureSet, select
+from fidsplat.effects.catalogue import CATALOGUE, IMAGES, OUTPUTS, Effect, Output, declared_output
+from fidsplat.effects.select import FeatureSet, select
 
-__all__ = ["CATALOGUE", "IMAGES", "OUTPUTS", "Effect", "FeatureSet", "Output", "select"]
+__all__ = [
+    "CATALOGUE",
+    "IMAGES",
+    "OUTPUTS",
+    "Effect",
+    "FeatureSet",
+    "Output",
+    "declared_output",
+    "select",
+]

@@ -1,12 +1,15 @@
-"""Every effect that a picture may call for, by name; how each backend draws it is the backend's own.
+"""Declarations of all effects and output images, by name. Backends map the names to kernel code.
 
-Of some kinds a picture has exactly one (camera, color, lowpass, stop, compose, footprint, background,
-arithmetic), of ellipsoids one where there are any; of outputs and of steps after blending any number.
+A frame has exactly one effect of each of some kinds (camera, color, lowpass, stop, compose, footprint,
+background, arithmetic), at most one ellipsoid effect, and any number of outputs and of steps after blending.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+DISPLAYS = ("color", "depth", "normal", "label", "count")
 
 
 @dataclass(frozen=True)
@@ -16,25 +19,49 @@ class Output:
     name: str
     channels: int
     dtype: str
+    summary: str = ""
+    """one line for `fidsplat render --help`"""
+    display: str = "color"
+    """how files and previews show it, one of `DISPLAYS`; all but color and normal are stored as arrays too"""
+    tolerance: float = 0.0
+    """largest error of a device beyond the reference's certificate (`NAME_certificate` of a pixel)"""
+    relative: bool = False
+    """the tolerance is a share of the value"""
+    discontinuous: bool = False
+    """the value jumps where a decision flips: pixels that the reference marks as `NAME_may_flip` are not
+    compared, and others may differ by the tolerance or by the reference's `NAME_bound`"""
+    blank: int = 0
+    """value of a pixel without splats"""
     public: bool = True
-    """False: for measuring and training only; captures cannot ask for it."""
+    """False: for measuring and training only; captures cannot request it"""
+
+    @property
+    def as_array(self) -> bool:
+        """Whether files store the array in addition to a picture."""
+        return self.display not in ("color", "normal")
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect as data."""
+    """Declaration of one effect."""
 
     name: str
     output: Output | None = None
     needs: tuple[str, ...] = ()
-    """other outputs that this one is made from"""
+    """other outputs from which this one is computed"""
 
 
 def _image(
-    name: str, channels: int = 1, dtype: str = "float32", needs: str = "", public: bool = True
+    name: str, summary: str = "", *, channels: int = 1, dtype: str = "float32", needs: str = "", **fields: Any
 ) -> Effect:
-    return Effect(name, Output(name, channels, dtype, public), (needs,) if needs else ())
+    return Effect(name, Output(name, channels, dtype, summary, **fields), (needs,) if needs else ())
 
+
+_COLOR: dict[str, Any] = {"tolerance": 2e-5}
+_NORMAL: dict[str, Any] = {"channels": 3, "display": "normal", "tolerance": 2e-5}
+_DEPTH: dict[str, Any] = {"display": "depth", "tolerance": 1e-4, "relative": True}
+_DEPTH_OF_ONE: dict[str, Any] = _DEPTH | {"discontinuous": True}
+_ID: dict[str, Any] = {"dtype": "int32", "display": "label", "discontinuous": True, "blank": -1}
 
 _PLAIN = (
     *("camera_pinhole", "camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
@@ -44,35 +71,57 @@ _PLAIN = (
     *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
     *("background_constant", "background_gradient", "background_panorama"),
     *("arithmetic_precise", "arithmetic_fast"),
-    # where a picture needs them
-    *(
-        "external_depth",
-        "motion_groups",
-        "shutter_exposure",
-        "shutter_rows",
-        "blend_double",
-        "termination_depths",
-    ),
+    # optional
+    *("external_depth", "motion_groups", "shutter_exposure", "shutter_rows", "blend_double"),
+    "termination_depths",
     # steps after blending
     *("fog", "exposure", "vignetting", "noise", "gain"),
     *("response_gamma", "response_srgb", "response_table", "quantise"),
 )
 _IMAGES = (
-    _image("alpha"),
-    _image("depth"),
-    _image("depth_median"),
-    _image("normal", 3),
-    _image("label", dtype="int32"),
-    _image("overdraw", dtype="int32", public=False),
-    _image("depth_first"),
-    _image("distance", needs="depth"),
-    _image("distance_median", needs="depth_median"),
-    _image("distance_first", needs="depth_first"),
-    _image("normal_world", 3, needs="normal"),
-    _image("splat_id", dtype="int32"),
-    _image("blended", dtype="int32"),
+    _image("alpha", "coverage, 1 - transmittance", **_COLOR),
+    _image("depth", "expected depth along z [m]; 0 where alpha is below 1/255", **_DEPTH),
+    _image("depth_median", "depth [m] at which transmittance falls to 1/2", **_DEPTH_OF_ONE),
+    _image("depth_first", "depth [m] at which opacity reaches the quality's first_hit", **_DEPTH_OF_ONE),
+    _image("distance", "expected distance along the ray [m]", needs="depth", **_DEPTH),
+    _image("distance_median", "distance [m] of depth_median", needs="depth_median", **_DEPTH_OF_ONE),
+    _image("distance_first", "distance [m] of depth_first", needs="depth_first", **_DEPTH_OF_ONE),
+    _image("normal", "unit normal towards the camera, in camera axes", **_NORMAL),
+    _image("normal_world", "the same in world axes", needs="normal", **_NORMAL),
+    _image("label", "label of the splat with the largest weight, or -1", **_ID),
+    _image("splat_id", "index of the splat with the largest weight, or -1", **_ID),
+    _image("blended", "number of composited splats", dtype="int32", display="count", discontinuous=True),
+    _image("overdraw", dtype="int32", display="count", public=False),
     _image("distortion", public=False),
     _image("rounding", public=False),
 )
 
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (*map(Effect, _PLAIN), *_IMAGES)}
+
+RGB = Output("rgb", 3, "float32", "colour in display space, not clamped above 1", **_COLOR)
+IMAGES: dict[str, Output] = {
+    "rgb": RGB,
+    **{effect.output.name: effect.output for effect in CATALOGUE.values() if effect.output},
+}
+"""all output images of backends"""
+OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
+"""outputs that captures can request and backends render"""
+COMPOSED = {
+    "error": Output(
+        "error", 1, "float32", "certified upper bound of the error of rgb (docs/quality.md)", "count"
+    ),
+}
+"""outputs that are computed from two renderings (fidsplat/render/certified_error.py)"""
+
+
+def declared_output(name: str) -> Output:
+    """Declaration of an output that captures can request, or of an internal one."""
+    effect = CATALOGUE.get(name)
+    return effect.output if effect is not None and effect.output else {"rgb": RGB, **COMPOSED}[name]
+
+
+def outputs_help() -> str:
+    """Table of all outputs that captures can request, a line each."""
+    outputs = (*OUTPUTS.values(), *COMPOSED.values())
+    width = max(len(output.name) for output in outputs) + 2
+    return "\n".join(f"  {output.name:{width}}{output.summary}" for output in outputs)

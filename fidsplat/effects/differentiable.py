@@ -1,4 +1,4 @@
-"""Which pictures have gradients: of the effects those whose derivatives backends know."""
+"""Effects and outputs with gradients, and checks that a frame is differentiable."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ DIFFERENTIABLE = frozenset(
         *("background_constant", "arithmetic_precise", "arithmetic_fast"),
     )
 )
-"""effects through which gradients go"""
+"""effects with a backward pass"""
 GRADIENT_OUTPUTS = ("rgb", "alpha", "depth", "normal", "distortion")
-"""outputs whose gradients backends take; captures cannot ask for `distortion` (`with_distortion`)"""
+"""outputs with a backward pass; `distortion` is internal (`with_distortion`)"""
 _REMEDIES = {
     "camera": "a pinhole camera",
     "lowpass": "lowpass='screen' or 'none'",
@@ -35,10 +35,10 @@ _REMEDIES = {
 
 
 def check_differentiable(features: FeatureSet) -> None:
-    """Refuse pictures that have no gradient.
+    """Refuse features without gradient.
 
     Raises:
-        InputError: it names the first effect that has none, and what would do.
+        InputError: names the first such effect and a remedy.
     """
     for name in features.slots:
         if name not in DIFFERENTIABLE:
@@ -50,19 +50,19 @@ def check_differentiable(features: FeatureSet) -> None:
 
 
 def with_distortion(features: FeatureSet) -> FeatureSet:
-    """These features and the output `distortion` (h, w): how far apart in depth the fragments of a pixel lie,
-    a loss of the 2DGS authors'. Sum over pairs of w_i w_j (m_i - m_j)^2, m the depth in a depth buffer."""
+    """These features and the output `distortion` (h, w), the depth distortion loss of 2DGS: sum over pairs of
+    fragments of w_i w_j (m_i - m_j)^2, m the depth-buffer value."""
     return replace(features, outputs=tuple(sorted({*features.outputs, "distortion"})))
 
 
 def check_gradients(features: FeatureSet, names: Iterable[str]) -> None:
-    """Refuse gradients of outputs that have none, or that were not drawn.
+    """Refuse gradients of outputs without a backward pass, or that were not rendered.
 
     Raises:
-        InputError: it names the output, and those that would do.
+        InputError: names the output and the possible ones.
     """
-    drawn = [name for name in GRADIENT_OUTPUTS if name == "rgb" or name in features.names]
+    rendered = [name for name in GRADIENT_OUTPUTS if name == "rgb" or name in features.names]
     for name in names:
-        if name not in drawn:
-            why = "was not drawn" if name in GRADIENT_OUTPUTS else "has no gradient"
-            raise InputError(f"the output {name!r} {why}; give gradients of: {', '.join(drawn)}")
+        if name not in rendered:
+            why = "was not rendered" if name in GRADIENT_OUTPUTS else "has no gradient"
+            raise InputError(f"the output {name!r} {why}; give gradients of: {', '.join(rendered)}")

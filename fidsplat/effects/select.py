@@ -1,4 +1,4 @@
-"""The one place that decides what a scene calls for."""
+"""Selection of the effects that a capture of a cloud requires; no other module decides this."""
 
 from __future__ import annotations
 
@@ -11,51 +11,39 @@ from fidsplat.cameras.lenses import Lens
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import Gradient, Panorama
 from fidsplat.capture.quality import Quality
-from fidsplat.effects.catalogue import CATALOGUE, Output
+from fidsplat.effects.catalogue import CATALOGUE, COMPOSED, OUTPUTS, RGB, Output
 from fidsplat.util.errors import InputError, unknown
-
-RGB = Output("rgb", 3, "float32")
-IMAGES: dict[str, Output] = {
-    "rgb": RGB,
-    **{effect.output.name: effect.output for effect in CATALOGUE.values() if effect.output},
-}
-"""all output images"""
-OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
-"""those that users ask for and backends render"""
-OF_TWO = ("error",)
-"""those that are made of two renderings (fidsplat/render/certified_error.py)"""
 
 _KINDS = {Gradient: "gradient", Panorama: "panorama"}
 
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """What one picture calls for: names and small integers only, so that it can be a key.
+    """Effects of a frame: names and small integers only, so that it is a cache key.
 
-    Numbers that change from view to view (intrinsics, poses, thresholds, background) are uniforms, never
-    here.
+    Numbers that change from view to view (intrinsics, poses, thresholds, background) are uniforms.
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, ellipsoids if any, lowpass, stop, a layer if
-    any, compose, footprint, background, arithmetic; then motion, shutter, double blending and where tiles
-    end, if any."""
+    """One effect per kind in fixed order: camera, color, ellipsoids (optional), lowpass, stop, external depth
+    (optional), compose, footprint, background, arithmetic; then optional motion, shutter, float64 blending
+    and termination depths."""
     outputs: tuple[str, ...]
-    """Sorted names of the outputs beside rgb."""
+    """Sorted names of the outputs other than rgb."""
     sh_degree: int
     samples: int
     setup_precision: str
     posts: tuple[str, ...] = ()
-    """What changes rgb on its way out, in its order: fog, the steps of the sensor."""
+    """Steps on rgb after blending, in order: fog, then sensor steps."""
 
     @cached_property
     def names(self) -> frozenset[str]:
-        """Names of all effects, those of outputs that others are made from among them."""
+        """Names of all effects, including outputs that other outputs need."""
         return frozenset((*self.slots, *(image.name for image in self.images[1:]), *self.posts))
 
     @cached_property
     def images(self) -> tuple[Output, ...]:
-        """Output images, rgb first, then those that others are made from."""
+        """Output images: rgb, those that other outputs need, the others."""
         needed = sorted({name for output in self.outputs for name in CATALOGUE[output].needs})
         names = (*needed, *(name for name in self.outputs if name not in needed))
         effects = (CATALOGUE[name] for name in names)
@@ -63,11 +51,11 @@ class FeatureSet:
 
 
 class Traits(Protocol):
-    """What of a cloud decides the kernels."""
+    """Properties of a cloud that select kernels."""
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the harmonics; -1 for plain colours."""
+        """Degree of the spherical harmonics; -1 for RGB colours."""
         ...
 
     @property
@@ -77,7 +65,7 @@ class Traits(Protocol):
 
     @property
     def footprint(self) -> str:
-        """`gaussian`, `box`, or `mixed` where there are splats of both kinds."""
+        """`gaussian`, `box`, or `mixed` for both kinds."""
         ...
 
     @property
@@ -87,15 +75,15 @@ class Traits(Protocol):
 
 
 def select(cloud: Traits, capture: Capture) -> FeatureSet:
-    """The features that a capture of a cloud calls for. Values that mean nothing call for nothing. Without a
-    camera it is a pinhole.
+    """Select the features that a capture of a cloud requires. Values without effect select nothing. A capture
+    without a camera is that of a pinhole.
 
     Raises:
-        InputError: an output that nobody declares, or two effects that do not go together.
+        InputError: an unknown output, or two effects that exclude each other.
     """
     for name in capture.outputs:
-        if name not in (*OUTPUTS, *OF_TWO):
-            raise InputError(unknown("output", name, (*OUTPUTS, *OF_TWO)))
+        if name not in (*OUTPUTS, *COMPOSED):
+            raise InputError(unknown("output", name, (*OUTPUTS, *COMPOSED)))
     quality, background = capture.quality, capture.backdrop
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
@@ -103,7 +91,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
         raise InputError(
             "a capture with external_depth must have a shutter with exposure_time=0 and readout=0"
         )
-    # what filters itself needs no low-pass
+    # boxes and EWA have a filter of their own
     alone = cloud.ellipsoids == "all" and ellipsoid != "exact"
     filtered = cloud.footprint == "box" or alone
     lowpass = "none" if filtered else quality.lowpass
@@ -112,7 +100,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
         _refuse_float64(lens, capture.foggy)
     flat = cloud.footprint == "gaussian" and not ellipsoid
     in_spheres = lens is None and flat and lowpass != "pixel"
-    # harmonics of degree 0 do not depend on the view: they are colours (`SplatCloud.plain_colors`)
+    # harmonics of degree 0 do not depend on the view and are RGB colours (`SplatCloud.plain_colors`)
     sh_degree = max(cloud.sh_degree, 0)
     return FeatureSet(
         slots=(
@@ -122,19 +110,19 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             *(("ellipsoids_only",) if alone else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
-            # before what composites, whose fragments it hides
+            # before compositing, whose fragments it occludes
             *(("external_depth",) if capture.external_depth is not None else ()),
             _composing(cloud, quality.order, one_depth_each=alone and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
-            # short functions are float32's
+            # the fast functions are float32
             f"arithmetic_{'precise' if double else quality.arithmetic}",
             *(("motion_groups",) if capture.motion.groups else ()),
             *(("shutter_exposure",) if capture.exposed else ()),
             *(("shutter_rows",) if capture.exposed and in_spheres else ()),
             *(("blend_double",) if double else ()),
         ),
-        outputs=tuple(sorted({*capture.outputs} - {"rgb", *OF_TWO})),
+        outputs=tuple(sorted({*capture.outputs} - {"rgb", *COMPOSED})),
         sh_degree=sh_degree,
         samples=quality.samples,
         setup_precision=quality.setup_precision,
@@ -143,15 +131,15 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
 
 
 def with_termination_depths(features: FeatureSet) -> FeatureSet:
-    """The same picture, of which blending tells where each tile was finished: what hides what of a store."""
+    """These features and the termination depth of each tile, for occlusion culling of stores."""
     return replace(features, slots=(*features.slots, "termination_depths"))
 
 
 def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
-    """The effect that composites: by splats' centres, or by depth at each pixel, with or without planes.
+    """Select the compositing effect: by centre depth, or by fragment depth with or without coplanar groups.
 
-    Where every fragment has its centre's depth as float32, as the lists' keys are, both orders are the same,
-    and nothing need wait.
+    If every fragment has the float32 depth of its splat's centre, both orders are equal and the k-buffer is
+    not needed.
     """
     if cloud.has_coplanar_groups:
         return "compose_ordered" if order == "centre" else "compose_coplanar"
@@ -159,18 +147,18 @@ def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
 
 
 def _ellipsoid(cloud: Traits, quality: Quality, lens: Lens | None) -> str:
-    """How 3D Gaussians are drawn; empty if there are none."""
+    """Projection of 3D Gaussians; empty if there are none."""
     if cloud.ellipsoids == "none":
         return ""
-    # 3DGS knows pinholes and parallel rays alone
+    # EWA projection is defined for pinholes and parallel rays
     return quality.ellipsoid if lens is None or isinstance(lens, Orthographic) else "exact"
 
 
 def _refuse_float64(lens: Lens | None, foggy: bool) -> None:
-    """Refuse to blend in float64 where rays are float32: better no picture than one that promises too much.
+    """Refuse float64 blending where rays are float32, which would limit its accuracy.
 
     Raises:
-        InputError: it names both effects and what would do.
+        InputError: names both effects and a remedy.
     """
     if foggy or not (lens is None or isinstance(lens, Orthographic)):
         what = "the fog's" if foggy or lens is None else f"a {lens.kind} lens's"

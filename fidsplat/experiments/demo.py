@@ -12,7 +12,6 @@ from fidsplat.cameras import Camera
 from fidsplat.experiments.demo_scene import OUTPUTS, demo_scene, demo_views
 from fidsplat.formats import save_ply
 from fidsplat.images.files import to_uint8, write_png
-from fidsplat.images.output_files import save_output
 from fidsplat.images.visualize import (
     contact_sheet,
     depth_key,
@@ -22,6 +21,7 @@ from fidsplat.images.visualize import (
     normal_picture,
     outlined,
 )
+from fidsplat.render.output_files import save_output
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.files import atomic_write, writable_folder

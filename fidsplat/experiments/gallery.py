@@ -11,8 +11,8 @@ from urllib.parse import quote
 
 from fidsplat import __version__
 from fidsplat.images.files import write_png
-from fidsplat.images.output_files import picture_of
 from fidsplat.render.frame import Frame
+from fidsplat.render.output_files import picture_of
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.files import atomic_write, printable, read_text, writable_folder

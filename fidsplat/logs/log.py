@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
+from fidsplat.effects import IMAGES
 from fidsplat.images.files import encoded, pixels_of, to_uint8
 from fidsplat.logs.files import log_file, typestore
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
@@ -18,8 +19,6 @@ from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.scalars import real_array
 from fidsplat.vision.detect import Detection
 
-_ENCODINGS = {"rgb": "rgb8", "label": "32SC1", "splat_id": "32SC1", "blended": "32SC1"}
-"""of outputs; the others are 32FC1 or 32FC3"""
 PIXEL = 0.5
 """what ROS and OpenCV count less than we do: the centre of their first pixel is at 0"""
 
@@ -89,7 +88,7 @@ class RobotLog:
             self._write(f"{topic}/compressed", time, message)
             return
         pixels = to_uint8(pixels) if output == "rgb" else pixels
-        kind = _ENCODINGS.get(output, f"32FC{1 if pixels.ndim == 2 else pixels.shape[2]}")
+        kind = _encoding(output, 1 if pixels.ndim == 2 else pixels.shape[2])
         dtype = np.uint8 if kind == "rgb8" else np.int32 if kind == "32SC1" else np.float32
         with np.errstate(over="ignore"):
             pixels = np.ascontiguousarray(pixels, dtype)
@@ -207,6 +206,14 @@ class RobotLog:
             self._file.write(topic, kind, _nanoseconds(time), data)
         except OSError as error:
             raise InputError(f"cannot write {self._path}: {error.strerror or error}") from error
+
+
+def _encoding(output: str, channels: int) -> str:
+    """ROS image encoding of an output."""
+    if output == "rgb":
+        return "rgb8"
+    declared = IMAGES.get(output)
+    return "32SC1" if declared is not None and declared.dtype == "int32" else f"32FC{channels}"
 
 
 def _nanoseconds(time: float) -> int:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fidsplat.images.output_files import save_output, suffixes_of
 from fidsplat.remote.queue import Engine, drain
 from fidsplat.render.flight import Flight, FlightFolder
+from fidsplat.render.output_files import save_output, suffixes_of
 from fidsplat.render.renderer import Renderer
 from fidsplat.store.store import Store
 from fidsplat.util.errors import FidsplatError, InputError

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.blank import blank
 from fidsplat.backends.interface import BatchImages, GivesArrays, Images, Waits
 from fidsplat.capture.views import Views
 from fidsplat.effects import OUTPUTS
@@ -125,7 +124,7 @@ class ViewByView:
         """(views, h, w) or (views, h, w, channels)."""
         output = OUTPUTS[name]
         channels = () if output.channels == 1 else (output.channels,)
-        made = np.full((self.views, *self._size, *channels), blank(name), output.dtype)
+        made = np.full((self.views, *self._size, *channels), output.blank, output.dtype)
         for number, images in self._images.items():
             made[number] = images.read(name)
         return made
@@ -136,7 +135,7 @@ class ViewByView:
             return self._images[number].read(name)
         output = OUTPUTS[name]
         channels = () if output.channels == 1 else (output.channels,)
-        return np.full((*self._size, *channels), blank(name), output.dtype)
+        return np.full((*self._size, *channels), output.blank, output.dtype)
 
     @property
     def timings(self) -> Mapping[str, float]:

@@ -18,9 +18,9 @@ from fidsplat.cameras import Motion, Shutter, Trajectory
 from fidsplat.capture.capture import Capture
 from fidsplat.formats import load_trajectory, save_trajectory
 from fidsplat.images.files import read_image, write_png
-from fidsplat.images.output_files import save_output, suffixes_of
 from fidsplat.images.video import write_video
 from fidsplat.images.visualize import contact_sheet
+from fidsplat.render.output_files import save_output, suffixes_of
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.errors import InputError

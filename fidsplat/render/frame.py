@@ -167,7 +167,7 @@ class Frame(Mapping):
     def _repr_png_(self) -> bytes:
         """What a notebook shows: rgb, or else the first output, in colours."""
         from fidsplat.images.files import png_bytes  # late: it brings OpenCV
-        from fidsplat.images.output_files import picture_of
+        from fidsplat.render.output_files import picture_of
 
         name = "rgb" if "rgb" in self.outputs else self.outputs[0]
         return png_bytes(picture_of(name, self[name]))

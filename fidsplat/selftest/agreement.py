@@ -1,9 +1,9 @@
-"""How far a device's picture is from the float64 reference: error, certificate, and what is left beyond both.
+"""Comparison of a device's images with the float64 reference: error, certificate, and excess over both.
 
-Colour, alpha and normals are held to 2e-5, depth to 1e-4 of its value, each plus the reference's certificate:
-what float32 may change in that pixel, because a decision lies on its threshold or a splat is thinner than the
-rounding of its distance (numerics.md, section 3). Median depth and labels may differ only where the reference
-says that they may flip. There is no global loose tolerance.
+The tolerance of an output is declared in fidsplat/effects/catalogue.py. The reference adds a certificate per
+pixel: the change that float32 rounding may cause there, because a decision is at its threshold or a splat is
+thinner than the rounding of its distance (docs/correctness.md). Outputs that jump at a decision, such as
+labels, may differ only in pixels that the reference marks.
 """
 
 from __future__ import annotations
@@ -22,34 +22,27 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import Background, Fog
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
-from fidsplat.effects import OUTPUTS, FeatureSet
+from fidsplat.effects import FeatureSet, declared_output
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
 
 ALL_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
-COLOR_TOLERANCE = 2e-5
-DEPTH_TOLERANCE = 1e-4
+COLOR_TOLERANCE = declared_output("rgb").tolerance
+DEPTH_TOLERANCE = declared_output("depth").tolerance
 """relative"""
-TOLERANCE = (
-    dict.fromkeys(OUTPUTS, 0.0)
-    | dict.fromkeys(("rgb", "alpha", "normal", "normal_world"), COLOR_TOLERANCE)
-    | dict.fromkeys(("depth", "distance"), DEPTH_TOLERANCE)
-)
-"""What each output may be wrong beyond its certificate."""
 RARE = 1e-3
-"""share of pixels whose certificate may exceed `RISKY`"""
+"""maximum share of pixels with a certificate above `RISKY`"""
 RISKY = 0.05
 CATALOGUED = Quality(alpha_cutoff=1 / 255)
-"""the cut-off that the triggers of numerics.md are written for; the fuzzer and the contract tests draw with
-the presets"""
+"""alpha cut-off of the catalogue's cases; the fuzzer and the contract tests use the presets"""
 CULLED = 0xFFFFFFFF
-"""depth key of a splat that is not drawn, on devices"""
+"""sort key of a culled splat, on devices"""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture to compare: what is drawn, from where, and how."""
+    """A frame to compare: cloud, camera and settings."""
 
     cloud: SplatCloud
     camera: Camera
@@ -61,26 +54,26 @@ class Picture:
 
     @property
     def capture(self) -> Capture:
-        """How it is taken."""
+        """The capture that renders it."""
         sensor = self.sensor or Sensor()
         return Capture(self.camera, self.outputs, self.quality, self.background, sensor=sensor, fog=self.fog)
 
     def prepared(self, *more: str) -> tuple[FeatureSet, View]:
-        """What a backend draws, with these outputs too."""
+        """Features and view of the frame with additional outputs."""
         return prepare(self.cloud, self.capture.with_(outputs=(*self.outputs, *more)))
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One output of one picture against the reference. Errors are absolute for rgb, alpha and normals,
-    relative for depth; for median depth and labels they are the share of pixels that differ.
+    """One output of one frame against the reference. Errors are in units of the output, or relative if it is
+    declared so; of discontinuous outputs they are the share of pixels that differ.
     """
 
     output: str
     error: float
     """largest error, certified pixels included"""
     excess: float
-    """largest error beyond certificate and `TOLERANCE`; at most 0 in agreement"""
+    """largest error beyond certificate and tolerance; at most 0 if the device agrees"""
     risky: float
     """share of pixels whose certificate exceeds `RISKY`"""
     finite: bool
@@ -88,21 +81,27 @@ class Difference:
     @property
     def uncertified(self) -> float:
         """Largest error beyond the certificate."""
-        return self.excess + TOLERANCE[self.output]
+        return self.excess + tolerance_of(self.output)
 
     @property
     def agrees(self) -> bool:
-        """Whether the output is as it should be."""
+        """Whether the output is within its tolerance."""
         return self.finite and self.excess <= 0 and self.risky < RARE
 
 
+def tolerance_of(name: str) -> float:
+    """Largest error of an output beyond its certificate; of a discontinuous one the share of pixels, 0."""
+    output = declared_output(name)
+    return 0.0 if output.discontinuous else output.tolerance
+
+
 def draw(renderer: Renderer, picture: Picture) -> Frame:
-    """The picture on a device."""
+    """Render the frame on a device."""
     return renderer.render(picture.cloud, picture.capture)
 
 
 def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, np.ndarray]:
-    """The reference's images with `alpha` and `certificate`: whole, or (k, ...) at pixels (rows, columns)."""
+    """Images of the reference with `alpha` and `certificate`: all pixels, or (k, ...) at (rows, columns)."""
     reference = ReferenceBackend()
     features, view = picture.prepared("alpha")
     pipeline, resident = reference.pipeline(features), reference.upload(picture.cloud)
@@ -112,40 +111,48 @@ def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = No
 
 
 def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:
-    """Images of a device against those of `truth_of`, for each of `outputs`."""
-    risk = truth["certificate"]
-    brightest = max(1.0, float(np.abs(truth["rgb"]).max(initial=1.0)))
-    risky = float((risk > RISKY).mean())
+    """Compare images of a device with those of `truth_of`, for each of `outputs`."""
+    risky = float((truth["certificate"] > RISKY).mean())
     found = []
     for name in outputs:
-        image, want = images[name], truth[name]
-        error = np.abs(image - want)
-        if error.ndim > risk.ndim:
-            error = error.max(-1)
-        if TOLERANCE[name] == 0:
-            error = error > (
-                DEPTH_TOLERANCE * want if name.startswith("d") else truth.get(f"{name}_bound", 0)
-            )
-            worst = float(error.mean())
-            beyond = float((error & ~truth.get(f"{name}_may_flip", np.zeros(error.shape, bool))).mean())
-        else:
-            if name in ("rgb", "alpha"):
-                certified = risk * brightest
-                if name == "rgb":
-                    certified = truth.get("certificate_rgb", certified)
-            else:
-                certified = truth[f"certificate_{name}"]
-            # parallel rays see what lies behind the camera's plane, at negative depths
-            size = np.maximum(np.abs(want), 1e-30) if name in ("depth", "distance") else 1.0
-            worst = float((error / size).max(initial=0.0))
-            beyond = float(((error - certified) / size).max(initial=0.0))
-        excess, finite = beyond - TOLERANCE[name], bool(np.isfinite(image).all())
-        found.append(Difference(name, worst, excess, risky, finite))
+        errors = _flips if declared_output(name).discontinuous else _errors
+        worst, beyond = errors(name, images[name], truth)
+        finite = bool(np.isfinite(images[name]).all())
+        found.append(Difference(name, worst, beyond - tolerance_of(name), risky, finite))
     return found
 
 
+def _errors(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Largest error of a continuous output, and beyond the certificate."""
+    want, certified = truth[name], _certificate(name, truth)
+    error = np.abs(image - want)
+    if error.ndim > truth["certificate"].ndim:
+        error = error.max(-1)
+    # parallel rays have negative depths behind the camera's plane
+    size = np.maximum(np.abs(want), 1e-30) if declared_output(name).relative else 1.0
+    return float((error / size).max(initial=0.0)), float(((error - certified) / size).max(initial=0.0))
+
+
+def _certificate(name: str, truth: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Change of an output that float32 may cause in each pixel."""
+    if name not in ("rgb", "alpha"):
+        return truth[f"certificate_{name}"]
+    brightest = max(1.0, float(np.abs(truth["rgb"]).max(initial=1.0)))
+    in_colors = truth["certificate"] * brightest
+    return truth.get("certificate_rgb", in_colors) if name == "rgb" else in_colors
+
+
+def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Share of pixels in which a discontinuous output differs, and of those that may not."""
+    output, want = declared_output(name), truth[name]
+    limit = output.tolerance * want if output.relative else truth.get(f"{name}_bound", output.tolerance)
+    differs = np.abs(image - want) > limit
+    may_flip = truth.get(f"{name}_may_flip", np.zeros(differs.shape, bool))
+    return float(differs.mean()), float((differs & ~may_flip).mean())
+
+
 def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:
-    """What passes between the stages of a device, with the outputs; `shape` replaces its build constants."""
+    """Buffers between the stages of a device, and the outputs; `shape` replaces its build constants."""
     features, view = picture.prepared()
     backend = renderer.backend
     if shape is not None and isinstance(backend, Reshapes):
@@ -156,7 +163,7 @@ def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndar
 
 
 def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], outputs) -> int:
-    """Number of pixels whose bits differ in any of the outputs; all of them where the shapes differ."""
+    """Number of pixels that are not bit-identical in all outputs; all of them if the shapes differ."""
     different = np.zeros((), bool)
     for name in outputs:
         one, other = (np.ascontiguousarray(images[name]) for images in (first, second))
@@ -169,7 +176,7 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
 
 
 def out_of_order(traced: Mapping[str, np.ndarray], wanted: np.ndarray) -> int:
-    """How many splats of a trace do not follow the order `wanted` (visible,), in tiles' lists or at all."""
+    """Number of splats of a trace that violate the order `wanted` (visible,) in lists or overall."""
     if "lists" not in traced:
         return int((traced["order"] != wanted).sum())
     rank = np.full(len(traced["keys"]), -1)

@@ -9,8 +9,9 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from fidsplat.backends.interface import DeviceInfo
+from fidsplat.effects import OUTPUTS
 from fidsplat.render.renderer import Renderer
-from fidsplat.selftest.agreement import TOLERANCE, Difference, Picture, compare, draw, truth_of
+from fidsplat.selftest.agreement import Difference, Picture, compare, draw, tolerance_of, truth_of
 from fidsplat.selftest.arithmetic import Arithmetic, measure
 from fidsplat.selftest.case import Case, Finding
 from fidsplat.util.errors import DeviceError
@@ -93,7 +94,7 @@ class CheckResult:
             "seconds": self.seconds,
             "arithmetic": arithmetic
             and {"float64": arithmetic.float64, "denormals": arithmetic.denormals, "ulp": arithmetic.ulp},
-            "tolerance": TOLERANCE,
+            "tolerance": {name: tolerance_of(name) for name in OUTPUTS},
             "failures": self.failures,
             "cases": [
                 {
@@ -197,7 +198,7 @@ def _in_words(number: int, difference: Difference) -> str:
     if difference.excess > 0:
         return (
             f"{image} is wrong by {difference.uncertified:.1e} beyond its certificate, above "
-            f"{TOLERANCE[difference.output]:.0e}"
+            f"{tolerance_of(difference.output):.0e}"
         )
     return f"{image}: {difference.risky:.1%} of the pixels have certificates above 0.05"
 

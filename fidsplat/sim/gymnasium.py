@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.effects import Output, declared_output
 from fidsplat.images.files import to_uint8
 from fidsplat.sim.rig import Rig
 from fidsplat.util.errors import InputError
@@ -17,7 +18,6 @@ except ImportError as error:
 
 gymnasium: Any = _gymnasium  # whose names its types do not tell where it is not installed
 spaces = gymnasium.spaces
-_LIMITS = {"label": (-1, np.iinfo(np.int32).max), "splat_id": (-1, np.iinfo(np.int32).max)}
 
 
 class SplatObservation(gymnasium.ObservationWrapper):
@@ -68,16 +68,21 @@ class SplatObservation(gymnasium.ObservationWrapper):
             for output in self._rig.outputs_of(name):
                 if output == "rgb":
                     found[f"{name}_rgb"] = spaces.Box(0, 255, (*size, 3), np.uint8)
-                elif output in _LIMITS:
-                    found[f"{name}_{output}"] = spaces.Box(*_LIMITS[output], size, np.int32)
                 else:
-                    low, shape = (-1.0, (*size, 3)) if output.startswith("normal") else (0.0, size)
-                    high = 1.0 if low else np.inf
-                    found[f"{name}_{output}"] = spaces.Box(low, high, shape, np.float32)
+                    found[f"{name}_{output}"] = _space(declared_output(output), size)
         return found
+
+
+def _space(output: Output, size: tuple[int, int]) -> Any:
+    """Space of an output image."""
+    shape = size if output.channels == 1 else (*size, output.channels)
+    if output.dtype == "int32":
+        return spaces.Box(output.blank, np.iinfo(np.int32).max, shape, np.int32)
+    low, high = (-1.0, 1.0) if output.display == "normal" else (0.0, np.inf)
+    return spaces.Box(low, high, shape, np.float32)
 
 
 def _as_observed(output: str, image: np.ndarray) -> np.ndarray:
     if output == "rgb":
         return to_uint8(image)
-    return np.clip(image, -1, 1) if output.startswith("normal") else image
+    return np.clip(image, -1, 1) if declared_output(output).display == "normal" else image

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -17,7 +18,10 @@ from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.cli import main
-from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, select
+from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, declared_output, select
+from fidsplat.effects.catalogue import COMPOSED, outputs_help
+from fidsplat.render.output_files import save_output
+from fidsplat.selftest.agreement import compare
 
 BACKEND = "opencl"
 SETS = {
@@ -141,7 +145,16 @@ def toys(monkeypatch, tmp_path):
     """An output and a sensor's step: for each a line in the catalogue, one in the layouts, and a file."""
     (tmp_path / "nearest.cl").write_text(TOY_OUTPUT)
     (tmp_path / "negative.cl").write_text(TOY_STEP)
-    output = Output("nearest", 1, "float32")
+    output = Output(
+        "nearest",
+        1,
+        "float32",
+        "depth [m] of the nearest splat",
+        "depth",
+        1e-3,
+        relative=True,
+        discontinuous=True,
+    )
     monkeypatch.setitem(CATALOGUE, "nearest", Effect("nearest", output))
     monkeypatch.setitem(OUTPUTS, "nearest", output)
     monkeypatch.setitem(CATALOGUE, "negative", Effect("negative"))
@@ -165,6 +178,37 @@ def test_an_output_and_a_step_from_elsewhere_are_drawn(renderer, toys):
     seen = plain["depth_first"] > 0
     assert (toy["nearest"][seen] <= plain["depth_first"][seen]).all()
     assert seen.any()
+
+
+def test_an_output_is_compared_listed_and_written_as_it_is_declared(toys, tmp_path):
+    truth = {
+        "nearest": np.array([[1.0, 2.0, 0.0]]),
+        "nearest_may_flip": np.array([[False, True, False]]),
+        "certificate": np.zeros((1, 3)),
+        "rgb": np.zeros((1, 3, 3)),
+    }
+    within, flipped, off = (
+        compare({"nearest": np.float32([row])}, truth, ("nearest",))[0]
+        for row in ([1.0009, 2, 0], [1, 3, 0], [1.0011, 2, 0])
+    )
+    assert (within.error, within.agrees) == (0, True)
+    assert (flipped.error, flipped.agrees) == (pytest.approx(1 / 3), True)
+    assert (off.excess, off.agrees) == (pytest.approx(1 / 3), False)
+
+    assert re.search(r"^  nearest +depth \[m\] of the nearest splat$", outputs_help(), re.MULTILINE)
+
+    image = np.float32([[0.5, 1.5]])
+    files = save_output("nearest", image, lambda name, suffix: tmp_path / f"{name}{suffix}")
+    assert [file.name for file in files] == ["nearest.npy", "nearest.png", "nearest-turbo.png"]
+    assert np.array_equal(np.load(files[0]), image)
+    assert cv2.imread(str(files[1]), cv2.IMREAD_UNCHANGED).tolist() == [[500, 1500]]
+
+
+def test_help_of_render_lists_all_outputs(capsys):
+    assert main(["render", "--help"]) == 0
+    listed = capsys.readouterr().out
+    for name in (*OUTPUTS, *COMPOSED):
+        assert declared_output(name).summary[:40] in " ".join(listed.replace("│", " ").split()), name
 
 
 def test_effects_from_elsewhere_leave_other_texts_as_they_were(request):

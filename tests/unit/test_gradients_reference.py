@@ -161,7 +161,7 @@ def test_what_has_no_gradient_is_refused_by_name():
     images = pipeline.forward(resident, view)
     with pytest.raises(fs.InputError, match="'label' has no gradient"):
         pipeline.backward(images, {"label": np.zeros((11, 14))})
-    with pytest.raises(fs.InputError, match="'depth' was not drawn"):
+    with pytest.raises(fs.InputError, match="'depth' was not rendered"):
         pipeline.backward(images, {"depth": np.zeros((11, 14))})
     with pytest.raises(fs.InputError, match=r"\(11, 14\); it must be \(11, 14, 3\)"):
         pipeline.backward(images, {"rgb": np.zeros((11, 14))})

@@ -35,9 +35,9 @@ MAY_IMPORT = {
     "viewer": DATA
     | {"store", "scenes", "effects", "backends", "render", "streaming", "images", "vision", "formats"},
     "remote": {"render", "images", "experiments", "store"},
-    "sim": DATA | {"scenes", "images", "render"},
+    "sim": DATA | {"scenes", "effects", "images", "render"},
     "worlds": DATA | {"scenes", "markers", "formats", "store", "sim"},
-    "logs": {"splats", "cameras", "images", "vision"},
+    "logs": {"splats", "cameras", "effects", "images", "vision"},
     "train": DATA | {"formats", "markers", "images", "vision", "render", "backends", "effects"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}

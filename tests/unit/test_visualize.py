@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from fidsplat.images.output_files import save_output
 from fidsplat.images.visualize import (
     KEY_WIDTH,
     contact_sheet,
@@ -18,6 +17,7 @@ from fidsplat.images.visualize import (
     normal_picture,
     outlined,
 )
+from fidsplat.render.output_files import save_output
 
 SQUARE = np.array([[20.5, 10.5], [60.5, 10.5], [60.5, 40.5], [20.5, 40.5]])
 

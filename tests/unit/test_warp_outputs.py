@@ -12,6 +12,8 @@ import fidsplat as fs
 from fidsplat.backends.view import View
 from fidsplat.backends.warp import runtime
 from fidsplat.effects import CATALOGUE, FeatureSet, Output
+from fidsplat.render.output_files import save_output
+from fidsplat.selftest.agreement import compare
 
 wp = pytest.importorskip("warp")
 STRONGEST = '''"""The largest weight of a fragment: of a pixel the mean of its samples."""
@@ -115,7 +117,7 @@ def make_anew(stage, monkeypatch):
 def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     features = FeatureSet(SLOTS, ("strongest",), 0, 1, "float64", ("negative",))
     backend = fs.Renderer("warp:cpu").backend
-    output = Output("strongest", 1, "float32")
+    output = Output("strongest", 1, "float32", tolerance=1e-3)
     monkeypatch.setitem(CATALOGUE, "strongest", replace(CATALOGUE["alpha"], name="strongest", output=output))
     monkeypatch.setitem(CATALOGUE, "negative", replace(CATALOGUE["gain"], name="negative"))
     with pytest.raises(fs.DeviceError, match=r"warp:cpu .* has no negative, strongest; use an OpenCL device"):
@@ -128,6 +130,15 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     # the nearer splat lets three quarters through, of which the other takes up to a half
     assert np.array_equal(toys["strongest"], plain["rgb"][..., :2].max(-1))
     assert toys["strongest"].max() == pytest.approx(0.375)
+    # files and the comparison with the reference follow from the declaration
+    files = save_output("strongest", toys["strongest"], lambda name, suffix: tmp_path / f"{name}{suffix}")
+    assert [file.name for file in files] == ["strongest.png"]
+    truth = {name: toys[name].astype(float) for name in ("rgb", "strongest")}
+    truth |= {"certificate": np.zeros(toys["strongest"].shape)}
+    truth |= {"certificate_strongest": np.zeros(toys["strongest"].shape)}
+    for error, agrees in ((0.9e-3, True), (1.1e-3, False)):
+        [difference] = compare({"strongest": toys["strongest"] + error}, truth, ("strongest",))
+        assert difference.agrees == agrees
 
     # an output whose file has changed, which Warp's cache would not see, is compiled again
     largest, sum_of_all = "wp.max(p.strongest, weight)", "p.strongest + weight"

@@ -11,7 +11,6 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.blank import blank
 from fidsplat.backends.opencl.images import Drawn
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects.catalogue import Output
@@ -54,7 +53,7 @@ class OutputBuffers:
         ]
         for (_, buffer), output in zip(self.leased, outputs, strict=True):
             if len(batch.slots) < views:
-                pattern = np.full(1, blank(output.name), output.dtype)
+                pattern = np.full(1, output.blank, output.dtype)
                 cl.enqueue_fill_buffer(workspace.queue, buffer, pattern, 0, bytes_of[output.name])
 
     def held(self) -> dict[str, cl.Buffer]:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.blank import blank
 from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.picture import Into
 from fidsplat.backends.warp.runtime import load
@@ -63,7 +62,7 @@ class WarpBatch:
             size, dtype = batch.total * height * width * output.channels, getattr(load(), output.dtype)
             array = workspace.pool.fresh(f"{output.name} of {batch.total} views", size, dtype)
             if len(batch.slots) < batch.total:
-                array.fill_(blank(output.name))
+                array.fill_(output.blank)
             self._images[output.name] = output, array
         self._pictures: list[WarpImages] = []
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.effects import declared_output
 from fidsplat.images.files import write_png
 from fidsplat.images.visualize import (
     count_picture,
@@ -17,16 +18,22 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
 from fidsplat.util.npy import load_npy
 
-_WHOLE = ("label", "splat_id", "blended")
-"""outputs of whole numbers"""
+_PICTURES = {
+    "color": lambda image: image,
+    "depth": depth_picture,
+    "normal": normal_picture,
+    "label": label_picture,
+    "count": count_picture,
+}
+"""picture of an image, by `Output.display`"""
 
 
 def suffixes_of(name: str) -> tuple[str, ...]:
-    """Endings of the files of an output, in the order in which `save_output` writes them; the last is a
-    picture to look at."""
-    if _is_depth(name):
+    """File suffixes of an output, in the order in which `save_output` writes them; the last is a picture."""
+    output = declared_output(name)
+    if output.display == "depth":
         return (".npy", ".png", "-turbo.png")
-    return (".npy", ".png") if name in (*_WHOLE, "error") else (".png",)
+    return (".npy", ".png") if output.as_array else (".png",)
 
 
 def save_output(
@@ -38,13 +45,13 @@ def save_output(
         name: "rgb", "depth", ...
         image: (h, w) or (h, w, 3).
         bits: 16 writes rgb as a 16-bit PNG.
-        name_of: gives the file for an output's name and a suffix such as ".png" or "-turbo.png".
+        name_of: file of an output's name and a suffix such as ".png" or "-turbo.png".
     """
     if name == "rgb" and bits == 16:
         deep = np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 65535).astype(np.uint16)
         return [write_png(name_of(name, ".png"), deep)]
     arrays = [_write_array(name_of(name, ".npy"), image)] if ".npy" in suffixes_of(name) else []
-    if _is_depth(name):
+    if declared_output(name).display == "depth":
         arrays.append(write_png(name_of(name, ".png"), depth_millimetres(image)))
     return [*arrays, write_png(name_of(name, suffixes_of(name)[-1]), picture_of(name, image))]
 
@@ -64,18 +71,8 @@ def load_output(file: Path, shape: tuple[int, int]) -> np.ndarray:
 
 
 def picture_of(name: str, image: np.ndarray) -> np.ndarray:
-    """An output image, (h, w) or (h, w, 3), as a picture that people look at."""
-    if _is_depth(name):
-        return depth_picture(image)
-    if name in ("blended", "error"):
-        return count_picture(image)
-    if name in _WHOLE:
-        return label_picture(image)
-    return normal_picture(image) if name in ("normal", "normal_world") else image
-
-
-def _is_depth(name: str) -> bool:
-    return name.startswith(("depth", "distance"))
+    """Picture of an output image, (h, w) or (h, w, 3)."""
+    return _PICTURES[declared_output(name).display](image)
 
 
 def _write_array(path: Path, array: np.ndarray) -> Path:
