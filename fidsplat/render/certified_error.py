@@ -63,6 +63,28 @@ _BOUNDED = frozenset(
 )
 """effects whose float32 rounding kernels bound"""
 
+_REQUESTED = {
+    "camera": ("a distorted or non-pinhole camera", "a pinhole camera"),
+    "ellipsoid_exact": ("3D Gaussians with ellipsoid='exact'", "ellipsoid='ewa'"),
+    "lowpass_pixel": ("lowpass='pixel'", "lowpass='screen'"),
+    "external_depth": ("an external depth image", "a capture without external_depth"),
+    "compose_coplanar": (
+        "coplanar groups (markers and other printed planes) in order='pixel'",
+        "order='centre'",
+    ),
+    "compose_pixel": ("order='pixel'", "order='centre'"),
+    "footprint": ("boxes (markers with mixture='exact')", "markers with mixture='fitted'"),
+    "background": ("a gradient or panorama background", "a background of one color"),
+    "shutter": (
+        "a shutter with an exposure time or a readout",
+        "a shutter with exposure_time=0 and readout=0",
+    ),
+    "blend_double": ("blend_precision='float64'", "blend_precision='float32'"),
+}
+"""prefix of an effect's name: what the user requested, and what to request instead"""
+_SENSOR = {"noise": "full_well", "quantise": "bits", "response": "response"}
+"""prefix of a sensor's step: the argument that requests it, where it has another name"""
+
 
 def cutoff_of(splats: int) -> float:
     """The cut-off at which what is left out of `splats` splats has opacities of `UNLISTED` in all."""
@@ -131,8 +153,8 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
     _refuse_unbounded(capture)
     if not isinstance(data, HasColorRange):
         raise InputError(
-            "the output 'error' must be of splats whose colours are known, got a store; render a SplatCloud, "
-            "or leave the output out"
+            "the output 'error' must be of splats in memory, got a store; render store.cloud() where it fits "
+            "into memory, or leave out the output 'error'"
         )
     quality = nothing_left_out(capture.quality, cutoff_of(data.count))
     features, view = _prepared(data, capture, quality, backend)
@@ -166,12 +188,20 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         if why := backend.unsupported(double[0]):
             raise InputError(why)
     except InputError as error:
-        effects = ", ".join(unbounded) or "blend_precision='float64'"
+        requested = dict(_requested(name) for name in unbounded or ["blend_double"])
+        got, instead = (" and ".join(words) for words in (requested, requested.values()))
         raise InputError(
-            f"the output 'error' must be of effects whose rounding {info.name} bounds, got {effects}; leave "
-            "out one of the two, or use device='reference'"
+            f"the output 'error' must be of effects whose rounding {info.name} bounds, got {got}; "
+            f"render with {instead}, leave out the output 'error', or use device='reference'"
         ) from error
     return double
+
+
+def _requested(effect: str) -> tuple[str, str]:
+    """What requests an effect, in the user's terms, and what to request instead."""
+    return next(
+        (words for prefix, words in _REQUESTED.items() if effect.startswith(prefix)), (effect, "less")
+    )
 
 
 def _refuse_unbounded(capture: Capture) -> None:
@@ -180,7 +210,9 @@ def _refuse_unbounded(capture: Capture) -> None:
     if capture.foggy:
         effect, remedy = "fog", "without fog"
     elif capture.sensor.steps:
-        effect, remedy = f"the sensor's {capture.sensor.steps[0]}", "with a sensor of no steps"
+        step = capture.sensor.steps[0]
+        name = next((name for prefix, name in _SENSOR.items() if step.startswith(prefix)), step)
+        effect, remedy = f"a sensor with {name}={getattr(capture.sensor, name)!r}", "with fs.Sensor()"
     elif camera is not None and math.isfinite(camera.far):
         # what lies beyond it is left out by the radius of the cut-off
         effect, remedy = f"a camera whose far is {camera.far:g} m", "with a camera whose far is infinite"

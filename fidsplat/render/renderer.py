@@ -356,7 +356,8 @@ class Renderer:
         plain = [_asked(scene, one) for one in each]
         if any("error" in one.outputs for one in plain):
             raise InputError(
-                "the captures of a batch must not ask for the output 'error', got it; render each by itself"
+                f"the output 'error' must be rendered one capture at a time, got a batch of {len(plain)}; "
+                "call render() for each capture, or leave out the output 'error'"
             )
         views = views_of(plain, poses, groups, mask)
         self._refuse_unknown_labels(resident, views)

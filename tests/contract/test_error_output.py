@@ -3,6 +3,7 @@
 import hashlib
 import math
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from brute_force import ideal
 
 import fidsplat as fs
+from fidsplat.effects.catalogue import CATALOGUE
+from fidsplat.render import certified_error
 from fidsplat.render.certified_error import UNLISTED, ideal_of
 from fidsplat.util.errors import InputError
 
@@ -169,7 +172,9 @@ def test_markers_are_composited_by_depth_in_float64(reference):
     assert off.max() > 1e-3
     assert (frame["error"] >= off - 2e-7).all()  # `want` is float32
     assert frame["error"].max() < 1.1 * off.max()
-    with pytest.raises(InputError, match=r"'error' must.* warp:cpu bounds, got .*compose_coplanar"):
+    with pytest.raises(
+        InputError, match=r"'error' must.* warp:cpu bounds, got coplanar groups .*order='centre'"
+    ):
         fs.Renderer("warp:cpu").render(cloud, camera, OUTPUTS)
 
 
@@ -203,19 +208,75 @@ def test_the_bound_holds_for_ellipsoids(reference, backend, parts):
 
 
 @pytest.mark.parametrize(
-    ("parts", "effect"),
+    ("parts", "effect", "remedy"),
     [
-        ({"fog": fs.Fog(0.1)}, "fog"),
-        ({"sensor": fs.Sensor(exposure=2.0)}, "the sensor's exposure"),
-        ({"camera": replace(SMALL, far=10.0)}, "a camera whose far is 10 m"),
-        ({"camera": replace(SMALL, lens=fs.Fisheye())}, ".*camera_fisheye"),
-        ({"background": fs.Gradient((0, 0, 1), (1, 1, 1))}, "background_gradient"),
+        ({"fog": fs.Fog(0.1)}, "fog", "without fog"),
+        ({"sensor": fs.Sensor(exposure=2.0)}, r"a sensor with exposure=2\.0", r"with fs\.Sensor\(\)"),
+        ({"sensor": fs.Sensor(bits=8)}, "a sensor with bits=8", r"with fs\.Sensor\(\)"),
+        ({"sensor": fs.Sensor(full_well=900.0)}, r"a sensor with full_well=900\.0", r"with fs\.Sensor\(\)"),
+        ({"sensor": fs.Sensor(response="srgb")}, "a sensor with response='srgb'", r"with fs\.Sensor\(\)"),
+        ({"sensor": fs.Sensor(response=2.2)}, r"a sensor with response=2\.2", r"with fs\.Sensor\(\)"),
+        ({"sensor": fs.Sensor(vignetting=(-0.1,))}, r"a sensor with vignetting=\(", r"with fs\.Sensor\(\)"),
+        (
+            {"camera": replace(SMALL, far=10.0)},
+            "a camera whose far is 10 m",
+            "with a camera whose far is inf",
+        ),
+        ({"camera": replace(SMALL, lens=fs.Fisheye())}, "a distorted or non-pinhole camera", "a pinhole"),
+        ({"background": fs.Gradient((0, 0, 1), (1, 1, 1))}, "a gradient or panorama", "of one color"),
     ],
 )
-def test_effects_without_a_bound_are_refused(renderer, parts, effect):
+def test_effects_without_a_bound_are_refused(renderer, parts, effect, remedy):
     capture = fs.Capture(SMALL, OUTPUTS).with_(**parts)
-    with pytest.raises(InputError, match=f"the output 'error' must .*got {effect}.*"):
+    with pytest.raises(InputError, match=f"the output 'error' must .*got {effect}.*; .*{remedy}"):
         renderer.render(haze(3, 0.5), capture)
+
+
+@pytest.mark.parametrize(
+    ("cloud", "parts", "effect", "remedy"),
+    [
+        ("haze", {"quality": "order=pixel"}, "order='pixel'", "order='centre'"),
+        ("haze", {"quality": "lowpass=pixel"}, "lowpass='pixel'", "lowpass='screen'"),
+        ("haze", {"quality": "blend_precision=float64"}, "blend_precision='float64'", "'float32'"),
+        (
+            "haze",
+            {"shutter": fs.Shutter(exposure_time=0.1), "motion": fs.Motion(lambda time: np.eye(4))},
+            "a shutter with an exposure time",
+            "exposure_time=0",
+        ),
+        ("marker", {}, "coplanar groups", "order='centre'"),
+        ("boxes", {}, r".*boxes \(markers with mixture='exact'\)", "mixture='fitted'"),
+        (
+            "spheres",
+            {"quality": "ellipsoid=exact"},
+            r"3D Gaussians with ellipsoid='exact'",
+            "ellipsoid='ewa'",
+        ),
+    ],
+)
+def test_refusals_name_what_was_requested(cloud, parts, effect, remedy):
+    """On Warp, which has no blending in float64."""
+    tag = "aruco:4x4_50:7"
+    clouds = {
+        "haze": lambda: haze(3, 0.5),
+        "marker": lambda: fs.marker(tag, size=1.0, mixture="fitted").cloud,
+        "boxes": lambda: fs.marker(tag, size=1.0, mixture="exact").cloud,
+        "spheres": lambda: spheres(9, 0.1),
+    }
+    capture = fs.Capture(SMALL, OUTPUTS).with_(**parts)
+    with pytest.raises(
+        InputError, match=f"warp:cpu bounds, got {effect}.*; render with .*{remedy}"
+    ) as caught:
+        fs.Renderer("warp:cpu").render(clouds[cloud](), capture)
+    assert not re.search("compose_|footprint_|lowpass_|camera_|ellipsoid_|shutter_|slot", str(caught.value))
+
+
+def test_every_effect_without_a_bound_has_words():
+    """Effects of the catalogue that a scene may request, outputs and steps of sensors left out."""
+    kinds = ("camera", "color", "ellipsoid", "lowpass", "compose", "footprint", "background", "shutter")
+    names = {name for name in CATALOGUE if name.startswith(kinds)} | {"external_depth", "blend_double"}
+    words = {name: certified_error._requested(name)[0] for name in names - certified_error._BOUNDED}
+    assert {name for name, said in words.items() if said == name} == set()
 
 
 def test_lenses_have_it_on_the_reference(reference):
@@ -229,12 +290,16 @@ def test_lenses_have_it_on_the_reference(reference):
 
 
 def test_batches_and_stores_are_refused(renderer, tmp_path):
-    with pytest.raises(InputError, match="batch must not ask for the output 'error'"):
+    with pytest.raises(
+        InputError, match=r"'error' must be rendered one capture at a time, got a batch of 1; call render"
+    ):
         renderer.render_batch(haze(3, 0.5), [fs.Capture(SMALL, OUTPUTS)])
     fs.save_ply(haze(3, 0.5), tmp_path / "few.ply")
     fs.build_store([tmp_path / "few.ply"], tmp_path / "few.fss")
     store = fs.Store(tmp_path / "few.fss")
-    with pytest.raises(InputError, match=r"'error' must .*got a store"):
+    with pytest.raises(
+        InputError, match=r"'error' must be of splats in memory, got a store; render store\.cloud"
+    ):
         renderer.render(store, SMALL, OUTPUTS)
 
 
