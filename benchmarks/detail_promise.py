@@ -20,7 +20,7 @@ from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
 from fidsplat.accuracy.detail_errors import measure_detail
-from fidsplat.accuracy.error import TRUTH_CUTOFF
+from fidsplat.accuracy.error import REFERENCE_CUTOFF
 from fidsplat.worlds.city import City
 
 ERRORS = (1 / 255, 4 / 255)
@@ -43,7 +43,7 @@ def path_around(side: float, views: int, size: tuple[int, int], low: bool = Fals
 
 def measure(store: fs.Store, cameras: list[fs.Camera], renderer: fs.Renderer) -> list[dict]:
     """Of each allowed error, and of the exact pictures, a row."""
-    base = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF)
+    base = fs.Quality(lowpass="pixel", alpha_cutoff=REFERENCE_CUTOFF)
     resident, errors = renderer.upload(store), (0.0, *ERRORS)
     rows = {error: {"allowed": error, "errors": [], "splats": [], "s": [], "jump": 0.0} for error in errors}
     before: dict[float, np.ndarray] = {}

@@ -1,5 +1,6 @@
-"""Small random scenes of as many kinds as can be, the same on every machine for the same seed: the table of
-budgets is made from them (budget_prices.py), and its promise is checked with others (budget_promise.py)."""
+"""Small random scenes of as many kinds as can be, the same on every machine for the same seed: the
+candidates of `quality_within` are measured with some (candidates.py), and its promises are checked with
+others (quality_within_promise.py)."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
 from fidsplat.accuracy.detail_errors import measure_detail
-from fidsplat.accuracy.error import TRUTH_CUTOFF
+from fidsplat.accuracy.error import REFERENCE_CUTOFF
 from fidsplat.backends.prepare import prepare
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.streaming.level_of_detail import select
@@ -89,7 +89,7 @@ def along(store: fs.Store, renderer: fs.Renderer, asked, error: float) -> dict:
     towards = np.mean(store.bounds(), axis=0)
     shares = np.linspace(0, len(places) - 1, asked.path)
     steps = np.column_stack([np.interp(shares, range(len(places)), axis) for axis in np.transpose(places)])
-    quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
+    quality = fs.Quality(lowpass="pixel", alpha_cutoff=REFERENCE_CUTOFF, detail_error=error)
     cameras = [fs.Camera.look_at(*size, math.radians(60), at, towards) for at in steps]
     made, begun = [], time.perf_counter()
     for frame in renderer.render_views(renderer.upload(store), cameras, quality=quality):
@@ -112,7 +112,7 @@ def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
         for error in ("standard", 0.0, *asked.errors):
             quality = fs.Quality()
             if error != "standard":
-                quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
+                quality = fs.Quality(lowpass="pixel", alpha_cutoff=REFERENCE_CUTOFF, detail_error=error)
             capture = fs.Capture(camera, quality=quality)
             features, view = prepare(splats, capture)
             begun = time.perf_counter()

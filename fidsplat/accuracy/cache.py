@@ -1,4 +1,4 @@
-"""What was measured is kept in the user's cache folder, so that the same question costs nothing again."""
+"""Cache of measured choices in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from fidsplat.util.files import atomic_write, from_json, read_text, user_cache
 
 
 def folder() -> Path:
-    """Where answers are kept: fidsplat/accuracy in the user's cache folder."""
-    return user_cache() / "fidsplat" / "budget"
+    """The cache folder."""
+    return user_cache() / "fidsplat" / "quality_within"
 
 
 def load(key: str | None) -> dict[str, Any] | None:
-    """What was kept under a key; None if nothing, or if the file is damaged."""
+    """The value of a key; None if there is none or its file is damaged."""
     if key is None:
         return None
     try:
-        kept = from_json(read_text(folder() / f"{key}.json"))
+        value = from_json(read_text(folder() / f"{key}.json"))
     except (OSError, ValueError):
         return None
-    return kept if isinstance(kept, dict) else None
+    return value if isinstance(value, dict) else None
 
 
 def save(key: str | None, value: dict[str, Any]) -> None:
-    """Keep something under a key. Where the folder cannot be written nothing is kept: it is only a cache."""
+    """Store the value of a key. Errors of writing are ignored."""
     if key is None:
         return
     try:

@@ -8,7 +8,7 @@ from datetime import date
 
 import numpy as np
 
-from fidsplat.accuracy.error import TRUTH_CUTOFF
+from fidsplat.accuracy.error import REFERENCE_CUTOFF
 from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
@@ -60,7 +60,7 @@ def measure_detail(
         for done, camera in enumerate(cameras_around(store, views, seed)):
             level = levels[done % len(levels)]
             # a cut-off omits a larger share of small splats than of merged ones
-            capture = Capture(camera, quality=Quality(lowpass=one, alpha_cutoff=TRUTH_CUTOFF))
+            capture = Capture(camera, quality=Quality(lowpass=one, alpha_cutoff=REFERENCE_CUTOFF))
             found = errors_of(store, renderer, capture, SIZES, level)
             worst[level] = [_larger(*pair) for pair in zip(worst[level], found, strict=True)]
             progress("measuring levels of detail", (number + (done + 1) / views) / len(lowpass))

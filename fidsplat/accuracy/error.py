@@ -1,8 +1,7 @@
-"""How wrong a picture is: its error against the same definition drawn at full precision.
+"""Error of an image against the same image at full precision.
 
-What a picture is (low-pass, samples per pixel, by which depth splats are ordered) is its definition;
-constants that leave something out of it (cut-off, stop, ceiling) and the arithmetic decide how accurate it
-is.
+Low-pass, samples per pixel and order define the image. Constants that omit contributions (cut-off, stop,
+ceiling) and the arithmetic determine its error.
 """
 
 from __future__ import annotations
@@ -23,13 +22,14 @@ from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import DeviceError, InputError
 
-TRUTH_CUTOFF = 1e-8
-"""alpha below which the truth leaves a contribution out: a thousand such layers hide 1e-5"""
+REFERENCE_CUTOFF = 1e-8
+"""alpha below which the reference image omits a contribution: a thousand such layers contribute 1e-5"""
 
-FLOAT32_OUTPUT = 1e-7
-"""what a truth of colours up to 1 is off that a device hands out in float32"""
-FLOAT32_TRUTH = 1e-5
-"""what one is off that is drawn in float32: more than any picture at full precision in budget/prices.json"""
+FLOAT32_OUTPUT_ERROR = 1e-7
+"""error of a reference image of colours up to 1 that a device returns in float32"""
+FLOAT32_REFERENCE_ERROR = 1e-5
+"""error of a reference image that is rendered in float32: above that of any image at full precision in
+candidates.json"""
 
 
 @dataclass(frozen=True)
@@ -46,28 +46,26 @@ class Errors:
     """dB against a peak of 1; infinite where the images are equal"""
 
 
-def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
-    """The error of an image, worked out in float64.
+def errors(image: ArrayLike, reference: ArrayLike) -> Errors:
+    """Error of an image, computed in float64.
 
     Args:
-        picture: any shape, e.g. (h, w, 3) or (h, w).
-        truth: the same shape.
+        image: any shape, e.g. (h, w, 3) or (h, w).
+        reference: the same shape.
 
     Raises:
         InputError: the shapes differ, there are no values, or one is not finite.
     """
-    seen, want = np.asarray(picture, np.float64), np.asarray(truth, np.float64)
-    if seen.shape != want.shape:
-        raise InputError(f"a picture of shape {seen.shape} cannot be compared with one of shape {want.shape}")
-    if seen.size == 0:
-        raise InputError(f"a picture of shape {seen.shape} has no values to compare")
-    for name, image in (("picture", seen), ("truth", want)):
-        bad = image.size - int(np.isfinite(image).sum())
+    found, wanted = np.asarray(image, np.float64), np.asarray(reference, np.float64)
+    if found.shape != wanted.shape:
+        raise InputError(f"image must have the shape {wanted.shape} of the reference, got {found.shape}")
+    if found.size == 0:
+        raise InputError(f"image must have values to compare, got shape {found.shape}")
+    for name, values in (("image", found), ("reference", wanted)):
+        bad = values.size - int(np.isfinite(values).sum())
         if bad:
-            raise InputError(
-                f"{bad} of {image.size} values of the {name} are not finite; they have no error to measure"
-            )
-    off = np.abs(seen - want)
+            raise InputError(f"{name} must be finite, got {bad} of {values.size} values that are not")
+    off = np.abs(found - wanted)
     mean_square = float(np.mean(off**2))
     return Errors(
         maximum=float(off.max()),
@@ -78,20 +76,23 @@ def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
 
 
 def full_precision(capture: Capture, renderer: Renderer) -> Capture:
-    """The capture of the same definition with nothing left out, in the best arithmetic of the device.
+    """The capture without omitted contributions, in the device's most precise arithmetic.
 
-    Low-pass, samples, order and first_hit stay. A device composites in float64 where it can
-    (`draws_float64`); else the arithmetic is its own, with the set-up in float64 if it has that.
+    Low-pass, samples, order and first_hit stay. The device composites in float64 if it can
+    (`supports_float64`); otherwise only the set-up is in float64, if supported.
     """
-    best = nothing_left_out(capture.quality, TRUTH_CUTOFF).with_(arithmetic="precise")
-    if not renderer.device.always_float64 and draws_float64(renderer, capture):
+    best = nothing_left_out(capture.quality, REFERENCE_CUTOFF).with_(arithmetic="precise")
+    if not renderer.device.always_float64 and supports_float64(renderer, capture):
         best = best.with_(blend_precision="float64")
     return capture.with_(quality=best)
 
 
-def draws_float64(renderer: Renderer, capture: Capture) -> bool:
-    """Whether its pictures at full precision are float64 throughout: the reference's, and those of devices
-    that composite in float64, but for lenses and fog, whose rays are float32."""
+def supports_float64(renderer: Renderer, capture: Capture) -> bool:
+    """Whether images at full precision are computed in float64 throughout.
+
+    True for the reference, and for devices that composite in float64, except with lenses and fog, whose rays
+    are float32.
+    """
     if renderer.device.always_float64:
         return True
     try:
@@ -102,35 +103,35 @@ def draws_float64(renderer: Renderer, capture: Capture) -> bool:
     return not renderer.backend.unsupported(features)
 
 
-def error_bound(reference: Renderer, capture: Capture) -> float:
-    """What the truth that a renderer draws may be off itself."""
+def reference_error(reference: Renderer, capture: Capture) -> float:
+    """Bound on the error of a renderer's reference image."""
     if reference.device.always_float64:
         return 0.0
-    return FLOAT32_OUTPUT if draws_float64(reference, capture) else FLOAT32_TRUTH
+    return FLOAT32_OUTPUT_ERROR if supports_float64(reference, capture) else FLOAT32_REFERENCE_ERROR
 
 
-def reference_for(renderer: Renderer, capture: Capture) -> Renderer:
-    """Who draws the truth for a renderer's pictures: itself if it can in float64, else OpenCL on this
-    machine's processor if that is there and can, else itself."""
-    if draws_float64(renderer, capture):
+def reference_renderer(renderer: Renderer, capture: Capture) -> Renderer:
+    """Renderer of reference images: the same one if it supports float64, else OpenCL on this machine's
+    processor if that does, else the same one."""
+    if supports_float64(renderer, capture):
         return renderer
     try:
         processor = Renderer("opencl:cpu")
     except DeviceError:
         return renderer
-    return processor if draws_float64(processor, capture) else renderer
+    return processor if supports_float64(processor, capture) else renderer
 
 
-def truth(
+def reference_image(
     renderer: Renderer, scene: Scene | SplatCloud | ResidentCloud, capture: Capture, output: str = "rgb"
 ) -> np.ndarray:
-    """The picture of the same definition, drawn by `renderer` at full precision (`full_precision`).
+    """The image at full precision (`full_precision`).
 
     Args:
-        renderer: who draws; "reference" gives float64 images, other devices what they give, as float64.
-        scene: whose splats.
-        capture: how; its outputs do not count.
-        output: the image.
+        renderer: device "reference" computes float64 images; images of others are converted.
+        scene: scene to render.
+        capture: capture; its outputs are ignored.
+        output: name of the image.
 
     Returns:
         float64, of the shape of the image: (h, w, 3) for rgb.
@@ -139,6 +140,6 @@ def truth(
         InputError, DeviceError: as `Renderer.render`.
     """
     frame = renderer.render(scene, full_precision(capture.with_(outputs=output), renderer))
-    if isinstance(frame._images, GivesFloat64):  # what is read otherwise is rounded to float32
+    if isinstance(frame._images, GivesFloat64):  # other reads round to float32
         return frame._images.read_float64(output)
     return np.asarray(frame[output], np.float64)

@@ -1,18 +1,18 @@
-"""Which candidates of the price list to take, by measuring their errors and times on the user's own device
-and scene."""
+"""Search among candidates by measuring their errors and times in a scene on a device."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from fidsplat.accuracy.error import error_bound, errors, reference_for, truth
-from fidsplat.accuracy.price_list import Candidate
+from fidsplat.accuracy.candidates import Candidate
+from fidsplat.accuracy.choice import Choice
+from fidsplat.accuracy.error import errors, reference_error, reference_image, reference_renderer
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.render.renderer import Renderer
@@ -22,212 +22,215 @@ from fidsplat.util.errors import DeviceError, InputError
 from fidsplat.util.timing import Timer, frame_timer, take_turns
 
 REPEATS = 9
-"""frames of each quality that are timed, in turn with those of the others"""
-FEWEST = 3
-PATIENCE = 10.0
-"""seconds that timing several qualities may take in all; where it would take longer, fewer frames are timed,
-but `FEWEST` of each"""
-ENOUGH = 4
-"""candidates that are timed together before one is taken"""
-TOO_LONG = 1.5
-"""times of the allowed time: a candidate whose first frame takes longer is timed no further"""
-SHORT = 0.5
-"""times of the allowed time: candidates that should take less by the list are tried last"""
-LUCK = 4.0
-"""how many times better than in proportion to the list a candidate may do in this scene"""
+"""timed frames of each quality, interleaved with those of the others"""
+MIN_REPEATS = 3
+MAX_SECONDS = 10.0
+"""limit on the time of a comparison of qualities, with at least `MIN_REPEATS` frames of each"""
+GROUP = 4
+"""candidates that are timed together before one is chosen"""
+TOO_SLOW = 1.5
+"""multiple of the allowed time: a candidate whose first frame takes longer is not timed further"""
+START = 0.5
+"""share of the allowed time: candidates whose expected time is below are tried last"""
+SCENE_VARIATION = 4.0
+"""factor by which the error of a candidate in this scene may be below the proportional expectation"""
 
 
 @dataclass(frozen=True)
 class Times:
-    """Milliseconds of a frame whose splats are on the device and whose picture stays there."""
+    """Frame time in milliseconds, with splats and image on the device."""
 
     median: float
     late: float
     """90th percentile"""
 
 
-class Calibration:
-    """One scene on one device.
+class SceneMeasurement:
+    """Errors and times of qualities, measured with one capture of a scene on a device.
 
     Args:
-        renderer: who draws.
-        cloud: what.
-        capture: how; its quality has the definition of the truth.
-        tell: called with what is being done.
+        capture: its quality defines the reference image.
+        report: called with the current step.
     """
 
     def __init__(
         self,
         renderer: Renderer,
-        cloud: SplatCloud | Scene,
+        scene: SplatCloud | Scene,
         capture: Capture,
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
         self.renderer, self.base = renderer, capture.quality
-        self._cloud, self._capture, self._tell = cloud, capture, tell
-        self._resident = renderer.upload(cloud)
+        self._scene, self._capture, self._report = scene, capture, report
+        self._resident = renderer.upload(scene)
         self._errors: dict[Quality, float] = {}
 
     @cached_property
-    def _truth(self) -> tuple[np.ndarray, float]:
-        """The picture (h, w, 3), and how far it may be off itself."""
-        self._tell("drawing the picture at full precision")
-        reference = reference_for(self.renderer, self._capture)
-        scene = self._resident if reference is self.renderer else self._cloud
-        image = truth(reference, scene, self._capture)
-        # what floats of 32 bits are off grows with the values
-        return image, error_bound(reference, self._capture) * max(1.0, float(np.abs(image).max(initial=0.0)))
+    def _reference(self) -> tuple[np.ndarray, float]:
+        """The reference image (h, w, 3), and a bound on its own error."""
+        self._report("rendering at full precision")
+        reference = reference_renderer(self.renderer, self._capture)
+        scene = self._resident if reference is self.renderer else self._scene
+        image = reference_image(reference, scene, self._capture)
+        # float32 rounding is relative to the values
+        scale = max(1.0, float(np.abs(image).max(initial=0.0)))
+        return image, scale * reference_error(reference, self._capture)
 
     def error(self, quality: Quality) -> float:
-        """Largest absolute error of rgb against the truth. What the truth may be off itself is added."""
+        """Largest absolute error of rgb, with the bound on the error of the reference image added."""
         if quality not in self._errors:
-            want, off = self._truth
-            self._tell(f"measuring errors ({len(self._errors) + 1} candidates so far)")
+            reference, reference_bound = self._reference
+            self._report(f"measuring errors ({len(self._errors) + 1} candidates so far)")
             frame = self.renderer.render(self._resident, self._capture, quality=quality)
-            self._errors[quality] = errors(frame["rgb"], want).maximum + off
+            self._errors[quality] = errors(frame["rgb"], reference).maximum + reference_bound
         return self._errors[quality]
 
     def time(self, quality: Quality) -> float:
-        """Milliseconds of one frame, now."""
+        """Time of one frame in milliseconds."""
         return self.timer(quality).run()
 
     def times(self, qualities: Iterable[Quality], repeats: int = REPEATS) -> list[Times]:
-        """Times of qualities that this device draws. Frames take turns; one of each goes before those that
-        count."""
+        """Frame times of qualities, interleaved, after one warm-up frame of each."""
         timers = [self.timer(quality) for quality in qualities]
-        self._tell(f"timing {len(timers)} candidates")
-        take_turns(timers, repeats, least=min(FEWEST, repeats), seconds=PATIENCE, warm_up=1)
+        self._report(f"timing {len(timers)} candidates")
+        take_turns(timers, repeats, least=min(MIN_REPEATS, repeats), seconds=MAX_SECONDS, warm_up=1)
         return [Times(timer.median, float(np.quantile(timer.ms, 0.9))) for timer in timers]
 
     def timer(self, quality: Quality) -> Timer:
-        """Times frames of a quality."""
+        """Timer of frames of a quality."""
         return frame_timer(self.renderer, self._resident, self._capture, quality=quality)
 
 
-@dataclass(frozen=True)
-class Found:
-    """A candidate that keeps its bound."""
-
-    candidate: Candidate
-    quality: Quality
-    error: float
-    """largest absolute error of rgb"""
-    times: Times
+Measured = tuple[Candidate, float]
+"""a candidate that the device supports, and its error in the scene"""
 
 
-class Search:
-    """Settings, the cheapest first, and a scene on a device to measure them with."""
+class CandidateSearch:
+    """Search among candidates, the fastest first, with a scene to measure them."""
 
-    def __init__(self, calibration: Calibration, candidates: tuple[Candidate, ...]) -> None:
-        self.calibration, self._candidates = calibration, candidates
-        self.device = calibration.renderer.device.name
+    def __init__(self, measurement: SceneMeasurement, candidates: tuple[Candidate, ...]) -> None:
+        self.measurement, self._candidates = measurement, candidates
+        self.device = measurement.renderer.device.name
 
-    def cheapest_within(self, error: float) -> Found:
-        """The fastest here of the first few candidates within the error.
+    def fastest_within(self, error: float) -> Choice:
+        """The fastest of the first few candidates within the error.
 
         Raises:
-            InputError: none is; it says which error is the least.
+            InputError: no candidate is; the message names the lowest error.
         """
-        hits: list[tuple[Candidate, float]] = []
-        missed: tuple[Candidate, float] | None = None
+        hits: list[Measured] = []
+        missed: Measured | None = None
         for candidate in self._candidates:
-            # what does not come near the error in the easiest scenes is not tried, nor what is hardly better
-            # than the last that missed it
-            if candidate.easy > LUCK * error or (missed and not _much_better(candidate, *missed)):
+            # skip candidates that are too inaccurate even in easy scenes, and those that are hardly more
+            # accurate than the last that exceeded the error
+            if candidate.error_easy > SCENE_VARIATION * error:
                 continue
-            for drawn, measured in self._measured([candidate]):
+            if missed and not _much_more_accurate(candidate, *missed):
+                continue
+            for supported, measured in self._measured([candidate]):
                 if measured <= error:
-                    hits.append((drawn, measured))
+                    hits.append((supported, measured))
                 else:
                     missed = candidate, error / measured
-            if len(hits) == ENOUGH:
+            if len(hits) == GROUP:
                 break
-        best = sorted(self._candidates, key=lambda candidate: candidate.median)[:ENOUGH]
-        finest = [] if hits else list(self._measured(best))  # of which some may have been passed over
-        hits = hits or [(drawn, measured) for drawn, measured in finest if measured <= error]
+        finest: list[Measured] = []
+        if not hits:  # the finest candidates may have been skipped
+            best = sorted(self._candidates, key=lambda candidate: candidate.error_median)[:GROUP]
+            finest = list(self._measured(best))
+            hits = [(supported, measured) for supported, measured in finest if measured <= error]
         if hits:
-            return min(self._timed(hits), key=lambda found: found.times.median)
-        least = min(measured for _, measured in finest)
+            return min(self._timed(hits), key=lambda choice: choice.ms or 0.0)
+        lowest = min(measured for _, measured in finest)
         raise InputError(
-            f"no quality keeps an error of {error:g} for this scene on {self.device}: the least is "
-            f"{least:.2g}; allow {least * 1.1:.2g} or more"
+            f"error must be at least {lowest:.2g} for this scene on {self.device}, got {error:g}; allow "
+            f"{lowest * 1.1:.2g} or more"
         )
 
-    def most_accurate_in(self, ms: float) -> Found:
-        """The candidate with the least error of those that draw nine frames of ten in `ms` milliseconds.
+    def most_accurate_in(self, ms: float) -> Choice:
+        """The candidate with the lowest error among those that render nine frames of ten in time.
 
         Raises:
-            InputError: none does; it says how long the fastest takes.
+            InputError: no candidate does; the message says how long the fastest takes.
         """
-        seen: list[Found] = []
+        tried: list[tuple[Measured, Choice]] = []
         start = self._start(ms)
         for group in (self._candidates[start:], self._candidates[:start]):
             likely = self._likely(group, ms)
-            for at in range(0, len(likely), ENOUGH):
-                seen += self._timed(likely[at : at + ENOUGH])
-                in_time = [found for found in seen if found.times.late <= ms]
+            for first in range(0, len(likely), GROUP):
+                pairs = likely[first : first + GROUP]
+                tried += zip(pairs, self._timed(pairs), strict=True)
+                in_time = [choice for _, choice in tried if late_ms(choice) <= ms]
                 if in_time:
-                    return min(in_time, key=lambda found: found.error)
-        # a second look at what was the fastest: on a busy machine the first may have been unlucky
-        pairs = [(found.candidate, found.error) for found in sorted(seen, key=_late)]
-        if not pairs:
-            pairs = list(itertools.islice(self._measured(self._candidates), ENOUGH))
-        best = min(self._timed(pairs[:ENOUGH]), key=_late)
-        if best.times.late <= ms:
+                    return min(in_time, key=lambda choice: choice.error)
+        # the fastest are timed again, since other work on the machine can delay frames
+        fastest = [pair for pair, _ in sorted(tried, key=lambda pair: late_ms(pair[1]))]
+        if not fastest:
+            fastest = list(itertools.islice(self._measured(self._candidates), GROUP))
+        best = min(self._timed(fastest[:GROUP]), key=late_ms)
+        if late_ms(best) <= ms:
             return best
         raise InputError(
-            f"no quality draws this scene in {ms:g} ms on {self.device}; the fastest takes "
-            f"{best.times.late:.3g} ms, with an error of {best.error:.2g}"
+            f"ms must be at least {late_ms(best):.3g} for this scene on {self.device}, got {ms:g}; the "
+            f"fastest quality has an error of {best.error:.2g}"
         )
 
     def _start(self, ms: float) -> int:
-        """Which candidate to begin with: the first that should take more than a `SHORT` part of the time."""
-        usual = min(self._candidates, key=lambda candidate: abs(math.log(candidate.cost))).everywhere
-        (taken,) = self.calibration.times([usual.of(self.calibration.base)], FEWEST)
-        costs = [candidate.cost * taken.median / usual.cost for candidate in self._candidates]
-        start = next((k for k, cost in enumerate(costs) if cost >= SHORT * ms), len(costs))
-        return max(0, min(start, len(costs) - 2 * ENOUGH))
+        """Index of the first candidate whose expected time is above a share `START` of the allowed time."""
+        usual = min(self._candidates, key=lambda candidate: abs(math.log(candidate.cost))).portable
+        (times,) = self.measurement.times([self._quality(usual)], MIN_REPEATS)
+        costs = [candidate.cost * times.median / usual.cost for candidate in self._candidates]
+        start = next((k for k, cost in enumerate(costs) if cost >= START * ms), len(costs))
+        return max(0, min(start, len(costs) - 2 * GROUP))
 
-    def _likely(self, group: Iterable[Candidate], ms: float) -> list[tuple[Candidate, float]]:
-        """Of candidates, the cheapest first, those whose first frame is not much too late; the most accurate
-        first."""
-        likely, late = [], 0
+    def _likely(self, group: Iterable[Candidate], ms: float) -> list[Measured]:
+        """Candidates whose first frame is not much too slow, the most accurate first."""
+        likely, slow = [], 0
         for candidate, measured in self._measured(group):
-            if self.calibration.time(candidate.of(self.calibration.base)) <= TOO_LONG * ms:
+            if self.measurement.time(self._quality(candidate)) <= TOO_SLOW * ms:
                 likely.append((candidate, measured))
             else:
-                late += 1
-            if late == ENOUGH:
+                slow += 1
+            if slow == GROUP:
                 break
         return sorted(likely, key=lambda pair: pair[1])
 
-    def _measured(self, candidates: Iterable[Candidate]):
-        """Settings with their errors, as they are asked for; without the knobs that the device lacks."""
+    def _quality(self, candidate: Candidate) -> Quality:
+        return candidate.quality(self.measurement.base)
+
+    def _measured(self, candidates: Iterable[Candidate]) -> Iterator[Measured]:
+        """Candidates with their errors, without settings that the device lacks."""
         for candidate in candidates:
             try:
-                measured = self.calibration.error(candidate.of(self.calibration.base))
+                measured = self.measurement.error(self._quality(candidate))
             except (InputError, DeviceError):
-                if candidate == candidate.everywhere:
+                if candidate == candidate.portable:
                     raise
-                candidate = candidate.everywhere
-                measured = self.calibration.error(candidate.of(self.calibration.base))
+                candidate = candidate.portable
+                measured = self.measurement.error(self._quality(candidate))
             yield candidate, measured
 
-    def _timed(self, pairs: list[tuple[Candidate, float]]) -> list[Found]:
-        qualities = [candidate.of(self.calibration.base) for candidate, _ in pairs]
-        times = self.calibration.times(qualities)
+    def _timed(self, pairs: list[Measured]) -> list[Choice]:
+        """Choices with their times."""
+        qualities = [self._quality(candidate) for candidate, _ in pairs]
+        every = zip(pairs, qualities, self.measurement.times(qualities), strict=True)
         return [
-            Found(candidate, quality, measured, taken)
-            for (candidate, measured), quality, taken in zip(pairs, qualities, times, strict=True)
+            Choice(quality, error, times.median, times.late, "measured", self.device, candidate.settings)
+            for (candidate, error), quality, times in every
         ]
 
 
-def _late(found: Found) -> float:
-    return found.times.late
+def late_ms(choice: Choice) -> float:
+    """90th percentile of the frame time of a measured choice."""
+    assert choice.ms_late is not None
+    return choice.ms_late
 
 
-def _much_better(candidate: Candidate, missed: Candidate, wanted: float) -> bool:
-    """Whether a candidate can have `wanted` times the error of one that missed: by the list's median, which
-    the cut-off decides, or by its largest error, which the stop does."""
-    enough = LUCK * wanted
-    return candidate.median <= enough * missed.median or candidate.most <= enough * missed.most
+def _much_more_accurate(candidate: Candidate, missed: Candidate, factor: float) -> bool:
+    """Whether a candidate can have `factor` times the error of one that exceeded the bound.
+
+    The cut-off decides the median error over the measured scenes, the stop the maximum.
+    """
+    enough = SCENE_VARIATION * factor
+    by_median = candidate.error_median <= enough * missed.error_median
+    return by_median or candidate.error_max <= enough * missed.error_max

@@ -27,7 +27,7 @@ from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import path_of, writable_folder
 
 if TYPE_CHECKING:
-    from fidsplat.accuracy.quality_within import Choice
+    from fidsplat.accuracy.choice import Choice
     from fidsplat.capture.quality import Quality
     from fidsplat.formats import Progress
     from fidsplat.render.frame import Frame
@@ -142,11 +142,12 @@ class Render:
 
     def _measured(self, scene: "Scene", renderer: "Renderer") -> "Choice":
         """The quality that keeps to --max-error and --max-ms."""
-        from fidsplat.accuracy.quality_within import certify, choose
+        from fidsplat.accuracy.certification import certify
+        from fidsplat.accuracy.quality_within import choose
 
         capture = scene.capture.with_(quality=self.quality)
         with console(self.json).status("measuring") as status:
-            choice = choose(self.max_error, self.max_ms, scene, capture, renderer, tell=status.update)
+            choice = choose(self.max_error, self.max_ms, scene, capture, renderer, report=status.update)
             if self.max_error is None:
                 return choice
             return certify(choice, self.max_error, self.max_ms, scene, capture, renderer, status.update)

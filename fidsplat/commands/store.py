@@ -292,7 +292,7 @@ class StoreDemo:
     def run(self) -> int:
         import fidsplat as fs
         from fidsplat.accuracy.detail_errors import measure_detail
-        from fidsplat.accuracy.error import TRUTH_CUTOFF
+        from fidsplat.accuracy.error import REFERENCE_CUTOFF
         from fidsplat.worlds.city import City, flight
 
         if not (math.isfinite(self.splats) and self.splats == int(self.splats)):
@@ -312,7 +312,7 @@ class StoreDemo:
                 measure_detail(store, fs.Renderer(self.device), self.views, progress=progress)
         camera, motion = flight(city)
         error = DEMO_ERROR if store.detail_errors else 0.0
-        quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
+        quality = fs.Quality(lowpass="pixel", alpha_cutoff=REFERENCE_CUTOFF, detail_error=error)
         scene = folder / "city.toml"
         poses = city.marker_poses(self.markers)
         placed = [

@@ -216,7 +216,7 @@ def test_memory_does_not_hang_on_what_was_drawn_before(session, monkeypatch):
 
 def test_a_device_without_float64_is_held_against_one_with_it(session, monkeypatch):
     """As Warp's."""
-    monkeypatch.setattr(session_module, "reference_for", lambda *_: session.renderer)
+    monkeypatch.setattr(session_module, "reference_renderer", lambda *_: session.renderer)
     lacking = fs.Renderer("opencl")
     monkeypatch.setattr(lacking, "render", lambda *_, **__: pytest.fail("it drew its own truth"))
     want = session.truth("apriltag@0", BASE)

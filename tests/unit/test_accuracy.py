@@ -7,7 +7,7 @@ import pytest
 from agreement import random_splats, reference_pixels
 
 import fidsplat as fs
-from fidsplat.accuracy.error import Errors, errors, full_precision, truth
+from fidsplat.accuracy.error import Errors, errors, full_precision, reference_image
 from fidsplat.selftest.agreement import compare
 from fidsplat.util.errors import InputError
 
@@ -36,10 +36,10 @@ def test_differences_are_not_rounded_to_float32():
 @pytest.mark.parametrize(
     ("picture", "want", "message"),
     [
-        (np.zeros((2, 3)), np.zeros((3, 2)), r"\(2, 3\).*\(3, 2\)"),
-        (np.zeros((0, 3)), np.zeros((0, 3)), "no values"),
-        (np.array([1.0, np.nan]), np.zeros(2), "1 of 2 values of the picture"),
-        (np.zeros(2), np.array([np.inf, np.nan]), "2 of 2 values of the truth"),
+        (np.zeros((2, 3)), np.zeros((3, 2)), r"shape \(3, 2\) .* got \(2, 3\)"),
+        (np.zeros((0, 3)), np.zeros((0, 3)), "must have values"),
+        (np.array([1.0, np.nan]), np.zeros(2), "image must be finite, got 1 of 2"),
+        (np.zeros(2), np.array([np.inf, np.nan]), "reference must be finite, got 2 of 2"),
     ],
 )
 def test_what_cannot_be_compared(picture, want, message):
@@ -66,7 +66,7 @@ def test_truth_of_a_device_is_that_of_the_reference(renderer):
     cloud = random_splats(60, seed=3, depth=(1.0, 6.0), scale=(0.05, 1.0))
     best = full_precision(fs.Capture(), fs.Renderer("reference")).quality
     reference = reference_pixels(cloud, CAMERA, ("rgb",), best)
-    ours = truth(renderer, cloud, fs.Capture(CAMERA))
+    ours = reference_image(renderer, cloud, fs.Capture(CAMERA))
     assert ours.dtype == np.float64
     assert ours.shape == (17, 24, 3)
     (difference,) = compare({"rgb": ours}, reference, ("rgb",))
@@ -82,11 +82,11 @@ def test_rays_of_lenses_and_fog_are_float32():
     assert full_precision(fs.Capture(fog=fog), renderer).quality.blend_precision == "float32"
     capture = fs.Capture(lens, fog=fog)
     assert full_precision(capture, renderer).fog == fog
-    picture = truth(renderer, cloud, capture)
-    assert errors(picture, truth(fs.Renderer("reference"), cloud, capture)).maximum < 1e-4
+    picture = reference_image(renderer, cloud, capture)
+    assert errors(picture, reference_image(fs.Renderer("reference"), cloud, capture)).maximum < 1e-4
 
 
 def test_the_reference_gives_its_float64():
     cloud = random_splats(20, seed=1, depth=(1.0, 6.0))
-    plane = truth(fs.Renderer("reference"), cloud, fs.Capture(CAMERA, background=(0.1, 0.2, 0.3)))
+    plane = reference_image(fs.Renderer("reference"), cloud, fs.Capture(CAMERA, background=(0.1, 0.2, 0.3)))
     assert (plane != plane.astype(np.float32)).any()

@@ -58,7 +58,7 @@ def test_a_budget_is_measured_and_told(scene, tmp_path, capsys, monkeypatch):
     assert chosen["source"] == "measured"
     assert 0 < chosen["certified"] <= 1e-3
     assert chosen["remark"] == ""
-    assert fs.Quality().with_(**chosen["knobs"])
+    assert fs.Quality().with_(**chosen["settings"])
     assert main(words) == 0
     printed = capsys.readouterr().out
     assert "chosen: alpha_cutoff" in printed

@@ -38,7 +38,7 @@ def test_a_changed_source_is_other_code(tree, tmp_path, monkeypatch, folder):
 
 
 def test_data_counts_and_what_python_makes_of_sources_does_not(tree):
-    assert "fidsplat/accuracy/prices.json" in tree
+    assert "fidsplat/accuracy/candidates.json" in tree
     assert not [name for name in tree if "__pycache__" in name or name.endswith(".pyc")]
 
 

@@ -9,10 +9,10 @@ import pytest
 from test_store_drawing import splats
 
 import fidsplat as fs
+from fidsplat.accuracy.candidates import load as load_candidates
+from fidsplat.accuracy.choice import Choice
 from fidsplat.accuracy.detail_errors import SIZES, cameras_around, errors_of, measure_detail
-from fidsplat.accuracy.error import truth
-from fidsplat.accuracy.price_list import load as load_prices
-from fidsplat.accuracy.quality_within import Choice
+from fidsplat.accuracy.error import reference_image
 from fidsplat.backends.prepare import prepare
 from fidsplat.cli import main
 from fidsplat.store import build_plan
@@ -299,34 +299,34 @@ def test_a_city_that_is_too_small_for_levels_is_drawn_exactly(tmp_path, capsys):
     assert not (tmp_path / "none").exists()
 
 
-def test_a_budget_of_error_turns_detail_too(store, renderer):
+def test_an_error_bound_allows_levels_of_detail(store, renderer):
     measure_detail(store, renderer, views=4 * store.levels)
     capture = fs.Capture(seen_from(1500.0), quality="lowpass=pixel")
     quality = fs.quality_within(error=0.08, scene=fs.Store(store.path), capture=capture, device=renderer)
     assert quality.detail_error == 0.04
-    exact = truth(renderer, store, capture.with_(quality=quality))
+    exact = reference_image(renderer, store, capture.with_(quality=quality))
     frame = renderer.render(fs.Store(store.path), capture, quality=quality)
     assert np.abs(frame["rgb"] - exact).max() <= 0.08
     assert frame.stats["splats"] < len(store)
-    assert np.array_equal(exact, truth(renderer, store.cloud(), capture))
+    assert np.array_equal(exact, reference_image(renderer, store.cloud(), capture))
 
 
-def test_a_budget_of_time_alone_turns_detail_too(store, renderer, monkeypatch, tmp_path):
+def test_a_time_bound_allows_levels_of_detail(store, renderer, monkeypatch, tmp_path):
     """The errors that are tried go up until they would exceed what was found."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     measure_detail(store, renderer, views=4 * store.levels)
     tried, errors = [], {0.0: None, 1 / 255: 0.2, 4 / 255: 0.03, 16 / 255: 0.1, 0.5: 0.0}
 
     def found(search, error, ms):
-        base = search.calibration.base
+        base = search.measurement.base
         tried.append(base.detail_error)
         if errors[base.detail_error] is None:
             raise fs.InputError("no quality draws this scene in 1 ms")
-        candidate = load_prices(renderer.device.kind)[0]
-        own = candidate.of(base)
-        return Choice(own, errors[base.detail_error], 1.0, 1.0, "measured", "here", candidate.knobs)
+        candidate = load_candidates(renderer.device.kind)[0]
+        own = candidate.quality(base)
+        return Choice(own, errors[base.detail_error], 1.0, 1.0, "measured", "here", candidate.settings)
 
-    monkeypatch.setattr(sys.modules["fidsplat.accuracy.quality_within"], "_measured", found)
+    monkeypatch.setattr(sys.modules["fidsplat.accuracy.quality_within"], "_search", found)
     asked = {"scene": store, "capture": seen_from(1500.0), "device": renderer}
     asked["capture"] = fs.Capture(asked["capture"], quality="lowpass=pixel")
     for _ in range(2):  # the second is kept

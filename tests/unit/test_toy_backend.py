@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.accuracy.error import draws_float64
+from fidsplat.accuracy.error import supports_float64
 from fidsplat.backends import registry
 
 CAMERA = fs.Camera.pinhole(6, 4, 6.0, 6.0, 3.0, 2.0)
@@ -105,4 +105,4 @@ def test_what_it_lacks_is_an_error_that_says_so(toy):
         toy.adopt(means=1, quats=1, scales=1, opacities=1, colors=1)
     with pytest.raises(fs.InputError, match="keeps rgb in no array"):
         toy.render(CLOUD, CAMERA).device_array("rgb")
-    assert not draws_float64(toy, fs.Capture(CAMERA))
+    assert not supports_float64(toy, fs.Capture(CAMERA))

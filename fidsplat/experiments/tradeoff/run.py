@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from fidsplat.accuracy.error import TRUTH_CUTOFF
+from fidsplat.accuracy.error import REFERENCE_CUTOFF
 from fidsplat.experiments.sweep import Key, Results, Sweep
 from fidsplat.experiments.tradeoff import compare, linear, points, scenes
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
@@ -164,7 +164,7 @@ def _begin(session: Session, key: Key, quick: bool) -> Callable[[], dict]:
         asked = BASE.with_(**{name: key[name] for name in DEFINITION})
         full, truth = session.full(view, asked), session.truth(view, asked)
         scene = session.scene(view, asked.marker)
-        facts = {"blend_precision": full.blend_precision, "alpha_cutoff": TRUTH_CUTOFF}
+        facts = {"blend_precision": full.blend_precision, "alpha_cutoff": REFERENCE_CUTOFF}
         return lambda: facts | compare.check_truth(truth, scene, full)
     quality = points.quality_of(key["quality"])
     frame, times = time_point(session, view, quality, QUICK if quick else FULL)

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from fidsplat.accuracy.error import full_precision, reference_for, truth
+from fidsplat.accuracy.error import full_precision, reference_image, reference_renderer
 from fidsplat.backends.interface import Measurable
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import MarkerQuality, Quality
@@ -34,7 +34,7 @@ class Session:
 
     def __init__(self, renderer: Renderer, own: Own | None = None) -> None:
         """own: one's own pictures, which have the splats of their files, whatever the knobs of markers."""
-        self.renderer, self._reference = renderer, reference_for(renderer, Capture())
+        self.renderer, self._reference = renderer, reference_renderer(renderer, Capture())
         self._own, self._uploaded = own or {}, {}
         self._made = lru_cache(_SCENES)(make)
         self.resident = lru_cache(_SCENES)(self._resident)
@@ -65,7 +65,7 @@ class Session:
     def _draw_truth(self, view: str, like: Quality) -> np.ndarray:
         scene, own = self.scene(view, like.marker), self._reference is self.renderer
         what = self.resident(view, like.marker) if own else scene.cloud
-        return truth(self._reference, what, scene.capture.with_(quality=like))
+        return reference_image(self._reference, what, scene.capture.with_(quality=like))
 
     def definition(self, view: str, quality: Quality) -> Quality:
         """The base with what `quality` says of the definition; 3D Gaussians as they are, in one's own

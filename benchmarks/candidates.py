@@ -1,15 +1,13 @@
-"""Makes fidsplat/accuracy/prices.json: the candidates that `fs.quality_within` chooses among, with their
-errors over random scenes and what they cost.
+"""Measure fidsplat/accuracy/candidates.json: the candidates of `fs.quality_within`, with errors and times.
 
-    python benchmarks/budget_prices.py --device opencl:pocl       about 15 minutes on two busy cores
-    python benchmarks/budget_prices.py --device opencl:nvidia     adds the candidates of GPUs
+    python benchmarks/candidates.py --device opencl:pocl       about 15 minutes on two busy cores
+    python benchmarks/candidates.py --device opencl:nvidia     adds the candidates of GPUs
 
-Each scene of `random_scenes.py` is drawn with every candidate and compared with the same
-definition at full precision, which the device draws in float64 (`fidsplat.accuracy.error.reference_for`).
-Costs are medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a
-second round the candidates on the front of error and cost are drawn with every set of MODIFIERS, and FINEST
-beside them; what is on that front then is kept. Knobs that the device does not have are left out. What the
-file says of another kind of device stays.
+Each scene of `random_scenes.py` is rendered with every candidate and compared with the image at full
+precision, in float64 (`fidsplat.accuracy.error.reference_renderer`). Costs are medians of interleaved frames
+of the scenes of TIMED, of processor time on CPUs. In a second round, the Pareto front is rendered with every
+set of MODIFIERS and with FINEST; the new Pareto front is written. Settings that the device lacks are left
+out. Entries of other kinds of devices stay.
 """
 
 from __future__ import annotations
@@ -24,8 +22,8 @@ import numpy as np
 from random_scenes import random_scene
 
 import fidsplat as fs
-from fidsplat.accuracy.error import error_bound, errors, reference_for, truth
-from fidsplat.accuracy.price_list import FILE, Candidate
+from fidsplat.accuracy.candidates import FILE, Candidate
+from fidsplat.accuracy.error import errors, reference_error, reference_image, reference_renderer
 from fidsplat.scenes.random_clouds import random_cloud, standard_camera
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
@@ -49,13 +47,13 @@ SLACK = 1.02
 
 
 class Measurement:
-    """Settings as knobs, with errors (scenes, candidates) and costs (candidates,)."""
+    """Candidates (settings) with errors (scenes, candidates) and costs (candidates,)."""
 
     def __init__(self, candidates: list[dict], errors_: np.ndarray, costs: np.ndarray) -> None:
         self.candidates, self.errors, self.costs = candidates, errors_, costs
 
-    def front(self) -> list[int]:
-        """Settings that no other equals or betters in cost, in median and in largest error, but for SLACK."""
+    def pareto_front(self) -> list[int]:
+        """Indices of the Pareto front in cost, median error and largest error, up to SLACK."""
         what = np.log([self.costs, np.median(self.errors, 0), self.errors.max(0)]).T  # (candidates, 3)
         total, slack = what.sum(1), np.log(SLACK)
         return [
@@ -63,15 +61,15 @@ class Measurement:
         ]
 
     def of(self, chosen: list[int]) -> Measurement:
-        """The chosen candidates alone."""
+        """The measurement of some candidates."""
         return Measurement([self.candidates[k] for k in chosen], self.errors[:, chosen], self.costs[chosen])
 
     def rows(self) -> list[dict]:
-        """As prices.json has them, the cheapest first."""
+        """Rows of candidates.json, the fastest first."""
         rows = []
-        for knobs, off, cost in zip(self.candidates, self.errors.T, self.costs.tolist(), strict=True):
+        for settings, off, cost in zip(self.candidates, self.errors.T, self.costs.tolist(), strict=True):
             sizes = (round_up(size) for size in (np.quantile(off, 0.05), np.median(off), off.max()))
-            rows.append(vars(Candidate(knobs, *sizes, cost=round(cost, 3))))
+            rows.append(vars(Candidate(settings, *sizes, cost=round(cost, 3))))
         return sorted(rows, key=lambda row: row["cost"])
 
 
@@ -88,13 +86,15 @@ def main() -> int:
     parser.add_argument("--out", default=str(FILE))
     args = parser.parse_args()
     renderer = fs.Renderer(args.device)
-    reference = reference_for(renderer, fs.Capture())
+    reference = reference_renderer(renderer, fs.Capture())
 
     say(f"truths of {args.scenes} scenes by {reference.device.name}")
     scenes = [random_scene(seed) for seed in range(args.scenes)]
     truths = []
     for k, scene in enumerate(scenes):
-        truths.append(truth(reference, scene.cloud, fs.Capture(scene.camera, background=scene.background)))
+        truths.append(
+            reference_image(reference, scene.cloud, fs.Capture(scene.camera, background=scene.background))
+        )
         say(f"truths: {k + 1} of {args.scenes}", end="\r")
 
     def measure(candidates: list[dict]) -> Measurement:
@@ -103,13 +103,13 @@ def main() -> int:
 
     grid = [{"alpha_cutoff": cut, "transmittance_stop": stop} for cut in CUTOFFS for stop in STOPS]
     plain = measure(grid)
-    plain = plain.of(plain.front())
+    plain = plain.of(plain.pareto_front())
     say(f"{len(plain.candidates)} of {len(grid)} are on the front")
     modifiers = [more for more in MODIFIERS if draws(renderer, scenes[0], more)]
-    finest = [knobs for knobs in FINEST if draws(renderer, scenes[0], knobs)]
-    combined = [knobs | more for knobs in plain.candidates for more in modifiers]
+    finest = [settings for settings in FINEST if draws(renderer, scenes[0], settings)]
+    combined = [settings | more for settings in plain.candidates for more in modifiers]
     both = measure(plain.candidates + combined + finest)
-    final = both.of(both.front())
+    final = both.of(both.pareto_front())
     say(f"{len(final.candidates)} of {len(both.candidates)} are kept")
 
     out = json.loads(FILE.read_text("utf-8")) if FILE.exists() else {"made": {}, "classes": {}}
@@ -120,7 +120,7 @@ def main() -> int:
         "driver": info.version,
         "date": date.today().isoformat(),
         "scenes": args.scenes,
-        "truth": reference.device.name,
+        "reference": reference.device.name,
         "fidsplat": fs.__version__,
     }
     with atomic_write(args.out) as stream:
@@ -132,13 +132,13 @@ def say(text: str, end: str = "\n") -> None:
     print(text, file=sys.stderr, end=end, flush=True)
 
 
-def quality(knobs: dict) -> fs.Quality:
-    return Candidate(knobs, 0, 0, 0, 0).of(fs.Quality())
+def quality(settings: dict) -> fs.Quality:
+    return Candidate(settings, 0, 0, 0, 0).quality(fs.Quality())
 
 
-def draws(renderer: fs.Renderer, scene, knobs: dict) -> bool:
+def draws(renderer: fs.Renderer, scene, settings: dict) -> bool:
     try:
-        renderer.render(scene.cloud, scene.camera, quality=quality(knobs))
+        renderer.render(scene.cloud, scene.camera, quality=quality(settings))
     except InputError as error:
         say(f"left out: {error}")
         return False
@@ -147,9 +147,9 @@ def draws(renderer: fs.Renderer, scene, knobs: dict) -> bool:
 
 def all_errors(renderer: fs.Renderer, scenes, truths, candidates: list[dict]) -> np.ndarray:
     """Largest absolute error of rgb (scenes, candidates)."""
-    qualities = [quality(knobs) for knobs in candidates]
+    qualities = [quality(settings) for settings in candidates]
     found = np.empty((len(scenes), len(candidates)))
-    off = error_bound(reference_for(renderer, fs.Capture()), fs.Capture())
+    off = reference_error(reference_renderer(renderer, fs.Capture()), fs.Capture())
     for k, (scene, want) in enumerate(zip(scenes, truths, strict=True)):
         resident = renderer.upload(scene.cloud)
         for j, each in enumerate(qualities):
@@ -162,7 +162,7 @@ def all_errors(renderer: fs.Renderer, scenes, truths, candidates: list[dict]) ->
 
 def all_costs(renderer: fs.Renderer, candidates: list[dict], repeats: int) -> np.ndarray:
     """Time of a frame over that of the candidates' base (candidates,): the mean over the timed scenes."""
-    qualities = [quality({}), *(quality(knobs) for knobs in candidates)]
+    qualities = [quality({}), *(quality(settings) for settings in candidates)]
     # a processor's own time does not hang on what else runs there
     clock = time.process_time if renderer.device.kind == "cpu" else time.perf_counter
     ratios = []

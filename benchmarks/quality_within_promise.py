@@ -1,11 +1,11 @@
-"""How often `fs.quality_within` keeps what it promises, on scenes that its price list was not made of.
+"""How often `fs.quality_within` keeps what it promises, on scenes that its candidates were not measured with.
 
-    python benchmarks/budget_promise.py [--device opencl:pocl] [--scenes 200] [--json FILE]
+    python benchmarks/quality_within_promise.py [--device opencl:pocl] [--scenes 200] [--json FILE]
 
 Errors: random scenes with held-out seeds, each with every bound of BOUNDS, against the float64 reference.
-`prices` is what the price list gives for the bound; `measured` the one that was calibrated on the scene
+`promised` is the quality without a scene; `measured` the one that was calibrated on the scene
 and camera; `elsewhere` the same from another camera (turned by 5 degrees, moved by a tenth of the distance);
-`crossing` the price list's quality in scenes whose loose splats cross a printed plane. Times: budgets of
+`crossing` the promised quality in scenes whose other splats cross a coplanar group. Times: budgets of
 TIMES times what TIMED takes in each scene; then FRAMES frames are drawn, and those in time counted.
 """
 
@@ -23,7 +23,7 @@ from random_scenes import HELD_OUT, RandomScene, random_scene
 from rich.progress import track
 
 import fidsplat as fs
-from fidsplat.accuracy.error import errors, truth
+from fidsplat.accuracy.error import errors, reference_image
 from fidsplat.accuracy.quality_within import choose
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.util.errors import InputError
@@ -73,7 +73,7 @@ def capture_of(scene: RandomScene) -> fs.Capture:
 def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
     """A row for each way of asking and each bound: of `count` scenes, and of the first `measured` of them."""
     reference = fs.Renderer("reference")
-    ways = ("prices", "crossing", "measured", "elsewhere")
+    ways = ("promised", "crossing", "measured", "elsewhere")
     kept = {(way, bound): Kept() for way in ways for bound in BOUNDS}
     listed = {bound: fs.quality_within(error=bound, device=renderer) for bound in BOUNDS}
 
@@ -82,7 +82,7 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
         kept[way, bound].worst.append(errors(frame["rgb"], want).maximum / bound)
 
     def truth_of(scene: RandomScene) -> np.ndarray:
-        return truth(reference, scene.cloud, capture_of(scene))
+        return reference_image(reference, scene.cloud, capture_of(scene))
 
     for k in track(range(count), "errors", console=PROGRESS):
         scene = random_scene(HELD_OUT + k)
@@ -90,7 +90,7 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
         crossing = random_scene(HELD_OUT + k, crossing=True)
         mixed = truth_of(crossing)
         for bound, quality in listed.items():
-            hold("prices", bound, scene, quality, want)
+            hold("promised", bound, scene, quality, want)
             hold("crossing", bound, crossing, quality, mixed)
         if k >= measured:
             continue

@@ -1,4 +1,4 @@
-"""`fs.quality_within`: what it promises is kept, on scenes that its price list has never seen."""
+"""`fs.quality_within`: its promises hold on scenes that its candidates were not measured with."""
 
 import dataclasses
 import json
@@ -12,9 +12,11 @@ from random_scenes import HELD_OUT, random_scene
 from sampling import in_turn
 
 import fidsplat as fs
-from fidsplat.accuracy import cache, price_list, search
-from fidsplat.accuracy.error import errors, truth
-from fidsplat.accuracy.quality_within import Choice, _key, certify, choose
+from fidsplat.accuracy import cache, candidates, search
+from fidsplat.accuracy.certification import certify
+from fidsplat.accuracy.choice import Choice
+from fidsplat.accuracy.error import errors, reference_image
+from fidsplat.accuracy.quality_within import _key, choose
 from fidsplat.util.errors import InputError
 from fidsplat.util.timing import Clock, Timer
 
@@ -27,7 +29,7 @@ SMALL = fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
-    """What is kept is kept here, not in the user's folder."""
+    """A cache folder of this test."""
     monkeypatch.setattr(cache, "folder", lambda: tmp_path / "cache")
 
 
@@ -38,9 +40,12 @@ def scene():
 
 @pytest.fixture(scope="module")
 def held_out(reference):
-    """Scenes that no price list is made of, with their truths."""
+    """Held-out scenes with their reference images."""
     scenes = [random_scene(HELD_OUT + k) for k in range(HELD_OUT_SCENES)]
-    return [(s, truth(reference, s.cloud, fs.Capture(s.camera, background=s.background))) for s in scenes]
+    return [
+        (s, reference_image(reference, s.cloud, fs.Capture(s.camera, background=s.background)))
+        for s in scenes
+    ]
 
 
 def error_of(renderer, scene, quality, want):
@@ -53,20 +58,20 @@ def within(renderer, scene, error=None, ms=None, **more):
     return choose(error, ms, scene.cloud, capture, renderer)
 
 
-# the price list
+# candidates
 
 
-def test_the_price_list_is_a_ladder():
-    candidates = price_list.load("cpu")
-    assert [s.cost for s in candidates] == sorted(s.cost for s in candidates)
-    assert all(0 < s.easy <= s.median <= s.most for s in candidates)
-    assert all(isinstance(s.of(fs.Quality()), fs.Quality) for s in candidates)
-    assert price_list.load("a kind that nobody measured") == candidates
+def test_candidates_are_sorted_by_cost():
+    front = candidates.load("cpu")
+    assert [s.cost for s in front] == sorted(s.cost for s in front)
+    assert all(0 < s.error_easy <= s.error_median <= s.error_max for s in front)
+    assert all(isinstance(s.quality(fs.Quality()), fs.Quality) for s in front)
+    assert candidates.load("an unknown kind") == front
 
 
 @pytest.mark.parametrize("error", BOUNDS)
-def test_the_price_list_keeps_its_promise(renderer, held_out, error):
-    """The long form, 200 scenes, is benchmarks/budget_promise.py; docs/budget.md has what it gave."""
+def test_a_promised_error_holds(renderer, held_out, error):
+    """benchmarks/quality_within_promise.py is the long form with 200 scenes."""
     quality = fs.quality_within(error=error, device=renderer)
     found = [error_of(renderer, scene, quality, want) for scene, want in held_out]
     assert max(found) <= error, found
@@ -140,10 +145,10 @@ def test_a_choice_without_a_certificate_says_why(renderer):
 
 
 def test_less_error_is_never_cheaper(renderer):
-    cost = {json.dumps(s.knobs): s.cost for s in price_list.load(renderer.device.kind)}
+    cost = {json.dumps(s.settings): s.cost for s in candidates.load(renderer.device.kind)}
     chosen = [choose(error, device=renderer) for error in (0.3, *BOUNDS)]
     assert all(choice.error <= error for choice, error in zip(chosen, (0.3, *BOUNDS), strict=True))
-    costs = [cost[json.dumps(choice.knobs)] for choice in chosen]
+    costs = [cost[json.dumps(choice.settings)] for choice in chosen]
     assert costs == sorted(costs)
     assert costs[0] < costs[-1]
 
@@ -151,9 +156,9 @@ def test_less_error_is_never_cheaper(renderer):
 def test_the_definition_stays():
     base = fs.Quality(lowpass="pixel", samples=3, order="centre", first_hit=0.3)
     kept = ("lowpass", "samples", "order", "first_hit", "marker")
-    for candidate in price_list.load("cpu"):
-        assert all(getattr(candidate.of(base), name) == getattr(base, name) for name in kept)
-        parity = candidate.of(fs.Quality.named("gsplat"))
+    for candidate in candidates.load("cpu"):
+        assert all(getattr(candidate.quality(base), name) == getattr(base, name) for name in kept)
+        parity = candidate.quality(fs.Quality.named("gsplat"))
         assert (parity.opacity_ceiling, parity.stop_rule, parity.order) == (1.0, "inclusive", "centre")
 
 
@@ -176,11 +181,11 @@ def test_what_the_truth_may_be_off_is_added(renderer, held_out, monkeypatch):
     capture = fs.Capture(scene.camera, background=scene.background)
 
     def measured():
-        return search.Calibration(renderer, scene.cloud, capture, lambda text: None).error(fs.Quality())
+        return search.SceneMeasurement(renderer, scene.cloud, capture, lambda text: None).error(fs.Quality())
 
-    monkeypatch.setattr(search, "error_bound", lambda *_: 0.0)
+    monkeypatch.setattr(search, "reference_error", lambda *_: 0.0)
     plain = measured()
-    monkeypatch.setattr(search, "error_bound", lambda *_: 0.25)
+    monkeypatch.setattr(search, "reference_error", lambda *_: 0.25)
     assert measured() == plain + 0.25
 
 
@@ -191,7 +196,7 @@ def test_errors_are_those_before_the_sensor(renderer, held_out):
 
 
 @in_turn(1)
-def test_measuring_finds_what_is_cheaper_than_the_price_list(renderer, held_out):
+def test_a_measured_quality_is_faster_than_a_promised_one(renderer, held_out):
     """Most scenes need less than the worst of the list does."""
     cutoff = fs.quality_within(error=1e-3, device=renderer).alpha_cutoff
     own = [within(renderer, scene, 1e-3).quality.alpha_cutoff for scene, _ in held_out[:6]]
@@ -203,13 +208,18 @@ def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monk
     first = within(renderer, scene, 1e-3)
     (file,) = cache.folder().iterdir()
     with monkeypatch.context() as patch:
-        patch.setattr(search.Calibration, "error", lambda *_: pytest.fail("it was measured again"))
+        patch.setattr(search.SceneMeasurement, "error", lambda *_: pytest.fail("it was measured again"))
         again = within(renderer, scene, 1e-3)
     assert dataclasses.replace(again, source="measured") == first
-    for broken in (b"", b"{", b"[1]", b'{"knobs": {"alpha_cutoff": 7}, "error": 0, "ms": 0, "ms_late": 0}'):
+    for broken in (
+        b"",
+        b"{",
+        b"[1]",
+        b'{"settings": {"alpha_cutoff": 7}, "error": 0, "ms": 0, "ms_late": 0}',
+    ):
         file.write_bytes(broken)
         assert within(renderer, scene, 1e-3).source == "measured"
-        assert json.loads(file.read_bytes())["knobs"]
+        assert json.loads(file.read_bytes())["settings"]
 
 
 @in_turn(1)
@@ -259,7 +269,7 @@ def test_a_device_without_a_knob(renderer, held_out, monkeypatch):
     for choice in (choose(3e-3, device=renderer), within(renderer, scene, 3e-3)):
         assert error_of(renderer, scene, choice.quality, want) <= 3e-3
         assert (choice.quality.setup_precision, choice.quality.arithmetic) == ("float64", "fast")
-    with pytest.raises(InputError, match="the least is"):
+    with pytest.raises(InputError, match="error must be at least"):
         within(renderer, scene, 1e-12)
 
 
@@ -278,12 +288,12 @@ def clock(monkeypatch):
 
         return Timer(frame, clock)
 
-    monkeypatch.setattr(search.Calibration, "timer", timer)
+    monkeypatch.setattr(search.SceneMeasurement, "timer", timer)
 
 
 def test_the_most_accurate_in_time(renderer, scene, clock):
     choice = within(renderer, scene, ms=31)
-    cutoffs = {s.of(fs.Quality()).alpha_cutoff for s in price_list.load(renderer.device.kind)}
+    cutoffs = {s.quality(fs.Quality()).alpha_cutoff for s in candidates.load(renderer.device.kind)}
     assert choice.quality.alpha_cutoff == min(cutoff for cutoff in cutoffs if -10 * np.log10(cutoff) <= 31)
     assert (choice.ms, choice.ms_late) == pytest.approx((-10 * np.log10(choice.quality.alpha_cutoff),) * 2)
     assert within(renderer, scene, ms=45).error < choice.error
@@ -292,7 +302,7 @@ def test_the_most_accurate_in_time(renderer, scene, clock):
 def test_error_and_time_together(renderer, scene, clock):
     choice = within(renderer, scene, 1e-2, 100)
     assert choice.error <= 1e-2
-    with pytest.raises(InputError, match=r"an error of 0\.0001 takes \d+.*; the least error in that"):
+    with pytest.raises(InputError, match=r"an error of 0\.0001 takes \d+.*; the lowest error in that"):
         within(renderer, scene, 1e-4, 25)
 
 
@@ -312,26 +322,26 @@ def test_a_time_is_kept_by_nine_frames_of_ten():
         def times(self, qualities, repeats=9):
             return [search.Times(1.0, late[quality.alpha_cutoff]) for quality in qualities]
 
-    candidates = tuple(price_list.Candidate({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
-    known = search.Search(Known(), candidates)
+    front = tuple(candidates.Candidate({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
+    known = search.CandidateSearch(Known(), front)
     assert known.most_accurate_in(5.0).error == 1e-2
     assert known.most_accurate_in(10.0).error == 1e-4
-    measured = import_module("fidsplat.accuracy.quality_within")._measured
+    measured = import_module("fidsplat.accuracy.quality_within")._search
     assert measured(known, 1e-3, 10.0).error == 1e-4
-    with pytest.raises(InputError, match=r"takes 9 ms a frame on known, not 5; the least error .* 0\.01"):
+    with pytest.raises(InputError, match=r"takes 9 ms a frame on known, not 5; the lowest error .* 0\.01"):
         measured(known, 1e-3, 5.0)
 
 
 def test_late_frames_are_the_90th_percentile_without_the_first(renderer, scene, monkeypatch):
     """Frames of 1 to 9 ms after one of a second, which warms up."""
-    calibration = search.Calibration.__new__(search.Calibration)
+    calibration = search.SceneMeasurement.__new__(search.SceneMeasurement)
     taken = iter([1.0, *(ms / 1e3 for ms in (5, 3, 9, 1, 7, 2, 8, 4, 6))])
     clock = Clock()
 
     def frame():
         clock.seconds += next(taken)
 
-    monkeypatch.setattr(calibration, "_tell", lambda words: None, raising=False)
+    monkeypatch.setattr(calibration, "_report", lambda words: None, raising=False)
     monkeypatch.setattr(calibration, "timer", lambda quality: Timer(frame, clock), raising=False)
     assert calibration.times([fs.Quality()], repeats=9) == [
         search.Times(pytest.approx(5.0), pytest.approx(8.2))
@@ -340,7 +350,7 @@ def test_late_frames_are_the_90th_percentile_without_the_first(renderer, scene, 
 
 @pytest.mark.parametrize("ms", [0, -3, 1e-6])
 def test_a_time_that_nothing_keeps(renderer, scene, clock, ms):
-    with pytest.raises(InputError, match=r"the fastest takes [\d.]+ ms, with an error of"):
+    with pytest.raises(InputError, match=r"ms must be at least [\d.]+ .* quality has an error of"):
         within(renderer, scene, ms=ms)
 
 
@@ -358,7 +368,7 @@ def test_frames_are_really_timed(renderer, scene):
 def test_an_error_that_nothing_keeps(renderer, scene, error):
     with pytest.raises(InputError, match=r"error must be at least \d.* to be promised"):
         fs.quality_within(error=error, device=renderer)
-    with pytest.raises(InputError, match=r"the least is \d.*allow \d"):
+    with pytest.raises(InputError, match=r"error must be at least \d.*allow \d"):
         within(renderer, scene, error)
 
 
@@ -366,16 +376,16 @@ def test_an_error_that_nothing_keeps(renderer, scene, error):
     ("words", "message"),
     [
         ({}, "an empty budget"),
-        ({"error": float("nan")}, "error is nan"),
-        ({"error": "small"}, "error is 'small'"),
-        ({"error": True}, "error is True"),
-        ({"ms": float("inf")}, "ms is inf"),
+        ({"error": float("nan")}, "error must be .* got nan"),
+        ({"error": "small"}, "error must be .* got 'small'"),
+        ({"error": True}, "error must be .* got True"),
+        ({"ms": float("inf")}, "ms must be .* got inf"),
         ({"ms": 5}, "needs a scene"),
         ({"error": 1e-3, "scene": fs.SplatCloud.empty()}, "needs a camera"),
         ({"error": 1e-3, "capture": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)}, "needs a scene"),
         (
             {"error": 1e-3, "scene": 7, "capture": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)},
-            "scene is a int",
+            "scene must be .* got a int",
         ),
         ({"error": 1e-3, "capture": "best"}, "camera is 'best'"),
     ],

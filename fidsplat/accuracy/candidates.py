@@ -1,0 +1,77 @@
+"""Candidates of `quality_within`: the Pareto front of quality settings in error and frame time.
+
+`candidates.json` holds them with their measured errors and times (benchmarks/candidates.py).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from fidsplat.capture.quality import Quality
+
+FILE = Path(__file__).with_name("candidates.json")
+MARGIN = 1.5
+"""factor between a promised error and the largest measured one, which other scenes slightly exceed"""
+
+DEFAULTS: dict[str, Any] = {
+    "alpha_cutoff": 1.0 / 255.0,
+    "transmittance_stop": 1e-4,
+    "setup_precision": "float64",
+    "arithmetic": "precise",
+    "blend_precision": "float32",
+}
+"""Quality settings that `quality_within` chooses, and their values unless a candidate differs.
+
+Settings that only add error are off (opacity ceiling, exclusive stop). The others define the image, and stay
+those of the base quality.
+"""
+PORTABLE = ("alpha_cutoff", "transmittance_stop", "arithmetic")
+"""the settings among them that every device supports"""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One point of the Pareto front: quality settings with measured error and time."""
+
+    settings: dict[str, Any]
+    """settings that differ from `DEFAULTS`"""
+    error_easy: float
+    """largest absolute error of an image, 5th percentile over the measured scenes"""
+    error_median: float
+    """the same, median over the scenes"""
+    error_max: float
+    """the same, maximum over the scenes"""
+    cost: float
+    """frame time relative to `DEFAULTS` (processor time on CPUs)"""
+
+    def quality(self, base: Quality) -> Quality:
+        """The quality with the image definition of `base` and the accuracy of this candidate."""
+        return base.with_(**(DEFAULTS | {"opacity_ceiling": 1.0, "stop_rule": "inclusive"} | self.settings))
+
+    @property
+    def portable(self) -> Candidate:
+        """The candidate without settings that some devices lack.
+
+        It is as accurate, except without blending in float64.
+        """
+        return replace(self, settings={k: value for k, value in self.settings.items() if k in PORTABLE})
+
+    @property
+    def expected_error(self) -> float:
+        """Error to expect in a scene like the measured ones; not a bound."""
+        return MARGIN * self.error_max
+
+
+@cache
+def load(kind: str) -> tuple[Candidate, ...]:
+    """The candidates for a kind of device (cpu, gpu), the fastest first.
+
+    A kind without measurements uses those of CPUs: float32 errors are alike, and costs have the same order.
+    """
+    classes = json.loads(FILE.read_text("utf-8"))["classes"]
+    rows = classes.get(kind, classes["cpu"])["candidates"]
+    return tuple(sorted((Candidate(**row) for row in rows), key=lambda candidate: candidate.cost))

@@ -1,0 +1,80 @@
+"""Certification of a choice by the output `error`, an upper bound on the error of every pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from fidsplat.accuracy.candidates import DEFAULTS
+from fidsplat.accuracy.choice import Choice
+from fidsplat.accuracy.error import supports_float64
+from fidsplat.accuracy.search import SceneMeasurement
+from fidsplat.capture.capture import Capture
+from fidsplat.capture.sensor import Sensor
+from fidsplat.render.certified_error import cutoff_of, nothing_left_out
+from fidsplat.render.renderer import Renderer
+from fidsplat.scenes import Scene
+from fidsplat.util.errors import InputError
+
+REFINEMENT = 1 / 16
+"""factor on cut-off and stop of a quality whose error is not certified"""
+
+
+def certify(
+    choice: Choice,
+    error: float,
+    ms: float | None,
+    scene: Scene,
+    capture: Capture,
+    renderer: Renderer,
+    report: Callable[[str], None] = lambda message: None,
+) -> Choice:
+    """The choice, refined until the output `error` of a frame is at most `error` everywhere.
+
+    If the output is not available, the choice is returned as measured, with the reason as its remark.
+
+    Raises:
+        InputError: the finest quality is not certified either, or takes longer than `ms`; the message says
+            what is possible.
+    """
+    plain = replace(capture, outputs=("error",), sensor=Sensor())
+    resident, quality = renderer.upload(scene), choice.quality
+    cutoff, float64 = cutoff_of(len(resident)), supports_float64(renderer, plain)
+    while True:
+        report(f"certifying a cut-off of {quality.alpha_cutoff:.2g} in {quality.blend_precision}")
+        try:
+            frame = renderer.render(resident, plain.with_(quality=quality))
+        except InputError as refused:
+            return replace(choice, remark=f"not certified: {refused}")
+        certified = float(frame["error"].max(initial=0.0))
+        if certified <= error:
+            break
+        if quality.alpha_cutoff > cutoff:
+            finer = max(REFINEMENT * quality.alpha_cutoff, cutoff)
+            stop = REFINEMENT * quality.transmittance_stop if finer > cutoff else 0.0
+            quality = nothing_left_out(quality, finer).with_(transmittance_stop=stop)
+            continue
+        if float64 and quality.blend_precision == "float32":
+            quality = quality.with_(blend_precision="float64", arithmetic="precise")
+            continue
+        raise InputError(
+            f"error must be at least {certified:.2g} to be certified for this scene on {choice.device}, got "
+            f"{error:g}; allow that"
+        )
+    if quality == choice.quality:
+        return replace(choice, certified=certified)
+    measurement = SceneMeasurement(renderer, scene, plain.with_(outputs=("rgb",)), report)
+    (times,) = measurement.times([quality])
+    if ms is not None and times.late > ms:
+        raise InputError(
+            f"an error that is certified to be at most {error:g} takes {times.late:.3g} ms a frame on "
+            f"{choice.device}, not {ms:g}; allow more of one of the two"
+        )
+    settings = {
+        name: getattr(quality, name) for name, value in DEFAULTS.items() if getattr(quality, name) != value
+    }
+    # the certified bound replaces an error that was not measured
+    return Choice(
+        *(quality, certified, times.median, times.late, "measured", choice.device, settings),
+        certified=certified,
+    )
