@@ -106,7 +106,8 @@ class ChunkedSplats:
 
     def all_chunks(self) -> Selection:
         """All chunks, without nodes of levels of detail."""
-        return Selection.of([np.tile(store.nodes["level"] == 0, store.places) for store in self.stores])
+        masks = (np.tile(store.nodes["level"] == 0, store.places) for store in self.stores)
+        return Selection.of(tuple(masks))
 
     def cell_sizes(self, *qualities: Quality) -> CellSizes:
         """Size on the image [samples] below which cells are merged, by `detail_error`; the strictest quality

@@ -56,10 +56,14 @@ class DeviceChunks:
         )
         return sum(each) + -(-len(self.scene.in_memory) // self.largest_chunk)
 
-    @cached_property
+    @property
     def group_table(self) -> PlaneTable | None:
         """Coplanar groups of all splats; their chunks are part of every frame."""
-        return PlaneTable(self._pinned_part) if self.has_coplanar_groups else None
+        return self._group_table if self.has_coplanar_groups else None
+
+    @cached_property
+    def _group_table(self) -> PlaneTable:
+        return PlaneTable(self._pinned_part)
 
     @cached_property
     def _pinned_part(self) -> PartialCloud:
