@@ -101,7 +101,7 @@ def test_gradients_are_named_arrays_in_the_shapes_of_the_cloud():
 
 def test_a_store_has_no_gradients(tmp_path):
     fs.save_ply(fs.SplatCloud(**arrays()), str(tmp_path / "cloud.ply"))
-    store = fs.build_store([str(tmp_path / "cloud.ply")], str(tmp_path / "cloud.fss"))
+    store = fs.Store(fs.build_store([str(tmp_path / "cloud.ply")], str(tmp_path / "cloud.fss")))
     with pytest.raises(fs.InputError, match=r"scene must be a SplatCloud .* got a store"):
         fs.Renderer("reference").render_differentiable(store, CAMERA)
 
