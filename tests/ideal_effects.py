@@ -45,9 +45,11 @@ def ideal_picture(
         np.zeros(3),
     )
     light = np.zeros((view.height, view.width, 3))
-    for shot in view.shots:
-        light[shot.top : shot.top + shot.view.height] += shot.weight * _samples(placed, shot.view)
-    if not view.shots:
+    for sub_frame in view.sub_frames:
+        light[sub_frame.top : sub_frame.top + sub_frame.view.height] += sub_frame.weight * _samples(
+            placed, sub_frame.view
+        )
+    if not view.sub_frames:
         light = _samples(placed, view)
     height, width = camera.height, camera.width
     pixels = light.reshape(height, samples, width, samples, 3).mean((1, 3)).reshape(-1, 3)

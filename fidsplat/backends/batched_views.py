@@ -69,7 +69,7 @@ class ViewStack:
         labels = [label for label, _ in first.groups]
         for view in views:
             alike = all(getattr(view, name) == getattr(first, name) for name in _SHARED)
-            alike = alike and view.raster is first.raster and not view.shots
+            alike = alike and view.raster is first.raster and not view.sub_frames
             if not alike or [label for label, _ in view.groups] != labels:
                 return None
         numbers = {name: np.array([getattr(view, name) for view in views], np.float64) for name in _OWN}

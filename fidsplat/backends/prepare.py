@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch, ViewStack
-from fidsplat.backends.view import FAR_EYE, Shot, View
+from fidsplat.backends.view import FAR_EYE, SubFrame, View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import Views
 from fidsplat.effects import FeatureSet, select
@@ -64,7 +64,7 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
         features, view = prepare(cloud, views.capture(0))
         numbers, groups = slots.astype(np.intp), sorted((views.groups or {}).items())
         poses = None if views.poses is None else views.poses[numbers]
-        if not view.shots:
+        if not view.sub_frames:
             moved = {label: each[numbers] for label, each in groups}
             stack = ViewStack.of_poses(view, cloud.origin, poses, moved, len(drawn))
             return features, ViewBatch(stack, slots, len(views), size)
@@ -83,7 +83,7 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
 
 
 def view_of(capture: Capture, origin: np.ndarray) -> View:
-    """The view of a capture: at its shutter's time, with `shots` if it is made of several poses.
+    """The view of a capture: at its shutter's time, with `sub_frames` if it is made of several poses.
 
     Raises:
         InputError: as View.of; a pose that is not rigid.
@@ -99,13 +99,13 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
     whole = at(shutter.time)
     if not capture.exposed:
         return whole
-    shots, samples = [], capture.quality.samples
+    sub_frames, samples = [], capture.quality.samples
     for top, end, middle in shutter.bands(whole.height // samples):
         times = shutter.times(middle)
         for k, time in enumerate(times):
             view = at(time).rows(top * samples, end * samples)
-            shots.append(Shot(view, top * samples, 1 / len(times), k == 0, k == len(times) // 2))
-    return replace(whole, shots=tuple(shots))
+            sub_frames.append(SubFrame(view, top * samples, 1 / len(times), k == 0, k == len(times) // 2))
+    return replace(whole, sub_frames=tuple(sub_frames))
 
 
 def _moved(view: View, motion: np.ndarray, origin: np.ndarray) -> View:

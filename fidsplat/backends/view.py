@@ -78,7 +78,7 @@ class View:
     """whether all rays are parallel to z; focal_x and focal_y are samples per metre then"""
     groups: tuple[tuple[int, View], ...] = ()
     """(label, the view that its splats have), for splats that move by themselves"""
-    shots: tuple[Shot, ...] = ()
+    sub_frames: tuple[SubFrame, ...] = ()
     """the sub-pictures of which this picture is made; none: it is one"""
     band: tuple[int, int] | None = None
     """rows of samples [first, end) that are wanted, with the bits of the whole; None: all"""
@@ -94,10 +94,10 @@ class View:
     def turns_of_rows(self) -> np.ndarray:
         """(h, 3, 3) world to camera, for each row of pixels that of the pose which normals show there."""
         turns = np.tile(self.rotation, (self.height // self.samples, 1, 1))
-        for shot in self.shots:
-            if shot.middle:
-                top = shot.top // self.samples
-                turns[top : top + shot.view.height // self.samples] = shot.view.rotation
+        for sub_frame in self.sub_frames:
+            if sub_frame.middle:
+                top = sub_frame.top // self.samples
+                turns[top : top + sub_frame.view.height // self.samples] = sub_frame.view.rotation
         return turns
 
     def rows(self, top: int, end: int) -> View:
@@ -218,7 +218,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Shot:
+class SubFrame:
     """One sub-picture of a picture that is made of several poses."""
 
     view: View

@@ -159,7 +159,7 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
     quality = nothing_left_out(capture.quality, cutoff_of(data.count))
     features, view = _prepared(data, capture, quality, backend)
     # float32 sums: of samples, of sub-frames, of harmonics
-    resolving = 8 + features.samples**2 + len(view.shots) + (32 if features.sh_degree else 0)
+    resolving = 8 + features.samples**2 + len(view.sub_frames) + (32 if features.sh_degree else 0)
     low, high = data.color_range()
     for color in _colors_behind(view):
         low, high = min(low, float(np.min(color))), max(high, float(np.max(color)))

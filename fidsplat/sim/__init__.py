@@ -4,6 +4,6 @@
 """
 
 from fidsplat.sim.description import Description, read_description
-from fidsplat.sim.rig import Pictures, Rig, RigCamera
+from fidsplat.sim.rig import Rig, RigCamera, RigImages
 
-__all__ = ["Description", "Pictures", "Rig", "RigCamera", "read_description"]
+__all__ = ["Description", "Rig", "RigCamera", "RigImages", "read_description"]

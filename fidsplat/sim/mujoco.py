@@ -13,7 +13,7 @@ from fidsplat.capture.environment import ExternalDepth
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.sim.poses import quaternions_of
-from fidsplat.sim.rig import Pictures, Rig, RigCamera
+from fidsplat.sim.rig import Rig, RigCamera, RigImages
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError, unknown
 
@@ -101,7 +101,7 @@ class MujocoRig(Rig):
         outputs: Iterable[str] | None = None,
         external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
         mask: Any = None,
-    ) -> Pictures:
+    ) -> RigImages:
         """What the cameras see.
 
         Args:

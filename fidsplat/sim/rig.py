@@ -117,7 +117,7 @@ class Rig:
         outputs: Iterable[str] | None = None,
         external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
         mask: Any = None,
-    ) -> Pictures:
+    ) -> RigImages:
         """Pictures of every environment by every camera.
 
         An environment's pictures have the same bits alone and among others.
@@ -155,7 +155,7 @@ class Rig:
             for name in self.cameras
         }
         self._drawn += count
-        return Pictures(self, batches, given, stands)
+        return RigImages(self, batches, given, stands)
 
     def outputs_of(self, camera: str) -> tuple[str, ...]:
         """Names of a camera's output images, where `render` is not told others."""
@@ -234,7 +234,7 @@ class Rig:
         return self.renderer.render_batch(self._cloud, taken, poses=poses, groups=groups, mask=mask)
 
 
-class Pictures(Mapping):
+class RigImages(Mapping):
     """What the cameras of a rig see: a mapping from an output's name to (env, camera, h, w[, c]).
 
     `of(camera)` gives one camera's, (env, h, w[, c]), also where cameras have different sizes.
@@ -284,7 +284,7 @@ class Pictures(Mapping):
     def __len__(self) -> int:
         return len(self._outputs)
 
-    def wait(self) -> Pictures:
+    def wait(self) -> RigImages:
         """These pictures, once the device has drawn them; nothing is copied."""
         for batch in self._batches.values():
             batch.wait()

@@ -164,7 +164,7 @@ class Band:
         """The two halves of its rows; empty where splitting does not help."""
         first, end = self.rows
         middle = (first + end) // 2
-        if end - first < 2 * _MIN_ROWS or self.full_view.shots:
+        if end - first < 2 * _MIN_ROWS or self.full_view.sub_frames:
             return []
         made = [self.with_rows(first, middle), self.with_rows(middle, end)]
         return made if sum(half.count for half in made) <= _MAX_OVERLAP * self.count else []

@@ -39,10 +39,10 @@ def in_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray
         boxes: tested with the motion of the camera and with that of each moving group.
         reach: (n,) metres: largest standard deviation of a box's splats.
     """
-    if view.shots:
+    if view.sub_frames:
         made = np.zeros(len(reach), bool)
-        for shot in view.shots:
-            made |= in_frustum(shot.view, features, boxes, reach)
+        for sub_frame in view.sub_frames:
+            made |= in_frustum(sub_frame.view, features, boxes, reach)
         return made
     made = _in_pose_frustum(view, features, boxes, reach)
     for _, own in view.groups:
@@ -264,8 +264,10 @@ def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
     The bound is over all poses of the shutter and all moving groups; it is infinite where a box reaches the
     camera.
     """
-    if view.shots:
-        return np.max([projected_sizes(shot.view, boxes, edges) for shot in view.shots], axis=0)
+    if view.sub_frames:
+        return np.max(
+            [projected_sizes(sub_frame.view, boxes, edges) for sub_frame in view.sub_frames], axis=0
+        )
     made = np.zeros(len(edges))
     for one in (view, *(own for _, own in view.groups)):
         focal = max(one.focal_x, one.focal_y)

@@ -23,7 +23,7 @@ _RANGE = 3.33
 
 def is_supported(view: View, features: FeatureSet) -> bool:
     """Whether occlusion can be tested: one pose, no moving groups, and splats of bounded extent."""
-    return not (view.shots or view.groups) and _extent(view, features) is not None
+    return not (view.sub_frames or view.groups) and _extent(view, features) is not None
 
 
 def minimum_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:

@@ -190,7 +190,7 @@ def test_what_moves_already_may_go_on_beside_poses(renderer, cloud):
 
 
 def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
-    """Against the memory budget, while each is made of its shots."""
+    """Against the memory budget, while each is made of its sub-frames."""
     if renderer.device.name == "reference":
         pytest.skip("no memory budget")
     capture = fs.Capture(

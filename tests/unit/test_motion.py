@@ -75,7 +75,7 @@ MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
 
 
 @pytest.mark.parametrize(
-    ("motion", "shutter", "shots"),
+    ("motion", "shutter", "sub_frames"),
     [
         (MOVING, fs.Shutter(time=0.3, sub_poses=4, rows_per_band=2), 0),
         (MOVING, fs.Shutter(exposure_time=0.1, sub_poses=1), 0),
@@ -84,11 +84,11 @@ MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
         (MOVING, fs.Shutter(exposure_time=0.1, sub_poses=2, readout=0.1, rows_per_band=40), 4),
     ],
 )
-def test_a_shutter_that_does_nothing_is_none(motion, shutter, shots):
+def test_a_shutter_that_does_nothing_is_none(motion, shutter, sub_frames):
     """One picture, without the code of several."""
     camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24)
     view = view_of(fs.Capture(camera, motion=motion, shutter=shutter), np.zeros(3))
-    assert len(view.shots) == shots
+    assert len(view.sub_frames) == sub_frames
 
 
 def test_a_group_moves_about_the_worlds_origin_wherever_the_clouds_is():

@@ -64,7 +64,7 @@ def test_outputs_of_a_blurred_band_show_its_middle_pose_in_all_of_its_rows():
             fs.Capture(CAMERA, quality=quality, motion=fs.Motion(turning), shutter=shutter), np.zeros(3)
         )
         bands = [(0, 10), (10, 20), (20, 24)]
-        assert [shot.middle for shot in view.shots] == [False, True, False] * 3
+        assert [sub_frame.middle for sub_frame in view.sub_frames] == [False, True, False] * 3
         assert view.turns_of_rows.shape == (24, 3, 3)
         for top, end in bands:
             time = 0.1 + 0.4 * ((top + end) / 2 / 24 - 0.5)

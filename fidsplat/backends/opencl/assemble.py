@@ -100,7 +100,7 @@ class Source:
     arguments: dict[str, tuple[Argument, ...]]
     """of each kernel of the texts"""
     samples: tuple[tuple[Samples, bool], ...]
-    """what passes from blending to resolving, and whether several shots are averaged there"""
+    """what passes from blending to resolving, and whether several sub-frames are averaged there"""
     scalars: Scalars
 
     @property

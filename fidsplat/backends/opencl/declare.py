@@ -199,7 +199,7 @@ class Layout:
     resolve: tuple[Argument, ...] = ()
     samples: tuple[Samples, ...] = ()
     averaged: bool = False
-    """Whether its samples are light: the mean of what several shots leave, not one shot's."""
+    """Whether its samples are light: the mean of what several sub-frames leave, not one sub-frame's."""
     backward_file: str = ""
     """derivatives, below kernels/opencl/; empty: no text of their own"""
     moments: tuple[Member, ...] = ()

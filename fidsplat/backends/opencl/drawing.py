@@ -16,7 +16,7 @@ import pyopencl as cl
 
 from fidsplat.backends.opencl.lists import LISTS
 from fidsplat.backends.opencl.picture import Picture
-from fidsplat.backends.view import Shot, View
+from fidsplat.backends.view import SubFrame, View
 from fidsplat.effects.catalogue import Output
 
 _FIRST = np.zeros(1, np.uint32)
@@ -50,7 +50,7 @@ def draw(
             picture.lease(f"{output.name}_out", 4 * pixels * output.channels)
     picture.held |= into.images
     picture.put("slots", into.numbers)
-    if view.shots:
+    if view.sub_frames:
         _expose(start, picture)
         _resolve(picture)
         return picture
@@ -102,25 +102,25 @@ def _resolve(picture: Picture) -> None:
 
 
 def _expose(start: Callable[[View], Picture], picture: Picture) -> None:
-    """Blends the shots of a picture of several poses one after another, and gathers their samples."""
+    """Blends the sub-frames of a picture of several poses one after another, and gathers their samples."""
     channel_stride, arguments = picture.rows * picture.stride, picture.source.arguments
     for name, channels, _ in _buffers_of(picture):
-        # names of scratch buffers that no shot's own have
+        # names of scratch buffers that no sub-frame's own have
         picture.held[name] = picture.pool.scratch(f"exposed {name}", 4 * channel_stride * channels)
     counts = {"splats": picture.resident.count, "visible": 0, "pairs": 0}
-    # what is around is the same for all shots
+    # what is around is the same for all sub-frames
     around = {
         one.name: picture.put(one.name, picture.view.array(one.name))
         for one in arguments.get("backdrop", ())
         if one.source == "array"
     }
-    for shot in picture.view.shots:
-        own = start(shot.view)
+    for sub_frame in picture.view.sub_frames:
+        own = start(sub_frame.view)
         own.held |= around
         for _ in _blended(own):
             pass
         picture.events += own.events
-        _gather(picture, own, shot)
+        _gather(picture, own, sub_frame)
         for name, value in own.stats().items():
             counts[name] = max(counts[name], value)
         picture.uploads += own.uploads
@@ -130,19 +130,19 @@ def _expose(start: Callable[[View], Picture], picture: Picture) -> None:
     picture.stats = lambda: counts
 
 
-def _gather(picture: Picture, own: Picture, shot: Shot) -> None:
-    """Adds a shot's samples to the picture's."""
+def _gather(picture: Picture, own: Picture, sub_frame: SubFrame) -> None:
+    """Adds a sub-frame's samples to the picture's."""
     whole = {
         "whole_stride": picture.stride,
         "whole_channel_stride": picture.rows * picture.stride,
-        "top": shot.top,
+        "top": sub_frame.top,
     }
     whole |= {"stride": own.stride, "channel_stride": own.rows * own.stride}
-    size = shot.view.width, shot.view.height
+    size = sub_frame.view.width, sub_frame.view.height
     for name, channels, averaged in _buffers_of(picture):
-        if not (averaged or shot.middle):
+        if not (averaged or sub_frame.middle):
             continue
         given = whole | {"channels": channels, "raw": own.held[name], "exposed": picture.held[name]}
         if averaged:
-            given |= {"weight": shot.weight, "first": shot.first}
+            given |= {"weight": sub_frame.weight, "first": sub_frame.first}
         picture.launch_grid("expose", "expose" if averaged else "expose_middle", *size, **given)

@@ -197,7 +197,7 @@ class Again:
             and pairs == kind.picture.trusted
             and (view.width, view.height, view.samples) == (before.width, before.height, before.samples)
             and kind.budgets == (workspace.memory_budget, workspace.pair_budget)
-            and not (view.groups or view.shots or view.raster or view.band)
+            and not (view.groups or view.sub_frames or view.raster or view.band)
         )
 
     def _is_like(self, kind: _Kind, picture: Picture) -> bool:

@@ -82,8 +82,8 @@ _WALK = takes(
 )
 _EXPOSED = takes(
     _SIZE,
-    "int stride  // samples per row of a shot",
-    "uint channel_stride  // samples per channel of a shot",
+    "int stride  // samples per row of a sub-frame",
+    "uint channel_stride  // samples per channel of a sub-frame",
     *("int whole_stride", "uint whole_channel_stride", "int top channels"),
 )
 RAY_UNIFORMS = uniforms(

@@ -269,7 +269,7 @@ class OpenCLPipeline:
         # what this picture takes besides is planned for; that of its own kind is there already
         pool.make_way(kind, self.workspace.memory_budget - plan.held, resident.room)
         picture = self._draw(resident, view, plan, trusted, commands)
-        whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
+        whole = not (plan.chunk or resident.streamed or view.sub_frames or picture.in_bands)
         if key is not None and whole and self.shape.lists != "ordered" and resident.count:
             rasters = {each.raster for each in resident.kept.values()} - {None, view.raster}
             if len(resident.kept) >= _KINDS or (view.raster is not None and len(rasters) >= _RASTERS):
@@ -357,14 +357,17 @@ class OpenCLPipeline:
         fixed = beside + stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
         fixed += BIG * (4 + source.records["Bounds"].itemsize)
         channels = 4 + sum(one.channels for one, _ in source.samples)
-        if view.shots:
-            channels *= 2  # the picture's own beside those of a shot
+        if view.sub_frames:
+            channels *= 2  # the picture's own beside those of a sub-frame
         fixed += 4 * tiles * shape.tile_width * shape.tile_height * channels  # whole tiles
         pixels = view.width * view.height // view.samples**2
         fixed += 4 * pixels * sum(output.channels for output in self.features.images)
         fixed += sum(view.array(name).nbytes for name in self._view_arrays)
         if view.raster is not None:
-            rasters = {view.raster, *(shot.view.raster for shot in view.shots if shot.view.raster)}
+            rasters = {
+                view.raster,
+                *(sub_frame.view.raster for sub_frame in view.sub_frames if sub_frame.view.raster),
+            }
             columns = tiles_x * shape.tile_width
             fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._slopes)
         workspace, record = self.workspace, source.records["Splat"].itemsize

@@ -178,7 +178,7 @@ class ReferencePipeline:
         sub_rows, sub_columns = np.mgrid[0:n, 0:n]
         y = (np.asarray(rows)[:, None] * n + sub_rows.ravel() + 0.5).ravel()
         x = (np.asarray(columns)[:, None] * n + sub_columns.ravel() + 0.5).ravel()
-        sampled = self._exposed if view.shots else self._samples
+        sampled = self._exposed if view.sub_frames else self._samples
         flat = sampled(resident, view, x, y, widest)
         samples = {name: values.reshape(-1, n * n, *values.shape[1:]) for name, values in flat.items()}
         samples |= {"x": x.reshape(-1, n * n), "y": y.reshape(-1, n * n)}
@@ -206,19 +206,21 @@ class ReferencePipeline:
     def _exposed(
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
-        """The same of a picture of several shots: the mean of colours, fog and transmittances, all else from
+        """The samples of several sub-frames: the mean of colours, fog and transmittances, all else from
         the middle one; `certificate_middle` is that one's certificate."""
         out: dict[str, np.ndarray] = {}
-        seen_by = [(y > shot.top) & (y < shot.top + shot.view.height) for shot in view.shots]
+        seen_by = [
+            (y > sub_frame.top) & (y < sub_frame.top + sub_frame.view.height) for sub_frame in view.sub_frames
+        ]
         self._progress.total = sum(int(mine.sum()) for mine in seen_by)
-        for shot, mine in zip(view.shots, seen_by, strict=True):
-            seen = self._samples(resident, shot.view, x[mine], y[mine] - shot.top, widest)
+        for sub_frame, mine in zip(view.sub_frames, seen_by, strict=True):
+            seen = self._samples(resident, sub_frame.view, x[mine], y[mine] - sub_frame.top, widest)
             seen["certificate_middle"] = seen["certificate"]
             for name, values in seen.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
                 if name in ("rgb", "t", "fogged", "certificate", "behind_bound"):
-                    plane[mine] += shot.weight * values
-                elif shot.middle:
+                    plane[mine] += sub_frame.weight * values
+                elif sub_frame.middle:
                     plane[mine] = values
         return out
 

@@ -34,7 +34,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
             unsure = unsure + samples["behind_bound"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
         out["rgb"], out["certificate_rgb"] = apply_sensor(out["rgb"], unsure, steps, view, columns, rows)
-    bound = samples.get("certificate_middle", bound)  # the other outputs show one shot
+    bound = samples.get("certificate_middle", bound)  # the other outputs show one sub-frame
     if "alpha" in features.names:
         out["alpha"] = 1 - t
     if "distortion" in features.names:

@@ -65,7 +65,7 @@ class Drawing:
         picture = Picture(self.program, self._workspace, resident, stack, launcher, beside)
         self._workspace.pictures += 1
         picture.draw()
-        if not stack.view.shots:
+        if not stack.view.sub_frames:
             self._learn(resident, stack, picture.stats["visible"], picture.stats["pairs"])
         return picture, self._resolved(picture, launcher, picture.stats, into)
 
@@ -76,7 +76,7 @@ class Drawing:
         workspace, view = self._workspace, stack.view
         kind = self._kinds.get(resident, {}).get(_size(stack))
         # arrays that were adopted may be others when the picture has to be drawn again
-        if kind is None or not workspace.ahead or view.shots or resident.adopted or not resident.count:
+        if kind is None or not workspace.ahead or view.sub_frames or resident.adopted or not resident.count:
             return self.picture(resident, stack, into, beside)[1]
         beside, room = beside or self._image_bytes(view), kind.room
         # whatever fills the inputs else, or fails while it fills them, leaves others there than it remembers

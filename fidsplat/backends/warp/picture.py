@@ -17,7 +17,7 @@ from typing import Any
 
 from fidsplat.backends.bands import cut
 from fidsplat.backends.batched_views import ViewStack
-from fidsplat.backends.view import Shot, View
+from fidsplat.backends.view import SubFrame, View
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
@@ -100,8 +100,8 @@ class Picture:
         """Fills what the stages read of these views, which are of the kind of those before."""
         program, inputs, view = self.program, self.inputs, stack.view
         self.stack, self.view = stack, view
-        if view.shots:
-            return  # each shot fills its own
+        if view.sub_frames:
+            return  # each sub-frame fills its own
         self._fill_views()
         self.held["lens"] = lens_of(view, self.workspace)
         self.held["moving"] = moving_of(self.resident, stack, inputs)
@@ -118,33 +118,33 @@ class Picture:
 
     def draw(self) -> None:
         """All stages but the last, which leave `samples`."""
-        self.samples = self._exposed() if self.view.shots else self._drawn()
+        self.samples = self._exposed() if self.view.sub_frames else self._drawn()
 
     def _exposed(self) -> Any:
-        """All stages but the last of each shot, and what their samples are together."""
+        """All stages but the last of each sub-frame, and what their samples are together."""
         whole = self._samples("exposed")
         beside = self.beside + self._sample_bytes()
-        for shot in self.view.shots:
-            stack = ViewStack.alone(shot.view)
+        for sub_frame in self.view.sub_frames:
+            stack = ViewStack.alone(sub_frame.view)
             part = Picture(self.program, self.workspace, self.resident, stack, self.launcher, beside)
             samples = part._drawn()
             self.launcher.stage("expose")
-            self._gather(shot, samples, whole)
+            self._gather(sub_frame, samples, whole)
             self.stats = {name: max(value, part.stats[name]) for name, value in self.stats.items()}
-        self._fill_views()  # where those of the shots stood
+        self._fill_views()  # where those of the sub-frames stood
         return whole
 
-    def _gather(self, shot: Shot, samples: Any, whole: Any) -> None:
-        """Adds a shot's samples to the picture's: light is averaged, other buffers are those of one pose."""
-        start, count = shot.top * self.grid[1], shot.view.height * self.grid[1]
+    def _gather(self, sub_frame: SubFrame, samples: Any, whole: Any) -> None:
+        """Add the samples of a sub-frame: light is averaged, other buffers are those of one pose."""
+        start, count = sub_frame.top * self.grid[1], sub_frame.view.height * self.grid[1]
         for name in self.program.sample_fields:
             mine, every = getattr(samples, name), getattr(whole, name)
             if name in self.program.expose:
-                given = {"weight": shot.weight, "fresh": int(shot.first), "start": start}
+                given = {"weight": sub_frame.weight, "fresh": int(sub_frame.first), "start": start}
                 self.launcher.launch(
                     self.program.expose[name], count, {**given, "raw": mine, "exposed": every}
                 )
-            elif shot.middle:
+            elif sub_frame.middle:
                 self.wp.copy(every, mine, dest_offset=start, count=count)
 
     def _drawn(self) -> Any:
@@ -168,7 +168,7 @@ class Picture:
             self.launcher.stage("blend")
             self._blend(first, end, samples)
         if program.backdrop:
-            # here, as shots may look in different directions
+            # here, as sub-frames may look in different directions
             self.launcher.stage("resolve")
             # without the derivatives that blending may have: a struct of another type
             rays = rays_of(self.view, self.workspace, self.inputs)
