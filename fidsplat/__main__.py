@@ -1,6 +1,7 @@
 """The `fidsplat` command and `python -m fidsplat`.
 
-Signals are handled before anything else is imported. Once the command is done they end the process at once.
+Signal handlers are installed before anything else is imported. After the command a signal ends the process
+immediately.
 """
 
 import signal
@@ -10,7 +11,7 @@ from fidsplat.util import interrupts
 
 
 def main() -> int:
-    """Run the command line; returns its exit status."""
+    """Run the command line and return its exit status."""
     replaced = interrupts.install()
     from fidsplat import cli
 

@@ -1,6 +1,6 @@
-"""The command line: words in, a command run, an exit status out.
+"""The command line: parses arguments, runs a command, returns its exit status.
 
-0: done. 1: the run failed. 2: the words or the input cannot be used. Errors are one line on stderr.
+0: done. 1: the run failed. 2: unusable arguments or input. Errors are one line on stderr.
 """
 
 import contextlib
@@ -19,22 +19,21 @@ from fidsplat.commands import COMMANDS, CommandTable
 from fidsplat.util import interrupts
 from fidsplat.util.process_limits import check_imports
 
-ABOUT = """Fiducial markers made of 2D Gaussian splats: make them, set them in scenes, draw them, read them
-back.
+ABOUT = """Make fiducial markers of 2D Gaussian splats, place them in scenes, render and detect them.
 
 Examples:
-  fidsplat demo                                     all of it, end to end, with pictures and a table
-  fidsplat devices                                  what can draw here
-  fidsplat marker apriltag:36h11:5 -o tag.ply       a marker as a splat file
-  fidsplat render scene.toml -o picture.png         draw a scene
-  fidsplat view scene.toml                          look at it in a browser
-  fidsplat detect picture.png --scene scene.toml    read it back, with poses
-  fidsplat bench                                    what a frame costs here
-  fidsplat tradeoff --quick                         what accuracy costs in time
-  fidsplat train photos -o scene.ply                splats from pictures with known cameras
+  fidsplat demo                                     make, render and detect markers, with a table
+  fidsplat devices                                  list the devices of this machine
+  fidsplat marker apriltag:36h11:5 -o tag.ply       make a marker as a splat file
+  fidsplat render scene.toml -o image.png           render a scene
+  fidsplat view scene.toml                          show a scene in a browser
+  fidsplat detect image.png --scene scene.toml      detect markers, with poses and errors
+  fidsplat bench                                    time frames of standard scenes
+  fidsplat tradeoff --quick                         measure time and error of the quality settings
+  fidsplat train photos -o scene.ply                train splats on images with known cameras
 
-`fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose; --version, alone,
-says which fidsplat this is."""
+`fidsplat COMMAND --help` explains a command. --debug, at any position, prints the traceback of an error.
+`fidsplat --version` prints the version."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _open_missing_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal that lacks a sign is no reason to stop
+            stream.reconfigure(errors="replace")  # a terminal may lack a character
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     try:
@@ -57,20 +56,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 interrupts.check()
                 status = command.run()
             except Exception:
-                interrupts.check()  # it may be a consequence of the signal
+                interrupts.check()  # a signal may have caused the error
                 raise
             interrupts.check()
         sys.stdout.flush()
         return status
-    except SystemExit as stop:  # help, or words that could not be parsed
+    except SystemExit as stop:  # help or version
         return stop.code if isinstance(stop.code, int) else 2
     except KeyboardInterrupt as stop:
-        if not debug:  # what was stopped while it was made may complain when it is thrown away
+        if not debug:  # destructors of half-constructed objects may raise
             sys.unraisablehook = lambda _: None
         terminated = isinstance(stop, interrupts.Terminated)
         return _fail(*(("terminated", 143) if terminated else ("interrupted", 130)))
     except BrokenPipeError:
-        _drop_output()  # whoever read it has gone; nothing is left to say to them
+        _drop_output()  # the reader has closed the pipe
         return 1
     except Exception as error:
         if debug:
@@ -84,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             or getattr(error, "errno", None) == errno.ENOMEM
             or (isinstance(error, ImportError) and "failed to map segment" in str(error))
         ):
-            return _fail("not enough memory for this; use a smaller picture or fewer splats", 1)
+            return _fail("not enough memory; use a smaller image or fewer splats", 1)
         if isinstance(error, OSError) and error.errno in _SHORTAGES:
             _drop_output()
             where = f" ({error.filename})" if error.filename else ""
@@ -93,44 +92,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 _SHORTAGES = {
-    errno.ENOSPC: "make room there, or on what the output goes to",
-    errno.EDQUOT: "make room there, or on what the output goes to",
-    errno.EFBIG: "files may not be larger here; see ulimit -f",
-    errno.EROFS: "give a folder that can be written",
-    errno.EMFILE: "a process may not have more files open here; see ulimit -n",
-    errno.ENFILE: "the system may not have more files open",
-    errno.EIO: "the disk or the terminal fails",
+    errno.ENOSPC: "free space there or on the disk of the output",
+    errno.EDQUOT: "free space there or on the disk of the output",
+    errno.EFBIG: "raise the limit on file sizes with ulimit -f",
+    errno.EROFS: "give a writable folder",
+    errno.EMFILE: "raise the limit on open files with ulimit -n",
+    errno.ENFILE: "the system's limit on open files is reached",
+    errno.EIO: "the disk or the terminal failed",
 }
-"""what a machine may lack anywhere, and what would help"""
+"""remedies for shortages of the machine, which any command may meet"""
 
 
 def _open_missing_streams() -> None:
-    """Where stdin, stdout or stderr was closed, the next file that is opened would take its place, and what
-    is printed would go into that."""
+    """Replace a closed stdin, stdout or stderr by the null device. Otherwise the next opened file would take
+    its descriptor and receive the output."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            # the lowest descriptor that is free, which is the one that is missing
+            # takes the lowest free descriptor, which is the missing one
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 it stays open
 
 
 def _drop_output() -> None:
-    """Say no more on stdout, not even by Python at its end."""
-    with contextlib.suppress(OSError, ValueError):  # what has no descriptor is not flushed there either
+    """Discard further output on stdout, including Python's final flush."""
+    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor is not flushed at the end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parse(words: list[str]):
-    """The command object of the words. Raises SystemExit: 0 after help or the version, 2 after one line about
-    what is wrong."""
+    """The command object of the arguments. Raises InputError, or SystemExit after help or the version."""
     import tyro
 
     from fidsplat import __version__
-    from fidsplat.commands.output import optional_values
+    from fidsplat.commands.options import value_rules
     from fidsplat.util.errors import InputError, unknown
 
     if not words:
         raise InputError(
-            "no command; try `fidsplat demo` first, which makes, draws and reads markers here, then "
+            "no command; try `fidsplat demo` first, which makes, renders and detects markers, then "
             "`fidsplat view fidsplat-demo/scene.toml`; "
             f"`fidsplat --help` explains: {', '.join(COMMANDS)}"
         )
@@ -150,14 +148,14 @@ def _parse(words: list[str]):
             raise SystemExit(0)
         given = unknown("command", words[0], known) if words else f"no command; known: {', '.join(known)}"
         raise InputError(f"{given}; see {program} --help")
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(printed):
             config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
-            # tyro runs lines that begin with a letter together; a space before each keeps them as they are
+            # tyro joins lines that begin with a letter; a space before each line prevents it
             about = "\n".join(f" {line}" for line in about.splitlines())
             return tyro.cli(
-                kind, prog=program, description=about, args=words, config=config, registry=optional_values
+                kind, prog=program, description=about, args=words, config=config, registry=value_rules
             )
     except SystemExit as stop:
         if stop.code in (0, None):
@@ -165,12 +163,12 @@ def _parse(words: list[str]):
         refused = stop.__context__
         while refused is not None and not isinstance(refused, InputError):
             refused = refused.__context__
-        message = str(refused) if refused else f"{_one_line(said.getvalue())}; see {program} --help"
+        message = str(refused) if refused else f"{_one_line(printed.getvalue())}; see {program} --help"
         raise InputError(message) from None
 
 
 def _group_help(program: str, about: str, commands: Mapping[str, type]) -> str:
-    """The help of a group: what it is about, and its commands with their first docstring lines."""
+    """The help of a group: its description and the first docstring lines of its commands."""
     width = max(map(len, commands)) + 2
     lines = [f"usage: {program} COMMAND ...", "", about, "", "Commands:"]
     for name in commands:
@@ -183,25 +181,24 @@ def _group_help(program: str, about: str, commands: Mapping[str, type]) -> str:
     return "\n".join(lines)
 
 
-_NO_NUMBER = re.compile(r"Error parsing (\S+): .*(int\(\) with base 10|string to float): ('.*?'|\".*?\")")
+_NOT_A_NUMBER = re.compile(r"Error parsing (\S+): .*(int\(\) with base 10|string to float): ('.*?'|\".*?\")")
 
 
 def _one_line(box: str) -> str:
-    """tyro's boxed message as one line: what is wrong, the nearest option if it names one, where to read
-    more."""
+    """tyro's boxed message as one line: the error and the nearest option."""
     lines = [line.strip(" │") for line in box.splitlines()]
     parts: list[list[str]] = [[]]
     for line in lines:
-        # the box is Unicode, or has its title above a line of hyphens where the terminal knows ASCII only
+        # a terminal without Unicode gets the title above a line of hyphens instead of a box
         if line.startswith("╭") or set(line) == {"-"} or set(line) == {"─"}:
             parts.append([])
         elif line and not line.startswith("╰"):
             parts[-1].append(line)
     parts = parts[1:]
-    message = " ".join(parts[0]) or "these words make no command"
-    if found := _NO_NUMBER.search(message):
+    message = " ".join(parts[0]) or "the arguments are not a command"
+    if found := _NOT_A_NUMBER.search(message):
         kind = "a whole number" if found[2].startswith("int") else "a number"
-        message = f"{found[1]} is {found[3]}; give {kind}"
+        message = f"{found[1]} must be {kind}, got {found[3]}"
     for part in parts[1:]:
         if part and part[0].startswith("Perhaps you meant"):
             message += f"; perhaps {part[1]}"

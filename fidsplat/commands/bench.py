@@ -4,18 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from fidsplat.commands.output import (
-    Devices,
-    console,
-    json_text,
-    option,
-    print_table,
-    progress_bar,
-    say,
-    writable_file,
-)
-from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
-from fidsplat.commands.sweeps import check_plot
+from fidsplat.commands.options import Devices, check_plot, option, writable_file
+from fidsplat.commands.output import console, json_text, print_lines, print_table, progress_bar
+from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
@@ -27,23 +18,23 @@ if TYPE_CHECKING:
     from fidsplat.experiments.bench.measure import Result
 
 _LEGEND = (
-    "ms: median (quartiles) of whole frames, medians of the stages by the device's own clock; splats "
-    "resident, picture left on the device. host: until the call returns. x roofline: how many times the "
-    "least that the device's measured best rates allow (devlog/roofline.md)."
+    "ms: median (quartiles) of complete frames; medians of the stages by the device's clock. Splats are "
+    "resident and the image stays on the device. host: time until the call returns. x roofline: multiple of "
+    "the minimum time at the device's measured peak rates (devlog/roofline.md)."
 )
 
 
 @dataclass
 class Bench:
-    """Time frames of standard scenes on one device, or on several side by side.
+    """Time frames of standard scenes on one or several devices.
 
-    The devices draw the same frames in turn, with the cut-off and stop that all renderers share and in
-    precise arithmetic (1/255, 1e-4; `fidsplat tradeoff` prices others). For each scene: milliseconds per
-    frame and per stage, what there was to draw, device memory, and how many times the device's roofline that
-    is: the least that its measured rates allow. Without --scenes: tag, r100k_720p, r1m_1080p and
-    tag_in_million, about a minute on two cores. A run that is stopped shows what it has.
+    The devices render the same frames interleaved, with the settings that renderers share: alpha cut-off
+    1/255, transmittance stop 1e-4, precise arithmetic (`fidsplat tradeoff` measures others). The table shows
+    for each scene the milliseconds per frame and stage, counts, device memory, and the multiple of the
+    device's roofline, the minimum time at its measured peak rates. Without --scenes: tag, r100k_720p,
+    r1m_1080p and tag_in_million, about a minute on two cores. An interrupted run shows its results so far.
 
-      tag             an AprilTag alone, 640 x 480
+      tag             one AprilTag, 640 x 480
       r100k_720p      100,000 random splats, 1280 x 720
       r1m_1080p       1,000,000, 1920 x 1080
       r5m_1080p       5,000,000, 1920 x 1080
@@ -52,8 +43,8 @@ class Bench:
       qr_wall         200 QR codes of version 22 on a wall, 1920 x 1080
       tag_in_million  an AprilTag before 1,000,000 random splats, 1920 x 1080
 
-    --scene takes one's own instead, with its camera; --cameras poses from which it is seen, of which eight
-    are drawn. Splats are timed alone: its effects, and what moves in it, are left out.
+    --scene measures your own scene from its camera, or from eight poses of --cameras. Only splats are timed:
+    its effects and motions are left out.
 
     Examples:
       fidsplat bench
@@ -68,17 +59,17 @@ class Bench:
         tuple[str, ...],
         option("NAME...", "scenes, or all (default: tag r100k_720p r1m_1080p tag_in_million)"),
     ] = ()
-    scene: OwnScenes = ()
+    scene: UserScenes = ()
     cameras: Cameras = None
     device: Devices = ()
-    repeats: Annotated[int, option("N", "frames of each scene on each device that count (default: 20)")] = 20
+    repeats: Annotated[int, option("N", "timed frames of each scene on each device (default: 20)")] = 20
     json: Annotated[
         str | None,
-        option("FILE", "write all figures to a file as well, after each scene; - for stdout alone"),
+        option("FILE", "also write all figures to a file after each scene; - for stdout only"),
     ] = None
     plot: Annotated[
         str | None,
-        option("FILE.svg", "a chart of the frames' times as well, or FILE.png (extra: experiments)"),
+        option("FILE.svg", "also write a chart of the frame times, or FILE.png (extra: experiments)"),
     ] = None
 
     def run(self) -> int:
@@ -89,10 +80,10 @@ class Bench:
         from fidsplat.render.renderer import default_device
 
         if self.repeats < 1:
-            raise InputError(f"--repeats is {self.repeats}; give a number of frames, at least 1")
+            raise InputError(f"--repeats must be at least 1 frame, got {self.repeats}")
         if self.plot is not None:
             check_plot(self.plot)
-        known = own_scenes_of(self.scene, self.cameras, self.scenes) or BENCH_SCENES
+        known = load_user_scenes(self.scene, self.cameras, self.scenes) or BENCH_SCENES
         scenes = tuple(known) if self.scene else scene_names(self.scenes)
         if self.json not in (None, "-"):
             writable_file(self.json)
@@ -128,7 +119,7 @@ class Bench:
         else:
             _print(results, where, {name: scene.about for name, scene in known.items()})
             if not (self.scenes or self.scene) and not interrupted:
-                where.print(f"These were {', '.join(scenes)}; more with --scenes NAME... or --scenes all.")
+                where.print(f"Measured {', '.join(scenes)}; --scenes NAME... or --scenes all measures more.")
         if interrupted:
             raise KeyboardInterrupt
         return 1 if any(result.timer.error for result in results) else 0
@@ -153,39 +144,39 @@ def _record(results: "list[Result]", scenes: tuple[str, ...], interrupted: bool)
 
 
 def _print(results: "list[Result]", where: "Console", about: dict[str, str]) -> None:
-    """A table for each scene; the devices are its columns. about: what scenes are, by name."""
+    """Print a table for each scene with one column per device. about: descriptions of scenes by name."""
     for scene in dict.fromkeys(result.scene for result in results):
-        drawn = [result for result in results if result.scene == scene]
-        for result in drawn:
+        measured = [result for result in results if result.scene == scene]
+        for result in measured:
             if result.timer.error:
-                say(where, f"{scene} on {result.device.name}: {result.timer.error}")
-        drawn = [result for result in drawn if result.timer.ms]
-        if drawn:
-            _print_scene(f"{scene}: {about[scene]}", drawn, where)
+                print_lines(where, f"{scene} on {result.device.name}: {result.timer.error}")
+        measured = [result for result in measured if result.timer.ms]
+        if measured:
+            _print_scene(f"{scene}: {about[scene]}", measured, where)
     if any(result.timer.ms for result in results):
         where.print(_LEGEND, markup=False)
 
 
-def _print_scene(title: str, drawn: "list[Result]", where: "Console") -> None:
+def _print_scene(title: str, results: "list[Result]", where: "Console") -> None:
     heads, rows = ["ms"], [["frame"]]
-    stages = list(dict.fromkeys(stage for result in drawn for stage in result.timer.parts))
+    stages = list(dict.fromkeys(stage for result in results for stage in result.timer.parts))
     rows += [[stage] for stage in stages]
-    for result in drawn:
+    for result in results:
         heads += [result.device.name, "x roofline"]
         low, middle, high = result.timer.quartiles
         rows[0] += [f"{middle:.2f} ({low:.2f} to {high:.2f})", _times(result, "frame")]
         for row, stage in zip(rows[1:], stages, strict=True):
             ms = result.timer.part_medians.get(stage)
             row += ["-" if ms is None else f"{ms:.2f}", _times(result, stage)]
-    facts = ("host", "first frame", *drawn[0].counts, "splats/s", "memory")
+    facts = ("host", "first frame", *results[0].counts, "splats/s", "memory")
     for fact in facts:
         rows.append([fact])
-        for result in drawn:
+        for result in results:
             rows[-1] += [_fact(result, fact), ""]
     print_table(where, title, heads, rows)
-    for result in drawn:
+    for result in results:
         device, frames = result.device, len(result.timer.ms)
-        say(where, f"{device.name}: {device.title}, {device.version}; {frames} frames")
+        print_lines(where, f"{device.name}: {device.title}, {device.version}; {frames} frames")
     where.print()
 
 
@@ -202,7 +193,7 @@ def _fact(result: "Result", fact: str) -> str:
     if fact == "splats/s":
         return f"{1e-3 * result.counts['splats'] / result.timer.quartiles[1]:.2f} M"
     if fact == "memory":
-        held = result.memory_bytes
-        return "-" if held is None else f"{held / 2**30:.3f} GiB"
+        size = result.memory_bytes
+        return "-" if size is None else f"{size / 2**30:.3f} GiB"
     count = result.counts.get(fact)
     return "-" if count is None else f"{count:,}"

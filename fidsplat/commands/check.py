@@ -4,17 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.output import (
-    Device,
-    Json,
-    console,
-    late_progress,
-    option,
-    print_json,
-    print_table,
-    say,
-)
-from fidsplat.util.errors import InputError
+from fidsplat.commands.options import Device, Json, option
+from fidsplat.commands.output import console, delayed_progress, print_json, print_lines, print_table
+from fidsplat.util.errors import InputError, several
 from fidsplat.util.files import writable_folder
 
 if TYPE_CHECKING:
@@ -30,12 +22,12 @@ if TYPE_CHECKING:
 class Check:
     """Test a device with the hard cases of splat rendering.
 
-    Draws scenes that are known to break renderers and compares them with a float64 reference, pixel by pixel;
-    measures the device's own arithmetic; and says what does not hold. Under two minutes on two cores. Writes
-    a picture of the worst case to DIR/worst.png. Exit status 1 when anything does not hold.
+    Renders scenes that are known to break renderers, compares every pixel with a float64 reference, measures
+    the device's arithmetic, and reports what fails. Takes under two minutes on two cores. Writes an image of
+    the worst case to DIR/worst.png. The exit status is 1 if anything fails.
 
-    --fuzz draws random scenes of up to 200 splats instead, until they hold N splats. A run that was stopped
-    goes on where it was (DIR/fuzz.json).
+    --fuzz renders random scenes of up to 200 splats instead, until they add up to N splats. An interrupted
+    run resumes (DIR/fuzz.json).
 
     Examples:
       fidsplat check
@@ -45,16 +37,16 @@ class Check:
 
     device: Device = None
     out: Annotated[
-        str, option("DIR", "folder for the picture and the fuzzer's state (default: fidsplat-check)", "-o")
+        str, option("DIR", "folder for the image and the fuzzer's state (default: fidsplat-check)", "-o")
     ] = "fidsplat-check"
-    fuzz: Annotated[int | None, option("N", "draw random scenes until they hold N splats")] = None
+    fuzz: Annotated[int | None, option("N", "render random scenes until they add up to N splats")] = None
     json: Json = False
 
     def run(self) -> int:
         import fidsplat as fs
 
         if self.fuzz is not None and self.fuzz < 1:
-            raise InputError(f"--fuzz is {self.fuzz}; give the number of splats, at least 1")
+            raise InputError(f"--fuzz must be at least 1 splat, got {self.fuzz}")
         folder = writable_folder(self.out)
         where = console(self.json)
         with where.status("opening the device"):
@@ -73,17 +65,16 @@ class Check:
         else:
             _print(result, where)
             if file is not None:
-                say(where, f"worst case in {file}")
+                print_lines(where, f"worst case in {file}")
         return 0 if result.passed else 1
 
     def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:
         from fidsplat.selftest.fuzz import fuzz_run
 
-        wanted = self.fuzz or 0
-        state = None
-        with late_progress(where) as progress:
-            for state in fuzz_run(renderer, wanted, folder / "fuzz.json"):
-                progress(f"{state.splats:,} splats", state.splats / wanted)
+        total, state = self.fuzz or 0, None
+        with delayed_progress(where) as progress:
+            for state in fuzz_run(renderer, total, folder / "fuzz.json"):
+                progress(f"{state.splats:,} splats", state.splats / total)
         assert state is not None
         if self.json:
             print_json({"device": renderer.device.name, "passed": state.passed, **vars(state)})
@@ -98,18 +89,20 @@ def _print(result: "CheckResult", where: "Console") -> None:
     device = result.device
     if result.arithmetic is not None:
         facts = result.arithmetic
-        heads = ("function", "error [ulp]", "promised", "")
+        heads = ("function", "error [ulp]", "bound", "")
         print_table(where, f"Arithmetic of {device.title}", heads, _ulps(facts))
-        kept = "kept" if facts.denormals else "flushed to 0"
-        say(where, f"float64: {'yes' if facts.float64 else 'no'}; float32 below 1.2e-38: {kept}\n")
-    say(where, f"Hard cases on {device.title}, {device.version}")
-    heads = ("group", "cases", "pictures", "colour", "uncertified", "depth", "uncertified", "verdict")
+        denormals = "kept" if facts.denormals else "flushed to 0"
+        print_lines(
+            where, f"float64: {'yes' if facts.float64 else 'no'}; float32 below 1.2e-38: {denormals}\n"
+        )
+    print_lines(where, f"Hard cases on {device.title}, {device.version}")
+    heads = ("group", "cases", "images", "colour", "uncertified", "depth", "uncertified", "verdict")
     bounds = ("bound", "", "", "", f"{COLOR_TOLERANCE:.0e}", "", f"{DEPTH_TOLERANCE:.0e}", "")
     print_table(where, "Largest errors", heads, [bounds, *(_row(*group) for group in result.groups.items())])
-    say(where, *(f"failed: {words}" for words in result.failures))
+    print_lines(where, *(f"failed: {words}" for words in result.failures))
     wrong = len(result.failures)
-    verdict = f"{wrong} check{' does' if wrong == 1 else 's do'} not hold" if wrong else "everything holds"
-    say(where, f"{verdict}; {result.seconds:.0f} s")
+    verdict = f"{several(wrong, 'checks')} failed" if wrong else "all checks passed"
+    print_lines(where, f"{verdict}; {result.seconds:.0f} s")
 
 
 def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
@@ -146,9 +139,9 @@ def _print_fuzz(state: "FuzzState", renderer: "Renderer", where: "Console") -> N
         )
         for name in state.largest
     ]
-    heads = ("output", "beyond the certificate", "seed", "with it", "seed")
+    heads = ("output", "error beyond the certificate", "seed", "error", "seed")
     print_table(where, f"Largest errors of random scenes on {renderer.device.title}", heads, rows)
-    say(
+    print_lines(
         where,
         f"{state.splats:,} splats in {state.scenes:,} scenes, {state.pixels:,} pixels, "
         f"{state.risky / max(state.pixels, 1):.2%} with certificates above 0.05; {state.seconds:.0f} s\n"

@@ -9,37 +9,29 @@ from typing import Annotated, Any
 
 import tyro
 
-from fidsplat.commands.output import (
-    Device,
-    Json,
-    Overwrite,
-    console,
-    late_progress,
-    new_file,
-    option,
-    switch,
-    tell,
-)
+from fidsplat.commands.options import Device, Json, Overwrite, new_file, option, switch
+from fidsplat.commands.output import console, delayed_progress, report
+from fidsplat.commands.scenes import framing_camera
 from fidsplat.util.errors import InputError
 
 
 @dataclass
 class Convert:
-    """Write splats in another format, and say what that costs.
+    """Convert splats to another format, and measure the loss.
 
-    Formats by their endings: .ply, .splat, .spz, .glb and .gltf (KHR_gaussian_splatting), .usda, .usdc and
-    .usd (OpenUSD's ParticleField; extra usd), and .sog, which is read only. What B cannot hold is said in
-    words; then both files are drawn from where `fidsplat render A` looks, and the largest and mean difference
-    of the pictures and their PSNR are measured.
+    Formats by ending: .ply, .splat, .spz, .glb and .gltf (KHR_gaussian_splatting), .usda, .usdc and .usd
+    (OpenUSD's ParticleField; extra usd), and .sog (read only). The command lists what format B cannot store,
+    renders both files from the camera of `fidsplat render A`, and prints the largest and mean difference of
+    the images and their PSNR.
 
     Examples:
       fidsplat convert room.ply room.spz
       fidsplat convert tag.ply tag.usda --json
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("A", "a splat file")]
-    target: Annotated[tyro.conf.Positional[str], option("B", "the file to write")]
-    no_pictures: Annotated[bool, switch("do not draw both")] = False
+    source: Annotated[tyro.conf.Positional[str], option("A", "splat file to read")]
+    target: Annotated[tyro.conf.Positional[str], option("B", "splat file to write")]
+    no_pictures: Annotated[bool, switch("do not render and compare both files")] = False
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False
@@ -52,9 +44,9 @@ class Convert:
         known = check_writable(self.target)
         source, target = Path(self.source), Path(self.target)
         if source.exists() and target.exists() and source.samefile(target):
-            raise InputError(f"{self.source} and {self.target} are one file; give B another name")
+            raise InputError(f"B must be another file than A, got {self.target}")
         new_file(self.target, self.overwrite)
-        with late_progress(console(True)) as progress:
+        with delayed_progress(console(True)) as progress:
             cloud = fs.load_splats(self.source, progress)
         lost = losses(cloud, self.target)
         save_splats(cloud, self.target)
@@ -62,24 +54,23 @@ class Convert:
         facts: dict[str, Any] = {"source": self.source, "target": self.target, "format": known.name}
         facts |= {"splats": len(cloud), "bytes": sizes, "lost": lost, "error": None}
         if not self.no_pictures and len(cloud):
-            with console(True).status("drawing both"):
-                facts["error"] = picture_error(cloud, fs.load_splats(self.target), self.device)
+            with console(True).status("rendering both"):
+                facts["error"] = image_error(cloud, fs.load_splats(self.target), self.device)
         lines = [f"{len(cloud):,} splats, {sizes[0]:,} to {sizes[1]:,} bytes, {known.name}: {self.target}"]
-        lines += [f"not kept: {words}" if not words.startswith("rounds") else words for words in lost]
+        lines += [f"lost: {words}" if not words.startswith("rounds") else words for words in lost]
         if error := facts["error"]:
-            psnr = "the same bits" if math.isinf(error["psnr"]) else f"{error['psnr']:.1f} dB"
-            apart = f"pictures differ by {error['largest']:.2g} at most, {error['mean']:.2g} in the mean"
+            psnr = "bit-identical" if math.isinf(error["psnr"]) else f"{error['psnr']:.1f} dB"
+            apart = f"image error: largest {error['largest']:.2g}, mean {error['mean']:.2g}"
             lines.append(f"{apart}; {psnr}")
-        return tell(self.json, facts, *lines)
+        return report(self.json, facts, *lines)
 
 
-def picture_error(before, after, device: str | None) -> dict[str, float]:
-    """How far the pictures of two clouds are apart, seen from where the first fits: largest and mean
-    difference of rgb, 0 to 1, and PSNR in dB, infinite for the same bits."""
+def image_error(before, after, device: str | None) -> dict[str, float]:
+    """Largest and mean difference of rgb (0 to 1) and PSNR [dB] of two clouds, from a camera that frames the
+    first; PSNR is infinite for bit-identical images."""
     import numpy as np
 
     import fidsplat as fs
-    from fidsplat.commands.framing import framing_camera
 
     renderer, camera = fs.Renderer(device), framing_camera(before)
     one, other = (renderer.render(cloud, camera)["rgb"].astype(np.float64) for cloud in (before, after))

@@ -4,18 +4,15 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
+from fidsplat.commands.options import Device, Json, check_range, option
 from fidsplat.commands.output import (
-    Device,
-    Json,
     console,
-    late_progress,
-    option,
+    delayed_progress,
     print_json,
+    print_lines,
     print_table,
-    say,
-    tell,
+    report,
 )
-from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.demo import DemoResult, Sighting
@@ -23,10 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass
 class DemoViews:
-    """The demo's scene as a data set to train on: pictures from many places, cameras, points.
+    """Write the demo's scene as a data set for training: images, cameras, points.
 
-    COLMAP's layout: DIR/images, DIR/sparse/0, and views to compare with in DIR/test; any trainer of splats
-    reads it.
+    The folder has COLMAP's layout: DIR/images, DIR/sparse/0, and test views in DIR/test. Any trainer of
+    splats reads it.
 
     Examples:
       fidsplat demo views -o yard && fidsplat train yard -o yard.ply --iterations 2000
@@ -36,51 +33,47 @@ class DemoViews:
     out: Annotated[str, option("DIR", "folder for the data set (default: fidsplat-demo-views)", "-o")] = (
         "fidsplat-demo-views"
     )
-    views: Annotated[int, option("N", "pictures to train on, 2 to 1000 (default: 30)")] = 30
-    width: Annotated[int, option("PIXELS", "of a picture, 64 to 4096 (default: 320)")] = 320
+    views: Annotated[int, option("N", "training images, 2 to 1000 (default: 30)")] = 30
+    width: Annotated[int, option("PIXELS", "width of an image, 64 to 4096 (default: 320)")] = 320
     device: Device = None
     json: Json = False
 
     def run(self) -> int:
         from fidsplat.experiments.demo_views import write_demo_views
 
-        if not 2 <= self.views <= 1000:
-            raise InputError(f"--views is {self.views}; give 2 to 1000")
-        if not 64 <= self.width <= 4096:
-            raise InputError(f"--width is {self.width}; give 64 to 4096 pixels")
-        with late_progress(console(True)) as progress:
+        check_range("--views", self.views, 2, 1000)
+        check_range("--width", self.width, 64, 4096, " pixels")
+        with delayed_progress(console(True)) as progress:
             folder = write_demo_views(
                 self.out, self.views, width=self.width, device=self.device, progress=progress
             )
-        return tell(self.json, {"folder": str(folder)}, f"{self.views} views to train on in {folder}")
+        return report(self.json, {"folder": str(folder)}, f"{self.views} training views in {folder}")
 
 
 @dataclass
 class Demo:
-    """The main job, end to end, with pictures and a table.
+    """Make markers, render them in a scene and detect them, with images and a table.
 
-    Makes an AprilTag, an ArUco tag and a QR code of splats, sets them in a yard of some ten thousand splats,
-    draws three views with colour, depth, normals and labels, and reads them back. Exit status 1 when a marker
-    that is wholly visible is not found within 1 % of its distance.
+    Makes an AprilTag, an ArUco tag and a QR code of splats, places them in a yard of ten thousand splats,
+    renders three views with colour, depth, normals and labels, and detects the markers in them. The exit
+    status is 1 if a completely visible marker is not located within 1 % of its distance.
 
     Examples:
       fidsplat demo
       fidsplat demo --mixture fitted --out soft
-      fidsplat demo --out pictures --json
-      fidsplat demo views -o yard                       its scene as a data set to train on
+      fidsplat demo --out images --json
+      fidsplat demo views -o yard                       the scene as a data set for training
     """
 
     PARTS: ClassVar[dict[str, type]] = {"views": DemoViews}
 
     out: Annotated[
-        str, option("DIR", "folder for pictures, scene and figures (default: fidsplat-demo)", "-o")
+        str, option("DIR", "folder for images, scene and figures (default: fidsplat-demo)", "-o")
     ] = "fidsplat-demo"
     device: Device = None
     mixture: Annotated[
         str,
-        option(
-            "NAME", "of the markers: exact, fitted, facets or paper, as `fidsplat marker` (default: exact)"
-        ),
+        option("NAME", "mixture of the markers: exact, fitted, facets or paper (default: exact)"),
     ] = "exact"
     json: Json = False
 
@@ -93,24 +86,25 @@ class Demo:
         if self.json:
             print_json(result.as_dict())
         else:
-            heads = ("view", "marker", "seen", "found", "mm", "%", "deg", "splats", "ms")
+            heads = ("view", "marker", "visible", "found", "mm", "%", "deg", "splats", "ms")
             rows = (_row(s, result) for s in result.sightings)
             print_table(where, f"fidsplat demo on {result.device}", heads, rows)
             where.print(
-                "seen: how much of it is in view. Errors: position in mm and in % of the distance, angle in "
-                "degrees. ms: a frame with colour, depth, normals and labels."
+                "visible: share of the marker in view. Errors: position in mm and in % of the distance, "
+                "angle "
+                "in degrees. ms: time of a frame with colour, depth, normals and labels."
             )
             markers = sum(result.marker_splats.values())
-            say(
+            print_lines(
                 where,
                 f"{result.background_splats:,} background and {markers:,} marker splats; "
-                f"{result.seconds:.1f} s in all; pictures in {self.out}/contact-sheet.png",
+                f"{result.seconds:.1f} s in total; images in {self.out}/contact-sheet.png",
             )
         if not result.passed:
             missed = [
                 f"{s.reading.placed.marker.spec} in '{s.view}'" for s in result.sightings if s.passed is False
             ]
-            say(where, "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.unexpected)]))
+            print_lines(where, "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.unexpected)]))
         return 0 if result.passed else 1
 
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
+from fidsplat.commands.options import Json, option
+from fidsplat.commands.output import console, delayed_progress, print_json, print_table
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
 
@@ -23,13 +24,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class Detect:
-    """Find AprilTag, ArUco and QR codes in pictures, folders of pictures, videos and logs of robots.
+    """Detect AprilTag, ArUco and QR codes in images, folders of images, videos and robot logs.
 
-    Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
-    printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker and board of
-    that scene was seen from its camera, how far that is from the truth, and the means: of a scene that moves,
-    from where things are at its shutter's time, when the middle row is exposed; in the folder or the log of
-    a flight, from where its camera was in each picture. Boards, and markers of one bundle, give one pose.
+    Prints the content and the corners of each code, in pixels: top left, top right, bottom right, bottom left
+    as printed; the centre of the first pixel is (0.5, 0.5). --scene adds the pose of each marker and board of
+    that scene, its errors against the true pose, and their means. The true pose of a moving scene is that at
+    its shutter's time, when the middle row is exposed; in the folder or log of a flight it is that of each
+    frame. A board, and the markers of one bundle, have one pose.
 
     Examples:
       fidsplat detect photo.jpg
@@ -42,20 +43,18 @@ class Detect:
 
     images: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
-        option("IMAGE", "a picture, a folder of them, a video, an MCAP file or a rosbag2 folder"),
+        option("IMAGE", "image, folder of images, video, MCAP file or rosbag2 folder"),
     ]
     family: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         option(
             "FAMILY",
-            "tag family to look for, once more for each (default: the scene's, or 36h11 25h9 4x4_50 5x5_100 "
-            "6x6_250 7x7_250)",
+            "tag family, repeat for several (default: the scene's, or 36h11 25h9 4x4_50 5x5_100 6x6_250 "
+            "7x7_250)",
         ),
     ] = ()
-    scene: Annotated[str | None, option("SCENE.toml", "the scene that the pictures show")] = None
-    topic: Annotated[
-        str | None, option("TOPIC", "of logs the pictures of this topic alone (default: of all)")
-    ] = None
+    scene: Annotated[str | None, option("SCENE.toml", "scene of the images")] = None
+    topic: Annotated[str | None, option("TOPIC", "topic of a log (default: all topics with images)")] = None
     json: Json = False
 
     def run(self) -> int:
@@ -63,7 +62,7 @@ class Detect:
         from fidsplat.vision.readback import means
 
         if not self.images:
-            raise InputError("give at least one IMAGE: a picture, a folder of them, or a video")
+            raise InputError("detection needs at least one IMAGE: an image, a folder of images, or a video")
         for name in self.family:
             parse_family(name)
         scene = None if self.scene is None else _load_scene(self.scene)
@@ -71,8 +70,8 @@ class Detect:
         readings: list[Reading] = []
         bundles: list[BundleReading] = []
         for path in self.images:
-            for name, image, then in self._pictures(path, scene):
-                result, read, bundled = self._one(name, image, then)
+            for name, image, then in self._images(path, scene):
+                result, read, bundled = self._detect(name, image, then)
                 results.append(result)
                 readings += read
                 bundles += bundled
@@ -87,11 +86,11 @@ class Detect:
             for result in results
             for code in result["detections"]
         ]
-        title = results[0]["image"] if single else f"{len(results)} pictures"
+        title = results[0]["image"] if single else f"{len(results)} images"
         if not rows:
-            where.print(f"no code found in {title}; --family looks for other tags", markup=False)
+            where.print(f"no code found in {title}; --family selects other tags", markup=False)
         else:
-            heads = ("code", "corners [px]") if single else ("picture", "code", "corners [px]")
+            heads = ("code", "corners [px]") if single else ("image", "code", "corners [px]")
             print_table(where, title, heads, rows)
         if scene is not None:
             heads = (
@@ -109,24 +108,27 @@ class Detect:
             print_table(where, f"Against {self.scene}: distance, and errors", heads, against)
         return 0
 
-    def _pictures(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
-        """Names, pictures, and the scene as it was in each."""
+    def _images(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
+        """Names, images, and the scene at the time of each."""
         from fidsplat.images.files import is_video, pictures
         from fidsplat.render.flight import RECORD, seen_in_flight
 
         if path.endswith(".mcap") or (Path(path) / "metadata.yaml").is_file():
-            yield from self._logged(path, scene)
+            yield from self._log_images(path, scene)
             return
         if scene is not None and is_video(path):
             raise InputError(
-                f"{path} does not say where its camera was in each picture, as --scene asks; give the folder "
+                f"--scene needs the camera's pose of each frame, which the video {path} lacks; give the "
+                "folder "
                 "of the flight, or its log"
             )
         folder = path_of(path)
         for name, image in pictures(folder / "rgb" if (folder / RECORD).is_file() else path):
             yield name, image, None if scene is None else seen_in_flight(scene, Path(name))
 
-    def _logged(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
+    def _log_images(
+        self, path: str, scene: "Scene | None"
+    ) -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
         from fidsplat.logs import log_pictures, log_poses
         from fidsplat.render.flight import seen_from
 
@@ -137,16 +139,17 @@ class Detect:
                 pose = poses.get((one.frame, one.stamp))
                 if pose is None:
                     raise InputError(
-                        f"{path} does not say where the camera of {one.name} was: /tf has no pose of "
-                        f"{one.frame!r} of that time; give its pictures without --scene"
+                        f"--scene needs a pose of {one.frame!r} in /tf at the time of {one.name}, which "
+                        f"{path} "
+                        "lacks; detect without --scene"
                     )
                 then = seen_from(scene, pose, one.stamp / 1e9)
             yield one.name, one.image, then
 
-    def _one(
+    def _detect(
         self, name: str, image: "np.ndarray", scene: "Scene | None"
     ) -> tuple[dict[str, Any], list["Reading"], list["BundleReading"]]:
-        """What one picture shows, for JSON, and the readings of the scene's markers and bundles."""
+        """The codes of an image for JSON, and the readings of the scene's markers and bundles."""
         from fidsplat.vision.bundles import read_bundles
         from fidsplat.vision.detect import detect
         from fidsplat.vision.readback import read_back
@@ -154,13 +157,13 @@ class Detect:
         families = self.family or None
         facts: dict[str, Any] = {"image": name, "width": image.shape[1], "height": image.shape[0]}
         if scene is None:
-            return facts | {"detections": [_said(code) for code in detect(image, families)]}, [], []
+            return facts | {"detections": [_describe(code) for code in detect(image, families)]}, [], []
         try:
             readings, others = read_back(image, scene, families=families)
         except InputError as error:
             raise InputError(f"{name} and {self.scene}: {error}") from None
         found = [reading.detection for reading in readings if reading.detection is not None]
-        facts["detections"] = [_said(code) for code in (*found, *others)]
+        facts["detections"] = [_describe(code) for code in (*found, *others)]
         facts["markers"] = [reading.as_dict() for reading in readings]
         facts["not_in_scene"] = [code.name for code in others]
         assert scene.camera is not None
@@ -173,14 +176,14 @@ class Detect:
 def _load_scene(path: str) -> "Scene":
     import fidsplat as fs
 
-    with late_progress(console(True)) as progress:
+    with delayed_progress(console(True)) as progress:
         scene = fs.Scene.load(path, progress=progress)
     if scene.camera is None:
-        raise InputError(f"{path} has no [camera] table, so the pose of its markers is unknown")
+        raise InputError(f"{path} must have a [camera] table, which the poses of its markers need")
     return scene
 
 
-def _said(code) -> dict[str, Any]:
+def _describe(code) -> dict[str, Any]:
     return {key: getattr(code, key) for key in ("name", "kind", "family", "id", "payload", "corners")}
 
 
@@ -192,7 +195,7 @@ _ERRORS = (("position_error_mm", 2), ("angle_error_deg", 3), ("corner_error_px",
 
 
 def reading_row(reading: "Reading") -> tuple[str, ...]:
-    """One row of a table of readings."""
+    """Table row of a reading."""
     facts = reading.as_dict()
     found, share = "yes" if facts["found"] else "no", facts["visible"]
     if share == 0 and not facts["found"]:

@@ -1,9 +1,14 @@
-"""`fidsplat devices`."""
+"""`fidsplat devices` and `fidsplat warm`."""
 
+from __future__ import annotations
+
+import time
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from fidsplat.commands.output import Json, tell
+from fidsplat.commands.options import Device, Json
+from fidsplat.commands.output import report, show_progress
+from fidsplat.util.errors import several
 
 if TYPE_CHECKING:
     from fidsplat.backends.interface import DeviceInfo
@@ -11,9 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass
 class Devices:
-    """List the devices that can draw here, and why the others cannot.
+    """List the devices that can render on this machine, and why others cannot.
 
-    The first column is what --device takes.
+    The first column is the value for --device.
 
     Examples:
       fidsplat devices
@@ -26,18 +31,56 @@ class Devices:
         import fidsplat as fs
 
         found = fs.devices()
-        table = "Devices", ("device", "what it is", "memory", "can draw"), map(_row, found)
-        return tell(self.json, {"devices": [asdict(info) for info in found]}, table=table)
+        table = "Devices", ("device", "description", "memory", "usable"), map(_row, found)
+        return report(self.json, {"devices": [asdict(info) for info in found]}, table=table)
 
 
-def _row(info: "DeviceInfo") -> tuple[str, ...]:
-    units = f"{info.compute_units} unit" + ("" if info.compute_units == 1 else "s")
-    what = f"{info.title}\n{info.kind}, {units}, {'with' if info.float64 else 'no'} float64\n"
+def _row(info: DeviceInfo) -> tuple[str, ...]:
     version = info.version if info.platform in info.version else f"{info.platform}: {info.version}"
+    units, float64 = several(info.compute_units, "units"), "with" if info.float64 else "no"
     usable = "yes" if info.usable else "no"
     return (
         info.name,
-        what + version,
+        f"{info.title}\n{info.kind}, {units}, {float64} float64\n{version}",
         f"{info.memory_bytes / 2**30:.1f} GiB",
         f"{usable}: {info.reason}" if info.reason else usable,
     )
+
+
+@dataclass
+class Warm:
+    """Compile the kernels of common scenes, so that first frames are fast.
+
+    The kernels of a scene are compiled when it is first rendered, which takes a second or more, and cached by
+    pyopencl, Warp and the driver. This command fills these caches: markers, 2D splats and captures of 3D
+    Gaussians, separate and combined, with the usual outputs. Run it once after an installation, an update or
+    a change of the driver. Cached kernels take no time.
+
+    Examples:
+      fidsplat warm
+      fidsplat warm --device opencl:nvidia --json
+    """
+
+    device: Device = None
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.experiments.bench.warm import recipes, warm
+        from fidsplat.render.renderer import Renderer
+
+        begun = time.perf_counter()
+        renderer, sets = Renderer(self.device), recipes()
+        compiled: list[tuple[str, float]] = []
+        steps = warm(renderer, sets)
+        try:
+            for recipe, seconds in show_progress(
+                "sets of kernels", steps, len(sets), label=lambda step: step[0].words
+            ):
+                compiled.append((recipe.words, seconds))
+        finally:  # an interrupted run reports what it has compiled
+            device, took = renderer.device, time.perf_counter() - begun
+            facts: dict = {"device": device.name, "title": device.title, "version": device.version}
+            facts["sets"] = [{"set": name, "seconds": seconds} for name, seconds in compiled]
+            line = f"{len(compiled)} of {len(sets)} sets of kernels are ready on {device.title}; {took:.1f} s"
+            report(self.json, facts | {"of": len(sets), "seconds": took}, line)
+        return 0

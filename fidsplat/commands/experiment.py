@@ -1,4 +1,4 @@
-"""`fidsplat experiment`: the experiments that measure."""
+"""`fidsplat experiment`."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from fidsplat.commands.experiment_files import (
+from fidsplat.commands.experiment_data import (
     Baseline,
     Blender,
     Dataset,
     Merge,
+    Plants,
     Report,
     write_report,
 )
 from fidsplat.commands.localise import Localise
-from fidsplat.commands.output import Json, console, counted, option, repeatable, say, tell
-from fidsplat.commands.plants import Plants
-from fidsplat.commands.remote import RayAddress, measure_by
-from fidsplat.commands.sweeps import need_reports, run_sweeps
+from fidsplat.commands.options import Json, RayAddress, option, repeatable, require_packages
+from fidsplat.commands.output import console, print_lines, report, show_progress
+from fidsplat.commands.sweeps import measure_on_cluster, run_sweeps
 from fidsplat.experiments.settings import (
     AngleSettings,
     ExperimentSettings,
@@ -54,17 +54,16 @@ class RayCommand(Command):
 
 
 def measure(names: tuple[str, ...], options: MeasureSettings, as_json: bool, ray: str | None = None) -> int:
-    """Run experiments, each to its file, and say where; what is no time by the cluster of --ray, if there is
-    one."""
+    """Run experiments and report the files of their results. A cluster measures everything but times."""
     from fidsplat.experiments import counts
     from fidsplat.experiments.run import prepared
 
     away = tuple(name for name in names if ray is not None and name != counts.NAME)
-    files = measure_by(ray, away, options) if ray and isinstance(options, ImageSettings) else {}
+    files = measure_on_cluster(ray, away, options) if ray and isinstance(options, ImageSettings) else {}
     with prepared([name for name in names if name not in away], options) as sweeps:
         run_sweeps(sweeps)
         files |= {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
-    return tell(as_json, {"files": files}, *files.values())
+    return report(as_json, {"files": files}, *files.values())
 
 
 @repeatable
@@ -72,14 +71,14 @@ def measure(names: tuple[str, ...], options: MeasureSettings, as_json: bool, ray
 class Angles(RayCommand, AngleSettings):
     """The largest tilt at which each detector finds and reads each marker (table 3).
 
-    Every tilt from 0 to 89.8 degrees in steps of 0.2 is drawn and shown to every detector: for tags OpenCV's
-    aruco and the AprilTag library (if pupil-apriltags is installed), for QR codes OpenCV's, zxing-cpp, and
-    zxing-cpp after the picture was made taller. Protocols: fixed-plane (2 x 2 plane, 800 x 800) and
-    fixed-module (8 px a module, 1600 x 1600). A run that was stopped goes on where it was.
+    Every tilt from 0 to 89.8 degrees in steps of 0.2 is rendered and read by every detector: for tags
+    OpenCV's aruco and the AprilTag library (if pupil-apriltags is installed), for QR codes OpenCV, zxing-cpp,
+    and zxing-cpp on a vertically stretched image. Protocols: fixed-plane (2 x 2 plane, 800 x 800) and
+    fixed-module (8 px per module, 1600 x 1600). An interrupted run resumes.
 
     Examples:
       fidsplat experiment angles --quick
-      fidsplat experiment angles --ideal                     only the detectors' ceiling; no device needed
+      fidsplat experiment angles --ideal                     only the ceiling of the detectors; no device
       fidsplat experiment angles --protocol fixed-plane --category small --tilts 60:89.8:0.2
       fidsplat experiment angles --shard 1/4 --device opencl:nvidia
     """
@@ -93,14 +92,14 @@ class Angles(RayCommand, AngleSettings):
 class Views(RayCommand, ViewSettings):
     """PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
 
-    Ground truth: the exact renderer (a pixel is the mean of its square), the same with means of linear light,
-    and Blender's pictures where `fidsplat experiment blender` has made them. FLIP needs flip-evaluator, LPIPS
-    weights. A run that was stopped goes on where it was.
+    Ground truth: the exact renderer (a pixel is the mean over its square), the same in linear light, and
+    Blender's images of `fidsplat experiment blender`. FLIP needs flip-evaluator, LPIPS needs weights. An
+    interrupted run resumes.
 
     Examples:
       fidsplat experiment views --quick
       fidsplat experiment views --category huge --mixture fitted
-      fidsplat experiment views --blender pictures/blender
+      fidsplat experiment views --blender images/blender
     """
 
     def run(self) -> int:
@@ -112,8 +111,8 @@ class Views(RayCommand, ViewSettings):
 class Counts(Command, MeasureSettings):
     """Components, rectangles, Gaussians and seconds of each marker (table 2, figure).
 
-    Squares of modules, runs of rows and the minimum partition, for every mixture. The time is that from the
-    text to the splats in a process that has made the marker before; keep the machine quiet.
+    Compares single modules, runs of rows and the minimum partition, for every mixture. The time is that from
+    text to splats in a process that has made the marker before; keep the machine idle.
 
     Examples:
       fidsplat experiment counts
@@ -129,9 +128,8 @@ class Counts(Command, MeasureSettings):
 class Localisation(RayCommand, ImageSettings):
     """Pose errors of AprilTags and small QR codes by distance and tilt.
 
-    Codes of 0.16 m; 1280 x 720, 60 degrees; 0.5 to 4 m, 0 to 70 degrees; corners by `fidsplat detect`. The
-    same cameras for every method, the ideal texture's errors beside them. A run that was stopped goes on
-    where it was.
+    Codes of 0.16 m in images of 1280 x 720, 60 degrees wide, at 0.5 to 4 m and 0 to 70 degrees; corners of
+    `fidsplat detect`. All methods and the ideal texture have the same cameras. An interrupted run resumes.
 
     Examples:
       fidsplat experiment localisation --quick
@@ -142,16 +140,16 @@ class Localisation(RayCommand, ImageSettings):
         from fidsplat.experiments.localisation import LOCATED
 
         if self.category and not set(self.category) & set(LOCATED):
-            raise InputError(f"localisation is of {' and '.join(LOCATED)}, not of {', '.join(self.category)}")
+            raise InputError(f"--category must be {' or '.join(LOCATED)}, got {', '.join(self.category)}")
         return measure(("localisation",), self, self.json, self.ray)
 
 
 @repeatable
 @dataclass(frozen=True)
 class Pictures(Command, RenderSettings):
-    """Draw sheets of marker 0 of each category, by every method, at tilts of 0, 45 and 70 degrees.
+    """Render marker 0 of each category by every method, at tilts of 0, 45 and 70 degrees.
 
-    The report takes them in.
+    The report includes these images.
 
     Examples:
       fidsplat experiment pictures
@@ -160,11 +158,11 @@ class Pictures(Command, RenderSettings):
 
     def run(self) -> int:
         files = draw_sheets(self)
-        return tell(self.json, {"files": files}, *files)
+        return report(self.json, {"files": files}, *files)
 
 
 def draw_sheets(options: RenderSettings) -> list[str]:
-    """Draw the sheets with a progress bar; returns the files."""
+    """Render the sheets of images; returns their files."""
     from fidsplat.experiments.methods import Painter
     from fidsplat.experiments.pictures import write_sheets
     from fidsplat.experiments.setup import chosen_categories
@@ -174,16 +172,16 @@ def draw_sheets(options: RenderSettings) -> list[str]:
     categories = chosen_categories(options.category)
     painter = Painter(Renderer(options.device), options.trained)
     sheets = write_sheets(categories, options.methods, painter, options.seed, options.folder)
-    return [str(file) for file in counted("pictures", sheets, len(categories))]
+    return [str(file) for file in show_progress("sheets", sheets, len(categories))]
 
 
 @repeatable
 @dataclass(frozen=True)
 class All(RayCommand, ExperimentSettings):
-    """Counts, localisation, views and angles, then the report.
+    """Run counts, localisation, views and angles, and write the report.
 
-    --quick takes under five minutes on two cores. A run that was stopped loses nothing that was finished: the
-    same command goes on. Many machines share the work by --shard, and `merge` joins their results.
+    --quick takes under five minutes on two cores. An interrupted run resumes. Several machines share the work
+    by --shard, and `merge` joins their results.
 
     Examples:
       fidsplat experiment all --quick
@@ -197,26 +195,26 @@ class All(RayCommand, ExperimentSettings):
 
         self.check()
         if self.shard is None:
-            need_reports()
+            require_packages()
         status = measure(NAMES, self, self.json, self.ray)
         if self.shard is not None:
             return status
         draw_sheets(self)
-        say(console(True), f"report in {write_report([self.folder], self.folder)[0]}")
+        print_lines(console(True), f"report in {write_report([self.folder], self.folder)[0]}")
         return status
 
 
 @dataclass
 class Experiment:
-    """The paper's experiments: its tables and figures with our columns, beside the ideal.
+    """Reproduce the paper's tables and figures with our methods and the ideal texture.
 
-    Each experiment writes one file of results; a run that was stopped goes on where it was.
+    Each experiment writes one file of results; an interrupted run resumes.
 
     Examples:
-      fidsplat experiment all --quick                   a rough picture of all of it, in minutes
+      fidsplat experiment all --quick                   all experiments, roughly, in minutes
       fidsplat experiment angles --category small       one experiment, one category
-      fidsplat experiment report                        tables, charts and pictures from the results
-      fidsplat experiment angles --help                 what one of them does, and its options
+      fidsplat experiment report                        tables, charts and images from the results
+      fidsplat experiment angles --help                 an experiment and its options
     """
 
     PARTS: ClassVar[dict[str, type]] = {

@@ -3,115 +3,93 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
-from fidsplat.commands.output import (
+from fidsplat.commands.options import (
     Json,
-    MemoryBudget,
     Overwrite,
-    SceneDevice,
-    SceneOutputs,
-    SceneQuality,
-    bytes_of,
-    check_words,
-    console,
-    counted,
-    late_progress,
-    names_of,
+    RayAddress,
+    Workers,
+    check_workers,
     option,
     switch,
-    tell,
     writable_file,
 )
-from fidsplat.commands.remote import RayAddress, Workers, check_workers
-from fidsplat.commands.render import load_source
+from fidsplat.commands.output import console, report, show_progress
+from fidsplat.commands.scenes import RenderInput
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from rich.console import Console
+    import numpy as np
 
     from fidsplat.cameras import Trajectory
     from fidsplat.render.flight import Flight, FlightFolder
     from fidsplat.scenes import Scene
 
 DEFAULT_FOLDER = "fidsplat-flight"
+CAMERA = "camera"
+"""name of the camera's frame and topics in a log"""
 
 
 @dataclass
-class Fly:
-    """Draw a scene along a trajectory: a picture for each moment, a contact sheet, a video.
+class Fly(RenderInput):
+    """Render a scene along a trajectory to images, a contact sheet and a video.
 
-    DIR/rgb/000000.png and so on, likewise for other outputs; trajectory.tum and transforms.json have the pose
-    of each picture, so that the folder is a data set too. A run that is stopped goes on where it was. What
-    moves in the scene moves by the trajectory's clock, and a shutter of the scene sees the camera move.
+    DIR/rgb/000000.png and so on are the frames, likewise for other outputs. DIR/trajectory.tum and
+    DIR/transforms.json hold their poses, so that the folder is also a data set. An interrupted run resumes.
+    Moving parts of the scene follow the trajectory's clock, and a shutter of the scene includes the motion of
+    the camera.
 
-    Files of poses, camera to world (docs/trajectories.md): TUM, KITTI, COLMAP's images.txt or folder,
-    nerfstudio's transforms.json. Without --trajectory the camera moves as the scene file says.
+    Trajectory files hold camera-to-world poses (docs/trajectories.md): TUM, KITTI, COLMAP's images.txt or
+    folder, nerfstudio's transforms.json. Without --trajectory the scene's [[camera.motion]] is used.
 
     Examples:
       fidsplat fly scene.toml --trajectory flight.tum -o flight --video flight.mp4
       fidsplat fly room.ply --trajectory poses.txt --file-rate 10 --smooth --outputs rgb,depth
       fidsplat fly moving.toml --times 0,0.5,1
       fidsplat fly scene.toml --trajectory flight.tum --outputs rgb,label --log run.mcap --coco truth.json
-      fidsplat fly scene.toml --trajectory flight.tum --ray ray://HOST:10001       by a cluster
+      fidsplat fly scene.toml --trajectory flight.tum --ray ray://HOST:10001       on a cluster
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to draw")]
     trajectory: Annotated[
-        str | None, option("FILE", "the camera's poses (default: the scene's [[camera.motion]])")
+        str | None, option("FILE", "poses of the camera (default: the scene's [[camera.motion]])")
     ] = None
     out: Annotated[
         str,
-        option(
-            "DIR|RUN.mcap",
-            f"folder for pictures (default: {DEFAULT_FOLDER}), or a log, with the pictures in RUN",
-            "-o",
-        ),
+        option("DIR|RUN.mcap", f"folder (default: {DEFAULT_FOLDER}), or a log and the folder RUN", "-o"),
     ] = DEFAULT_FOLDER
-    rate: Annotated[float, option("HZ", "pictures a second, also of the video (default: 30)")] = 30.0
-    times: Annotated[
-        str | None, option("T,T,...", "seconds on the trajectory's clock, instead of --rate")
-    ] = None
-    file_rate: Annotated[float, option("HZ", "poses a second of a file that has no times (default: 10)")] = (
-        10.0
-    )
-    smooth: Annotated[bool, switch("curves through the poses, without a kink there")] = False
-    video: Annotated[str | None, option("FILE.mp4", "a video of the first output as well (extra: video)")] = (
+    rate: Annotated[float, option("HZ", "frames per second, also of the video (default: 30)")] = 30.0
+    times: Annotated[str | None, option("T,T,...", "seconds on the trajectory's clock instead of --rate")] = (
         None
     )
+    file_rate: Annotated[float, option("HZ", "poses per second of a file without times (default: 10)")] = 10.0
+    smooth: Annotated[bool, switch("interpolate poses by smooth curves instead of straight lines")] = False
+    video: Annotated[
+        str | None, option("FILE.mp4", "also write a video of the first output (extra: video)")
+    ] = None
     log: Annotated[
         str | None,
-        option("FILE.mcap|BAG", "a log of ROS 2 as well: pictures, intrinsics, poses (extra: logs)"),
+        option("FILE.mcap|BAG", "also write a ROS 2 log of images, intrinsics and poses (extra: logs)"),
     ] = None
     coco: Annotated[
-        str | None, option("FILE.json", "where markers are in each picture as well, as COCO annotations")
+        str | None, option("FILE.json", "also write the markers in each image as COCO annotations")
     ] = None
-    outputs: SceneOutputs = None
-    device: SceneDevice = None
-    quality: SceneQuality = None
-    memory_budget: MemoryBudget = None
     ray: RayAddress = None
     workers: Workers = None
     overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:
-        import fidsplat as fs
         from fidsplat.cameras.trajectory import check_rate
-        from fidsplat.commands.flight_records import write_log, write_truth
+        from fidsplat.formats import load_trajectory
         from fidsplat.images.video import check_video
         from fidsplat.render.flight import Flight, FlightFolder
 
-        names = names_of(self.outputs)
-        check_words(names, self.quality)
-        budget = bytes_of("--memory-budget", self.memory_budget)
+        budget = self.check()
         check_workers(self.ray, self.workers)
         if self.out.endswith(".mcap"):
             self.log, self.out = self.log or self.out, self.out.removesuffix(".mcap")
@@ -120,32 +98,31 @@ class Fly:
             check_video(self.video)
         if self.coco is not None:
             writable_file(self.coco)
-        given = self.trajectory
-        path = None if given is None else fs.load_trajectory(given, self.file_rate, self.smooth)
-        where = console(self.json)
-        with late_progress(console(True)) as progress:
-            scene = load_source(self.source, self.quality, progress)
-        path = path or _own_motion(self.source, scene, self.smooth)
-        times = path.sampled(self.rate).times if self.times is None else _times(self.times)
-        flight = Flight(scene, path, times, scene.capture.with_(outputs=names, quality=self.quality))
-        with self._drawn_by(flight, budget, where) as (title, draw):
-            logged = self._logged(flight.key(title))
+        path = None
+        if self.trajectory is not None:
+            path = load_trajectory(self.trajectory, self.file_rate, self.smooth)
+        scene = self.load()
+        path = path or _camera_motion(self.source, scene, self.smooth)
+        times = path.sampled(self.rate).times if self.times is None else _parse_times(self.times)
+        flight = Flight(scene, path, times, scene.capture.with_(outputs=self.names, quality=self.quality))
+        with self._engine(flight, budget) as (title, render):
+            log_is_complete = self._log_is_complete(flight.key(title))
             folder = FlightFolder(self.out, flight, title, self.overwrite, self.source)
             begun = time.perf_counter()
             left = len(folder.left())
-            list(counted("pictures", draw(folder), len(flight), len(flight) - left))
+            list(show_progress("frames", render(folder), len(flight), len(flight) - left))
             seconds = time.perf_counter() - begun
         sheet = folder.write_sheet()
         if self.video is not None:
-            list(counted("video", folder.write_video(self.video, self.rate), len(flight)))
-        if self.log is not None and not logged:
-            list(counted("log", write_log(folder, self.log, self.overwrite), len(flight)))
+            list(show_progress("video", folder.write_video(self.video, self.rate), len(flight)))
+        if self.log is not None and not log_is_complete:
+            list(show_progress("log", write_log(folder, self.log, self.overwrite), len(flight)))
         if self.coco is not None:
-            list(counted("truth", write_truth(folder, self.coco), len(flight)))
-        return self._tell(folder, sheet, left, seconds)
+            list(show_progress("truth", write_truth(folder, self.coco), len(flight)))
+        return self._report(folder, sheet, left, seconds)
 
-    def _logged(self, source: str) -> bool:
-        """Whether the log of a flight is there already, of a run that was stopped later."""
+    def _log_is_complete(self, source: str) -> bool:
+        """Whether an interrupted run of the same flight has already written the log."""
         if self.log is None:
             return False
         from fidsplat.logs import check_log
@@ -153,15 +130,15 @@ class Fly:
         return check_log(self.log, self.overwrite, source)
 
     @contextmanager
-    def _drawn_by(
-        self, flight: Flight, budget: int | None, where: Console
+    def _engine(
+        self, flight: Flight, budget: int | None
     ) -> Iterator[tuple[str, Callable[[FlightFolder], Iterator[int]]]]:
-        """What draws, in words, and how it draws what is left of a flight."""
+        """Title of the device or cluster, and a function that renders the missing frames of a folder."""
         from fidsplat.render.renderer import Renderer, default_device
 
         device = self.device or flight.scene.device or default_device()
         if self.ray is None:
-            with where.status("opening the device"):
+            with console(self.json).status("opening the device"):
                 renderer = Renderer(device, budget)
             yield renderer.device.title, lambda folder: folder.draw(renderer)
             return
@@ -169,35 +146,90 @@ class Fly:
         from fidsplat.remote.ray_engine import ray_engine
 
         with ExitStack() as stack:
-            with where.status("starting workers"):
+            with console(self.json).status("starting workers"):
                 work = FlightWork(flight, device, budget)
                 engine = stack.enter_context(ray_engine(self.ray, work, self.workers))
             yield engine.title, lambda folder: draw(folder, engine, engine.workers)
 
-    def _tell(self, folder: FlightFolder, sheet: Path, drawn: int, seconds: float) -> int:
+    def _report(self, folder: FlightFolder, sheet: Path, rendered: int, seconds: float) -> int:
         frames = len(folder.flight)
         facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
-        facts |= {"drawn": drawn, "seconds": seconds, "folder": str(folder.folder)}
+        facts |= {"drawn": rendered, "seconds": seconds, "folder": str(folder.folder)}
         facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
-        kept = f" ({frames - drawn} were there already)" if drawn < frames else ""
-        rate = f", {drawn / seconds:.1f} a second" if drawn else ""
-        lines = [f"{frames} pictures{kept} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)]
-        more = (name for name in (self.video, self.log, self.coco) if name is not None)
-        return tell(self.json, facts, *lines, *more)
+        earlier = f" ({frames - rendered} of an earlier run)" if rendered < frames else ""
+        rate = f", {rendered / seconds:.1f} per second" if rendered else ""
+        lines = [f"{frames} frames{earlier} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)]
+        files = (name for name in (self.video, self.log, self.coco) if name is not None)
+        return report(self.json, facts, *lines, *files)
 
 
-def _own_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:
-    """The camera's own keyframes, camera to world."""
+def _camera_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:
+    """The scene's [[camera.motion]] as camera-to-world poses."""
     from fidsplat.cameras import Trajectory
 
     if not isinstance(scene.camera_motion, Trajectory):
-        raise InputError(f"{source} has no [[camera.motion]] to fly along; give --trajectory FILE")
-    back = scene.camera_motion.inverse()
-    return Trajectory(back.times, back.poses, smooth)
+        raise InputError(f"{source} must have [[camera.motion]] to fly along; or give --trajectory FILE")
+    inverse = scene.camera_motion.inverse()
+    return Trajectory(inverse.times, inverse.poses, smooth)
 
 
-def _times(text: str) -> list[float]:
+def _parse_times(text: str) -> list[float]:
     try:
         return [float(word) for word in text.split(",")]
     except ValueError:
-        raise InputError(f"--times is {text!r}; give seconds with commas between, e.g. 0,0.5,1") from None
+        raise InputError(
+            f"--times must be seconds separated by commas, got {text!r}; write for example 0,0.5,1"
+        ) from None
+
+
+def write_log(folder: FlightFolder, path: str, overwrite: bool) -> Iterator[int]:
+    """Write rgb, outputs that are arrays, intrinsics and poses to a log; yields the number of each frame."""
+    from fidsplat.logs import RobotLog
+
+    flight = folder.flight
+    camera = flight.capture.camera
+    assert camera is not None
+    start = min(0.0, float(flight.path.times[0]))  # the times of a log are not negative
+    with RobotLog(path, overwrite=overwrite, source=folder.key) as log:
+        for k, (seconds, pose) in enumerate(zip(flight.path.times, flight.path.poses, strict=True)):
+            moment = float(seconds) - start
+            for name, image in _load_images(folder, k).items():
+                log.image(moment, CAMERA, image, name)
+            log.camera_info(moment, CAMERA, camera)
+            log.transform(moment, CAMERA, pose)
+            yield k
+
+
+def write_truth(folder: FlightFolder, path: str) -> Iterator[int]:
+    """Write the markers in each image as COCO annotations; yields the number of each frame."""
+    from fidsplat.images.files import read_image
+    from fidsplat.render.output_files import suffixes_of
+    from fidsplat.vision.coco import CocoAnnotations
+    from fidsplat.vision.truth import truth_of
+
+    annotations, flight = CocoAnnotations(), folder.flight
+    for k, capture in enumerate(flight.captures):
+        scene = replace(flight.scene, shutter=capture.shutter)
+        assert capture.camera is not None
+        camera = capture.motion.moved(capture.camera, capture.shutter.time)
+        name = flight.capture.outputs[0]
+        file = folder.file(k, name, suffixes_of(name)[-1])
+        images = _load_images(folder, k) or {name: read_image(file)}
+        annotations.add(str(file.relative_to(folder.folder)), truth_of(images, scene, camera))
+        yield k
+    annotations.save(path)
+
+
+def _load_images(folder: FlightFolder, k: int) -> dict[str, np.ndarray]:
+    """The lossless outputs of a frame: rgb, and outputs that are written as arrays."""
+    from fidsplat.images.files import read_image
+    from fidsplat.render.output_files import load_output, suffixes_of
+
+    found, camera = {}, folder.flight.capture.camera
+    assert camera is not None
+    for name in folder.flight.capture.outputs:
+        if ".npy" in suffixes_of(name):
+            found[name] = load_output(folder.file(k, name, ".npy"), (camera.height, camera.width))
+        elif name == "rgb":
+            found[name] = read_image(folder.file(k, name, ".png"))
+    return found

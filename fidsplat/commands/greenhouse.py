@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from fidsplat.commands.output import Json, Overwrite, option, tell
+from fidsplat.commands.options import Json, Overwrite, option
+from fidsplat.commands.output import report
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of, writable_folder
 from fidsplat.worlds.greenhouse import Greenhouse as World
@@ -12,23 +13,23 @@ from fidsplat.worlds.greenhouse import GreenhouseSettings
 
 @dataclass
 class Greenhouse:
-    """Make a greenhouse of splats: rows of plants on benches under glass, with AprilTags and QR codes.
+    """Make a greenhouse of splats: plants on benches under glass, with AprilTags and QR codes.
 
-    DIR/greenhouse.toml is a scene for every command, with its splat files; DIR/greenhouse.xml is a MuJoCo
-    model of what a robot collides with. Tomatoes, cucumbers and lettuces are grown from the seed, or taken
-    from a folder of plants; tags of 0.16 m hang on the benches' sides and ends, a QR code above each row.
+    DIR/greenhouse.toml is a scene for every command, next to its splat files. DIR/greenhouse.xml is a MuJoCo
+    model for collisions of a robot. Tomatoes, cucumbers and lettuces are grown from the seed or read from a
+    folder of plants. Tags of 0.16 m are on the sides and ends of the benches, a QR code is above each row.
 
     Examples:
       fidsplat greenhouse
       fidsplat greenhouse -o small --rows 2 --plants 6 --seed 3
-      fidsplat greenhouse -o real --plants-from plants   of fidsplat experiment plants
+      fidsplat greenhouse -o real --plants-from plants   plants of fidsplat experiment plants
       fidsplat render greenhouse/greenhouse.toml
     """
 
     out: Annotated[str, option("DIR", "folder (default: greenhouse)", "-o")] = "greenhouse"
     settings: GreenhouseSettings = field(default_factory=GreenhouseSettings)
     plants_from: Annotated[
-        str | None, option("DIR", "KIND-NUMBER.ply to take plants from (default: grown as disks)")
+        str | None, option("DIR", "folder of plants KIND-NUMBER.ply (default: plants are grown as disks)")
     ] = None
     overwrite: Overwrite = False
     json: Json = False
@@ -42,14 +43,14 @@ class Greenhouse:
         folder = path_of(self.out)
         scene_file, model = folder / "greenhouse.toml", folder / "greenhouse.xml"
         if scene_file.exists() and not self.overwrite:
-            raise InputError(f"{scene_file} is there already; give another folder, or --overwrite")
+            raise InputError(f"{scene_file} already exists; give another folder, or --overwrite")
         scene = made.scene
         writable_folder(folder)
         with atomic_write(model) as stream:
             stream.write(made.mjcf().encode())
-        scene.save(scene_file)  # last: by it the next run knows that all is there
+        scene.save(scene_file)  # last: it marks a complete greenhouse
         plants, splats, markers = settings.rows * settings.plants, len(scene.cloud()), len(made.markers)
         facts = {"scene": str(scene_file), "model": str(model), "splats": splats, "markers": markers}
         facts |= {"rows": settings.rows, "plants": plants, "length_m": made.length}
         words = f"{plants} plants in {settings.rows} rows, {splats} splats, {markers} markers"
-        return tell(self.json, facts, words, f"draw it: fidsplat render {scene_file}")
+        return report(self.json, facts, words, f"render it: fidsplat render {scene_file}")

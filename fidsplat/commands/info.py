@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.output import Json, console, late_progress, option, tell
+from fidsplat.commands.options import Json, option
+from fidsplat.commands.output import console, delayed_progress, report
 
 if TYPE_CHECKING:
     from fidsplat.splats.cloud import SplatCloud
@@ -17,41 +18,43 @@ SHARES = (1, 50, 99)
 """percent"""
 
 FLAT = 0.94
-"""Cosine of 20 degrees: a splat is level when its normal is nearer than this to the axis."""
+"""cosine of 20 degrees, the largest angle between an axis and the normal of a level splat"""
 
 
 @dataclass
 class Info:
-    """Say what a splat file holds, where, and how large it is.
+    """Describe a splat file: number, kind and bounds of its splats.
 
-    Bounds are of all splats, and of the middle 99 % of their centres along each axis: captures have strays
-    far away. Which way is up is a guess: away from where most of the area is level, or along a side that is
-    by far the longest. From these come a size for a first marker, and a place where it is seen from -z, as
-    `fidsplat render FILE.ply` looks.
+    Bounds are those of all splats, and of the middle 99 % of their centres along each axis, as captures have
+    strays far away. The up axis is a guess: away from the level areas, or along a side that is by far the
+    longest. The command suggests a size for a first marker and a position at which `fidsplat render FILE.ply`
+    shows it.
 
     Examples:
       fidsplat info scene.ply
       fidsplat info scene.ply --json
     """
 
-    file: Annotated[tyro.conf.Positional[str], option("FILE", "splats: PLY, .splat, SPZ, glTF, USD, a store")]
+    file: Annotated[
+        tyro.conf.Positional[str], option("FILE", "PLY, .splat, SPZ, glTF or USD file, or a store")
+    ]
     json: Json = False
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.commands.store import tell_store
+        from fidsplat.commands.store import report_store
         from fidsplat.store.layout import SUFFIX
 
         if Path(self.file).suffix.lower() == SUFFIX:
-            return tell_store(self.file, self.json)
-        with late_progress(console(True)) as progress:
+            return report_store(self.file, self.json)
+        with delayed_progress(console(True)) as progress:
             cloud = fs.load_splats(self.file, progress)
         facts = {"file": self.file, "bytes": Path(self.file).stat().st_size, **describe(cloud)}
-        return tell(self.json, facts, table=(self.file, ("", ""), _rows(facts)))
+        return report(self.json, facts, table=(self.file, ("", ""), _rows(facts)))
 
 
 def describe(cloud: SplatCloud) -> dict[str, Any]:
-    """A cloud in figures: metres as the file has them, percentiles of `SHARES`."""
+    """Figures of a cloud: lengths in the file's metres, percentiles of `SHARES`."""
     import numpy as np
 
     facts: dict[str, Any] = {
@@ -83,15 +86,17 @@ def describe(cloud: SplatCloud) -> dict[str, Any]:
 
 
 def guess_up(cloud: SplatCloud) -> tuple[str, str]:
-    """Which way is up, e.g. "-y", and why: away from where most of the area is level; else along a side that
-    is by far the longest, as a thing stands."""
+    """The up axis, for example "-y", and the reason: away from the level areas, or along a side that is by
+    far the longest."""
     import numpy as np
 
     from fidsplat.splats.rotations import quaternion_to_matrix
 
     level = np.abs(quaternion_to_matrix(cloud.quats)[:, :, 2]) > FLAT
     area = cloud.scales.prod(1).astype(np.float64) * cloud.opacities
-    area = np.minimum(area, np.percentile(area, 99)) + 1e-30  # a sky of few huge splats is no ground
+    area = (
+        np.minimum(area, np.percentile(area, 99)) + 1e-30
+    )  # a few huge splats of a sky must not count as ground
     low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0)
     shares, sides = area @ level / area.sum(), np.sort(high - low)
     axis = int(np.argmax(shares))
@@ -119,7 +124,9 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     scales, opacities = (" / ".join(f"{v:.3g}" for v in facts[key]) for key in ("scales", "opacities"))
     shares = " / ".join(map(str, SHARES))
     low, high = facts["middle_bounds"]
-    place = f"position = {point(facts['marker_position'])}: a tenth of the whole, before its middle from -z"
+    place = (
+        f"position = {point(facts['marker_position'])}: a tenth of the scene, in front of its middle from -z"
+    )
     return [
         *rows,
         ("bounds", " to ".join(map(point, facts["bounds"])) + " m"),

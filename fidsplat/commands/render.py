@@ -1,7 +1,9 @@
-"""`fidsplat render`."""
+"""`fidsplat render` and `fidsplat gallery`."""
+
+from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,18 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import (
-    Json,
-    MemoryBudget,
-    SceneDevice,
-    bytes_of,
-    check_words,
-    console,
-    late_progress,
-    names_of,
-    option,
-    tell,
-)
+from fidsplat.commands.options import Device, Json, check_request, option
+from fidsplat.commands.output import console, delayed_progress, report
+from fidsplat.commands.scenes import RenderInput, load_source
 from fidsplat.effects.catalogue import outputs_help
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import path_of, writable_folder
@@ -29,32 +22,32 @@ from fidsplat.util.files import path_of, writable_folder
 if TYPE_CHECKING:
     from fidsplat.accuracy.choice import Choice
     from fidsplat.capture.quality import Quality
-    from fidsplat.formats import Progress
     from fidsplat.render.frame import Frame
     from fidsplat.render.renderer import Renderer
     from fidsplat.scenes import Scene
 
-_OTHER_PICTURES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gif", ".npy")
+_OTHER_IMAGES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gif", ".npy")
 
 
 @dataclass
-class Render:
-    """Draw a scene file or a bare splat file.
+class Render(RenderInput):
+    """Render a scene file, a splat file or a store to images.
 
-    A splat file without a scene is seen from -z, as large as fits a picture of 1280 x 720. OUT.png names the
-    colour picture; other outputs stand beside it as OUT-depth.png and so on. Any other OUT is a folder for
-    rgb.png, depth.png and so on. Depth comes as .npy (metres), .png (16-bit millimetres) and -turbo.png
-    (colours); labels, ids and counts as .npy and .png (colours).
+    A splat file has no camera: it is framed from -z in 1280 x 720 pixels. With -o OUT.png the colour image is
+    OUT.png and other outputs are OUT-depth.png and so on. Any other OUT is a folder for rgb.png, depth.png
+    and so on. Depth is written as .npy (metres), .png (16-bit millimetres) and -turbo.png (colours), labels,
+    ids and counts as .npy and .png (colours).
 
     Outputs:
     {outputs}
 
-    Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and
-    change standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are
-    made take marker.mixture, marker.levels, marker.density, marker.growth and marker.template from it.
+    Quality: standard, fast, reference, gsplat or surfel, then settings of fs.Quality as key=value; settings
+    without a preset change standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file use
+    marker.mixture, marker.levels, marker.density, marker.growth and marker.template of the quality where the
+    file does not state them.
 
     Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
-    (docs/scene-files.md); they go together.
+    (docs/scene-files.md) and can be combined.
 
     Examples:
       fidsplat render scene.toml
@@ -62,36 +55,25 @@ class Render:
       fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
       fidsplat render tag.ply -o tag.png --device reference --quality gsplat
       fidsplat render scene.toml --device reference --every 8      every 8th pixel, in a 64th of the time
-      fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found
+      fidsplat render scene.toml --max-error 1e-3        measures qualities first and caches the result
       fidsplat render scene.toml --max-ms 20
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to draw")]
     out: Annotated[
         str | None, option("OUT", "PNG file or folder (default: the source's name with .png, here)", "-o")
     ] = None
-    outputs: Annotated[
-        str | None,
-        option("A,B,...", "output images, named above (default: the scene's, or rgb)"),
-    ] = None
-    device: SceneDevice = None
-    quality: Annotated[
-        str | None,
-        option("Q", "a preset, knobs as key=value, or both, as below (default: the scene's, or standard)"),
-    ] = None
     max_error: Annotated[
         float | None,
-        option("E", "render with the cheapest quality whose error of rgb is certified to be at most E"),
+        option("E", "use the cheapest quality whose error of rgb is certified to be at most E"),
     ] = None
     max_ms: Annotated[
         float | None,
-        option("T", "draw with the most accurate quality that takes at most T milliseconds a frame"),
+        option("T", "use the most accurate quality that takes at most T milliseconds per frame"),
     ] = None
     every: Annotated[
         int | None,
-        option("N", "of the reference: every Nth pixel in both directions, as a picture of those alone"),
+        option("N", "render every Nth pixel in both directions as a smaller image (device reference only)"),
     ] = None
-    memory_budget: MemoryBudget = None
     json: Json = False
 
     def run(self) -> int:
@@ -99,49 +81,46 @@ class Render:
         from fidsplat.accuracy.quality_within import check_bounds
         from fidsplat.render.output_files import save_output
 
-        names = names_of(self.outputs)
-        check_words(names, self.quality)
-        memory = bytes_of("--memory-budget", self.memory_budget)
-        budget = self.max_error is not None or self.max_ms is not None
-        if budget:
+        memory = self.check()
+        bounded = self.max_error is not None or self.max_ms is not None
+        if bounded:
             check_bounds(self.max_error, self.max_ms)
-        name_of = _names(self.out, path_of(self.source))
-        where = console(self.json)
-        with late_progress(console(True)) as progress:
-            scene = load_source(self.source, self.quality, progress)
-        with _named(self.source, "render.outputs", names is None):
-            check_words(scene.outputs, None)
-        of_scene = _named(self.source, "render.device", self.device is None and scene.device is not None)
-        with where.status("opening the device"), of_scene:
+        name_of = _file_names(self.out, path_of(self.source))
+        scene = self.load()
+        with _scene_key(self.source, "render.outputs", self.names is None):
+            check_request(scene.outputs, None)
+        named = _scene_key(self.source, "render.device", self.device is None and scene.device is not None)
+        with console(self.json).status("opening the device"), named:
             renderer = fs.Renderer(self.device or scene.device, memory)
-        choice = self._measured(scene, renderer) if budget else None
+        choice = self._choose_quality(scene, renderer) if bounded else None
         begun = time.perf_counter()
-        frame = self._drawn(renderer, scene, names, self.quality if choice is None else choice.quality)
+        frame = self._render(renderer, scene, self.quality if choice is None else choice.quality)
         images = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
-        files = [file for name, image in images.items() for file in save_output(name, image, name_of, bits)]
+        files = [str(file) for name in images for file in save_output(name, images[name], name_of, bits)]
+        height, width = images[frame.outputs[0]].shape[:2]
         facts = {
             "source": self.source,
             "device": renderer.device.name,
-            "width": images[frame.outputs[0]].shape[1],
-            "height": images[frame.outputs[0]].shape[0],
+            "width": width,
+            "height": height,
             "outputs": list(frame.outputs),
             "chosen": None if choice is None else choice.as_dict(),
             "stats": dict(frame.stats),
             "timings_ms": dict(frame.timings),
             "seconds": seconds,
-            "files": [str(file) for file in files],
+            "files": files,
         }
         rows = [(stage, f"{ms:.2f} ms") for stage, ms in frame.timings.items()]
         rows += [(what, f"{count:,}") for what, count in frame.stats.items()]
         rows += [("with compilation and transfer", f"{seconds:.2f} s")]
-        lines = [*(() if choice is None else (f"chosen: {choice.summary}",)), *facts["files"]]
+        lines = [*(() if choice is None else (f"chosen: {choice.summary}",)), *files]
         title = f"{self.source} on {renderer.device.title}"
-        return tell(self.json, facts, *lines, table=(title, ("", ""), rows))
+        return report(self.json, facts, *lines, table=(title, ("", ""), rows))
 
-    def _measured(self, scene: "Scene", renderer: "Renderer") -> "Choice":
-        """The quality that keeps to --max-error and --max-ms."""
+    def _choose_quality(self, scene: Scene, renderer: Renderer) -> Choice:
+        """The quality within --max-error and --max-ms."""
         from fidsplat.accuracy.certification import certify
         from fidsplat.accuracy.quality_within import choose
 
@@ -152,48 +131,43 @@ class Render:
                 return choice
             return certify(choice, self.max_error, self.max_ms, scene, capture, renderer, status.update)
 
-    def _drawn(
-        self,
-        renderer: "Renderer",
-        scene: "Scene",
-        names: tuple[str, ...] | None,
-        quality: "Quality | str | None",
-    ) -> "Frame":
-        """The picture; the reference says how far it is."""
+    def _render(self, renderer: Renderer, scene: Scene, quality: Quality | str | None) -> Frame:
+        """The frame; the slow reference device shows its progress."""
         if renderer.device.always_float64 or self.every is not None:
-            with late_progress(console(True)) as progress:
+            with delayed_progress(console(True)) as progress:
                 step = 1 if self.every is None else self.every
                 return renderer.render_every(
-                    step, scene, None, names, quality, lambda share: progress("drawing", share)
+                    step, scene, None, self.names, quality, lambda share: progress("rendering", share)
                 )
-        with console(self.json).status("drawing"):
-            return renderer.render(scene, outputs=names, quality=quality)
+        with console(self.json).status("rendering"):
+            return renderer.render(scene, outputs=self.names, quality=quality)
 
 
 Render.__doc__ = (Render.__doc__ or "").replace("    {outputs}", indent(outputs_help(), "    "))
 
 
 @contextmanager
-def _named(source: str, key: str, of_scene: bool) -> Iterator[None]:
-    """Puts the scene file and its key before an error about what stands there, if that is what is used."""
+def _scene_key(source: str, key: str, from_scene: bool) -> Iterator[None]:
+    """Prefix errors with the scene file and its key if the value comes from there."""
     try:
         yield
     except FidsplatError as error:
-        if of_scene and Path(source).suffix.lower() == ".toml":
+        if from_scene and Path(source).suffix.lower() == ".toml":
             raise type(error)(f"{source}: {key}: {error}") from error
         raise
 
 
-def _names(out: str | None, source: Path):
-    """A function from an output's name and a suffix to the file that it goes to, in a folder known to be
-    writable."""
+def _file_names(out: str | None, source: Path) -> Callable[[str, str], Path]:
+    """A function (output, suffix) -> file in a writable folder."""
     if not source.name:
-        raise InputError(f"cannot draw {source}, a folder: give a scene file (.toml) or a splat file in it")
+        raise InputError(f"the source must be a scene file (.toml) or a splat file, got the folder {source}")
     if out == "":
-        raise InputError("-o is empty; give a PNG file or a folder")
+        raise InputError("-o must be a PNG file or a folder, got ''")
     file = path_of(out) if out is not None else Path(source.name).with_suffix(".png")
-    if file.suffix.lower() in _OTHER_PICTURES:
-        raise InputError(f"pictures are written as PNG: name {file.with_suffix('.png')}, or a folder")
+    if file.suffix.lower() in _OTHER_IMAGES:
+        raise InputError(
+            f"-o must be a PNG file or a folder, got {file}; name {file.with_suffix('.png')} or a folder"
+        )
     if file.suffix.lower() == ".png" and not file.is_dir():
         writable_folder(file.parent)
         return lambda name, suffix: file.with_name(
@@ -203,32 +177,39 @@ def _names(out: str | None, source: Path):
     return lambda name, suffix: file / f"{name}{suffix}"
 
 
-def load_source(source: str, quality: str | None, progress: "Progress") -> "Scene":
-    """A scene file, or a splat file as a scene of its own, seen by a camera that fits it.
+@dataclass
+class Gallery:
+    """Render scenes and make a web page of their images.
 
-    Raises:
-        InputError: neither; a scene without a camera.
+    DIR/index.html shows every scene with its outputs, its splats and its scene file, and needs only the
+    images next to it. Unchanged scenes are not rendered again.
+
+    Examples:
+      fidsplat gallery examples/*.toml
+      fidsplat gallery fidsplat-demo/scene.toml room.ply -o images --device opencl:nvidia
     """
-    import fidsplat as fs
-    from fidsplat.commands.framing import framing_camera
-    from fidsplat.formats.files import FORMATS
-    from fidsplat.store.layout import SUFFIX
 
-    suffix = Path(source).suffix.lower()
-    if suffix == ".toml":
-        scene = fs.Scene.load(source, quality, progress)
-        if scene.camera is None:
+    sources: Annotated[tyro.conf.Positional[tuple[str, ...]], option("SCENE.toml|FILE.ply...", "scenes")]
+    out: Annotated[str, option("DIR", "folder (default: fidsplat-gallery)", "-o")] = "fidsplat-gallery"
+    device: Device = None
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.experiments.gallery import piece_of, write_gallery
+
+        if not self.sources:
             raise InputError(
-                f"{source} has no [camera] table; add one with width, height, fov_x_deg, position, look_at"
+                "a gallery needs at least one scene file (.toml) or splat file, e.g. examples/*.toml"
             )
-        return scene
-    if suffix == SUFFIX:
-        store = fs.Store(source)
-        return fs.Scene(stores=(store,), camera=framing_camera(store))
-    if suffix in FORMATS:
-        cloud = fs.load_splats(source, progress)
-        return fs.Scene([cloud], camera=framing_camera(cloud))
-    raise InputError(
-        f"cannot draw {source}: give a scene file (.toml), a store ({SUFFIX}) or a splat file "
-        f"({', '.join(FORMATS)})"
-    )
+        with delayed_progress(console(True)) as progress:
+            total, pieces = len(self.sources), []
+            for k, source in enumerate(self.sources):
+                progress(f"reading {source}", 0.5 * k / total)
+                pieces.append(piece_of(path_of(source), load_source(source, None, lambda words, share: None)))
+            files: list[Path] = []
+            for file in write_gallery(path_of(self.out), pieces, self.device):
+                files.append(file)
+                progress(file.name, 0.5 + 0.5 * len(files) / (total + 1))
+        page = str(files[-1])
+        facts = {"page": page, "pictures": [str(file) for file in files[:-1]]}
+        return report(self.json, facts, f"{total} scenes in {page}")

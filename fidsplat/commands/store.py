@@ -9,37 +9,25 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from fidsplat.commands.output import (
-    Device,
-    Json,
-    Overwrite,
-    bytes_of,
-    console,
-    late_progress,
-    option,
-    print_json,
-    print_table,
-    switch,
-    tell,
-)
+from fidsplat.commands.options import Device, Json, Overwrite, check_range, option, parse_bytes, switch
+from fidsplat.commands.output import console, delayed_progress, print_json, print_table, report
 from fidsplat.util.errors import InputError, several
 from fidsplat.util.files import writable_folder
 
 if TYPE_CHECKING:
     import fidsplat as fs
 
-Out = Annotated[str, option("OUT.fss", "the store to write", "-o")]
-StorePath = Annotated[tyro.conf.Positional[str], option("STORE.fss", "a store")]
+Out = Annotated[str, option("OUT.fss", "store to write", "-o")]
+StorePath = Annotated[tyro.conf.Positional[str], option("STORE.fss", "store to read")]
 
 
 @dataclass
 class Build:
-    """Build a store of splat files of any size: splats in a spatial order, in chunks, with levels of detail.
+    """Build a store of splat files of any size: spatially sorted chunks with levels of detail.
 
-    PLY files are read in parts, so memory follows --memory and not the files; other formats are loaded. A
-    build that is stopped, or whose disk was full, goes on where it was when the same command is given again.
-    Splats that cannot be drawn are left out and counted. Beside the store as much room again is needed while
-    it is built.
+    PLY files are read in parts, so that memory is limited by --memory and not by the files; other formats are
+    loaded completely. The same command resumes an interrupted build. Splats that cannot be rendered are left
+    out and counted. While it is built, a store needs twice its size on the disk.
 
     Examples:
       fidsplat store build street.ply -o street.fss
@@ -48,13 +36,15 @@ class Build:
 
     inputs: Annotated[tyro.conf.Positional[list[str]], option("IN...", "splat files")]
     out: Out
-    chunk: Annotated[int, option("N", "splats of a chunk, at most (default: 32768)")] = 32768
-    memory: Annotated[str, option("SIZE", "to take while building, roughly (default: 2GiB)")] = "2GiB"
-    sh_degree: Annotated[int | None, option("N", "highest degree of SH to keep (default: the files')")] = None
-    colors: Annotated[str, option("TYPE", "of colours and SH: float32 or float16 (default: float32)")] = (
-        "float32"
-    )
-    no_levels: Annotated[bool, switch("without levels of detail: exact pictures alone")] = False
+    chunk: Annotated[int, option("N", "maximum number of splats per chunk (default: 32768)")] = 32768
+    memory: Annotated[str, option("SIZE", "approximate memory while building (default: 2GiB)")] = "2GiB"
+    sh_degree: Annotated[
+        int | None, option("N", "highest SH degree to store (default: that of the files)")
+    ] = None
+    colors: Annotated[
+        str, option("TYPE", "type of colours and SH: float32 or float16 (default: float32)")
+    ] = "float32"
+    no_levels: Annotated[bool, switch("store no levels of detail; every image is then exact")] = False
     overwrite: Overwrite = False
     json: Json = False
 
@@ -62,9 +52,9 @@ class Build:
         from fidsplat.store.build import build_store
         from fidsplat.store.store import Store
 
-        memory, begun = bytes_of("--memory", self.memory), time.perf_counter()
+        memory, begun = parse_bytes("--memory", self.memory), time.perf_counter()
         assert memory is not None
-        with late_progress(console(True)) as progress:
+        with delayed_progress(console(True)) as progress:
             folder = build_store(
                 self.inputs,
                 self.out,
@@ -82,15 +72,15 @@ class Build:
         words = f"{_splats(store)}, {store.nbytes / 2**20:.1f} MiB, "
         left = (f"left out: {count:,}: {why}" for why, count in store.header.dropped.items())
         rate = len(store) / seconds / 1e6
-        return tell(self.json, facts, words + f"in {seconds:.1f} s ({rate:.2f} M/s): {folder}", *left)
+        return report(self.json, facts, words + f"in {seconds:.1f} s ({rate:.2f} M/s): {folder}", *left)
 
 
 @dataclass
 class Place:
-    """Place a store many times: the new store holds poses alone, and names the other by the way to it.
+    """Place instances of a store: the new store holds only poses and the path of the other.
 
-    Poses come from a file (camera to world, as for `fidsplat fly`), or stand on a grid, the first where the
-    store itself is.
+    Poses come from a file (camera to world, as for `fidsplat fly`) or form a grid whose first pose is that of
+    the store itself.
 
     Examples:
       fidsplat store place house.fss -o street.fss --grid 10,1,2 --pitch 12,0,30
@@ -99,9 +89,9 @@ class Place:
 
     source: StorePath
     out: Out
-    grid: Annotated[str | None, option("NX,NY,NZ", "places along the world's axes")] = None
-    pitch: Annotated[str, option("DX,DY,DZ", "metres from place to place (default: 10,10,10)")] = "10,10,10"
-    poses: Annotated[str | None, option("FILE", "poses, e.g. TUM, instead of a grid")] = None
+    grid: Annotated[str | None, option("NX,NY,NZ", "instances along the world's axes")] = None
+    pitch: Annotated[str, option("DX,DY,DZ", "metres between instances (default: 10,10,10)")] = "10,10,10"
+    poses: Annotated[str | None, option("FILE", "poses, for example TUM, instead of a grid")] = None
     overwrite: Overwrite = False
     json: Json = False
 
@@ -111,14 +101,16 @@ class Place:
         from fidsplat.store.store import Store
 
         if (self.grid is None) == (self.poses is None):
-            raise InputError("give --grid NX,NY,NZ or --poses FILE, and not both")
+            raise InputError("give either --grid NX,NY,NZ or --poses FILE")
         if self.poses is not None:
             poses = list(load_trajectory(self.poses).poses)
         else:
-            poses = _grid(_three("--grid", self.grid, int), _three("--pitch", self.pitch, float))
+            poses = _grid_poses(
+                _parse_triple("--grid", self.grid, int), _parse_triple("--pitch", self.pitch, float)
+            )
         store = Store(place_store(self.source, self.out, poses, overwrite=self.overwrite))
         facts = {"store": str(store.path), "places": store.places, "splats": len(store)}
-        return tell(
+        return report(
             self.json,
             facts,
             f"{several(len(store), 'splats')} at {several(store.places, 'places')}: {store.path}",
@@ -129,24 +121,22 @@ def _splats(store: fs.Store) -> str:
     return f"{several(len(store), 'splats')} in {several(store.chunks, 'chunks')}"
 
 
-def _three(name: str, text: str | None, kind: type) -> list:
+def _parse_triple(name: str, text: str | None, kind: type) -> list:
     try:
         values = [kind(word) for word in str(text).split(",")]
         if len(values) != 3 or (kind is int and min(values) < 1) or not all(abs(v) < 1e9 for v in values):
             raise ValueError
     except ValueError:
-        what = "three whole numbers from 1 on" if kind is int else "three numbers of metres"
-        raise InputError(f"{name} is {text!r}; give {what}, e.g. 10,1,2") from None
+        what = "three whole numbers of at least 1" if kind is int else "three lengths in metres"
+        raise InputError(f"{name} must be {what}, got {text!r}; write for example 10,1,2") from None
     return values
 
 
-def _grid(counts: list[int], pitch: list[float]) -> list:
+def _grid_poses(counts: list[int], pitch: list[float]) -> list:
     import numpy as np
 
     if np.prod([float(count) for count in counts]) > 1e7:
-        raise InputError(
-            f"--grid asks for {' x '.join(map(str, counts))} places; at most 10,000,000 are made"
-        )
+        raise InputError(f"--grid must be at most 10,000,000 instances, got {' x '.join(map(str, counts))}")
     steps = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
     poses = np.tile(np.eye(4), (len(steps), 1, 1))
     poses[:, :3, 3] = steps * pitch
@@ -155,7 +145,7 @@ def _grid(counts: list[int], pitch: list[float]) -> list:
 
 @dataclass
 class StoreInfo:
-    """Say what a store holds: splats, chunks, levels of detail, bytes, bounds.
+    """Describe a store: splats, chunks, levels of detail, bytes, bounds.
 
     Examples:
       fidsplat store info city.fss
@@ -166,15 +156,15 @@ class StoreInfo:
     json: Json = False
 
     def run(self) -> int:
-        return tell_store(self.store, self.json)
+        return report_store(self.store, self.json)
 
 
-def tell_store(path: str, as_json: bool) -> int:
-    """Print what a store holds; returns the exit status 0. Raises InputError for what is none."""
+def report_store(path: str, as_json: bool) -> int:
+    """Describe a store; returns the exit status 0. Raises InputError for another kind of folder."""
     from fidsplat.store.store import Store
 
     facts = _facts(Store(path))
-    return tell(as_json, facts, table=(path, ("", ""), _rows(facts)))
+    return report(as_json, facts, table=(path, ("", ""), _rows(facts)))
 
 
 def _facts(store: fs.Store) -> dict[str, Any]:
@@ -239,9 +229,11 @@ class Measure:
     """
 
     store: StorePath
-    views: Annotated[int, option("N", "places to look from (default: 60)")] = 60
-    lowpass: Annotated[str, option("A,B,...", "of pixel, screen, none (default: pixel)")] = "pixel"
-    seed: Annotated[int, option("N", "of the places (default: 0)")] = 0
+    views: Annotated[int, option("N", "number of viewpoints (default: 60)")] = 60
+    lowpass: Annotated[str, option("A,B,...", "low-pass filters: pixel, screen, none (default: pixel)")] = (
+        "pixel"
+    )
+    seed: Annotated[int, option("N", "seed of the viewpoints (default: 0)")] = 0
     device: Device = None
     json: Json = False
 
@@ -250,7 +242,7 @@ class Measure:
         from fidsplat.accuracy.detail_errors import measure_detail
 
         store, names = fs.Store(self.store), [name.strip() for name in self.lowpass.split(",")]
-        with late_progress(console(True)) as progress:
+        with delayed_progress(console(True)) as progress:
             renderer = fs.Renderer(self.device)
             made = measure_detail(store, renderer, self.views, names, self.seed, progress)
         if self.json:
@@ -268,10 +260,10 @@ class Measure:
 
 @dataclass
 class StoreDemo:
-    """Make a city of 20 million splats to fly through, with its levels of detail measured.
+    """Make a city of 20 million splats with measured levels of detail.
 
-    DIR/city.fss is the store; DIR/city.toml a scene with a flight through a street and up over the roofs.
-    Markers are ArUco markers of 0.8 m on the houses' walls, beside the store in the scene.
+    DIR/city.fss is the store, DIR/city.toml a scene with a flight through a street and over the roofs.
+    --markers places ArUco markers of 0.8 m on the walls of the houses, in the scene and not in the store.
 
     Examples:
       fidsplat store demo -o city
@@ -280,11 +272,11 @@ class StoreDemo:
     """
 
     out: Annotated[str, option("DIR", "folder (default: fidsplat-city)", "-o")] = "fidsplat-city"
-    splats: Annotated[float, option("N", "of the city (default: 20e6)")] = 20e6
-    houses: Annotated[int, option("N", "along a side (default: 8)")] = 8
-    seed: Annotated[int, option("N", "of houses and splats (default: 0)")] = 0
-    markers: Annotated[int, option("N", "on the walls, 0 to 1,000 (default: 0)")] = 0
-    views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 24)")] = 24
+    splats: Annotated[float, option("N", "number of splats (default: 20e6)")] = 20e6
+    houses: Annotated[int, option("N", "houses along a side (default: 8)")] = 8
+    seed: Annotated[int, option("N", "seed of houses and splats (default: 0)")] = 0
+    markers: Annotated[int, option("N", "markers on the walls, 0 to 1,000 (default: 0)")] = 0
+    views: Annotated[int, option("N", "viewpoints of the measurement, 0 for none (default: 24)")] = 24
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False
@@ -296,14 +288,12 @@ class StoreDemo:
         from fidsplat.worlds.city import City, flight
 
         if not (math.isfinite(self.splats) and self.splats == int(self.splats)):
-            raise InputError(f"--splats is {self.splats:g}; give a whole number")
-        if not 0 <= self.views <= 10_000:
-            raise InputError(f"--views is {self.views}; give 0 to 10,000")
-        if not 0 <= self.markers <= 1000:
-            raise InputError(f"--markers is {self.markers}; give 0 to 1,000")
+            raise InputError(f"--splats must be a whole number, got {self.splats:g}")
+        check_range("--views", self.views, 0, 10_000)
+        check_range("--markers", self.markers, 0, 1000)
         city, folder = City(int(self.splats), self.houses, self.seed), writable_folder(self.out)
         begun = time.perf_counter()
-        with late_progress(console(True)) as progress:
+        with delayed_progress(console(True)) as progress:
             path = fs.build_store(
                 [city.source], folder / "city.fss", overwrite=self.overwrite, progress=progress
             )
@@ -326,16 +316,16 @@ class StoreDemo:
         seconds = time.perf_counter() - begun
         facts = {"store": str(path), "scene": str(scene), "splats": len(store), "seconds": seconds}
         words = f"{_splats(store)}, in {seconds:.0f} s: {path}"
-        return tell(self.json, facts, words, f"fly through it: fidsplat fly {scene}")
+        return report(self.json, facts, words, f"fly through it: fidsplat fly {scene}")
 
 
 DEMO_ERROR = 1 / 255
-"""of the demo's pictures: below what eight bits show"""
+"""error of the demo's images, one step of 8 bits"""
 
 
 @dataclass
 class Verify:
-    """Read all of a store and compare every chunk with its checksum; exit status 1 if one is damaged.
+    """Compare every chunk of a store with its checksum; the exit status is 1 if one is damaged.
 
     Examples:
       fidsplat store verify city.fss
@@ -348,18 +338,20 @@ class Verify:
         from fidsplat.store.store import Store
 
         store = Store(self.store)
-        with late_progress(console(True)) as progress:
+        with delayed_progress(console(True)) as progress:
             wrong = store.verify(progress)
         facts = {"store": self.store, "nodes": len(store.nodes), "damaged": wrong}
-        tell(self.json, facts, *(wrong or [f"{self.store} is whole: {several(len(store.nodes), 'nodes')}"]))
+        report(
+            self.json, facts, *(wrong or [f"{self.store} is complete: {several(len(store.nodes), 'nodes')}"])
+        )
         return 1 if wrong else 0
 
 
 @dataclass
 class Store:
-    """Scenes on disk, larger than memory: build them, place them, look into them.
+    """Build, place and describe stores: scenes on disk that may be larger than memory.
 
-    Every command that takes a splat file takes a store (docs/large-scenes.md).
+    Every command that reads a splat file also reads a store (docs/large-scenes.md).
 
     Examples:
       fidsplat store build street.ply -o street.fss

@@ -11,20 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import (
+from fidsplat.commands.options import (
     Device,
     Json,
-    console,
-    late_progress,
     new_file,
     option,
-    progress_bar,
-    say,
+    require_packages,
     switch,
-    tell,
     writable_file,
 )
-from fidsplat.commands.sweeps import need_reports
+from fidsplat.commands.output import console, delayed_progress, print_lines, progress_bar, report
 from fidsplat.train.settings import TrainSettings
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
@@ -36,15 +32,15 @@ if TYPE_CHECKING:
 
 @dataclass
 class Train:
-    """Train splats on pictures with known cameras.
+    """Train splats on images with known cameras.
 
-    DATASET is a folder with COLMAP's model (sparse/0) and pictures (images), one with nerfstudio's
-    transforms.json, or what `fidsplat demo views` and `fidsplat experiment dataset` write. Views in its
-    folder test, or else every eighth of 16 and more, are held out and compared with at the end.
+    DATASET is a folder with COLMAP's model (sparse/0) and images (images), one with nerfstudio's
+    transforms.json, or a folder of `fidsplat demo views` or `fidsplat experiment dataset`. Views in its
+    folder test are held out and evaluated at the end; without that folder every eighth view of 16 or more.
 
-    The same command gives the same file, in every bit, on the same device. A run that was stopped goes on
-    where its last checkpoint is, FILE.training.npz beside FILE.ply, which is written every half minute and
-    at Ctrl-C, and stays: with more iterations the same command goes on from there. --overwrite begins again.
+    The same command writes a bit-identical file on the same device. A checkpoint, FILE.training.npz next to
+    FILE.ply, is written every half minute and at Ctrl-C. The same command resumes from it, also with more
+    iterations; --overwrite restarts.
 
     Examples:
       fidsplat demo views -o yard && fidsplat train yard -o yard.ply --iterations 2000
@@ -52,24 +48,25 @@ class Train:
       fidsplat train photos -o photos.ply --random-points 5000 --within-memory 4
     """
 
-    dataset: Annotated[tyro.conf.Positional[str], option("DATASET", "folder, or transforms.json")]
-    out: Annotated[str, option("FILE.ply", "where the splats go", "-o")]
+    dataset: Annotated[tyro.conf.Positional[str], option("DATASET", "folder or transforms.json")]
+    out: Annotated[str, option("FILE.ply", "file for the splats", "-o")]
     device: Device = None
     settings: TrainSettings = field(default_factory=TrainSettings)
     within_memory: Annotated[
-        float | None, option("GIB", "of splats and pictures while training: fewer splats where it needs them")
+        float | None,
+        option("GIB", "memory of splats and images while training; reduces the number of splats"),
     ] = None
     hold_out: Annotated[
-        int | None, option("N", "keep every N-th view to compare with, 0 for none (default: see above)")
+        int | None, option("N", "hold out every Nth view, 0 for none (default: see above)")
     ] = None
     random_points: Annotated[
-        int, option("N", "start from so many random points, not the data set's (default: 0)")
+        int, option("N", "start from N random points instead of the data set's (default: 0)")
     ] = 0
     report: Annotated[
-        str | None, option("DIR|FILE.md", "write a page with curves and pictures of the views held out")
+        str | None, option("DIR|FILE.md", "write a page with curves and images of the held-out views")
     ] = None
     overwrite: Annotated[
-        bool, switch("begin again; the checkpoint stays until the new run writes its first")
+        bool, switch("restart; the old checkpoint stays until the new run writes its first")
     ] = False
     json: Json = False
 
@@ -78,16 +75,16 @@ class Train:
         from fidsplat.train import Trainer, load_dataset, splats_within
 
         if path_of(self.out).suffix.lower() != ".ply":
-            raise InputError(f"-o is {self.out}; splats are written as PLY: name a file that ends in .ply")
+            raise InputError(f"-o must be a .ply file, got {self.out}")
         if self.report is not None:
-            need_reports()
+            require_packages()
         settings = self.settings
         file = writable_file(self.out)
         checkpoint = file.with_suffix(".training.npz")
-        if file.exists() and not checkpoint.exists():  # it is not of this training
+        if file.exists() and not checkpoint.exists():  # from something else than this training
             new_file(file, self.overwrite)
         where = console(self.json)
-        with late_progress(console(True)) as progress:
+        with delayed_progress(console(True)) as progress:
             dataset = load_dataset(self.dataset, self.hold_out, self.random_points, settings.seed, progress)
         if self.within_memory is not None:
             settings = splats_within(settings, _bytes(self.within_memory), dataset)
@@ -97,14 +94,16 @@ class Train:
         before, begun = trainer.iteration, time.perf_counter()
         with interrupts.postponed() as stopped, _bar(trainer) as show:
 
-            def told(step: Step) -> None:
+            def progress_step(step: Step) -> None:
                 show(step)
                 if (stop := stopped()) is not None:
                     trainer.save_checkpoint()
-                    say(console(True), f"the same command goes on after iteration {trainer.iteration:,}")
+                    print_lines(
+                        console(True), f"the same command resumes after iteration {trainer.iteration:,}"
+                    )
                     raise stop
 
-            trainer.run(told, prompt=False)
+            trainer.run(progress_step, prompt=False)
         seconds = time.perf_counter() - begun
         trainer.save(file)
         scores = trainer.evaluate()
@@ -118,25 +117,25 @@ class Train:
         rows = [(score.name, f"{score.psnr:.2f}", f"{score.ssim:.4f}") for score in scores]
         if scores:
             rows.append(("mean", f"{facts['psnr']:.2f}", f"{facts['ssim']:.4f}"))
-        title = f"{dataset.name} on {facts['device']}: views held out"
+        title = f"{dataset.name} on {facts['device']}: held-out views"
         rate = facts["iterations_per_second"]
-        speed = "nothing was left to do" if rate is None else f"{seconds:.1f} s, {rate:.1f} it/s"
+        speed = "already complete" if rate is None else f"{seconds:.1f} s, {rate:.1f} it/s"
         words = f"{facts['splats']:,} splats after {trainer.iteration:,} iterations ({speed})"
         if not scores:
-            words += "; no view was held out: --hold-out 8 keeps every eighth"
+            words += "; no view was held out; --hold-out 8 holds out every eighth"
         table = (title, ("view", "PSNR, dB", "SSIM"), rows) if scores else None
-        return tell(self.json, facts, words, facts["file"], *facts.get("report", []), table=table)
+        return report(self.json, facts, words, facts["file"], *facts.get("report", []), table=table)
 
 
 def _bytes(gibibytes: float) -> int:
     if not 0 < gibibytes < 2**20:
-        raise InputError(f"--within-memory is {gibibytes!r}; give GiB, above 0, e.g. 4")
+        raise InputError(f"--within-memory must be above 0 GiB, got {gibibytes!r}; write for example 4")
     return int(gibibytes * 2**30)
 
 
 @contextmanager
 def _bar(trainer: Trainer) -> Iterator:
-    """A progress bar, and what to call with each step."""
+    """A progress bar, as a callback for each step."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
     columns = (
@@ -149,7 +148,7 @@ def _bar(trainer: Trainer) -> Iterator:
         mean = {"loss": 0.0, "psnr": 0.0}
 
         def show(step: Step) -> None:
-            share = max(0.02, 1 / (step.iteration - first))  # of the last in the mean that is shown
+            share = max(0.02, 1 / (step.iteration - first))  # weight of the last step in the running mean
             mean["loss"] += share * (step.loss - mean["loss"])
             mean["psnr"] += share * (min(step.psnr, 100.0) - mean["psnr"])
             rate = (step.iteration - first) / (time.perf_counter() - begun)

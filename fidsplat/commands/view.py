@@ -8,41 +8,35 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import (
-    MemoryBudget,
-    SceneDevice,
-    SceneQuality,
-    bytes_of,
-    console,
-    late_progress,
-    option,
-    say,
-)
-from fidsplat.commands.render import load_source
-from fidsplat.commands.runs import TrainingRun, checkpoint_of, flown
+from fidsplat.commands.options import MemoryBudget, option, parse_bytes
+from fidsplat.commands.output import console, delayed_progress, print_lines
+from fidsplat.commands.scenes import SceneDevice, SceneQuality, framing_camera, load_source
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import path_of
+from fidsplat.util.files import from_json, path_of, read_text
 
 if TYPE_CHECKING:
     from fidsplat.formats import Progress
     from fidsplat.scenes import Scene
 
+CHECKPOINT = ".training.npz"
+"""ending of a checkpoint's name"""
+
 
 @dataclass
 class View:
-    """Show a scene in a browser: our own pictures, from wherever one looks.
+    """Show a scene in a browser, rendered by fidsplat from any viewpoint.
 
-    Small pictures while the view moves, an exact one at rest, none while nothing changes; no GPU is needed,
-    here or in the browser's machine. Drag to turn, right-drag to shift, wheel to come near; click to ask
-    what is there. Controls for device, quality, lens, fog and sensor; a gizmo moves a marker or a splat file
-    and writes its pose into the scene file, which is read again when it is edited meanwhile; keyframes become
-    a trajectory for `fidsplat fly`. Needs pip install 'fidsplat[viewer]'.
+    Small images while the view moves, an exact image at rest, none while nothing changes. Neither this
+    machine nor the browser's needs a GPU. Drag to rotate, right-drag to pan, wheel to approach; click a pixel
+    to read its outputs. Controls set device, quality, lens, fog and sensor. A gizmo moves a marker or a splat
+    file and writes its pose into the scene file, which is reloaded when it is edited. Keyframes become a
+    trajectory for `fidsplat fly`. Needs pip install 'fidsplat[viewer]'.
 
-    Only this machine reaches the page. From elsewhere: ssh -L 8080:localhost:8080 THAT_MACHINE
+    Only this machine can open the page. From elsewhere: ssh -L 8080:localhost:8080 THAT_MACHINE
 
-    A RUN is a folder of `fidsplat fly`, whose poses stand there as keyframes, or of `fidsplat train`, or its
-    checkpoint, whose splats are shown as they grow.
+    A RUN is a folder of `fidsplat fly`, whose poses become keyframes, or a folder or checkpoint of `fidsplat
+    train`, whose splats are shown as they grow.
 
     Examples:
       fidsplat view                                                      the demo's scene
@@ -54,83 +48,160 @@ class View:
 
     source: Annotated[
         tyro.conf.Positional[str | None],
-        option("SCENE.toml|FILE.ply|STORE.fss|RUN", "what to show (default: the demo's scene)"),
+        option("SCENE.toml|FILE.ply|STORE.fss|RUN", "scene to show (default: the demo's scene)"),
     ] = None
     trajectory: Annotated[
         str | None,
-        option(
-            "FILE", "poses shown as keyframes (docs/trajectories.md), e.g. DIR/trajectory.tum of a flight"
-        ),
+        option("FILE", "poses to show as keyframes (docs/trajectories.md), e.g. a flight's trajectory.tum"),
     ] = None
-    port: Annotated[int, option("N", "of the page (default: 8080)")] = 8080
+    port: Annotated[int, option("N", "port of the page (default: 8080)")] = 8080
     host: Annotated[
-        str, option("ADDRESS", "to listen on; 0.0.0.0 lets the whole network in (default: 127.0.0.1)")
+        str, option("ADDRESS", "address to listen on; 0.0.0.0 opens it to the network (default: 127.0.0.1)")
     ] = "127.0.0.1"
     device: SceneDevice = None
     quality: SceneQuality = None
-    rate: Annotated[float, option("HZ", "pictures a second to aim at while moving (default: 30)")] = 30.0
+    rate: Annotated[float, option("HZ", "target frame rate while moving (default: 30)")] = 30.0
     memory_budget: MemoryBudget = None
 
     def run(self) -> int:
         from fidsplat.formats import load_trajectory
         from fidsplat.viewer.server import Viewer, check_port
 
-        budget = bytes_of("--memory-budget", self.memory_budget)
+        budget = parse_bytes("--memory-budget", self.memory_budget)
         if not 0 < self.rate <= 1000:
-            raise InputError(f"--rate is {self.rate:g}; give pictures a second, up to 1000")
+            raise InputError(f"--rate must be above 0 and at most 1000 frames per second, got {self.rate:g}")
         check_port(self.host, self.port)
-        shown = self._shown()
-        path = None if shown.trajectory is None else load_trajectory(shown.trajectory)
+        target = self._target()
+        path = None if target.trajectory is None else load_trajectory(target.trajectory)
         where = console(True)
-        with late_progress(where) as progress:
-            scene = shown.scene(self.quality, progress)
-        file = Path(shown.source) if shown.source.lower().endswith(".toml") else None
-        again = None if shown.run is None else shown.run.again
+        with delayed_progress(where) as progress:
+            scene = target.scene(self.quality, progress)
+        file = Path(target.source) if target.source.lower().endswith(".toml") else None
+        reload = None if target.training is None else target.training.reload
         with where.status("compiling"):
-            words = (self.device, budget, self.host, self.port, self.rate, path, again)
-            viewer = Viewer(scene, file, *words, quality=self.quality)
-        say(console(False), f"{viewer.address} shows {self.source or 'the demo'}; Ctrl-C ends it")
+            viewer = Viewer(
+                scene,
+                file,
+                self.device,
+                budget,
+                self.host,
+                self.port,
+                self.rate,
+                keyframes=path,
+                reload=reload,
+                quality=self.quality,
+            )
+        print_lines(console(False), f"{viewer.address} shows {self.source or 'the demo'}; Ctrl-C ends it")
         try:
             while True:
                 interrupts.sleep(1.0)
         finally:
             viewer.close()
 
-    def _shown(self) -> Shown:
+    def _target(self) -> Target:
         from fidsplat.store.layout import SUFFIX
 
         if self.source is None:
-            return Shown("", self.trajectory)
+            return Target("", self.trajectory)
         folder = path_of(self.source)
-        if checkpoint := checkpoint_of(folder):
-            return Shown(self.source, self.trajectory, TrainingRun(checkpoint, self.quality))
+        if checkpoint := find_checkpoint(folder):
+            return Target(self.source, self.trajectory, Training(checkpoint, self.quality))
         if not folder.is_dir() or folder.suffix.lower() == SUFFIX:
-            return Shown(self.source, self.trajectory)
-        source, poses = flown(folder)
-        return Shown(source, self.trajectory or poses)
+            return Target(self.source, self.trajectory)
+        source, poses = flight_source(folder)
+        return Target(source, self.trajectory or poses)
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What is to be shown."""
+class Target:
+    """The scene, flight or training run to show."""
 
     source: str
     """file; empty for the demo"""
     trajectory: str | None
-    """file of the poses that stand there as keyframes"""
-    run: TrainingRun | None = None
-    """that is followed"""
+    """file of the poses shown as keyframes"""
+    training: Training | None = None
 
     def scene(self, quality: str | None, progress: Progress) -> Scene:
-        """The scene; quality: instead of its own."""
-        if self.run is not None:
-            return self.run.scene
+        """The scene, at a quality that replaces its own if one is given."""
+        changes = {} if quality is None else {"quality": quality}
+        if self.training is not None:
+            return self.training.scene
         if self.source:
-            return replace(load_source(self.source, quality, progress), **_of(quality))
+            return replace(load_source(self.source, quality, progress), **changes)
         from fidsplat.experiments.demo_scene import demo_scene
 
-        return replace(demo_scene(), **_of(quality))
+        return replace(demo_scene(), **changes)
 
 
-def _of(quality: str | None) -> dict[str, str]:
-    return {} if quality is None else {"quality": quality}
+def find_checkpoint(source: Path) -> Path | None:
+    """The checkpoint in a training run's folder, or the source if it is one; None where it is neither.
+
+    Raises:
+        InputError: the folder holds several checkpoints.
+    """
+    if source.name.endswith(CHECKPOINT):
+        return source
+    found = sorted(source.glob(f"*{CHECKPOINT}")) if source.is_dir() else []
+    if len(found) > 1:
+        names = ", ".join(file.name for file in found)
+        raise InputError(f"{source} holds several training runs; name one of {names} there")
+    return found[0] if found else None
+
+
+def flight_source(folder: Path) -> tuple[str, str]:
+    """The scene of a flight's folder and the file of its poses.
+
+    Raises:
+        InputError: not a folder of `fidsplat fly`, or its scene no longer exists.
+    """
+    from fidsplat.render.flight import POSES, RECORD
+
+    poses = folder / POSES
+    try:
+        source = from_json(read_text(folder / RECORD))["source"]
+        file = folder / source
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(
+            f"a folder to view must hold *{CHECKPOINT} of `fidsplat train` or a {RECORD} of `fidsplat fly` "
+            f"that names its scene, got {folder}; to view a scene, give its file"
+        ) from None
+    if not file.exists():
+        raise InputError(
+            f"the scene {source} of the flight {folder} no longer exists; give its new place with "
+            "--trajectory "
+            f"{poses}"
+        )
+    return str(file), str(poses)
+
+
+class Training:
+    """The splats of a training run, by its checkpoint, which changes while the run continues."""
+
+    def __init__(self, file: Path, quality: str | None = None) -> None:
+        self.file, self._quality = file, quality
+        self._loaded = self._stamp()
+        self.scene = self._load()
+
+    def reload(self) -> Scene | None:
+        """The current splats, from the first camera, if the checkpoint has changed; None otherwise."""
+        stamp = self._stamp()
+        if stamp is None or stamp == self._loaded:
+            return None
+        self._loaded = stamp
+        self.scene = replace(self._load(), camera=self.scene.camera)
+        return self.scene
+
+    def _load(self) -> Scene:
+        from fidsplat.scenes import Scene
+        from fidsplat.train import splats_of
+
+        cloud, background = splats_of(self.file)
+        return Scene((cloud,), camera=framing_camera(cloud), background=background, quality=self._quality)
+
+    def _stamp(self) -> tuple[int, int] | None:
+        try:
+            found = self.file.stat()
+        except OSError:
+            return None
+        return found.st_mtime_ns, found.st_size

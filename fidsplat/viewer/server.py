@@ -69,7 +69,7 @@ class Viewer:
         port: 0 takes a free one.
         rate: pictures a second to aim at while moving.
         keyframes: whose poses, camera to world, stand there at first.
-        again: asked once a second for another scene to show, None where there is none: of a run that goes on.
+        reload: called once a second; returns a newer scene of a running training, or None.
         quality: instead of the scene file's, when it is read again.
 
     Raises:
@@ -87,7 +87,7 @@ class Viewer:
         port: int = 8080,
         rate: float = 30.0,
         keyframes: Trajectory | None = None,
-        again: Callable[[], Scene | None] | None = None,
+        reload: Callable[[], Scene | None] | None = None,
         quality: str | None = None,
     ) -> None:
         viser = _viser()
@@ -98,7 +98,7 @@ class Viewer:
         self._said: dict[int, Any] = {}
         self._keyframes: list[np.ndarray] = [] if keyframes is None else list(keyframes.poses)
         self._file = None if file is None else SceneFile(file)
-        self._again, self._quality = again, quality
+        self._reload, self._quality = reload, quality
         self._held: Held | None = None
         self._saved: Path | None = None
         self.session = Session(scene, device, memory_budget, self._changed)
@@ -336,7 +336,7 @@ class Viewer:
         """Read the scene file again when somebody else has written it, and ask for a run's newest splats."""
         while not self._closed.wait(LOOK):
             try:
-                if self._again is not None and (newer := self._again()) is not None:
+                if self._reload is not None and (newer := self._reload()) is not None:
                     self.session.wish(scene=newer, done=lambda why: self._controls.say(why or ""))
                 with self._lock:
                     text = None if self._file is None else self._file.changed()

@@ -162,7 +162,7 @@ def test_scenes_for_trainers(capsys, tmp_path):
         (["blender", "--samples", "0"], "--samples must be at least 1, got 0"),
         (["blender", "--threads", "0"], "--threads must be at least 1, got 0"),
         (["views", "--trained", "."], "holds none of 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17"),
-        (["localisation", "--category", "huge"], "localisation is of apriltag and small, not of huge"),
+        (["localisation", "--category", "huge"], "--category must be apriltag or small, got huge"),
         (
             ["views", "--blender", "nowhere"],
             "--blender must be a folder that `fidsplat experiment blender`",
@@ -222,7 +222,7 @@ def test_merge_names_shards_that_are_missing(capsys, tmp_path):
     status, out, err = run(capsys, "merge", tmp_path, "-o", tmp_path / "out")
     assert status == 0
     assert "1 results of 1 files" in out
-    assert err == "fidsplat: warning: counts: there is no shard 2/3, 3/3\n"
+    assert err == "fidsplat: warning: counts: missing shard 2/3, 3/3\n"
 
 
 def test_pictures_of_another_seed_are_not_the_truth(capsys, tmp_path):

@@ -103,7 +103,7 @@ def test_several_devices_measure_into_folders_of_their_names(capsys, tmp_path, m
     words = ["tradeoff", "--quick", "--scenes", "hard", "--knobs", "opacity_ceiling", "-o", str(tmp_path)]
     words += ["--device", "opencl:pocl", "--device", "warp:cpu"]
     assert main([*words, "--plot", str(tmp_path / "times.pdf")]) == 2
-    assert "--plot is" in capsys.readouterr().err
+    assert "--plot must be a file that ends in .svg or .png" in capsys.readouterr().err
     assert main([*words[:-1], "opencl:nowhere"]) == 2
     assert not begun  # a device that is not there is said first
     capsys.readouterr()

@@ -372,7 +372,8 @@ def test_a_quality_in_words_is_the_same_for_the_same():
 
 
 def test_without_what_makes_reports_one_line_says_what_to_install(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("fidsplat.commands.sweeps.find_spec", lambda name: None if name == "jinja2" else True)
+    found = "fidsplat.commands.options.find_spec"
+    monkeypatch.setattr(found, lambda name: None if name == "jinja2" else True)
     for words in (["tradeoff", "report", str(tmp_path)], ["experiment", "report", str(tmp_path)]):
         assert main(words) == 2
         assert "a report needs jinja2; pip install 'fidsplat[experiments]'" in capsys.readouterr().err

@@ -162,7 +162,7 @@ def test_the_command(renderer, tmp_path, capsys, monkeypatch):
     words = ["check", "--device", renderer.device.name, "--out", str(tmp_path / "here")]
     assert main(words) == 0
     out = capsys.readouterr().out
-    assert "everything holds" in out
+    assert "all checks passed" in out
     assert "A bounds" in out
     assert "exp" in out
     assert read_image(tmp_path / "here" / "worst.png").shape[2] == 3
@@ -181,7 +181,7 @@ def test_the_command_fails_with_the_device(renderer, tmp_path, capsys, monkeypat
     assert main(["check", "--device", renderer.device.name, "-o", str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert "failed: C1: slip is 2, above 1" in out
-    assert "1 check does not hold" in out
+    assert "1 check failed" in out
     assert not (tmp_path / "worst.png").exists()
 
 
@@ -197,7 +197,8 @@ def test_the_command_fuzzes(renderer, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "says"), [(["--fuzz", "0"], "--fuzz is 0"), (["--device", "opncl"], "'opencl'")]
+    ("words", "says"),
+    [(["--fuzz", "0"], "--fuzz must be at least 1 splat, got 0"), (["--device", "opncl"], "'opencl'")],
 )
 def test_bad_words(words, says, tmp_path, capsys):
     assert main(["check", "-o", str(tmp_path), *words]) == 2

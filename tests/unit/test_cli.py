@@ -17,7 +17,7 @@ from rich.console import Console
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands import COMMANDS
-from fidsplat.commands.output import late_progress
+from fidsplat.commands.output import delayed_progress
 from fidsplat.images.files import read_image, write_png
 from fidsplat.images.tag_dictionaries import dictionary_bits
 
@@ -69,10 +69,10 @@ def test_help_loads_nothing_heavy():
         (["store", "biuld", "a.ply"], "(did you mean 'build'?); known: build, place"),
         (["marker"], "SPEC"),
         (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),
-        (["marker", "qr:a", "--size", "big"], "--size is 'big'; give a number; see fidsplat marker"),
-        (["marker", "qr:a", "--size", "it's"], '--size is "it\'s"; give a number; see fidsplat marker'),
-        (["view", "--port", "abc"], "--port is 'abc'; give a whole number; see fidsplat view --help"),
-        (["check", "--fuzz", "1e5"], "--fuzz is '1e5'; give a whole number; see"),
+        (["marker", "qr:a", "--size", "big"], "--size must be a number, got 'big'; see fidsplat marker"),
+        (["marker", "qr:a", "--size", "it's"], '--size must be a number, got "it\'s"; see fidsplat marker'),
+        (["view", "--port", "abc"], "--port must be a whole number, got 'abc'; see fidsplat view --help"),
+        (["check", "--fuzz", "1e5"], "--fuzz must be a whole number, got '1e5'; see"),
         (["marker", "qr:a", "qr:b"], "Unrecognized options: qr:b"),
         (["render"], "SCENE.toml"),
         (["detect", "--json"], "IMAGE"),
@@ -102,7 +102,7 @@ def test_words_that_make_no_command(words, says, capsys):
         (["render", "missing.toml"], "missing.toml"),
         (["render", "missing.ply"], "missing.ply"),
         (["render", "scene.yaml"], "scene.yaml"),
-        (["render", "."], "cannot draw ., a folder: give a scene file"),
+        (["render", "."], "the source must be a scene file (.toml) or a splat file, got the folder ."),
         (["render", "missing.ply", "--outputs", "rgb,dpth"], "depth"),
         (["render", "missing.ply", "--quality", "best"], "standard"),
         (["render", "missing.ply", "-o", "picture.jpg"], "picture.png"),
@@ -235,7 +235,7 @@ def test_devices(capsys):
 def test_work_is_shown_once_it_takes_long():
     for after in (60.0, 0.0):
         shown = io.StringIO()
-        with late_progress(Console(file=shown, force_terminal=True), after) as progress:
+        with delayed_progress(Console(file=shown, force_terminal=True), after) as progress:
             progress("squares", 0.5)
             deadline = time.monotonic() + 30
             while not after and "squares" not in shown.getvalue() and time.monotonic() < deadline:
@@ -300,7 +300,7 @@ def test_detect_in_folders_and_videos(capsys, picture, tmp_path):
     assert [one["image"] for one in result["pictures"]] == [str(folder / "a.png"), str(folder / "b.png")]
     assert main(["detect", str(folder), str(picture)]) == 0
     out = capsys.readouterr().out
-    assert "3 pictures" in out
+    assert "3 images" in out
     assert out.count("apriltag:36h11:5") == 3
 
     image = read_image(picture)

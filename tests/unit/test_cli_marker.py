@@ -34,13 +34,13 @@ def test_splats_that_are_there_are_replaced_where_that_is_asked_for(capsys, tmp_
     other.write_bytes(b"another")
     os.link(mine, tmp_path / "the same.ply")
     for words, why in (
-        (("marker", "qr:a", "-o", mine), f"{mine} is there already; give another name, or --overwrite"),
-        (("convert", other, mine), f"{mine} is there already; give another name, or --overwrite"),
-        (("train", tmp_path, "-o", mine), f"{mine} is there already; give another name, or --overwrite"),
-        (("convert", tmp_path / "nowhere.ply", mine), f"{mine} is there already"),
+        (("marker", "qr:a", "-o", mine), f"{mine} already exists; give another name, or --overwrite"),
+        (("convert", other, mine), f"{mine} already exists; give another name, or --overwrite"),
+        (("train", tmp_path, "-o", mine), f"{mine} already exists; give another name, or --overwrite"),
+        (("convert", tmp_path / "nowhere.ply", mine), f"{mine} already exists"),
         (("convert", tmp_path / "nowhere.ply", mine, "--overwrite"), "cannot read"),
-        (("convert", mine, mine), f"{mine} and {mine} are one file"),
-        (("convert", mine, tmp_path / "the same.ply", "--overwrite"), "are one file"),
+        (("convert", mine, mine), f"B must be another file than A, got {mine}"),
+        (("convert", mine, tmp_path / "the same.ply", "--overwrite"), "B must be another file than A"),
     ):
         status, line = fails(capsys, *words)
         assert (status, mine.read_bytes()) == (2, b"a scan of months"), words

@@ -8,7 +8,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.commands.framing import framing_camera
+from fidsplat.commands.scenes import framing_camera
 from fidsplat.images.files import read_image, to_uint8
 
 SCENE = """

@@ -111,7 +111,7 @@ def test_a_flights_log_is_read_from_where_its_camera_was(here, capsys):
         log.transform(0.25, "camera", np.eye(4))
     assert main(["detect", "blind.mcap"]) == 0
     assert main(["detect", "blind.mcap", "--scene", "scene.toml"]) == 2
-    assert "does not say where the camera of /camera/image_raw 0.500 s was" in capsys.readouterr().err
+    assert "in /tf at the time of /camera/image_raw 0.500 s" in capsys.readouterr().err
 
 
 def test_poses_of_a_log_are_those_of_frames_in_the_world(here):
@@ -128,7 +128,7 @@ def test_poses_of_a_log_are_those_of_frames_in_the_world(here):
 def test_a_video_does_not_say_where_its_camera_was(here, capsys):
     (here / "v.mp4").write_bytes(b"")
     assert main(["detect", "v.mp4", "--scene", "scene.toml"]) == 2
-    assert "v.mp4 does not say where its camera was" in capsys.readouterr().err
+    assert "which the video v.mp4 lacks" in capsys.readouterr().err
 
 
 def test_the_shutter_sees_the_camera_move(here):
@@ -172,7 +172,7 @@ def test_a_flight_that_was_stopped_after_its_log_goes_on(here, capsys, monkeypat
         def stopped(folder, path):
             raise KeyboardInterrupt
 
-        patch.setattr("fidsplat.commands.flight_records.write_truth", stopped)
+        patch.setattr("fidsplat.commands.fly.write_truth", stopped)
         assert fly(*words) == 130
     first = _bytes_of(here / name)
     assert fly(*words) == 0
@@ -299,15 +299,15 @@ def test_a_video_has_every_picture(here):
     ("words", "message"),
     [
         (["--rate", "0"], "the rate is 0.0; give a number"),
-        (["--times", "0,noon"], "--times is '0,noon'; give seconds"),
+        (["--times", "0,noon"], "--times must be seconds separated by commas, got '0,noon'"),
         (["--times", "1,0"], "increasing"),
         (["--video", "a.avi"], "videos are written as MP4: name a.mp4"),
         (["--outputs", "deep"], "unknown output 'deep'"),
-        (["--memory-budget", "lots"], "--memory-budget is 'lots'; give a number of bytes"),
+        (["--memory-budget", "lots"], "--memory-budget must be a number of bytes above 0, got 'lots'"),
         (["--trajectory", "none.tum"], "cannot read none.tum"),
         (["--times", "0,1", "--rate", "-1"], "the rate is -1.0; give a number"),
         (["--log", "poses.tum"], "poses.tum is there already"),
-        (["--coco", "."], ". is a folder"),
+        (["--coco", "."], "got the folder ."),
     ],
 )
 def test_words_that_cannot_be_flown(here, capsys, words, message):
@@ -318,18 +318,18 @@ def test_words_that_cannot_be_flown(here, capsys, words, message):
 
 def test_a_scene_that_stands_still_needs_a_trajectory(here, capsys):
     assert main(["fly", "scene.toml"]) == 2
-    assert "scene.toml has no [[camera.motion]] to fly along; give --trajectory" in capsys.readouterr().err
+    assert "scene.toml must have [[camera.motion]] to fly along" in capsys.readouterr().err
 
 
 def test_sizes_in_bytes():
-    from fidsplat.commands.output import bytes_of
+    from fidsplat.commands.options import parse_bytes
 
-    assert bytes_of("--x", None) is None
+    assert parse_bytes("--x", None) is None
     sizes = {"1": 1, "2GiB": 2 * 2**30, "1.5 MB": 1_500_000, "3kb": 3000, "7 MiB": 7 * 2**20}
-    assert {text: bytes_of("--x", text) for text in sizes} == sizes
+    assert {text: parse_bytes("--x", text) for text in sizes} == sizes
     for text in ("", "0", "-1", "2 GBit", "1e9", "GiB"):
-        with pytest.raises(fs.InputError, match="give a number of bytes above 0"):
-            bytes_of("--x", text)
+        with pytest.raises(fs.InputError, match="must be a number of bytes above 0"):
+            parse_bytes("--x", text)
 
 
 def test_pictures_that_are_not_whole_are_drawn_again(here):

@@ -361,8 +361,8 @@ def test_what_a_format_cannot_hold_is_said():
 
 def test_convert_says_what_it_costs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("fidsplat.commands.framing.WIDTH", 64)
-    monkeypatch.setattr("fidsplat.commands.framing.HEIGHT", 36)
+    monkeypatch.setattr("fidsplat.commands.scenes.WIDTH", 64)
+    monkeypatch.setattr("fidsplat.commands.scenes.HEIGHT", 36)
     fs.save_splats(some(labels=2), "a.ply")
     assert main(["convert", "a.ply", "a.glb", "--device", "reference", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -370,8 +370,8 @@ def test_convert_says_what_it_costs(tmp_path, monkeypatch, capsys):
     assert said["error"]["largest"] < 1e-5
     assert main(["convert", "a.ply", "a.spz", "--device", "reference"]) == 0
     out = capsys.readouterr().out
-    assert "not kept: labels (1 different)" in out
-    assert "pictures differ by 0." in out
+    assert "lost: labels (1 different)" in out
+    assert "image error: largest 0." in out
     assert main(["convert", "a.ply", "b.splat", "--no-pictures"]) == 0
     assert "pictures" not in capsys.readouterr().out
     assert Path("b.splat").stat().st_size == 40 * 32

@@ -53,9 +53,9 @@ def test_a_page_shows_scenes_with_their_outputs_and_text(here, capsys):
 
 def test_what_cannot_be_shown_is_said(here, capsys):
     for words, why in (
-        ([], "no scene to draw"),
+        ([], "a gallery needs at least one scene file"),
         (["none.toml"], "none.toml"),
-        (["a.png"], "cannot draw a.png"),
+        (["a.png"], "got a.png"),
     ):
         assert main(["gallery", *words]) == 2
         assert why in capsys.readouterr().err

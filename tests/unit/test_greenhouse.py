@@ -83,7 +83,7 @@ def test_the_command(tmp_path, capsys):
     assert len(scene.cloud()) == facts["splats"]
     assert len(scene.markers) == facts["markers"]
     assert main(words) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     assert main([*words, "--overwrite"]) == 0
     capsys.readouterr()
     assert main([*words[:3], "--rows", "0"]) == 2

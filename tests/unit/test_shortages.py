@@ -13,7 +13,7 @@ import fidsplat as fs
 
 ROOT = Path(__file__).parents[2]
 FIDSPLAT = f"{sys.executable} -m fidsplat"
-NO_ROOM = "fidsplat: No space left on device; make room there, or on what the output goes to"
+NO_ROOM = "fidsplat: No space left on device; free space there or on the disk of the output"
 
 
 def shell(text, folder, **environment):

@@ -47,10 +47,10 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert "number of iterations" in capsys.readouterr().err
     assert main([*words[:-1], "3", "--overwrite"]) == 0
     for wrong, said in (
-        (["-o", "a.png"], "-o is a.png"),
+        (["-o", "a.png"], "-o must be a .ply file, got a.png"),
         (["--random-points", "-1"], "--random-points must be"),
         (["--random-points", "99999999999"], "--random-points must be"),
-        (["--within-memory", "0"], "--within-memory is 0"),
+        (["--within-memory", "0"], "--within-memory must be above 0 GiB, got 0"),
         (["--within-memory", "1e-6"], "alone take 0.0001 GiB of the 1e-06 GiB"),
     ):
         assert main([*words, *wrong]) == 2

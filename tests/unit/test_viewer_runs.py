@@ -9,8 +9,7 @@ from training_scene import BACKGROUND, QUICK, scene
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.commands.runs import TrainingRun, checkpoint_of
-from fidsplat.commands.view import Shown, View
+from fidsplat.commands.view import Target, Training, View, find_checkpoint
 from fidsplat.train import Trainer, splats_of
 
 SCENE = (
@@ -32,16 +31,16 @@ def flight(tmp_path, monkeypatch):
 
 def test_a_flight_is_its_scene_and_its_poses(flight, monkeypatch):
     monkeypatch.chdir(flight.parent)  # the scene is found from wherever one stands
-    shown = View("one")._shown()
-    assert shown.run is None
+    shown = View("one")._target()
+    assert shown.training is None
     assert os.path.samefile(shown.source, "../scene.toml")
     assert len(fs.load_trajectory(shown.trajectory)) == 1
-    assert View("one", trajectory="other.tum")._shown().trajectory == "other.tum"
-    assert View("../scene.toml")._shown() == Shown("../scene.toml", None)
+    assert View("one", trajectory="other.tum")._target().trajectory == "other.tum"
+    assert View("../scene.toml")._target() == Target("../scene.toml", None)
 
 
 def test_without_a_scene_the_demo_is_shown():
-    scene = View()._shown().scene("fast", lambda words, share: None)
+    scene = View()._target().scene("fast", lambda words, share: None)
     assert [placed.marker.kind for placed in scene.markers] == ["apriltag", "aruco", "qr"]
     assert scene.capture.quality == fs.Quality.named("fast")
 
@@ -49,7 +48,7 @@ def test_without_a_scene_the_demo_is_shown():
 def test_a_splat_file_is_shown_by_the_quality_that_is_given(tmp_path):
     file = tmp_path / "a.ply"
     fs.save_ply(fs.marker("aruco:4x4_50:7", size=0.4).gaussians, file)
-    scene = View(str(file))._shown().scene("samples=2", lambda words, share: None)
+    scene = View(str(file))._target().scene("samples=2", lambda words, share: None)
     assert scene.capture.quality.samples == 2
 
 
@@ -82,15 +81,15 @@ def test_a_scene_file_that_is_edited_keeps_the_quality_that_was_given(flight, mo
 def test_what_is_no_run_is_said(flight, capsys):
     (flight.parents[1] / "scene.toml").unlink()
     for folder, words in (
-        (flight, "is a flight through ../../scene.toml, which is not there any more"),
-        (flight.parent, "is the folder of no run"),
+        (flight, "the scene ../../scene.toml of the flight"),
+        (flight.parent, "a folder to view must hold"),
     ):
         assert main(["view", str(folder)]) == 2
         assert words in capsys.readouterr().err
     for damaged in ("{", "[]", '{"source": null}'):
         (flight / "flight.json").write_text(damaged)
         assert main(["view", str(flight)]) == 2
-        assert "is the folder of no run" in capsys.readouterr().err
+        assert "a folder to view must hold" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -115,26 +114,26 @@ def test_a_checkpoint_holds_what_is_drawn(trainer):
 def test_a_training_is_shown_as_it_grows(trainer):
     folder = trainer.checkpoint.parent
     for source in (folder, trainer.checkpoint):
-        run = View(str(source), quality="fast")._shown().run
-        assert isinstance(run, TrainingRun)
+        run = View(str(source), quality="fast")._target().training
+        assert isinstance(run, Training)
         assert run.file == trainer.checkpoint
     first = run.scene
     assert first.capture.background == BACKGROUND
     assert first.capture.quality == fs.Quality.named("fast")
-    assert run.again() is None
+    assert run.reload() is None
     trainer.step()
     trainer.save_checkpoint()
     os.utime(run.file, ns=(1, 1))  # however coarse the file system's clock is
-    second = run.again()
+    second = run.reload()
     assert second.camera is first.camera
     assert not np.array_equal(second.cloud().means, first.cloud().means)
-    assert run.again() is None
+    assert run.reload() is None
     kept = run.file.read_bytes()
     run.file.unlink()
-    assert run.again() is None  # as while another takes its place
+    assert run.reload() is None  # as while another takes its place
     run.file.write_bytes(kept[:-9])
     with pytest.raises(fs.InputError, match="no checkpoint of `fidsplat train` that can be read"):
-        run.again()
+        run.reload()
     run.file.write_bytes(kept)
 
 
@@ -142,9 +141,9 @@ def test_the_page_shows_the_newest_splats(trainer):
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     from fidsplat.viewer.server import Viewer
 
-    first = TrainingRun(trainer.checkpoint).scene
+    first = Training(trainer.checkpoint).scene
     newer = [replace(first, background=(1, 1, 1))]
-    viewer = Viewer(first, device="reference", port=0, again=lambda: newer.pop() if newer else None)
+    viewer = Viewer(first, device="reference", port=0, reload=lambda: newer.pop() if newer else None)
     try:
         for _ in range(100):
             if viewer.session.drawn.scene is not first:
@@ -156,10 +155,10 @@ def test_the_page_shows_the_newest_splats(trainer):
 
 
 def test_several_runs_in_a_folder_are_named(tmp_path):
-    assert checkpoint_of(tmp_path) is None
+    assert find_checkpoint(tmp_path) is None
     for name in ("a", "b"):
         (tmp_path / f"{name}.training.npz").touch()
     with pytest.raises(fs.InputError, match=r"several training runs; name one of a.training.npz, b.training"):
-        checkpoint_of(tmp_path)
+        find_checkpoint(tmp_path)
     with pytest.raises(fs.InputError, match="no checkpoint"):
-        TrainingRun(tmp_path / "a.training.npz")
+        Training(tmp_path / "a.training.npz")

@@ -1,20 +1,27 @@
-"""`fidsplat experiment`: data sets, Blender's pictures, results of shards, reports."""
+"""`fidsplat experiment`: data sets, training of the baseline, Blender's images, results of shards,
+reports."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from fidsplat.commands.output import Device, Json, console, counted, option, repeatable, switch, tell
-from fidsplat.commands.sweeps import (
+from fidsplat.commands.options import (
     BlenderEnvironment,
+    Device,
     Folders,
+    Json,
     ReportTo,
-    need_reports,
-    run_in_turn,
+    option,
+    repeatable,
+    require_packages,
+    switch,
 )
+from fidsplat.commands.output import console, delayed_progress, report, show_progress
+from fidsplat.commands.sweeps import run_interleaved
+from fidsplat.experiments.plants import PlantSettings
 from fidsplat.experiments.settings import CountedSettings
 from fidsplat.experiments.trained import BaselineSettings
 from fidsplat.util.errors import InputError
@@ -23,10 +30,10 @@ from fidsplat.util.errors import InputError
 @repeatable
 @dataclass(frozen=True)
 class Dataset(CountedSettings):
-    """Write the data set of section 4.1: 100 scenes for COLMAP, 25 markers x 4 collections.
+    """Write the paper's data set: 100 scenes in COLMAP's layout, 25 markers x 4 numbers of views.
 
-    Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Scenes that
-    are there stay. About 300 MB.
+    Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Existing
+    scenes are kept. About 300 MB.
 
     Examples:
       fidsplat experiment dataset -o dataset
@@ -59,8 +66,8 @@ class Dataset(CountedSettings):
         folder = writable_folder(self.out)
         wanted = dataset_scenes(chosen_categories(self.category), self.marker_count)
         scenes = (write_scene(part, folder, self.seed, self.truth, self.blender) for part in wanted)
-        names = [scene.name for scene in counted("scenes", scenes, len(wanted))]
-        return tell(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
+        names = [scene.name for scene in show_progress("scenes", scenes, len(wanted))]
+        return report(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
 
 
 @repeatable
@@ -68,14 +75,13 @@ class Dataset(CountedSettings):
 class Baseline(BaselineSettings):
     """Train the paper's baseline: 2DGS on 3, 5, 9 and 17 views of each marker, 7,000 iterations.
 
-    Writes the data set's scenes where they are missing, the splats as 2dgs-17/small-0.ply and the like, and
-    trained.jsonl with seconds, splats, PSNR and SSIM. What is trained is at once shown to the metrics and
-    detectors, as `experiment views` and `angles` do (views.jsonl, angles.jsonl). One marker of each category
-    comes first. A run that was stopped goes on where it was.
+    Writes missing scenes of the data set, the splats (2dgs-17/small-0.ply and so on), and trained.jsonl with
+    seconds, splats, PSNR and SSIM. Each result is immediately measured like `experiment views` and `angles`
+    (views.jsonl, angles.jsonl). One marker of each category comes first. An interrupted run resumes.
 
     Examples:
       fidsplat experiment baseline --device opencl:nvidia
-      fidsplat experiment baseline --shard 2/8 --seeds 3            several at once on one GPU, then `merge`
+      fidsplat experiment baseline --shard 2/8 --seeds 3            several processes on one GPU, then `merge`
       fidsplat experiment baseline --category small --markers 1 --views 17 --iterations 1000 -o rough
       fidsplat experiment report fidsplat-experiments fidsplat-baseline
     """
@@ -90,21 +96,20 @@ class Baseline(BaselineSettings):
         from fidsplat.experiments.trained import baseline_sweeps
         from fidsplat.render.renderer import Renderer
 
-        self.check()  # before the device is opened
+        self.check()
         with baseline_sweeps(self, Renderer(self.device)) as sweeps:
-            run_in_turn("baseline", sweeps)
+            run_interleaved("baseline", sweeps)
             files = {sweep.name: str(sweep.results.file) for sweep in sweeps}
-        return tell(self.json, {"files": files}, *files.values())
+        return report(self.json, {"files": files}, *files.values())
 
 
 @repeatable
 @dataclass(frozen=True)
 class Blender(CountedSettings):
-    """Draw every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
+    """Render every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
 
-    --install makes a virtual environment of its own (about 1 GB, Python 3.11 needed) with bpy. Without it,
-    pictures are rendered; those that are there stay. About 3 s a picture on two cores; 20 test views for each
-    of 25 markers, with --training 17 more.
+    --install makes a virtual environment with bpy (about 1 GB, needs Python 3.11). Without it, missing images
+    are rendered, about 3 s each on two cores: 20 test views for each of 25 markers, with --training 17 more.
 
     Examples:
       fidsplat experiment blender --install
@@ -133,7 +138,7 @@ class Blender(CountedSettings):
         if self.install:
             with console(self.json).status("") as status:
                 python = blender.install(environment, status.update)
-            return tell(self.json, {"python": str(python)}, f"Blender is in {environment}")
+            return report(self.json, {"python": str(python)}, f"Blender is in {environment}")
         self.check()
         for name in ("samples", "threads"):
             if (number := getattr(self, name)) is not None and number < 1:
@@ -151,17 +156,53 @@ class Blender(CountedSettings):
                 for category in categories
                 for index in range(self.marker_count)
             ]
-            drawn = blender.render(jobs, view, environment, self.samples, threads=self.threads)
-            done += len(list(counted(f"view {view}", drawn, sum(len(job["shots"]) for job in jobs))))
-        return tell(self.json, {"folder": str(folder), "pictures": done}, f"{done} pictures in {folder}")
+            images = blender.render(jobs, view, environment, self.samples, threads=self.threads)
+            done += len(list(show_progress(f"view {view}", images, sum(len(job["shots"]) for job in jobs))))
+        return report(self.json, {"folder": str(folder), "pictures": done}, f"{done} images in {folder}")
+
+
+@repeatable
+@dataclass
+class Plants:
+    """Make plants: meshes, rendered by Blender from many poses, and splats trained on these images.
+
+    DIR/KIND-NUMBER.ply are for `fidsplat greenhouse --plants-from DIR`; their images remain as data sets.
+    Existing plants are kept, and an interrupted run resumes. `fidsplat experiment blender --install` installs
+    Blender. With --iterations 0 plants are disks on the meshes, and Blender is not needed.
+
+    Examples:
+      fidsplat experiment blender --install
+      fidsplat experiment plants -o plants && fidsplat greenhouse --plants-from plants
+      fidsplat experiment plants -o plants --kind tomato --each 10
+      fidsplat experiment plants -o sampled --iterations 0
+    """
+
+    out: Annotated[str, option("DIR", "folder (default: fidsplat-plants)", "-o")] = "fidsplat-plants"
+    settings: PlantSettings = field(default_factory=PlantSettings)
+    environment: BlenderEnvironment = None
+    device: Device = None
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.experiments import plants
+        from fidsplat.experiments.blender import default_environment
+
+        environment = self.environment or default_environment()
+        with delayed_progress(console(True)) as progress:
+            made = list(
+                plants.write_plants(self.settings, Path(self.out), environment, self.device, progress)
+            )
+        facts = {"plants": [{"file": str(file), "psnr": score} for file, score in made]}
+        rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in made]
+        return report(self.json, facts, table=("plants", ("file", "PSNR of test views [dB]"), rows))
 
 
 @dataclass
 class Merge:
     """Join results of shards: NAME-1-of-4.jsonl and so on in the folders become NAME.jsonl.
 
-    What NAME.jsonl holds beside them stays. Warns of shards that are missing, and where the results are not
-    of one device, version or code.
+    Other results in NAME.jsonl are kept. The command warns of missing shards, and of results that differ in
+    device, version or code.
 
     Examples:
       fidsplat experiment merge shards -o results
@@ -189,26 +230,26 @@ class Merge:
                 facts = {"file": str(target), "files": len(files), "points": joined.points}
                 result[name] = facts | {"repeated": joined.repeated, "missing": missing_shards(files)}
                 if result[name]["missing"]:
-                    text = f"{name}: there is no shard {', '.join(result[name]['missing'])}"
+                    text = f"{name}: missing shard {', '.join(result[name]['missing'])}"
                     warnings.warn(text, stacklevel=2)
                 if joined.differ:
-                    text = f"{name}: results that differ in {' and '.join(joined.differ)} are joined"
+                    text = f"{name}: joined results differ in {' and '.join(joined.differ)}"
                     warnings.warn(f"{text}; the report lists them", stacklevel=2)
         if not result:
             raise InputError(f"no results of shards in {', '.join(self.folders) or 'no folder'}")
         lines = []
         for facts in result.values():
-            again = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
-            lines.append(f"{facts['file']}: {facts['points']} results of {facts['files']} files{again}")
-        return tell(self.json, result, *lines)
+            twice = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
+            lines.append(f"{facts['file']}: {facts['points']} results of {facts['files']} files{twice}")
+        return report(self.json, result, *lines)
 
 
 @dataclass
 class Report:
-    """Write report.md: tables as in the paper, beside the paper's figures.
+    """Write report.md: the paper's tables with our results next to the paper's.
 
-    Charts, pictures and small tables of all results lie in its folder, or for FILE.md in a folder of that
-    name; the report can be made again from those tables. It says what was not measured.
+    Charts, images and small tables of all results are written to its folder, or for FILE.md to a folder of
+    that name; the report can be made again from these tables. It lists what was not measured.
 
     Examples:
       fidsplat experiment report
@@ -222,12 +263,12 @@ class Report:
     def run(self) -> int:
         folders = [Path(folder) for folder in self.folders or ("fidsplat-experiments",)]
         files = write_report(folders, Path(self.out or folders[0]))
-        return tell(self.json, {"files": files}, f"report in {files[0]}")
+        return report(self.json, {"files": files}, f"report in {files[0]}")
 
 
 def write_report(folders: list[Path], out: Path) -> list[str]:
     """Write the report; returns its files, the page first."""
-    need_reports()
+    require_packages()
     from fidsplat.experiments.report import make_report
 
     return [str(file) for file in make_report(folders, out)]

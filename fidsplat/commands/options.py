@@ -1,0 +1,159 @@
+"""Options that several commands share, and parsers of their values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Union, get_args, get_origin
+
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import ordinary_file, path_of, writable_folder
+
+repeatable = tyro.conf.configure(tyro.conf.UseAppendAction)
+"""Decorator of a command whose options with several values are repeated, one value each time."""
+
+
+def option(metavar: str, text: str, short: str | None = None):
+    """tyro's description of an option. The text states the default itself."""
+    aliases = [] if short is None else [short]
+    return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint="")
+
+
+def switch(text: str):
+    """tyro's description of an option without a value."""
+    return tyro.conf.arg(help=text, help_behavior_hint="")
+
+
+value_rules = ConstructorRegistry()
+"""tyro's rules for values, with one for optional values: help shows `INT` instead of `{None}|INT`."""
+
+
+@value_rules.primitive_rule
+def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if get_origin(info.type) not in (Union, UnionType) or len(kinds) != 1:
+        return None
+    inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
+    if not isinstance(inner, PrimitiveConstructorSpec):
+        return None
+    return replace(
+        inner,
+        is_instance=lambda value: value is None or inner.is_instance(value),
+        str_from_instance=lambda value: ["none"] if value is None else inner.str_from_instance(value),
+    )
+
+
+Device = Annotated[
+    str | None, option("D", "device; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)")
+]
+Devices = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    option("D", "device, repeat for several; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)"),
+]
+Json = Annotated[bool, switch("print one JSON object on stdout and nothing else there")]
+Overwrite = Annotated[bool, switch("replace existing files")]
+"""Commands whose output may be somebody's own or cost hours refuse to replace it without this option. Images,
+charts and tables replace earlier ones without asking."""
+MemoryBudget = Annotated[
+    str | None,
+    option("SIZE", "device memory for an image and its splats, e.g. 2GiB (default: nine tenths of it)"),
+]
+RayAddress = Annotated[
+    str | None,
+    option("ADDRESS", "Ray cluster that does the work: local, auto, ray://HOST:10001 (extra: ray)"),
+]
+Workers = Annotated[int | None, option("N", "workers of --ray (default: one per GPU, or one per machine)")]
+Folders = tyro.conf.Positional[tuple[str, ...]]
+ReportTo = Annotated[
+    str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
+]
+BlenderEnvironment = Annotated[
+    Path | None,
+    option("DIR", "Blender's virtual environment (default: fidsplat/blender in the user's cache)"),
+]
+
+
+def parse_outputs(text: str | None) -> tuple[str, ...] | None:
+    """Output names of a comma-separated list; None stays None."""
+    return None if text is None else tuple(name.strip() for name in text.split(","))
+
+
+def check_request(outputs: tuple[str, ...] | None, quality: str | None) -> None:
+    """Raise InputError for outputs or a quality that no scene can have, before anything is opened."""
+    import fidsplat as fs
+    from fidsplat.effects import select
+
+    select(fs.SplatCloud.empty(), fs.Capture(outputs=outputs or "rgb", quality=fs.Quality.of(quality)))
+
+
+_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+
+
+def parse_bytes(option: str, text: str | None) -> int | None:
+    """A number of bytes, with or without a unit; None stays None. Raises InputError."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)\s*", text.lower())
+    size = int(float(found[1]) * _UNITS.get(found[2], 0)) if found else 0
+    if size <= 0:
+        raise InputError(
+            f"{option} must be a number of bytes above 0, got {text!r}; write for example 500MB or 2GiB"
+        )
+    return size
+
+
+def check_range(option: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Raise InputError for a number outside [low, high]."""
+    if not low <= value <= high:
+        raise InputError(f"{option} must be {low:,} to {high:,}{unit}, got {value:g}")
+
+
+def check_workers(ray: str | None, workers: int | None) -> None:
+    """Raise InputError for an impossible number of workers, before anything is read."""
+    if workers is not None and (ray is None or workers < 1):
+        raise InputError(f"--workers must be at least 1, with --ray ADDRESS, got {workers}")
+
+
+def writable_file(path: str | Path) -> Path:
+    """The path of a file that can be written. Raises InputError."""
+    file = path_of(path)
+    if file.is_dir():
+        raise InputError(f"the output must be a file, got the folder {file}; name a file in it")
+    writable_folder(file.parent)
+    return ordinary_file(file)
+
+
+def new_file(path: str | Path, overwrite: bool) -> Path:
+    """The path of a writable file that does not exist, unless it may be replaced. Raises InputError."""
+    file = writable_file(path)
+    if file.exists() and not overwrite:
+        raise InputError(f"{file} already exists; give another name, or --overwrite")
+    return file
+
+
+def require_packages(
+    what: str = "a report", packages: Sequence[str] = ("pandas", "matplotlib", "jinja2")
+) -> None:
+    """Raise InputError where packages of the extra `experiments` are missing."""
+    missing = [name for name in packages if find_spec(name) is None]
+    if missing:
+        raise InputError(f"{what} needs {' and '.join(missing)}; pip install 'fidsplat[experiments]'")
+
+
+def check_plot(name: str, *packages: str) -> None:
+    """Raise InputError for a chart that cannot be written, before anything is measured.
+
+    Args:
+        packages: packages that the chart needs in addition to matplotlib.
+    """
+    if Path(name).suffix.lower() not in (".svg", ".png"):
+        raise InputError(f"--plot must be a file that ends in .svg or .png, got {name}")
+    require_packages("--plot", ("matplotlib", *packages))
+    writable_file(name)
