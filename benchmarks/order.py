@@ -31,9 +31,9 @@ import fidsplat as fs
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.visualize import contact_sheet
 from fidsplat.scenes.random_clouds import load_scene, random_splats
-from fidsplat.selftest.agreement import Picture, draw, truth_of
-from fidsplat.selftest.clouds import taken
-from fidsplat.selftest.order import STEP, largest_jump, turning, wall
+from fidsplat.selftest.agreement import FrameSpec, reference_images, render
+from fidsplat.selftest.clouds import subset_of
+from fidsplat.selftest.order import STEP, camera_path, largest_jump, wall
 from fidsplat.util.timing import frame_timer, quartiles, ratios, take_turns
 
 ORDERS = ("centre", "pixel")
@@ -63,7 +63,7 @@ def turned_about() -> dict[str, tuple[fs.SplatCloud, float]]:
     }
 
 
-def around_capture(cloud: fs.SplatCloud, order: str) -> Iterator[Picture]:
+def around_capture(cloud: fs.SplatCloud, order: str) -> Iterator[FrameSpec]:
     """A captured scene from the front, the camera going round it."""
     low, high = extent(cloud)
     middle, front = (low + high) / 2, views(cloud)["front"].position
@@ -73,15 +73,15 @@ def around_capture(cloud: fs.SplatCloud, order: str) -> Iterator[Picture]:
         c, s = math.cos(turn), math.sin(turn)
         position = middle + np.array([c * away[0] + s * away[2], away[1], c * away[2] - s * away[0]])
         camera = fs.Camera.look_at(SIZE["width"], SIZE["height"], math.radians(60), position, middle)
-        yield Picture(cloud, camera, fs.Quality(order=order), ("rgb",))
+        yield FrameSpec(cloud, camera, fs.Quality(order=order), ("rgb",))
 
 
-def beside_reference(renderer: fs.Renderer, pictures: list[Picture]) -> dict:
+def beside_reference(renderer: fs.Renderer, pictures: list[FrameSpec]) -> dict:
     """The largest jump of the reference at the pixels that jump furthest, and of ours beyond it."""
-    drawn = np.stack([draw(renderer, picture)["rgb"] for picture in pictures])
+    drawn = np.stack([render(renderer, picture)["rgb"] for picture in pictures])
     furthest = np.abs(np.diff(drawn, axis=0)).max((0, 3))
     at = np.unravel_index(np.argsort(-furthest, axis=None)[:LOOKED_AT], furthest.shape)
-    truth = np.stack([truth_of(picture, at)["rgb"] for picture in pictures])
+    truth = np.stack([reference_images(picture, at)["rgb"] for picture in pictures])
     ours, wanted = (np.abs(np.diff(rgb, axis=0)).max(2) for rgb in (drawn[:, *at], truth))
     padded = np.pad(wanted, ((1, 1), (0, 0)))
     allowed = np.max([padded[:-2], wanted, padded[2:]], axis=0)
@@ -98,15 +98,15 @@ def jumps(renderer: fs.Renderer, capture: fs.SplatCloud | None, panels: dict) ->
     """A row for each scene; what the QR code looks like goes to `panels`."""
     rows = []
     for name, (cloud, tilt) in track(turned_about().items(), "jumps", console=PROGRESS):
-        shuffled = taken(cloud, np.random.default_rng(0).permutation(len(cloud)))
+        shuffled = subset_of(cloud, np.random.default_rng(0).permutation(len(cloud)))
         row = {"scene": name, "splats": len(cloud)}
         for order in ORDERS:
-            found = largest_jump(renderer, turning(cloud, order, STEPS, tilt, **SIZE))
-            first, again = (next(turning(one, order, 0, tilt, **SIZE)) for one in (cloud, shuffled))
-            change = np.abs(draw(renderer, first)["rgb"] - draw(renderer, again)["rgb"]).max()
+            found = largest_jump(renderer, camera_path(cloud, order, STEPS, tilt, **SIZE))
+            first, again = (next(camera_path(one, order, 0, tilt, **SIZE)) for one in (cloud, shuffled))
+            change = np.abs(render(renderer, first)["rgb"] - render(renderer, again)["rgb"]).max()
             row |= jump_of(order, found) | {f"shuffle_{order}": float(change)}
             panels[name, order] = found
-        row |= beside_reference(renderer, list(turning(cloud, "pixel", STEPS, tilt, **SIZE)))
+        row |= beside_reference(renderer, list(camera_path(cloud, "pixel", STEPS, tilt, **SIZE)))
         rows.append(row)
     if capture is not None:
         row = {"scene": "captured", "splats": len(capture)}
@@ -122,7 +122,7 @@ def times(renderer: fs.Renderer, capture: fs.SplatCloud | None, repeats: int) ->
     scenes = {name: load_scene(name) for name in TIMED}
     before_wall = fs.SplatCloud.concatenate([fs.marker("apriltag:36h11:5", size=1.0).cloud, wall()])
     for name, cloud in (("AprilTag before a wall", before_wall), (CROSSING, turned_about()[CROSSING][0])):
-        scenes[name] = cloud, next(turning(cloud, "auto", 0, 30.0, 1280, 720)).camera
+        scenes[name] = cloud, next(camera_path(cloud, "auto", 0, 30.0, 1280, 720)).camera
     if capture is not None:
         scenes["captured"] = capture, views(capture)["front"]
     rows = []

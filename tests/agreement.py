@@ -7,8 +7,8 @@ import numpy as np
 
 from fidsplat.capture.quality import Quality
 from fidsplat.scenes.random_clouds import random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, Picture, compare, draw
-from fidsplat.selftest.agreement import truth_of as draw_truth
+from fidsplat.selftest.agreement import ALL_OUTPUTS, FrameSpec, compare, render
+from fidsplat.selftest.agreement import reference_images as render_reference
 from fidsplat.splats.cloud import SplatCloud
 
 __all__ = [
@@ -17,37 +17,37 @@ __all__ = [
     "assert_agrees",
     "compare",
     "random_splats",
+    "reference_images",
     "reference_pixels",
     "some_thick",
-    "truth_of",
 ]
 
 _TRUTHS: dict[bytes, dict[str, np.ndarray]] = {}
 
 
-def truth_of(picture, pixels=None):
+def reference_images(picture, pixels=None):
     """The reference's images. They are drawn once for all devices: they take longer than on any of them."""
     key = hashlib.sha256(pickle.dumps((picture, pixels))).digest()
     if key not in _TRUTHS:
-        _TRUTHS[key] = draw_truth(picture, pixels)
+        _TRUTHS[key] = render_reference(picture, pixels)
     return _TRUTHS[key]
 
 
 def against_reference(renderer, picture):
     """Draw a picture on a device and compare every output with the reference."""
-    return compare(draw(renderer, picture), truth_of(picture), picture.outputs)
+    return compare(render(renderer, picture), reference_images(picture), picture.outputs)
 
 
 def reference_pixels(cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0), pixels=None):
     """Reference images with the certificate: whole, or at `pixels` = (rows, columns)."""
-    return truth_of(Picture(cloud, camera, Quality.of(quality), tuple(outputs), background), pixels)
+    return reference_images(FrameSpec(cloud, camera, Quality.of(quality), tuple(outputs), background), pixels)
 
 
 def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, background=(0.1, 0.2, 0.3)):
     """Draw with a device and with the reference and compare every output; returns the frame."""
-    picture = Picture(cloud, camera, Quality.of(quality), tuple(outputs), background)
+    picture = FrameSpec(cloud, camera, Quality.of(quality), tuple(outputs), background)
     frame = renderer.render(cloud, camera, outputs, picture.quality, background=background)
-    truth = truth_of(picture)
+    truth = reference_images(picture)
     assert all(frame[name].shape == truth[name].shape for name in outputs)
     differences = compare(frame, truth, outputs)
     assert all(difference.agrees for difference in differences), differences

@@ -133,7 +133,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     from fidsplat.backends.view import View
     from fidsplat.effects import select
     from fidsplat.scenes.random_clouds import random_splats
-    from fidsplat.selftest.agreement import ALL_OUTPUTS, Picture, truth_of
+    from fidsplat.selftest.agreement import ALL_OUTPUTS, FrameSpec, reference_images
     from fidsplat.selftest.clouds import camera, splats
 
     backend = renderer.backend
@@ -153,7 +153,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
             planes = backend.pipeline(features, shape).render(backend.upload(cloud), view)
             drawn = {name: planes.read(name) for name in ("rgb", *features.outputs)}
             backend.pair_budget = kept
-            truth = truth_of(Picture(cloud, view_from, chosen, outputs))
+            truth = reference_images(FrameSpec(cloud, view_from, chosen, outputs))
             worst = 0.0
             for name in {"rgb", "alpha"} & set(drawn):
                 error = np.abs(drawn[name] - truth[name])

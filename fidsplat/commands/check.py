@@ -55,11 +55,11 @@ class Check:
             return self._fuzz(renderer, folder, where)
         from fidsplat.images.files import write_png
         from fidsplat.selftest.catalogue import all_cases
-        from fidsplat.selftest.check import run_check, worst_picture
+        from fidsplat.selftest.check import run_check, worst_image
 
         with where.status("starting") as status:
             result = run_check(renderer, all_cases(), status.update)
-        file = None if result.worst is None else write_png(folder / "worst.png", worst_picture(result.worst))
+        file = None if result.worst is None else write_png(folder / "worst.png", worst_image(result.worst))
         if self.json:
             print_json({**result.as_dict(), "picture": file and str(file)})
         else:

@@ -41,7 +41,7 @@ CULLED = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
-class Picture:
+class FrameSpec:
     """A frame to compare: cloud, camera and settings."""
 
     cloud: SplatCloud
@@ -95,12 +95,14 @@ def tolerance_of(name: str) -> float:
     return 0.0 if output.discontinuous else output.tolerance
 
 
-def draw(renderer: Renderer, picture: Picture) -> Frame:
+def render(renderer: Renderer, picture: FrameSpec) -> Frame:
     """Render the frame on a device."""
     return renderer.render(picture.cloud, picture.capture)
 
 
-def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+def reference_images(
+    picture: FrameSpec, pixels: tuple[np.ndarray, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
     """Images of the reference with `alpha` and `certificate`: all pixels, or (k, ...) at (rows, columns)."""
     reference = ReferenceBackend()
     features, view = picture.prepared("alpha")
@@ -111,7 +113,7 @@ def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = No
 
 
 def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:
-    """Compare images of a device with those of `truth_of`, for each of `outputs`."""
+    """Compare images of a device with those of `reference_images`, for each of `outputs`."""
     risky = float((truth["certificate"] > RISKY).mean())
     found = []
     for name in outputs:
@@ -151,7 +153,7 @@ def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tup
     return float(differs.mean()), float((differs & ~may_flip).mean())
 
 
-def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:
+def trace(renderer: Renderer, picture: FrameSpec, shape=None) -> dict[str, np.ndarray]:
     """Buffers between the stages of a device, and the outputs; `shape` replaces its build constants."""
     features, view = picture.prepared()
     backend = renderer.backend

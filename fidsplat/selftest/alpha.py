@@ -7,9 +7,9 @@ import numpy as np
 from fidsplat.capture.quality import Quality
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, Picture
+from fidsplat.selftest.agreement import ALL_OUTPUTS, FrameSpec
 from fidsplat.selftest.case import Finding, Found, case
-from fidsplat.selftest.clouds import camera, splats, turned
+from fidsplat.selftest.clouds import camera, rotation, splats
 from fidsplat.splats.cloud import SplatCloud
 
 CUT = 1.0 / 255.0
@@ -44,16 +44,16 @@ def near_values(value: float, ulps) -> np.ndarray:
 def d1(renderer: Renderer) -> Found:
     stripes = [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]
     for n in (1, 2, 4):
-        yield Picture(stack([1.0] * n, stripes[:n]), SMALL)
+        yield FrameSpec(stack([1.0] * n, stripes[:n]), SMALL)
     # the second layer takes the transmittance to 1e-4, give or take a few steps of the opacity
     edge = near_values(0.99, [-3, -1, 0, 1, 3])
     for opacity in edge:
         layers = stack([opacity] * 3, stripes[:3])
-        yield Picture(layers, SMALL)
-        yield Picture(layers, SMALL, Quality.named("gsplat"))
-    yield Picture(stack([1.0, 0.999, 0.5], stripes[:3]), SMALL, Quality.named("surfel"))
+        yield FrameSpec(layers, SMALL)
+        yield FrameSpec(layers, SMALL, Quality.named("gsplat"))
+    yield FrameSpec(stack([1.0, 0.999, 0.5], stripes[:3]), SMALL, Quality.named("surfel"))
     # on one plane: opaque splats share what they cover
-    yield Picture(
+    yield FrameSpec(
         stack([1.0, 1.0, 0.5, 1.0], stripes, step=0.0, size=0.3).with_coplanar_groups(0), camera(61, 45, 48.0)
     )
 
@@ -80,11 +80,11 @@ def d2(renderer: Renderer) -> Found:
     means = np.column_stack([(grid + 0.5 - (SMALL.cx, SMALL.cy)) / SMALL.fx, np.ones(len(grid))])
     for sizes in ((0.2, 0.2), (1e-4, 1e-4)):
         faint = splats(means, FACING, sizes, near_values(CUT, steps), np.eye(3)[np.arange(len(grid)) % 3])
-        yield Picture(faint, SMALL)
-    yield Picture(stack([0.0039] * 300, step=0.01), SMALL, Quality.named("reference"))
+        yield FrameSpec(faint, SMALL)
+    yield FrameSpec(stack([0.0039] * 300, step=0.01), SMALL, Quality.named("reference"))
     contours = random_splats(150, 21, depth=(1.0, 4.0), scale=(0.05, 0.5), across=1.5)
-    yield Picture(contours, camera(), Quality(alpha_cutoff=0.1))
-    yield Picture(contours, camera(), Quality(alpha_cutoff=1e-4))
+    yield FrameSpec(contours, camera(), Quality(alpha_cutoff=0.1))
+    yield FrameSpec(contours, camera(), Quality(alpha_cutoff=1e-4))
     small = camera(3, 3, 20.0)
 
     def haze(n: int, opacity: float, quality) -> tuple[float, float]:
@@ -111,8 +111,8 @@ def d3(renderer: Renderer) -> Found:
     colors = np.resize(np.eye(3), (400, 3))
     for opacity in (0.3, 0.9, 1.0):
         layers = stack([opacity] * 400, colors, step=0.01)
-        yield Picture(layers, SMALL, unending)
-    yield Picture(
+        yield FrameSpec(layers, SMALL, unending)
+    yield FrameSpec(
         stack([0.6] * 200, colors[:200], step=0.01).with_coplanar_groups(np.arange(200) // 40),
         SMALL,
         unending,
@@ -133,15 +133,15 @@ def d3(renderer: Renderer) -> Found:
 def d4(renderer: Renderer) -> Found:
     tilted = splats(
         [[0.0, 0.0, 2.0], [0.3, -0.1, 2.2], [-0.4, 0.2, 1.5]],
-        [turned((1, 0, 0), 60), turned((0, 1, 0), 75), turned((1, 1, 0), 40)],
+        [rotation((1, 0, 0), 60), rotation((0, 1, 0), 75), rotation((1, 1, 0), 40)],
         (0.5, 0.4),
         [1.0, 0.7, 0.4],
         np.eye(3),
     )
-    yield Picture(tilted, camera(), outputs=ALL_OUTPUTS)
+    yield FrameSpec(tilted, camera(), outputs=ALL_OUTPUTS)
     silhouettes = random_splats(120, 5, depth=(0.5, 9.0), scale=(0.02, 0.5))
-    yield Picture(silhouettes, camera(), outputs=ALL_OUTPUTS)
-    yield Picture(silhouettes, camera(), Quality(alpha_cutoff=1e-3), ALL_OUTPUTS)
+    yield FrameSpec(silhouettes, camera(), outputs=ALL_OUTPUTS)
+    yield FrameSpec(silhouettes, camera(), Quality(alpha_cutoff=1e-3), ALL_OUTPUTS)
     names = ("alpha", "depth", "depth_median")
 
     def middle(opacities, depths) -> tuple[float, float]:
@@ -190,7 +190,7 @@ def d5(renderer: Renderer) -> Found:
         plain.means, plain.quats, plain.scales, plain.opacities, colors=generator.uniform(-1.0, 4.0, (100, 3))
     )
     for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.25), (3.0, -0.5, 0.1)):
-        yield Picture(bright, camera(), background=background)
+        yield FrameSpec(bright, camera(), background=background)
     cloud = random_splats(100, 32, depth=(1.0, 5.0), scale=(0.03, 0.5))
     names, behind = ("rgb", "alpha"), (2.0, 0.5, -1.0)
     black = renderer.render(cloud, camera(), names)
@@ -213,8 +213,8 @@ def d5(renderer: Renderer) -> Found:
             float((~np.isfinite(frame["rgb"])).sum()),
             0.0,
         )
-        spoilt = (frame["rgb"] != without["rgb"]).any(-1) & ~touched
-        yield Finding(f"{name}: pixels that it changes without touching them", float(spoilt.sum()), 0.0)
+        corrupted = (frame["rgb"] != without["rgb"]).any(-1) & ~touched
+        yield Finding(f"{name}: pixels that it changes without touching them", float(corrupted.sum()), 0.0)
     dark = SplatCloud(fire.means, fire.quats, fire.scales, fire.opacities, sh=np.full((1, 1, 3), -9.0))
     lowest = float(renderer.render(dark, camera())["rgb"].min())
     yield Finding("how far below 0 a negative SH colour goes", -lowest, 0.0)

@@ -13,7 +13,7 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import log_uniform, random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, Picture, out_of_order
+from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, FrameSpec, out_of_order
 from fidsplat.selftest.case import Finding, Found, case
 from fidsplat.selftest.clouds import camera, splats
 from fidsplat.splats.cloud import SplatCloud
@@ -160,11 +160,11 @@ def f4(renderer: Renderer) -> Found:
     means = [[0.1 * k - 0.4, 0.05 * k - 0.2, 1.0 + 0.2 * k] for k in range(9)]
     opacities = [1e-38, 1e-40, 1e-30, 1e-20, 1e-10, 1e-5, 0.5, 1.0, 0.9]
     faint = splats(means, (1, 0.2, 0.1, 0), (0.2, 0.3), opacities)
-    yield Picture(faint, VIEW, quality)
+    yield FrameSpec(faint, VIEW, quality)
     thin = splats(means, (1, 0.2, 0.1, 0), [[1e-38, 0.3]] * 4 + [[0.3, 1e-42]] * 5, 0.8)
-    yield Picture(thin, VIEW, outputs=ALL_OUTPUTS)
+    yield FrameSpec(thin, VIEW, outputs=ALL_OUTPUTS)
     dark = splats(means, (1, 0.2, 0.1, 0), (0.2, 0.3), 0.7, (1e-39, 1e-44, 1e-38))
-    yield Picture(dark, VIEW, background=(1e-40, 0.0, 1e-45))
+    yield FrameSpec(dark, VIEW, background=(1e-40, 0.0, 1e-45))
     measured = measure(renderer)
     if measured:
         # either will do: nothing that is drawn is as small (the cut-off of the presets is at least 1e-6)

@@ -9,9 +9,9 @@ import numpy as np
 from fidsplat.backends.probing import Reshapes
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import log_uniform, random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, Picture, differing, draw, trace
+from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, FrameSpec, differing, render, trace
 from fidsplat.selftest.case import Finding, Found, case
-from fidsplat.selftest.clouds import camera, quaternion, splats, taken, turned
+from fidsplat.selftest.clouds import camera, quaternion, rotation, splats, subset_of
 from fidsplat.splats.cloud import SplatCloud
 
 FOCAL = 52.0  # 1000 px at a width of 1920 are 52 px at 100
@@ -20,8 +20,8 @@ FLAT = quaternion((1, 0, 0), (0, 0, 1))
 CUT = 1.0 / 255.0
 
 
-def _picture(cloud: SplatCloud, focal: float = FOCAL, **view) -> Picture:
-    return Picture(cloud, camera(focal=focal, **view), outputs=ALL_OUTPUTS)
+def _picture(cloud: SplatCloud, focal: float = FOCAL, **view) -> FrameSpec:
+    return FrameSpec(cloud, camera(focal=focal, **view), outputs=ALL_OUTPUTS)
 
 
 def _ground(scale: float, depth: float = 5.0, below: float = 1.5) -> SplatCloud:
@@ -30,7 +30,7 @@ def _ground(scale: float, depth: float = 5.0, below: float = 1.5) -> SplatCloud:
 
 def _wall(degrees: float) -> SplatCloud:
     """An upright splat 0.4 m away, turned about y."""
-    return splats([[0, 0, 0.4]], turned((0, 1, 0), degrees), 0.2)
+    return splats([[0, 0, 0.4]], rotation((0, 1, 0), degrees), 0.2)
 
 
 def _crossing(count: int = 300, seed: int = 1) -> SplatCloud:
@@ -70,8 +70,8 @@ def a2(renderer: Renderer) -> Found:
     picture = _picture(_ring())
     traced = trace(renderer, picture)
     kept = traced["order"] if traced["keys"].dtype != np.uint32 else np.flatnonzero(traced["keys"] != CULLED)
-    fewer = _picture(taken(picture.cloud, np.sort(kept)))
-    changed = differing(draw(renderer, picture), draw(renderer, fewer), ALL_OUTPUTS)
+    fewer = _picture(subset_of(picture.cloud, np.sort(kept)))
+    changed = differing(render(renderer, picture), render(renderer, fewer), ALL_OUTPUTS)
     yield Finding("pixels that change without the culled splats", changed, 0)
     yield Finding("splats behind that are not culled", float(len(kept)), len(picture.cloud) * 0.75)
 
@@ -86,7 +86,7 @@ def a3(renderer: Renderer) -> Found:
 
 
 def _tilted(ratio: float, degrees: float = 80.0, depth: float = 5.0, opacity: float = 1.0) -> SplatCloud:
-    return splats([[0.1, 0.05, depth]], turned((0.2, 1, 0), degrees), ratio * depth, opacity)
+    return splats([[0.1, 0.05, depth]], rotation((0.2, 1, 0), degrees), ratio * depth, opacity)
 
 
 @case("A4", "box of a disk in perspective", "tilt 80 deg, s / z = 0.05 to 0.28; tiles")
@@ -109,14 +109,14 @@ def _specks() -> SplatCloud:
     columns, rows = (grid.ravel() for grid in np.meshgrid(x, x))
     depth = 10.0
     means = [(columns - 46.5) / FOCAL * depth, (rows - 38.5) / FOCAL * depth, np.full(len(rows), depth)]
-    return splats(np.column_stack(means), turned((1, 2, 3), 40), 1e-4)
+    return splats(np.column_stack(means), rotation((1, 2, 3), 40), 1e-4)
 
 
-def _speck(x: float) -> Picture:
+def _speck(x: float) -> FrameSpec:
     """One speck at pixel coordinate x, in the middle of row 20."""
     view = camera(focal=FOCAL)
     means = [[(x - view.cx) / FOCAL * 10, (20.5 - view.cy) / FOCAL * 10, 10]]
-    return Picture(splats(means, (1, 0, 0, 0), 1e-4), view, outputs=ALL_OUTPUTS)
+    return FrameSpec(splats(means, (1, 0, 0, 0), 1e-4), view, outputs=ALL_OUTPUTS)
 
 
 @case("A5", "support of the low-pass", "s f / z = 5e-4 centred at x = 15.0, tile of 16")
@@ -125,7 +125,7 @@ def a5(renderer: Renderer) -> Found:
         yield _speck(x)
     yield _picture(_specks(), width=93, height=77)
     # the first pixel of the next tile is 1.5 px from x = 15.0 and gets exp(-1.5^2)
-    alpha = draw(renderer, _speck(15.0))["alpha"]
+    alpha = render(renderer, _speck(15.0))["alpha"]
     yield Finding("alpha error across the tile's edge", abs(float(alpha[20, 16]) - math.exp(-2.25)), 2e-5)
 
 
@@ -136,7 +136,7 @@ def a6(renderer: Renderer) -> Found:
     yield _picture(_tilted(0.1, 60.0, opacity=0.3), focal=80.0)
     # nothing bright stands where the middle of the 3 sigma box is: only the disk's own value
     picture = _picture(_tilted(0.2, 60.0), focal=80.0)
-    alpha = draw(renderer, picture)["alpha"].astype(float)
+    alpha = render(renderer, picture)["alpha"].astype(float)
     # a dot would stand out from its neighbours two pixels away by up to 0.7; a disk is smooth
     padded = np.pad(alpha, 2, mode="edge")
     around = np.max([padded[2:-2, :-4], padded[2:-2, 4:], padded[:-4, 2:-2], padded[4:, 2:-2]], axis=0)
@@ -158,4 +158,4 @@ def a7(renderer: Renderer) -> Found:
     # the least positive float32, and far behind the far plane
     means = [[0, 0, 4], [0.5, 0.2, 4], [-0.5, 0.1, -4], [0, 0, 1e6]]
     thin = [[1.0, 1.4e-45], [1.4e-45, 1.4e-45], [1.0, 1e-3], [1e5, 1e5]]
-    yield _picture(splats(means, turned((1, 1, 1), 30), thin, 0.7), far=1e5)
+    yield _picture(splats(means, rotation((1, 1, 1), 30), thin, 0.7), far=1e5)

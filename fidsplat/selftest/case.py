@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from fidsplat.render.renderer import Renderer
-from fidsplat.selftest.agreement import Picture
+from fidsplat.selftest.agreement import FrameSpec
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Finding:
         return self.value <= self.bound
 
 
-Found = Iterator[Picture | Finding]
+Found = Iterator[FrameSpec | Finding]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from fidsplat.backends.interface import DeviceInfo
 from fidsplat.effects import OUTPUTS
 from fidsplat.render.renderer import Renderer
-from fidsplat.selftest.agreement import Difference, Picture, compare, draw, tolerance_of, truth_of
+from fidsplat.selftest.agreement import Difference, FrameSpec, compare, reference_images, render, tolerance_of
 from fidsplat.selftest.arithmetic import Arithmetic, measure
 from fidsplat.selftest.case import Case, Finding
 from fidsplat.util.errors import DeviceError
@@ -139,7 +139,7 @@ def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tupl
     result = CaseResult(case)
     try:
         for found in case.run(renderer):
-            if isinstance(found, Picture):
+            if isinstance(found, FrameSpec):
                 result.pictures += 1
                 worst = _compared(renderer, found, result, worst)
             else:
@@ -152,8 +152,10 @@ def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tupl
     return result, worst
 
 
-def _compared(renderer: Renderer, picture: Picture, result: CaseResult, worst: Worst | None) -> Worst | None:
-    frame, truth = draw(renderer, picture), truth_of(picture)
+def _compared(
+    renderer: Renderer, picture: FrameSpec, result: CaseResult, worst: Worst | None
+) -> Worst | None:
+    frame, truth = render(renderer, picture), reference_images(picture)
     for difference in compare(frame, truth, picture.outputs):
         name = difference.output
         raise_to(result.uncertified, name, difference.uncertified)
@@ -171,7 +173,7 @@ def _compared(renderer: Renderer, picture: Picture, result: CaseResult, worst: W
     return worst
 
 
-def worst_picture(worst: Worst) -> np.ndarray:
+def worst_image(worst: Worst) -> np.ndarray:
     """Device, reference, difference and certificate side by side, (h, w, 3) uint8.
 
     The difference and the certificate are multiplied by a power of ten, so that they can be seen.

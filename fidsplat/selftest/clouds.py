@@ -28,7 +28,7 @@ def quaternion(tangent_u, tangent_v) -> np.ndarray:
     return matrix_to_quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
 
 
-def turned(axis, degrees: float) -> np.ndarray:
+def rotation(axis, degrees: float) -> np.ndarray:
     """Quaternion (4,) of a turn by an angle about an axis (3,)."""
     half = math.radians(degrees) / 2
     unit = np.asarray(axis, float) / np.linalg.norm(axis)
@@ -50,7 +50,7 @@ def splats(
     return SplatCloud(means, each(quats, 4), sizes, each(opacities), colors=each(colors, 3), **more)
 
 
-def taken(cloud: SplatCloud, index) -> SplatCloud:
+def subset_of(cloud: SplatCloud, index) -> SplatCloud:
     """The splats at an index array, in its order."""
     names = ("means", "quats", "scales", "opacities", "colors", "sh", "labels")
     arrays = {name: array[index] for name in names if (array := getattr(cloud, name)) is not None}

@@ -8,17 +8,17 @@ import numpy as np
 
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import log_uniform
-from fidsplat.selftest.agreement import ALL_OUTPUTS, CATALOGUED, Picture, draw
+from fidsplat.selftest.agreement import ALL_OUTPUTS, CATALOGUED, FrameSpec, render
 from fidsplat.selftest.case import Finding, Found, case
-from fidsplat.selftest.clouds import camera, splats, turned
+from fidsplat.selftest.clouds import camera, rotation, splats
 from fidsplat.splats.cloud import SplatCloud
 
 ALONG_Z = (1.0, 0.0, 0.0, 0.0)
 EXACT, EWA = CATALOGUED.with_(ellipsoid="exact"), CATALOGUED.with_(ellipsoid="ewa")
 
 
-def _picture(cloud: SplatCloud, quality=EXACT, **view) -> Picture:
-    return Picture(cloud, camera(**view), quality, ALL_OUTPUTS)
+def _picture(cloud: SplatCloud, quality=EXACT, **view) -> FrameSpec:
+    return FrameSpec(cloud, camera(**view), quality, ALL_OUTPUTS)
 
 
 def _spread(scales, seed: int) -> SplatCloud:
@@ -46,9 +46,9 @@ def g2(renderer: Renderer) -> Found:
     flat[:, 2] = 1e-6 * flat[:, :2].min(axis=1)
     thick = _picture(_spread(flat, 4))
     yield thick
-    yield _picture(splats([[0, 0, 2]], turned((1, 0, 0), 90), flat[:1]))
-    disks = Picture(thick.cloud.flattened(), thick.camera, EXACT, ALL_OUTPUTS)
-    error = draw(renderer, thick)["rgb"] - draw(renderer, disks)["rgb"]
+    yield _picture(splats([[0, 0, 2]], rotation((1, 0, 0), 90), flat[:1]))
+    disks = FrameSpec(thick.cloud.flattened(), thick.camera, EXACT, ALL_OUTPUTS)
+    error = render(renderer, thick)["rgb"] - render(renderer, disks)["rgb"]
     psnr = -10 * math.log10(max(float((error**2).mean()), 1e-20))
     yield Finding("80 dB less PSNR of flat 3D Gaussians against disks", 80 - psnr, 0)
 

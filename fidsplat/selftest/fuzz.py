@@ -21,7 +21,7 @@ from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import log_uniform
-from fidsplat.selftest.agreement import ALL_OUTPUTS, RARE, RISKY, Picture, compare, draw, truth_of
+from fidsplat.selftest.agreement import ALL_OUTPUTS, RARE, RISKY, FrameSpec, compare, reference_images, render
 from fidsplat.selftest.clouds import quaternion
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import quaternion_multiply, quaternion_to_matrix
@@ -43,7 +43,7 @@ SHARES = (0.5, 0.15, 0.15, 0.1, 0.1)
 _SAVE_EVERY = 5.0  # seconds
 
 
-def scene_of(seed: int) -> Picture:
+def scene_of(seed: int) -> FrameSpec:
     """The picture of a seed: 1 to 200 splats, at most 80 x 64 pixels, the camera anywhere."""
     generator = np.random.default_rng(seed)
     count = int(generator.integers(1, LARGEST_SCENE + 1))
@@ -95,7 +95,7 @@ def scene_of(seed: int) -> Picture:
     cx, cy = generator.uniform(-0.2, 1.2, 2) * [width, height]
     camera = Camera.pinhole(width, height, focal, focal, cx, cy, pose, near=near)
     quality = QUALITIES[int(generator.choice(len(QUALITIES), p=SHARES))]
-    return Picture(cloud, camera, quality, ALL_OUTPUTS)
+    return FrameSpec(cloud, camera, quality, ALL_OUTPUTS)
 
 
 def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:
@@ -174,9 +174,9 @@ class FuzzState:
     def add(self, seed: int, renderer: Renderer) -> None:
         """Draw the scene of the next seed and compare it."""
         picture = scene_of(seed)
-        truth = truth_of(picture)
+        truth = reference_images(picture)
         failed = False
-        for difference in compare(draw(renderer, picture), truth, ALL_OUTPUTS):
+        for difference in compare(render(renderer, picture), truth, ALL_OUTPUTS):
             name = difference.output
             failed |= not (difference.finite and difference.excess <= 0)
             errors = (self.uncertified, difference.uncertified), (self.largest, difference.error)

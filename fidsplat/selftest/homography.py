@@ -10,9 +10,16 @@ from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture, differing, draw, truth_of
+from fidsplat.selftest.agreement import (
+    ALL_OUTPUTS,
+    COLOR_TOLERANCE,
+    FrameSpec,
+    differing,
+    reference_images,
+    render,
+)
 from fidsplat.selftest.case import Finding, Found, case
-from fidsplat.selftest.clouds import camera, quaternion, splats, turned
+from fidsplat.selftest.clouds import camera, quaternion, rotation, splats
 from fidsplat.splats.cloud import SplatCloud
 
 WIDTH, HEIGHT, FOCAL = 8192, 5461, 6400.0
@@ -55,12 +62,12 @@ def grazing_errors(renderer: Renderer, tilt: float, sigma: int, quality: Quality
             quats.append(_tilted(generator, ray, tilt, flatness))
             scales.append(sigma * depth / FOCAL)
     cloud = splats(np.asarray(means, np.float32), quats, np.asarray(scales)[:, None])
-    picture = Picture(cloud, view, quality, ("rgb", "alpha"))
-    alpha = draw(renderer, picture)["alpha"]
+    picture = FrameSpec(cloud, view, quality, ("rgb", "alpha"))
+    alpha = render(renderer, picture)["alpha"]
     drawn = np.nonzero(alpha > 0)
     some = generator.permutation(len(drawn[0]))[:4000]
     drawn = drawn[0][some], drawn[1][some]
-    truth = truth_of(picture, drawn)["alpha"]
+    truth = reference_images(picture, drawn)["alpha"]
     errors = np.abs(alpha[drawn] - truth)[truth > 0.004]
     return errors
 
@@ -92,12 +99,12 @@ def b1(renderer: Renderer) -> Found:
             yield Finding("pixels missing of 500 to measure it in", max(0.0, 500 - len(errors)), 0)
 
 
-def _edge_on(angle: float) -> Picture:
+def _edge_on(angle: float) -> FrameSpec:
     """A splat seen from 3 m and `angle` radians beside its plane; its centre falls at (16.2, 12.4)."""
     position = 3 * math.sin(angle), 0.0, -3 * math.cos(angle)
     view = Camera.look_at(32, 24, 0.6, position, (0, 0, 0))
     moved = Camera.pinhole(32, 24, view.fx, view.fy, 16.2, 12.4, view.world_to_camera, position=position)
-    return Picture(splats([[0, 0, 0]], SIDE, 0.3, 0.9), moved, outputs=ALL_OUTPUTS)
+    return FrameSpec(splats([[0, 0, 0]], SIDE, 0.3, 0.9), moved, outputs=ALL_OUTPUTS)
 
 
 @case("B2", "edge-on", "0, 1e-7, 1e-4, 1e-2 rad beside the plane; steps of 1e-6")
@@ -105,9 +112,9 @@ def b2(renderer: Renderer) -> Found:
     for angle in (0.0, 1e-7, -1e-7, 1e-4, -1e-4, 1e-2, -1e-2):
         yield _edge_on(angle)
     # exactly edge-on, and the camera within the disk
-    yield Picture(splats([[0, 0, 3]], SIDE, 0.3, 0.9), camera(33, 25, 40.0), outputs=ALL_OUTPUTS)
-    yield Picture(splats([[0, 0, 0.5]], SIDE, 1.0, 0.9), camera(33, 25, 40.0), outputs=ALL_OUTPUTS)
-    frames = [draw(renderer, _edge_on(step * 1e-6)) for step in range(-12, 13)]
+    yield FrameSpec(splats([[0, 0, 3]], SIDE, 0.3, 0.9), camera(33, 25, 40.0), outputs=ALL_OUTPUTS)
+    yield FrameSpec(splats([[0, 0, 0.5]], SIDE, 1.0, 0.9), camera(33, 25, 40.0), outputs=ALL_OUTPUTS)
+    frames = [render(renderer, _edge_on(step * 1e-6)) for step in range(-12, 13)]
     alpha = np.stack([frame["alpha"] for frame in frames])
     finite = all(np.isfinite(frame[name]).all() for frame in frames for name in ALL_OUTPUTS)
     yield Finding("jump of alpha in steps of 1e-6 rad", float(np.abs(np.diff(alpha, axis=0)).max()), 1e-3)
@@ -119,15 +126,17 @@ def b2(renderer: Renderer) -> Found:
 @case("B3", "low-pass filter", "splats of 1e-4 px; a crowd at 50 to 200 m")
 def b3(renderer: Renderer) -> Found:
     crowd = random_splats(300, seed=6, depth=(50.0, 200.0), scale=(1e-4, 1e-2), across=60.0)
-    yield Picture(crowd, camera(), outputs=ALL_OUTPUTS)
-    yield Picture(splats([[0.01, 0.02, 4]], turned((1, 0, 0), 70), 0.03, 0.8), camera(), outputs=ALL_OUTPUTS)
+    yield FrameSpec(crowd, camera(), outputs=ALL_OUTPUTS)
+    yield FrameSpec(
+        splats([[0.01, 0.02, 4]], rotation((1, 0, 0), 70), 0.03, 0.8), camera(), outputs=ALL_OUTPUTS
+    )
     # A splat without extent is exp(-d^2) of its opacity, within its radius
     view = camera(31, 31, 100.0)
     error = 0.0
     rows, columns = np.mgrid[0:31, 0:31] + 0.5
     for x, y, opacity in ((15.5, 15.5, 1.0), (14.9, 16.2, 0.7), (16.0, 15.0, 0.05)):
         means = [[(x - view.cx) / 100, (y - view.cy) / 100, 1]]
-        alpha = draw(renderer, Picture(splats(means, AHEAD, 1e-7, opacity), view))["alpha"]
+        alpha = render(renderer, FrameSpec(splats(means, AHEAD, 1e-7, opacity), view))["alpha"]
         square = (columns - x) ** 2 + (rows - y) ** 2
         inside = square <= math.log(opacity / CUT)
         rim = np.abs(square - math.log(opacity / CUT)) < 1e-4  # where float32 centres decide
@@ -139,34 +148,34 @@ def b3(renderer: Renderer) -> Found:
 @case("B4", "depth of grazing and thin splats", "tilts of 60, 89, 89.99 and 90 deg")
 def b4(renderer: Renderer) -> Found:
     for degrees in (89.0, 89.99, 90.0):
-        cloud = splats([[0.1, 0.05, 4]], turned((0, 1, 0), degrees), (1e-3, 5e-3))
-        yield Picture(cloud, camera(), outputs=ALL_OUTPUTS)
+        cloud = splats([[0.1, 0.05, 4]], rotation((0, 1, 0), degrees), (1e-3, 5e-3))
+        yield FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS)
     # depth of a tilted wall against the plane's own, and no depth beyond the disk's
     view = camera()
-    wall = turned((0.3, 1, 0), 60)
+    wall = rotation((0.3, 1, 0), 60)
     cloud = splats([[0, 0, 5]], wall, 1.0)
     rows, columns = np.mgrid[0:80, 0:100] + 0.5
     rays = np.stack([(columns - view.cx) / view.fx, (rows - view.cy) / view.fy, np.ones_like(rows)], -1)
     w, x, y, z = cloud.quats[0].astype(float)
     normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     want = (normal @ [0, 0, 5]) / (rays @ normal)
-    depth = draw(renderer, Picture(cloud, view, outputs=("depth",)))["depth"]
+    depth = render(renderer, FrameSpec(cloud, view, outputs=("depth",)))["depth"]
     seen = depth > 0
     error = np.abs(depth / want - 1)[seen].max()
     yield Finding("relative depth error of a tilted plane", float(error), 1e-4)
-    needle = splats([[0.1, 0.05, 4]], turned((0, 1, 0), 89.99), (1e-3, 5e-3))
+    needle = splats([[0.1, 0.05, 4]], rotation((0, 1, 0), 89.99), (1e-3, 5e-3))
     reach = math.sqrt(2 * math.log(255)) * 5e-3
-    depth = draw(renderer, Picture(needle, view, outputs=("depth",)))["depth"]
+    depth = render(renderer, FrameSpec(needle, view, outputs=("depth",)))["depth"]
     yield Finding("depth beyond the disk's own [m]", float(depth.max()) - 4 - reach, 1e-5)
 
 
-def _shifted(shift: np.ndarray) -> Picture:
+def _shifted(shift: np.ndarray) -> FrameSpec:
     """A cloud about an origin and a camera beside it, both moved."""
     cloud = random_splats(150, seed=8, depth=(1.0, 6.0), scale=(1e-2, 0.5))
     origin, position, target = np.add(shift, ((0.5, -0.25, 2.0), (0.25, -0.125, -0.5), (0.75, 0.5, 6.0)))
     own = {"colors": cloud.colors, "labels": cloud.labels, "origin": origin}
     cloud = SplatCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, **own)
-    return Picture(cloud, Camera.look_at(100, 80, 1.0, position, target), outputs=ALL_OUTPUTS)
+    return FrameSpec(cloud, Camera.look_at(100, 80, 1.0, position, target), outputs=ALL_OUTPUTS)
 
 
 @case("B5", "far from the world's origin", "camera and cloud at (5e5, 4.5e6, 300) m")
@@ -176,8 +185,8 @@ def b5(renderer: Renderer) -> Found:
     near = _shifted(np.zeros(3)).cloud
     means = near.world_means() + SHIFT
     cloud = SplatCloud(means, near.quats, near.scales, near.opacities, colors=near.colors, labels=near.labels)
-    yield Picture(cloud, _shifted(SHIFT).camera, outputs=ALL_OUTPUTS)
-    here, there = (draw(renderer, _shifted(shift)) for shift in (np.zeros(3), SHIFT))
+    yield FrameSpec(cloud, _shifted(SHIFT).camera, outputs=ALL_OUTPUTS)
+    here, there = (render(renderer, _shifted(shift)) for shift in (np.zeros(3), SHIFT))
     changed = differing(here, there, ALL_OUTPUTS)
     yield Finding("pixels that change at (5e5, 4.5e6, 300) m", changed, 0)
 
@@ -186,9 +195,9 @@ def b5(renderer: Renderer) -> Found:
 def b6(renderer: Renderer) -> Found:
     means = [[-0.6, 0.1, 3], [0.0, -0.2, 3], [0.6, 0.3, 3], [0.2, 0.4, 2.5]]
     for scales in (1e-25, 1e-12, 1e-6, 1e4, 1e9):
-        yield Picture(splats(means, turned((1, 2, 3), 50), scales, 0.6), camera(), outputs=ALL_OUTPUTS)
+        yield FrameSpec(splats(means, rotation((1, 2, 3), 50), scales, 0.6), camera(), outputs=ALL_OUTPUTS)
     mixed = [[1e-25, 0.1], [0.1, 1e-30], [1e9, 1e-9], [1e-38, 1e-38]]
-    yield Picture(splats(means, turned((1, 2, 3), 50), mixed, 0.6), camera(), outputs=ALL_OUTPUTS)
+    yield FrameSpec(splats(means, rotation((1, 2, 3), 50), mixed, 0.6), camera(), outputs=ALL_OUTPUTS)
 
 
 @case("B7", "normals", "both sides of a splat")
@@ -196,13 +205,13 @@ def b7(renderer: Renderer) -> Found:
     for side in (-1.0, 1.0):
         cloud = random_splats(40, seed=9, depth=(-1.0, 1.0), scale=(0.05, 0.5), across=0.8)
         view = Camera.look_at(100, 80, 0.9, (0.3, -0.2, 4.0 * side), (0, 0, 0))
-        yield Picture(cloud, view, outputs=ALL_OUTPUTS)
+        yield FrameSpec(cloud, view, outputs=ALL_OUTPUTS)
     # seen from the other side the same splat has the opposite normal in the world
-    cloud = splats([[0, 0, 0]], turned((1, 0.5, 0.2), 35), 0.5)
+    cloud = splats([[0, 0, 0]], rotation((1, 0.5, 0.2), 35), 0.5)
     normals = []
     for side in (-1.0, 1.0):
         view = Camera.look_at(31, 31, 0.3, (0, 0, 3.0 * side), (0, 0, 0))
-        normal = draw(renderer, Picture(cloud, view, outputs=("normal",)))["normal"][15, 15]
+        normal = render(renderer, FrameSpec(cloud, view, outputs=("normal",)))["normal"][15, 15]
         towards = view.world_to_camera[:3, :3] @ (view.position / 3)
         yield Finding("normal away from the camera", -float(normal @ towards), 0)
         normals.append(view.world_to_camera[:3, :3].T @ normal)
@@ -216,12 +225,12 @@ def _centred() -> SplatCloud:
 @case("B8", "pixel centres", "odd sizes, 1 x 1; principal point outside; 3 x 3 samples")
 def b8(renderer: Renderer) -> Found:
     for width, height in ((1, 1), (7, 5), (33, 1), (101, 79)):
-        yield Picture(_centred(), camera(width, height, 30.0), outputs=ALL_OUTPUTS)
+        yield FrameSpec(_centred(), camera(width, height, 30.0), outputs=ALL_OUTPUTS)
     beside = camera(53, 31, 60.0, cx=-20.5, cy=44.25)
-    yield Picture(random_splats(80, seed=2), beside, outputs=ALL_OUTPUTS)
-    yield Picture(random_splats(60, seed=13), camera(47, 33, 40.0), Quality(samples=3), ALL_OUTPUTS)
+    yield FrameSpec(random_splats(80, seed=2), beside, outputs=ALL_OUTPUTS)
+    yield FrameSpec(random_splats(60, seed=13), camera(47, 33, 40.0), Quality(samples=3), ALL_OUTPUTS)
     # A splat on the axis of a camera of odd size is symmetric, bit for bit
-    frame = draw(renderer, Picture(_centred(), camera(101, 79, 30.0), outputs=("rgb", "depth")))
+    frame = render(renderer, FrameSpec(_centred(), camera(101, 79, 30.0), outputs=("rgb", "depth")))
     for name, turned_over in (("left and right", np.s_[:, ::-1]), ("top and bottom", np.s_[::-1])):
         mirrored = {key: image[turned_over] for key, image in frame.items()}
         yield Finding(f"pixels that differ {name}", differing(frame, mirrored, frame.outputs), 0)

@@ -15,15 +15,15 @@ from fidsplat.capture.quality import Quality
 from fidsplat.effects import select
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, CATALOGUED, Picture
+from fidsplat.selftest.agreement import ALL_OUTPUTS, CATALOGUED, FrameSpec
 from fidsplat.selftest.case import Finding, Found, case
-from fidsplat.selftest.clouds import camera, splats, taken, turned
+from fidsplat.selftest.clouds import camera, rotation, splats, subset_of
 from fidsplat.splats.cloud import SplatCloud
 
 NAN, INF = float("nan"), float("inf")
 DENORMAL = 1e-45
 VICTIM = 7
-"""index of the splat whose fields are spoilt"""
+"""index of the splat whose fields are corrupted"""
 VIEW = camera(60, 45, 48.0)
 
 BROKEN = {
@@ -47,12 +47,12 @@ ODD = {
 def crowd() -> SplatCloud:
     """Splats of which the victim covers the middle of the picture."""
     cloud = random_splats(40, 41, depth=(1.0, 5.0), scale=(0.03, 0.4), across=1.0)
-    victim = splats([[0.05, 0.02, 1.2]], turned((1, 1, 0), 30), (0.3, 0.2), 0.9, (0.2, 0.9, 0.4))
-    before, after = taken(cloud, np.arange(VICTIM)), taken(cloud, np.arange(VICTIM, len(cloud)))
+    victim = splats([[0.05, 0.02, 1.2]], rotation((1, 1, 0), 30), (0.3, 0.2), 0.9, (0.2, 0.9, 0.4))
+    before, after = subset_of(cloud, np.arange(VICTIM)), subset_of(cloud, np.arange(VICTIM, len(cloud)))
     return SplatCloud.concatenate([before, victim, after])
 
 
-def spoilt(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
+def corrupted(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
     """The cloud from arrays in which fields of the victim have other values; it may be left out."""
     arrays = {name: getattr(cloud, name).copy() for name in BROKEN}
     for name, value in changes.items():
@@ -89,16 +89,16 @@ def e1(renderer: Renderer) -> Found:
             field = np.array(getattr(cloud, name)[VICTIM])
             field[0 if field.ndim else ()] = value
             outputs = ALL_OUTPUTS if name == "scales" else ("rgb", "alpha")
-            yield Picture(spoilt(cloud, {name: field}), VIEW, outputs=outputs)
-    yield Picture(spoilt(cloud, {"scales": DENORMAL}), VIEW, outputs=ALL_OUTPUTS)
-    yield Picture(spoilt(cloud, {"means": (0.0, 0.0, 1e15), "scales": 1e15}), VIEW)
-    yield Picture(spoilt(cloud, {"means": (1e15, -1e15, 1e15)}), VIEW)
+            yield FrameSpec(corrupted(cloud, {name: field}), VIEW, outputs=outputs)
+    yield FrameSpec(corrupted(cloud, {"scales": DENORMAL}), VIEW, outputs=ALL_OUTPUTS)
+    yield FrameSpec(corrupted(cloud, {"means": (0.0, 0.0, 1e15), "scales": 1e15}), VIEW)
+    yield FrameSpec(corrupted(cloud, {"means": (1e15, -1e15, 1e15)}), VIEW)
     cloud = crowd()
-    without = taken(cloud, np.delete(np.arange(len(cloud)), VICTIM))
+    without = subset_of(cloud, np.delete(np.arange(len(cloud)), VICTIM))
     wanted = renderer.render(without, VIEW, ALL_OUTPUTS)
     different = miscounted = tried = 0
     for _, changes in broken_fields(cloud):
-        bad = spoilt(cloud, changes)
+        bad = corrupted(cloud, changes)
         frame = renderer.render(bad, VIEW, ALL_OUTPUTS)
         same = all(np.array_equal(frame[name], wanted[name]) for name in ALL_OUTPUTS)
         different += not same
@@ -124,12 +124,12 @@ def e2(renderer: Renderer) -> Found:
         offset = pixels / VIEW.fx * depth
         means = np.column_stack([offset * np.cos(angle), offset * np.sin(angle), depth])
         scales = offset[:, None] / generator.uniform(0.4, 3.4, (n, 2))
-        quats = [turned((0, 0, 1), degrees) for degrees in generator.uniform(0, 180, n)]
+        quats = [rotation((0, 0, 1), degrees) for degrees in generator.uniform(0, 180, n)]
         colors = generator.uniform(0, 1, (n, 3))
-        yield Picture(splats(means, quats, scales, generator.uniform(0.3, 1.0, n), colors), VIEW)
+        yield FrameSpec(splats(means, quats, scales, generator.uniform(0.3, 1.0, n), colors), VIEW)
     # the same far ahead: a centre that projects to 1e6 pixels and more because its depth is next to nothing
     means = np.column_stack([generator.uniform(-2, 2, (40, 2)), 10 ** generator.uniform(-7, -1, 40)])
-    yield Picture(
+    yield FrameSpec(
         splats(means, generator.normal(size=(40, 4)), (0.5, 0.8), 0.8), camera(60, 45, 48.0, near=1e-8)
     )
     # off the picture by 2 pixels to 1e15: no tile has them, and no edge tile is one off
@@ -205,10 +205,10 @@ def sized(width: int, height: int) -> Camera:
 def e4(renderer: Renderer) -> Found:
     cloud = random_splats(12, 44, depth=(1.0, 4.0), scale=(0.05, 0.6), across=0.8)
     for width, height in SIZES:
-        yield Picture(cloud, sized(width, height))
+        yield FrameSpec(cloud, sized(width, height))
     dot = splats([[0.0, 0.0, 2.0]], (1, 0, 0, 0), (1e-3, 1e-3))
-    yield Picture(dot, sized(160, 120))  # one pair, many tiles
-    yield Picture(dot, sized(160, 120), outputs=ALL_OUTPUTS)
+    yield FrameSpec(dot, sized(160, 120))  # one pair, many tiles
+    yield FrameSpec(dot, sized(160, 120), outputs=ALL_OUTPUTS)
     nothing = SplatCloud.empty()
     behind = splats([[0.0, 0.0, -3.0]], (1, 0, 0, 0), (0.1, 0.1))
     clear = splats([[0.0, 0.0, 2.0]], (1, 0, 0, 0), (0.1, 0.1), 0.0)

@@ -17,14 +17,14 @@ from fidsplat.selftest.agreement import (
     ALL_OUTPUTS,
     COLOR_TOLERANCE,
     CULLED,
-    Picture,
+    FrameSpec,
     differing,
-    draw,
     out_of_order,
+    render,
     trace,
 )
 from fidsplat.selftest.case import Finding, Found, case
-from fidsplat.selftest.clouds import camera, quaternion, splats, taken, turned
+from fidsplat.selftest.clouds import camera, quaternion, rotation, splats, subset_of
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import quaternion_to_matrix
 
@@ -58,7 +58,7 @@ def wall(count: int = 2000, away: float = 0.05, seed: int = 1) -> SplatCloud:
     return splats(means.astype(np.float32), (1, 0, 0, 0), scales, 0.9, grey)
 
 
-def turning(
+def camera_path(
     cloud: SplatCloud,
     order: str,
     steps: int = 8,
@@ -66,7 +66,7 @@ def turning(
     width: int = 96,
     height: int = 80,
     step: float = STEP,
-) -> Iterator[Picture]:
+) -> Iterator[FrameSpec]:
     """Pictures of a tag 1 m wide from 1.6 m, the camera turning about it in steps of `step` radians.
 
     It goes round it and rises with it, and is level with its middle halfway. tilt: degrees about the vertical
@@ -78,10 +78,10 @@ def turning(
         round_it, level = math.radians(tilt) + rise, 1.6 * math.cos(rise)
         position = -level * math.sin(round_it), -1.6 * math.sin(rise), -level * math.cos(round_it)
         camera = Camera.look_at(width, height, 0.8, position, (0, 0, 0))
-        yield Picture(cloud, camera, quality, ("rgb",))
+        yield FrameSpec(cloud, camera, quality, ("rgb",))
 
 
-def beside_a_big_splat(where: str) -> tuple[SplatCloud, SplatCloud]:
+def tag_and_large_splat(where: str) -> tuple[SplatCloud, SplatCloud]:
     """A tag, and a big slanted splat `before` it, `behind` it or `through` it. By its centre alone it would
     be on the other side.
     """
@@ -92,7 +92,7 @@ def beside_a_big_splat(where: str) -> tuple[SplatCloud, SplatCloud]:
     return tag(6), big
 
 
-def layered(
+def composited_parts(
     renderer: Renderer, parts: Sequence[SplatCloud], camera: Camera, order: str = "auto"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Clouds of one plane or one splat each, drawn together, and composited pixel by pixel from pictures of
@@ -101,8 +101,8 @@ def layered(
     # with a cut-off above 1/255 all that is drawn has a depth
     quality = Quality(alpha_cutoff=1 / 250, transmittance_stop=0.0, order=order)
     # more outputs than are looked at: with these the kernels are compiled anyway
-    alone = [draw(renderer, Picture(part, camera, quality, ALL_OUTPUTS, (0, 0, 0))) for part in parts]
-    whole = Picture(SplatCloud.concatenate(parts), camera, quality, ALL_OUTPUTS, (0, 0, 0))
+    alone = [render(renderer, FrameSpec(part, camera, quality, ALL_OUTPUTS, (0, 0, 0))) for part in parts]
+    whole = FrameSpec(SplatCloud.concatenate(parts), camera, quality, ALL_OUTPUTS, (0, 0, 0))
     rgb, alpha, depth = (np.stack([frame[name] for frame in alone]) for name in ("rgb", "alpha", "depth"))
     ranks = np.argsort(np.where(alpha > 0, depth, np.inf), axis=0)
     light, wanted = np.ones(alpha.shape[1:]), np.zeros(rgb.shape[1:])
@@ -113,35 +113,35 @@ def layered(
     ranked = np.sort(np.where(alpha > 0, depth, np.inf), axis=0)
     with np.errstate(invalid="ignore"):
         clear = 1.0 - np.any(np.diff(ranked, axis=0) < 1e-4, axis=0)[..., None]
-    return draw(renderer, whole)["rgb"] * clear, wanted * clear
+    return render(renderer, whole)["rgb"] * clear, wanted * clear
 
 
-def faint_between(opacity: float) -> Picture:
+def faint_between(opacity: float) -> FrameSpec:
     """A black and a white splat on a plane tilted by 40 degrees, and a faint one of no plane whose centre's
     depth lies between those of theirs.
     """
-    turn = turned((0, 1, 0), 40)
+    turn = rotation((0, 1, 0), 40)
     along = quaternion_to_matrix(turn)[:, 0]
     means = [(0, 0, 2) - 0.1 * along, (0, 0, 2) + 0.1 * along, (0, 0, 2)]
     colors = [(0, 0, 0), (1, 1, 1), (0.5, 0.5, 0.5)]
     cloud = splats(means, turn, 0.15, [0.9, 0.9, opacity], colors).with_coplanar_groups([0, 0, -1])
-    return Picture(cloud, Camera.pinhole(33, 33, 60.0, 60.0, 16.5, 16.5), outputs=("rgb",))
+    return FrameSpec(cloud, Camera.pinhole(33, 33, 60.0, 60.0, 16.5, 16.5), outputs=("rgb",))
 
 
-def largest_jump(renderer: Renderer, pictures: Iterator[Picture]) -> tuple[float, np.ndarray, np.ndarray]:
+def largest_jump(renderer: Renderer, pictures: Iterator[FrameSpec]) -> tuple[float, np.ndarray, np.ndarray]:
     """Largest change of a pixel from one picture to the next, and the two pictures (h, w, 3)."""
     worst = -1.0, np.zeros(0), np.zeros(0)
     last = None
     for picture in pictures:
-        rgb = draw(renderer, picture)["rgb"]
+        rgb = render(renderer, picture)["rgb"]
         if last is not None and (jump := float(np.abs(rgb - last).max())) > worst[0]:
             worst = jump, last, rgb
         last = rgb
     return worst
 
 
-def fronto_parallel(away: float, count: int = 200) -> Picture:
-    """Splats at depth 5 facing a camera that is turned, `away` metres from the origin: many tie."""
+def fronto_parallel(away: float, count: int = 200) -> FrameSpec:
+    """Splats at depth 5 facing a camera that is rotation, `away` metres from the origin: many tie."""
     generator = np.random.default_rng(int(away) + 1)
     turn = generator.normal(size=4)
     turn /= np.linalg.norm(turn)
@@ -152,41 +152,43 @@ def fronto_parallel(away: float, count: int = 200) -> Picture:
     facing = turn * [1, -1, -1, -1]
     grey = np.repeat(generator.integers(0, 2, (count, 1)), 3, axis=1)
     world = (means @ pose[:3, :3]).astype(np.float32)
-    return Picture(splats(world, facing, 0.25, 0.9, grey), camera(world_to_camera=pose), outputs=ALL_OUTPUTS)
+    return FrameSpec(
+        splats(world, facing, 0.25, 0.9, grey), camera(world_to_camera=pose), outputs=ALL_OUTPUTS
+    )
 
 
 def crossing_tags() -> list[SplatCloud]:
     """Two tilted tags that cross."""
     pose = np.eye(4)
-    pose[:3, :3] = quaternion_to_matrix(turned((0.2, 1, 0), 50))
+    pose[:3, :3] = quaternion_to_matrix(rotation((0.2, 1, 0), 50))
     return [tag(6), tag(6, seed=1).transformed(pose)]
 
 
-def _tilted_planes(quality: Quality) -> Picture:
+def _tilted_planes(quality: Quality) -> FrameSpec:
     """Two tags that cross, and splats of no plane between."""
     others = random_splats(30, seed=10, depth=(-0.6, 0.6), scale=(0.02, 0.2), across=0.6)
     cloud = SplatCloud.concatenate([*crossing_tags(), others])
     view = Camera.look_at(100, 80, 0.8, (0.9, -0.4, -1.4), (0, 0, 0))
-    return Picture(cloud, view, quality, ALL_OUTPUTS)
+    return FrameSpec(cloud, view, quality, ALL_OUTPUTS)
 
 
-def _three_tags() -> Picture:
+def _three_tags() -> FrameSpec:
     """Three tags that cross, and splats of no plane between."""
     pose = np.eye(4)
-    pose[:3, :3] = quaternion_to_matrix(turned((1, 0.3, 0), -35))
+    pose[:3, :3] = quaternion_to_matrix(rotation((1, 0.3, 0), -35))
     pose[2, 3] = 0.1
     others = random_splats(30, seed=13, depth=(-0.6, 0.6), scale=(0.02, 0.2), across=0.6)
     cloud = SplatCloud.concatenate([*crossing_tags(), others, tag(6, seed=2).transformed(pose)])
-    return Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
+    return FrameSpec(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
 
 
-def before_a_wall(count: int) -> SplatCloud:
+def tag_before_wall(count: int) -> SplatCloud:
     """A tag 5 cm before a wall of splats of no plane."""
     return SplatCloud.concatenate([tag(), wall(count)])
 
 
 def _shuffled(cloud: SplatCloud) -> SplatCloud:
-    return taken(cloud, np.random.default_rng(3).permutation(len(cloud)))
+    return subset_of(cloud, np.random.default_rng(3).permutation(len(cloud)))
 
 
 def _c1_order(renderer: Renderer) -> Iterator[Finding]:
@@ -201,31 +203,31 @@ def _c1_order(renderer: Renderer) -> Iterator[Finding]:
 
     cloud = tag()
     yield Finding(
-        "jump of a tag in steps of 1e-4 deg", largest_jump(renderer, turning(cloud, "auto", 2))[0], SMOOTH
+        "jump of a tag in steps of 1e-4 deg", largest_jump(renderer, camera_path(cloud, "auto", 2))[0], SMOOTH
     )
-    tilted = next(turning(before_a_wall(150), "auto", 0, 30))
+    tilted = next(camera_path(tag_before_wall(150), "auto", 0, 30))
     for what, picture in (
-        ("a tag's splats", next(turning(cloud, "auto", 0))),
+        ("a tag's splats", next(camera_path(cloud, "auto", 0))),
         ("a tag's splats among others", tilted),
     ):
-        again = Picture(_shuffled(picture.cloud), picture.camera, picture.quality, ("rgb",))
-        change = np.abs(draw(renderer, again)["rgb"] - draw(renderer, picture)["rgb"]).max()
+        again = FrameSpec(_shuffled(picture.cloud), picture.camera, picture.quality, ("rgb",))
+        change = np.abs(render(renderer, again)["rgb"] - render(renderer, picture)["rgb"]).max()
         yield Finding(f"change when {what} are re-ordered", float(change), COLOR_TOLERANCE)
 
 
 def _c1_layers(renderer: Renderer) -> Iterator[Finding]:
     for tilt in (0.0, 30.0, 60.0):
-        jump = largest_jump(renderer, turning(before_a_wall(150), "auto", 2, tilt))[0]
+        jump = largest_jump(renderer, camera_path(tag_before_wall(150), "auto", 2, tilt))[0]
         yield Finding(f"jump of a tag before a wall, {tilt:g} deg", jump, SMOOTH)
     # a splat that is just drawn, and one that is just not, with its own opacity between
-    with_it, without = (draw(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
+    with_it, without = (render(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
     change = float(np.abs(with_it - without).max())
     yield Finding("change when a faint splat comes between", change, 1.01 / 255)
     for title, parts in (
-        *((f"tag with a big splat {side} it", beside_a_big_splat(side)) for side in SIDES),
+        *((f"tag with a big splat {side} it", tag_and_large_splat(side)) for side in SIDES),
         ("tags that cross", crossing_tags()),
     ):
-        got, wanted = layered(renderer, parts, ON_TAGS)
+        got, wanted = composited_parts(renderer, parts, ON_TAGS)
         yield Finding(f"{title}, from pictures of each", float(np.abs(got - wanted).max()), COLOR_TOLERANCE)
 
 
@@ -237,15 +239,15 @@ def c1(renderer: Renderer) -> Found:
     yield _tilted_planes(Quality(order="centre"))
     yield _three_tags()
     for side in SIDES:
-        cloud = SplatCloud.concatenate(beside_a_big_splat(side))
-        yield Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
-    at_wall = next(turning(before_a_wall(150), "auto", 0, 30))
-    yield Picture(at_wall.cloud, at_wall.camera, outputs=ALL_OUTPUTS)
+        cloud = SplatCloud.concatenate(tag_and_large_splat(side))
+        yield FrameSpec(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
+    at_wall = next(camera_path(tag_before_wall(150), "auto", 0, 30))
+    yield FrameSpec(at_wall.cloud, at_wall.camera, outputs=ALL_OUTPUTS)
     yield from _c1_order(renderer)
     yield from _c1_layers(renderer)
 
 
-def _keys_and_order(renderer: Renderer, picture: Picture) -> tuple[int, int]:
+def _keys_and_order(renderer: Renderer, picture: FrameSpec) -> tuple[int, int]:
     """How many keys are not their splat's depth to 2 ulp, and how many splats stand where they should not."""
     traced = trace(renderer, picture)
     view = view_of(picture.capture, picture.cloud.origin)
@@ -263,7 +265,7 @@ def _keys_and_order(renderer: Renderer, picture: Picture) -> tuple[int, int]:
     return int(off.sum()), out_of_order(traced, wanted)
 
 
-def _depths(values) -> Picture:
+def _depths(values) -> FrameSpec:
     """Splats that cover the middle at these depths, in shuffled order; half of them show."""
     generator = np.random.default_rng(11)
     depths = generator.permutation(np.asarray(values, np.float32))
@@ -272,10 +274,10 @@ def _depths(values) -> Picture:
     quats = generator.normal(size=(len(depths), 4))
     scales = np.maximum(np.abs(depths), 0.3)[:, None]
     colors = generator.random((len(depths), 3))
-    return Picture(splats(means, quats, scales, 0.5, colors), camera(), outputs=ALL_OUTPUTS)
+    return FrameSpec(splats(means, quats, scales, 0.5, colors), camera(), outputs=ALL_OUTPUTS)
 
 
-def _key_pictures() -> Iterator[Picture]:
+def _key_pictures() -> Iterator[FrameSpec]:
     ulp = np.float32(5) + np.arange(12, dtype=np.float32) * np.spacing(np.float32(5))
     yield _depths(ulp)  # neighbours of float32
     yield _depths([-2.0, -1.0, -0.5, -1e-3, -0.0, 0.0, 1e-3, 0.5, 1.0])  # centres behind the camera
@@ -295,18 +297,18 @@ def c2(renderer: Renderer) -> Found:
 
 @case("C3", "the same bits every time", "300 splats, again and in other tiles")
 def c3(renderer: Renderer) -> Found:
-    picture = Picture(random_splats(300, seed=12), camera(), outputs=ALL_OUTPUTS)
-    first = draw(renderer, picture)
+    picture = FrameSpec(random_splats(300, seed=12), camera(), outputs=ALL_OUTPUTS)
+    first = render(renderer, picture)
     kept = {name: first[name].copy() for name in first}
-    changed = max(differing(kept, draw(renderer, picture), ALL_OUTPUTS) for _ in range(3))
+    changed = max(differing(kept, render(renderer, picture), ALL_OUTPUTS) for _ in range(3))
     yield Finding("pixels that change when drawn again", changed, 0)
     if isinstance(renderer.backend, Reshapes):
         tiles = next(iter(renderer.backend.shapes("tiles").values()))
         changed = differing(kept, trace(renderer, picture, tiles), ALL_OUTPUTS)
         yield Finding("pixels that change in other tiles", changed, 0)
-    plain = Picture(taken(picture.cloud, np.arange(300)), picture.camera, outputs=("rgb",))
+    plain = FrameSpec(subset_of(picture.cloud, np.arange(300)), picture.camera, outputs=("rgb",))
     yield Finding(
-        "pixels that change without other outputs", differing(kept, draw(renderer, plain), ("rgb",)), 0
+        "pixels that change without other outputs", differing(kept, render(renderer, plain), ("rgb",)), 0
     )
 
 
@@ -318,23 +320,25 @@ def crossing(count: int = 120) -> SplatCloud:
 def fan(count: int = 40, seed: int = 5) -> SplatCloud:
     """Splats 2 m wide that all pass through one line, 3 m away: each is in front of every other somewhere."""
     generator = np.random.default_rng(seed)
-    quats = np.array([turned((0, 1, 0), angle) for angle in np.linspace(-75, 75, count)])
+    quats = np.array([rotation((0, 1, 0), angle) for angle in np.linspace(-75, 75, count)])
     means = np.tile([0.0, 0.0, 3.0], (count, 1))
     return splats(means, quats, (0.35, 0.5), generator.uniform(0.1, 0.9, count), generator.random((count, 3)))
 
 
-def _pixel_pictures() -> Iterator[Picture]:
+def _pixel_pictures() -> Iterator[FrameSpec]:
     by_pixel = Quality(order="pixel")
-    yield Picture(crossing(), camera(), by_pixel, ALL_OUTPUTS)
-    yield Picture(fan(), camera(), by_pixel, ALL_OUTPUTS)
-    yield Picture(crossing(60), Camera.fisheye(90, 70, math.radians(160)), by_pixel, ALL_OUTPUTS)
+    yield FrameSpec(crossing(), camera(), by_pixel, ALL_OUTPUTS)
+    yield FrameSpec(fan(), camera(), by_pixel, ALL_OUTPUTS)
+    yield FrameSpec(crossing(60), Camera.fisheye(90, 70, math.radians(160)), by_pixel, ALL_OUTPUTS)
     yield _tilted_planes(Quality())
-    yield Picture(SplatCloud.concatenate([fan(), tag().transformed(_ahead())]), camera(), outputs=ALL_OUTPUTS)
+    yield FrameSpec(
+        SplatCloud.concatenate([fan(), tag().transformed(_ahead())]), camera(), outputs=ALL_OUTPUTS
+    )
 
 
 def _ahead() -> np.ndarray:
     pose = np.eye(4)
-    pose[:3, :3] = quaternion_to_matrix(turned((0.3, 1, 0), 30))
+    pose[:3, :3] = quaternion_to_matrix(rotation((0.3, 1, 0), 30))
     pose[2, 3] = 2.9
     return pose
 
@@ -343,10 +347,10 @@ def _ahead() -> np.ndarray:
 def c4(renderer: Renderer) -> Found:
     yield from _pixel_pictures()
     # an edge along which two splats cross may pass over a few pixels
-    _, before, after = largest_jump(renderer, turning(crossing(), "pixel", 2))
+    _, before, after = largest_jump(renderer, camera_path(crossing(), "pixel", 2))
     jumped = float((np.abs(after - before).max(2) > SMOOTH).mean())
     yield Finding("share of pixels that jump where splats cross, 1e-4 deg", jumped, 1e-3)
-    picture = Picture(crossing(), camera(), Quality(order="pixel"), ("rgb",))
-    again = Picture(_shuffled(picture.cloud), picture.camera, picture.quality, ("rgb",))
-    change = np.abs(draw(renderer, again)["rgb"] - draw(renderer, picture)["rgb"]).max()
+    picture = FrameSpec(crossing(), camera(), Quality(order="pixel"), ("rgb",))
+    again = FrameSpec(_shuffled(picture.cloud), picture.camera, picture.quality, ("rgb",))
+    change = np.abs(render(renderer, again)["rgb"] - render(renderer, picture)["rgb"]).max()
     yield Finding("change when they are shuffled", float(change), COLOR_TOLERANCE)

@@ -8,7 +8,7 @@ from test_agreement import coplanar_cloud
 
 import fidsplat as fs
 from fidsplat.effects import select
-from fidsplat.selftest.agreement import Picture, differing, trace
+from fidsplat.selftest.agreement import FrameSpec, differing, trace
 from fidsplat.selftest.arithmetic import BOUNDS, worst
 
 CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -89,7 +89,7 @@ def test_faint_fragments_stay_faint(renderer):
 @in_turn(1)
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_both_schedules_draw_the_same_bits(renderer, cloud):
-    picture = Picture(cloud, CAMERA, FAST, ALL_OUTPUTS)
+    picture = FrameSpec(cloud, CAMERA, FAST, ALL_OUTPUTS)
     own, other = (
         trace(renderer, picture),
         trace(renderer, picture, renderer.backend.shapes("schedule")["groups"]),

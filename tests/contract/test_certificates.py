@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from agreement import random_splats, truth_of
+from agreement import random_splats, reference_images
 from test_agreement import coplanar_cloud
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
-from fidsplat.selftest.agreement import RARE, RISKY, Picture, compare
+from fidsplat.selftest.agreement import RARE, RISKY, FrameSpec, compare
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0, 0, -0.1), (0, 0, 3.0))
 MARKED = fs.Camera.look_at(81, 59, 0.7, (0.8, -0.3, -1.6), (0, 0, 0))
@@ -27,7 +27,7 @@ SCENES = {
 def test_certificates_leave_little_open(name):
     """Nine pixels of ten are held to the tolerance of colours alone; decisions that may turn out otherwise
     (where is half of the light, what is heaviest) are a matter of one in forty."""
-    truth = truth_of(Picture(*SCENES[name], fs.Quality(), tuple(OUTPUTS)))
+    truth = reference_images(FrameSpec(*SCENES[name], fs.Quality(), tuple(OUTPUTS)))
     bound = truth["certificate"]
     assert np.median(bound) < 1e-5
     assert (bound > 2e-5).mean() < 0.1
@@ -46,7 +46,7 @@ def test_certificates_leave_little_open(name):
 @pytest.mark.parametrize("output", OUTPUTS)
 def test_one_wrong_pixel_is_named(output):
     """By a thousandth of a colour, of a normal's length or of a depth; by one label, index or fragment."""
-    truth = truth_of(Picture(AROUND, CAMERA, fs.Quality(), tuple(OUTPUTS)))
+    truth = reference_images(FrameSpec(AROUND, CAMERA, fs.Quality(), tuple(OUTPUTS)))
     images = {name: truth[name].astype(OUTPUTS[name].dtype) for name in OUTPUTS}
     assert all(difference.agrees for difference in compare(images, truth, OUTPUTS))
     sure = (truth["certificate"] < 1e-5) & (truth["certificate_normal"] < 2e-4) & (truth["depth_first"] > 0)

@@ -12,7 +12,7 @@ import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
-from fidsplat.selftest.agreement import Picture, compare
+from fidsplat.selftest.agreement import FrameSpec, compare
 
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
@@ -52,7 +52,7 @@ def turning(time):
 
 
 def assert_agrees(renderer, **picture):
-    differences = against_reference(renderer, Picture(**{"cloud": CLOUD, **picture}))
+    differences = against_reference(renderer, FrameSpec(**{"cloud": CLOUD, **picture}))
     assert all(difference.agrees for difference in differences), differences
 
 

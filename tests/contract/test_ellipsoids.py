@@ -12,7 +12,7 @@ import fidsplat as fs
 from fidsplat.capture.quality import ELLIPSOID
 from fidsplat.scenes.random_clouds import log_uniform
 from fidsplat.selftest import fuzz
-from fidsplat.selftest.agreement import RARE, Picture
+from fidsplat.selftest.agreement import RARE, FrameSpec
 
 CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
 
@@ -144,7 +144,7 @@ def test_a_flat_ellipsoid_is_a_disk(renderer):
 REST = pytest.param(range(6, 1000), marks=pytest.mark.exhaustive)
 
 
-def thick_scene_of(seed: int) -> Picture:
+def thick_scene_of(seed: int) -> FrameSpec:
     """The same with 3D Gaussians for most splats of no plane, drawn in one of the ways: a third standard
     deviation from 1e-6 of the first two, needles and balls among them, to 100 times as large. No two splats
     of no plane have one depth: by nothing else are they ordered, as EWA draws them."""

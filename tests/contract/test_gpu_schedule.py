@@ -8,7 +8,7 @@ import multiprocessing
 
 import numpy as np
 import pytest
-from agreement import random_splats, truth_of
+from agreement import random_splats, reference_images
 from optimisation import hardly
 from sampling import in_turn
 from test_lens_pictures import CAMERAS
@@ -16,7 +16,7 @@ from test_lens_pictures import CAMERAS
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.effects import OUTPUTS
-from fidsplat.selftest.agreement import Picture, compare
+from fidsplat.selftest.agreement import FrameSpec, compare
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 EVERYTHING = tuple(OUTPUTS)
@@ -44,18 +44,18 @@ def scene_of_layers():
 
 
 PICTURES = {
-    "layers": lambda: Picture(scene_of_layers(), CAMERA, outputs=EVERYTHING, fog=fs.Fog(0.3)),
-    "boxes": lambda: Picture(AROUND.with_boxes(), CAMERA, outputs=("rgb", "depth_first", "blended")),
-    "pixel": lambda: Picture(
+    "layers": lambda: FrameSpec(scene_of_layers(), CAMERA, outputs=EVERYTHING, fog=fs.Fog(0.3)),
+    "boxes": lambda: FrameSpec(AROUND.with_boxes(), CAMERA, outputs=("rgb", "depth_first", "blended")),
+    "pixel": lambda: FrameSpec(
         AROUND, CAMERA, fs.Quality(lowpass="pixel", samples=2), background=fs.Gradient((0, 0, 1), (1, 0, 0))
     ),
-    "3D Gaussians, exact": lambda: Picture(
+    "3D Gaussians, exact": lambda: FrameSpec(
         fs.SplatCloud.concatenate([THICK, MIXED]), CAMERA, fs.Quality(ellipsoid="exact"), ("rgb", "depth")
     ),
-    "3D Gaussians": lambda: Picture(THICK, CAMERA, outputs=("rgb", "depth")),
-    "gsplat": lambda: Picture(AROUND, CAMERA, fs.Quality.of("gsplat"), outputs=EVERYTHING),
+    "3D Gaussians": lambda: FrameSpec(THICK, CAMERA, outputs=("rgb", "depth")),
+    "gsplat": lambda: FrameSpec(AROUND, CAMERA, fs.Quality.of("gsplat"), outputs=EVERYTHING),
     **{
-        name: lambda camera=CAMERAS[name]: Picture(MIXED, camera, outputs=EVERYTHING, fog=fs.Fog(0.3))
+        name: lambda camera=CAMERAS[name]: FrameSpec(MIXED, camera, outputs=EVERYTHING, fog=fs.Fog(0.3))
         for name in ("fisheye 200", "distortion", "panorama", "parallel")
     },
 }
@@ -71,7 +71,7 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
         backend.upload(cloud), view
     )
     drawn = {output: images.read(output) for output in picture.outputs}
-    differences = compare(drawn, truth_of(picture), picture.outputs)
+    differences = compare(drawn, reference_images(picture), picture.outputs)
     assert all(difference.agrees for difference in differences), differences
     assert drawn["rgb"].std() > 0.05
 

@@ -13,7 +13,7 @@ from test_agreement import coplanar_cloud
 import fidsplat as fs
 from fidsplat.backends.view import View
 from fidsplat.cameras import BrownConrady, Fisheye
-from fidsplat.selftest.agreement import Picture
+from fidsplat.selftest.agreement import FrameSpec
 from fidsplat.splats.rotations import matrix_to_quaternion
 
 POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, 0.2, -0.1), (0.1, 0.0, 3.0)).world_to_camera
@@ -199,7 +199,7 @@ def test_outside_the_lens_is_background(renderer):
 
 @pytest.mark.parametrize("name", ["fold", "fisheye 200"])
 def test_where_a_lens_sees_nothing_there_is_no_distance_and_no_gradient(renderer, name):
-    picture = Picture(
+    picture = FrameSpec(
         random_splats(60, 3, depth=(1.0, 4.0)),
         CAMERAS[name],
         fs.Quality(samples=2),

@@ -13,7 +13,7 @@ from sampling import SAMPLES, alternate, in_turn
 import fidsplat as fs
 from fidsplat.backends.reference.post import variates
 from fidsplat.backends.view import View
-from fidsplat.selftest.agreement import Picture
+from fidsplat.selftest.agreement import FrameSpec
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 IN_FOG = ("rgb", "alpha", "depth", "distance")
@@ -44,12 +44,12 @@ SENSORS = {
 @in_turn()
 @pytest.mark.parametrize("name", SENSORS)
 def test_steps_of_the_sensor(renderer, name):
-    agree(renderer, Picture(CLOUD, CAMERA, outputs=("rgb",), sensor=SENSORS[name]))
+    agree(renderer, FrameSpec(CLOUD, CAMERA, outputs=("rgb",), sensor=SENSORS[name]))
 
 
 @pytest.mark.parametrize("name", ["all", "vignetting"])
 def test_the_sensor_sees_pixels_not_samples(renderer, name):
-    agree(renderer, Picture(CLOUD, CAMERA, fs.Quality(samples=2), sensor=SENSORS[name]))
+    agree(renderer, FrameSpec(CLOUD, CAMERA, fs.Quality(samples=2), sensor=SENSORS[name]))
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_fog(renderer, density, samples):
     )
     fog = fs.Fog(density, (0.6, 0.7, 0.8))
     for cloud in (CLOUD, fs.SplatCloud.concatenate([tag, random_splats(30, 4)])):
-        agree(renderer, Picture(cloud, CAMERA, fs.Quality(samples=samples), IN_FOG, fog=fog))
+        agree(renderer, FrameSpec(cloud, CAMERA, fs.Quality(samples=samples), IN_FOG, fog=fog))
 
 
 SKIES = {"gradient": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), "panorama": panorama()}
@@ -71,7 +71,7 @@ SKIES = {"gradient": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3
 def test_backgrounds(renderer, background, samples):
     for target in ((0.0, 0.1, 3.0), (0.0, 0.1, -3.0), (0.3, -9.0, 0.0)):
         camera = fs.Camera.look_at(81, 59, 1.4, (0.3, -0.2, -0.1), target, up=(0.1, -1, 0.2))
-        agree(renderer, Picture(CLOUD, camera, fs.Quality(samples=samples), background=background))
+        agree(renderer, FrameSpec(CLOUD, camera, fs.Quality(samples=samples), background=background))
 
 
 def agree(renderer, picture):
@@ -117,7 +117,7 @@ def test_the_middle_of_a_panorama_lies_ahead(renderer):
 def test_a_panorama_reaches_to_its_poles(renderer, up):
     """Straight up and down, where the top or the bottom row is all that a narrow view shows."""
     camera = fs.Camera.look_at(21, 15, 0.3, (0.0, 0.0, 0.0), (0.02, up, 0.01), up=(0.2, 0.0, 1.0))
-    agree(renderer, Picture(CLOUD, camera, outputs=("rgb",), background=panorama(16, 8)))
+    agree(renderer, FrameSpec(CLOUD, camera, outputs=("rgb",), background=panorama(16, 8)))
 
 
 def test_noise_has_the_variance_of_its_electrons(renderer):

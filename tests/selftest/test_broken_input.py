@@ -9,8 +9,8 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.selftest.agreement import ALL_OUTPUTS, CATALOGUED
-from fidsplat.selftest.clouds import taken
-from fidsplat.selftest.inputs import BROKEN, VICTIM, VIEW, broken_fields, crowd, spoilt
+from fidsplat.selftest.clouds import subset_of
+from fidsplat.selftest.inputs import BROKEN, VICTIM, VIEW, broken_fields, corrupted, crowd
 
 NAN, INF = float("nan"), float("inf")
 ALL_ZERO_ROWS = 889_536
@@ -22,7 +22,7 @@ def same_bits(first, second):
 
 
 def without_victim(cloud):
-    return taken(cloud, np.delete(np.arange(len(cloud)), VICTIM))
+    return subset_of(cloud, np.delete(np.arange(len(cloud)), VICTIM))
 
 
 def expected_reason(name, value):
@@ -41,7 +41,7 @@ def test_each_broken_value_is_counted_under_its_reason(name):
     for value in BROKEN[name]:
         field = np.array(getattr(cloud, name)[VICTIM])
         field[0 if field.ndim else ()] = value
-        assert spoilt(cloud, {name: field}).dropped == {expected_reason(name, value): 1}, value
+        assert corrupted(cloud, {name: field}).dropped == {expected_reason(name, value): 1}, value
 
 
 def test_all_broken_values_at_once(renderer):
@@ -57,7 +57,7 @@ def test_all_broken_values_at_once(renderer):
     mixed = {name: np.concatenate([arrays[name], rows[name]])[order] for name in arrays}
     with pytest.warns(UserWarning, match=f"{len(bad)} of {len(order)} splats left out"):
         left = fs.SplatCloud(**mixed)
-    good = taken(cloud, order[order < len(cloud)])
+    good = subset_of(cloud, order[order < len(cloud)])
     assert sum(left.dropped.values()) == len(bad)
     frames = [renderer.render(c.with_labels(0), VIEW, ALL_OUTPUTS) for c in (left, good)]
     assert same_bits(*frames)
@@ -114,7 +114,7 @@ def test_minus_zero_is_zero(renderer):
     frames = []
     for zero in (0.0, -0.0):
         changes = {"means": (zero, zero, 1.2), "quats": (1.0, zero, zero, zero), "colors": (zero, zero, zero)}
-        frames.append(renderer.render(spoilt(cloud, changes), VIEW, ALL_OUTPUTS))
+        frames.append(renderer.render(corrupted(cloud, changes), VIEW, ALL_OUTPUTS))
     assert same_bits(*frames)
 
 
@@ -123,7 +123,7 @@ def test_splats_that_cannot_be_seen_leave_no_trace(renderer):
     cloud = crowd()
     wanted = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS, CATALOGUED)
     for opacity in (0.0, -0.0, 1e-45, 1e-30, 0.0039):
-        kept = spoilt(cloud, {"opacities": opacity})
+        kept = corrupted(cloud, {"opacities": opacity})
         frame = renderer.render(kept, VIEW, ALL_OUTPUTS, CATALOGUED)
         assert len(kept) == len(cloud)
         assert same_bits(frame, wanted)

@@ -11,17 +11,17 @@ from fidsplat.cli import main
 from fidsplat.images.files import read_image
 from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.selftest import catalogue, check, inputs
-from fidsplat.selftest.agreement import ALL_OUTPUTS, Picture
+from fidsplat.selftest.agreement import ALL_OUTPUTS, FrameSpec
 from fidsplat.selftest.arithmetic import BOUNDS, measure
 from fidsplat.selftest.case import Case, Finding
-from fidsplat.selftest.clouds import camera, splats, turned
+from fidsplat.selftest.clouds import camera, rotation, splats
 from fidsplat.util.errors import DeviceError
 
 CLOUD = random_splats(40, seed=41, depth=(1.0, 4.0), scale=(0.02, 0.5))
 
 
 def pictures():
-    yield Picture(CLOUD, camera(40, 30, 40.0), outputs=("rgb", "alpha", "depth"))
+    yield FrameSpec(CLOUD, camera(40, 30, 40.0), outputs=("rgb", "alpha", "depth"))
 
 
 def good(renderer):
@@ -59,7 +59,7 @@ def test_a_good_device_passes(renderer):
     assert set(only.largest) == set(only.uncertified) == {"rgb", "alpha", "depth"}
     assert only.uncertified["rgb"] <= 2e-5
     assert result.worst is not None
-    image = check.worst_picture(result.worst)
+    image = check.worst_image(result.worst)
     assert image.dtype == np.uint8
     assert image.shape[1] > 800
 
@@ -78,7 +78,7 @@ def test_a_bad_device_fails(renderer, spoil, words):
     assert any(words in failure for failure in result.failures), result.failures
     assert result.worst is not None
     assert result.worst.rank[0]
-    assert check.worst_picture(result.worst).ndim == 3
+    assert check.worst_image(result.worst).ndim == 3
 
 
 def test_findings_that_do_not_hold(renderer):
@@ -101,7 +101,7 @@ def test_a_device_that_fails_fails_its_case_only(renderer):
 def test_certificates_are_small_where_nothing_is_hard():
     """They are no loose tolerance: below it in every pixel of an ordinary scene, where nothing may flip."""
     cloud = random_splats(300, seed=20, depth=(1.0, 6.0), scale=(0.01, 0.3))
-    truth = check.truth_of(Picture(cloud, camera(), outputs=ALL_OUTPUTS))
+    truth = check.reference_images(FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS))
     assert truth["alpha"].max() > 0.9
     assert truth["certificate"].max() < 1e-5
     assert np.median(truth["certificate"]) < 2e-6
@@ -115,10 +115,13 @@ def test_certificates_are_small_where_nothing_is_hard():
 
 def test_certificates_name_what_single_precision_cannot_decide():
     # a needle 1e-4 px wide across the picture, through pixel centres; a splat at the cut-off; a tie
-    needle = splats([[0.00625, 0.00625, 1]], turned((0, 0, 1), 45), (0.4, 1.25e-6))
+    needle = splats([[0.00625, 0.00625, 1]], rotation((0, 0, 1), 45), (0.4, 1.25e-6))
     faint = splats([[0.00625, 0.00625, 1]], (1, 0, 0, 0), 0.2, np.float32(1 / 255) * (1 + 1e-6))
     tie = splats([[0, 0, 1], [0, 0, 2]], (1, 0, 0, 0), 50.0, [0.5, 1.0], labels=[1, 2])
-    truths = [check.truth_of(Picture(cloud, camera(), outputs=ALL_OUTPUTS)) for cloud in (needle, faint, tie)]
+    truths = [
+        check.reference_images(FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS))
+        for cloud in (needle, faint, tie)
+    ]
     assert truths[0]["certificate"].max() > 1e-3
     assert 0.003 < truths[1]["certificate"].max() < 0.005
     assert truths[2]["label_may_flip"].any()
@@ -126,13 +129,13 @@ def test_certificates_name_what_single_precision_cannot_decide():
 
 
 def test_too_many_uncertain_pixels_fail(renderer, monkeypatch):
-    truth_of = check.truth_of
+    reference_images = check.reference_images
 
     def uncertain(picture):
-        truth = truth_of(picture)
+        truth = reference_images(picture)
         return truth | {"certificate": truth["certificate"] + 0.06}
 
-    monkeypatch.setattr(check, "truth_of", uncertain)
+    monkeypatch.setattr(check, "reference_images", uncertain)
     failures = check.run_check(renderer, [GOOD]).failures
     assert "certificates above 0.05" in failures[0]
 

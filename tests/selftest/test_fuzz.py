@@ -112,11 +112,11 @@ def test_a_failing_seed_is_named(renderer, monkeypatch):
         """Images of a device that is off by a little where it is sure."""
 
     def wrong(one, picture):
-        frame = draw(one, picture)
+        frame = render(one, picture)
         return Wrong({name: frame[name] + (1e-3 if name == "alpha" else 0) for name in frame})
 
-    draw = fuzz.draw
-    monkeypatch.setattr(fuzz, "draw", wrong)
+    render = fuzz.render
+    monkeypatch.setattr(fuzz, "render", wrong)
     state = fuzz.FuzzState("")
     state.add(3, renderer)
     assert state.failing == [3]

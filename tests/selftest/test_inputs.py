@@ -6,7 +6,7 @@ from agreement import random_splats
 
 import fidsplat as fs
 from fidsplat.selftest import inputs
-from fidsplat.selftest.agreement import COLOR_TOLERANCE, Picture, draw, truth_of
+from fidsplat.selftest.agreement import COLOR_TOLERANCE, FrameSpec, reference_images, render
 
 
 @pytest.mark.parametrize(("width", "height"), [(32767, 3), (3, 32767), (4001, 1003)])
@@ -16,8 +16,8 @@ def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
     camera = inputs.sized(width, height)
     generator = np.random.default_rng(0)
     pixels = generator.integers(0, height, 200), generator.integers(0, width, 200)
-    picture = Picture(cloud, camera)
-    truth, frame = truth_of(picture, pixels), draw(renderer, picture)
+    picture = FrameSpec(cloud, camera)
+    truth, frame = reference_images(picture, pixels), render(renderer, picture)
     for name in ("rgb", "alpha"):
         error = np.abs(frame[name][pixels] - truth[name])
         error = error.max(-1) if error.ndim > 1 else error

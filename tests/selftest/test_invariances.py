@@ -8,8 +8,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.backends.probing import Reshapes
 from fidsplat.scenes.random_clouds import random_splats
-from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, Picture, differing, draw, trace
-from fidsplat.selftest.clouds import camera, splats, taken, turned
+from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, FrameSpec, differing, render, trace
+from fidsplat.selftest.clouds import camera, rotation, splats, subset_of
 from fidsplat.selftest.order import tag
 
 CLOUDS = {
@@ -27,18 +27,18 @@ CLOUDS = {
 
 @pytest.fixture(params=CLOUDS)
 def picture(request):
-    return Picture(CLOUDS[request.param], camera(93, 77, 70.0), outputs=ALL_OUTPUTS)
+    return FrameSpec(CLOUDS[request.param], camera(93, 77, 70.0), outputs=ALL_OUTPUTS)
 
 
 def test_run_to_run(renderer, picture):
-    first = draw(renderer, picture)
-    assert all(differing(first, draw(renderer, picture), ALL_OUTPUTS) == 0 for _ in range(4))
+    first = render(renderer, picture)
+    assert all(differing(first, render(renderer, picture), ALL_OUTPUTS) == 0 for _ in range(4))
 
 
 def test_tile_sizes(renderer, picture):
     if not isinstance(renderer.backend, Reshapes):
         pytest.skip("draws without tiles")
-    own = draw(renderer, picture)
+    own = render(renderer, picture)
     for shape in renderer.backend.shapes("tiles").values():
         assert differing(own, trace(renderer, picture, shape), ALL_OUTPUTS) == 0, shape
 
@@ -51,7 +51,7 @@ def test_one_tile_for_the_whole_picture(renderer):
     width, height = (own.lanes, 32) if own.schedule == "lanes" else (32, 32)
     whole = replace(own, tile_width=width, tile_height=height)
     for cloud in CLOUDS.values():
-        picture = Picture(cloud, camera(width, height, 20.0), outputs=ALL_OUTPUTS)
+        picture = FrameSpec(cloud, camera(width, height, 20.0), outputs=ALL_OUTPUTS)
         traced = trace(renderer, picture, whole)
         assert len(traced["starts"]) == 2
         for shape in renderer.backend.shapes("tiles").values():
@@ -87,13 +87,13 @@ def test_pictures_of_one_upload_are_those_of_a_fresh_renderer(renderer):
 def test_what_is_culled_may_as_well_not_be_there(renderer, picture):
     keys = trace(renderer, picture)["keys"]
     kept = np.flatnonzero(keys != CULLED)
-    fewer = replace(picture, cloud=taken(picture.cloud, kept))
-    assert differing(draw(renderer, picture), draw(renderer, fewer), ALL_OUTPUTS) == 0
+    fewer = replace(picture, cloud=subset_of(picture.cloud, kept))
+    assert differing(render(renderer, picture), render(renderer, fewer), ALL_OUTPUTS) == 0
 
 
 def test_most_of_what_is_behind_is_culled(renderer):
     behind = random_splats(100, seed=35, depth=(-6.0, -3.0), scale=(0.01, 0.5))
-    assert draw(renderer, Picture(behind, camera())).stats["visible"] == 0
+    assert render(renderer, FrameSpec(behind, camera())).stats["visible"] == 0
 
 
 @pytest.mark.parametrize(("right", "down"), [(16, 0), (7, 5), (-3, 11)])
@@ -102,7 +102,7 @@ def test_whole_pixels_of_the_principal_point_move_the_picture(renderer, right, d
     cloud = random_splats(120, seed=36, depth=(2.0, 5.0), scale=(1e-3, 0.5), across=0.5)
     still = camera(120, 100, 90.0)
     moved = camera(120, 100, 90.0, cx=60.0 + right, cy=50.0 + down)
-    frames = [draw(renderer, Picture(cloud, view, outputs=ALL_OUTPUTS)) for view in (still, moved)]
+    frames = [render(renderer, FrameSpec(cloud, view, outputs=ALL_OUTPUTS)) for view in (still, moved)]
     rows, columns = max(down, 0), max(right, 0)
     shown = np.s_[rows : 100 + min(down, 0), columns : 120 + min(right, 0)]
     before = np.s_[rows - down : 100 + min(down, 0) - down, columns - right : 120 + min(right, 0) - right]
@@ -130,16 +130,16 @@ def test_a_mirrored_scene_gives_the_mirrored_picture(renderer, width):
     cloud = random_splats(150, seed=37, depth=(-1.0, 6.0))
     names = [name for name in ALL_OUTPUTS if name != "normal"]
     view = camera(width, 77, 70.0)
-    seen = draw(renderer, Picture(cloud, view, outputs=ALL_OUTPUTS))
-    twin = draw(renderer, Picture(mirrored(cloud), view, outputs=ALL_OUTPUTS))
+    seen = render(renderer, FrameSpec(cloud, view, outputs=ALL_OUTPUTS))
+    twin = render(renderer, FrameSpec(mirrored(cloud), view, outputs=ALL_OUTPUTS))
     assert differing(seen, {name: twin[name][:, ::-1] for name in names}, names) == 0
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (3, 5), (33, 1), (101, 79)])
 def test_a_splat_in_the_middle_of_an_odd_picture_is_symmetric(renderer, width, height):
-    for quat in ((1, 0, 0, 0), turned((1, 0, 0), 70), turned((0, 1, 0), 89.9)):
-        picture = Picture(splats([[0, 0, 2]], quat, (0.3, 0.2), 0.9), camera(width, height, 30.0))
-        alpha = np.asarray(draw(renderer, picture)["alpha"])
+    for quat in ((1, 0, 0, 0), rotation((1, 0, 0), 70), rotation((0, 1, 0), 89.9)):
+        picture = FrameSpec(splats([[0, 0, 2]], quat, (0.3, 0.2), 0.9), camera(width, height, 30.0))
+        alpha = np.asarray(render(renderer, picture)["alpha"])
         if quat[1] == 0:  # not tilted up or down
             assert np.array_equal(alpha, alpha[::-1])
         if quat[2] == 0:
@@ -158,5 +158,5 @@ def test_the_world_may_be_anywhere(renderer):
         pose[:3, 3] = shift
         position, target = np.add(shift, (1.5, 2.0, -3.25)), np.add(shift, (1.0, 2.25, 1.0))
         view = fs.Camera.look_at(93, 77, 1.0, position, target)
-        pictures.append(draw(renderer, Picture(cloud.transformed(pose), view, outputs=ALL_OUTPUTS)))
+        pictures.append(render(renderer, FrameSpec(cloud.transformed(pose), view, outputs=ALL_OUTPUTS)))
     assert all(differing(pictures[0], other, ALL_OUTPUTS) == 0 for other in pictures[1:])

@@ -10,17 +10,17 @@ import fidsplat as fs
 from fidsplat.cameras import Camera
 from fidsplat.scenes.random_clouds import load_scene, standard_camera
 from fidsplat.selftest import clouds, order
-from fidsplat.selftest.agreement import Picture, differing, draw, trace
-from fidsplat.selftest.clouds import splats, taken
+from fidsplat.selftest.agreement import FrameSpec, differing, render, trace
+from fidsplat.selftest.clouds import splats, subset_of
 from fidsplat.selftest.order import (
     SMOOTH,
     WALL_STEP,
-    beside_a_big_splat,
+    camera_path,
+    composited_parts,
     faint_between,
     largest_jump,
-    layered,
     tag,
-    turning,
+    tag_and_large_splat,
 )
 
 
@@ -34,18 +34,18 @@ def test_fronto_parallel_splats_do_tie(renderer, away):
 def test_a_tag_jumps_only_where_depth_decides(renderer):
     """Face to face, half of the depths change places within one step of 1e-4 degrees."""
     cloud = tag()
-    before = largest_jump(renderer, turning(cloud, "centre", steps=2))[0]
-    after = largest_jump(renderer, turning(cloud, "auto", steps=2))[0]
+    before = largest_jump(renderer, camera_path(cloud, "centre", steps=2))[0]
+    after = largest_jump(renderer, camera_path(cloud, "auto", steps=2))[0]
     assert before > 0.2
     assert after < 1e-4
 
 
 def test_a_tag_before_a_wall_does_not_jump(renderer):
     """Ten times the step of the aim, and nothing but edges moves."""
-    cloud = order.before_a_wall(2000)
+    cloud = order.tag_before_wall(2000)
     for tilt in (0.0, 30.0, 60.0):
         before, after = (
-            largest_jump(renderer, turning(cloud, order, 2, tilt, 54, 45, WALL_STEP))[0]
+            largest_jump(renderer, camera_path(cloud, order, 2, tilt, 54, 45, WALL_STEP))[0]
             for order in ("centre", "auto")
         )
         assert before > 0.15
@@ -57,9 +57,13 @@ def test_splats_that_cross_do_not_jump(renderer, name):
     """Every splat by itself is what its picture alone shows, composited in the order of depths there."""
     cloud = getattr(order, name)(30)
     view = Camera.pinhole(40, 30, 40.0, 40.0, 20.0, 15.0)
-    got, wanted = layered(renderer, [taken(cloud, np.array([k])) for k in range(30)], view, "pixel")
+    got, wanted = composited_parts(
+        renderer, [subset_of(cloud, np.array([k])) for k in range(30)], view, "pixel"
+    )
     assert np.abs(got - wanted).max() < 1e-5
-    centre = layered(renderer, [taken(cloud, np.array([k])) for k in range(30)], view, "centre")[0]
+    centre = composited_parts(renderer, [subset_of(cloud, np.array([k])) for k in range(30)], view, "centre")[
+        0
+    ]
     assert np.abs(centre - wanted).max() > 0.1
 
 
@@ -72,7 +76,7 @@ def test_splats_that_cross_do_not_jump(renderer, name):
 def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):
     """Room for one fragment at a pixel, or a few: the list is gone through again until the picture is the
     same, bit for bit."""
-    picture = Picture(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ALL_OUTPUTS)
+    picture = FrameSpec(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ALL_OUTPUTS)
     shapes = renderer.backend.shapes("k_buffer")
     wanted = trace(renderer, picture)
     for name, shape in shapes.items():
@@ -93,7 +97,7 @@ def _near_elsewhere() -> dict[str, fs.SplatCloud]:
     """Large splats, whose nearest points lie in other tiles than most of their fragments."""
     generator = np.random.default_rng(4)
     nearly_edge_on = [
-        clouds.turned((1, 0, 0) if flat else (0, 1, 0), angle)
+        clouds.rotation((1, 0, 0) if flat else (0, 1, 0), angle)
         for flat, angle in zip(generator.random(300) < 0.5, 90 + generator.uniform(-12, 12, 300), strict=True)
     ]
     edge_on = _faint(300, 5, (2, 3), (2.0, 3.0), across=0.3)
@@ -131,7 +135,7 @@ def test_bounds_of_what_follows_hide_nothing(renderer, name):
         "behind a fisheye": Camera.fisheye(34, 20, math.radians(100)),
     }
     view = views.get(name, clouds.camera(34, 20, 30.0))
-    picture = Picture(NEAR_ELSEWHERE[name], view, fs.Quality(order="pixel"), ("rgb", "depth", "normal"))
+    picture = FrameSpec(NEAR_ELSEWHERE[name], view, fs.Quality(order="pixel"), ("rgb", "depth", "normal"))
     groups = renderer.backend.shapes("schedule")["groups"]
     assert differing(trace(renderer, picture, groups), trace(renderer, picture), picture.outputs) == 0
 
@@ -160,21 +164,21 @@ def test_every_pixel_of_a_hundred_thousand_splats(renderer):
     """Against the sort of every pixel in float64; docs/order.md has what `-s` prints."""
     cloud, _ = load_scene("r100k_720p")
     camera, quality = standard_camera(320, 180), fs.Quality(order="pixel")
-    differences = against_reference(renderer, Picture(cloud, camera, quality, ("rgb", "depth")))
+    differences = against_reference(renderer, FrameSpec(cloud, camera, quality, ("rgb", "depth")))
     print(renderer.device.name, *differences, sep="\n")
     assert all(difference.agrees for difference in differences)
 
 
 def test_a_faint_splat_between_decides_nothing(renderer):
     """Drawn or not, with 1/255: a cut layer changed by 0.26."""
-    with_it, without = (draw(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
+    with_it, without = (render(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
     assert 0 < np.abs(with_it - without).max() < 1.01 / 255
 
 
 @pytest.mark.parametrize("side", order.SIDES)
 def test_a_layer_lies_where_its_depth_says(renderer, side):
     """The big splat's centre alone would put it on the other side."""
-    got, wanted = layered(renderer, beside_a_big_splat(side), order.ON_TAGS)
+    got, wanted = composited_parts(renderer, tag_and_large_splat(side), order.ON_TAGS)
     assert wanted.max() > 0.5
     assert np.abs(got - wanted).max() < 1e-6
 
@@ -204,7 +208,7 @@ def test_any_number_of_layers_wait(renderer):
         for k, z in enumerate((2, 4, 6))
     ]
     view = Camera.pinhole(17, 17, 20.0, 20.0, 8.5, 8.5)
-    got, wanted = layered(renderer, [*sheets, splats([(0, 0, 5)], (1, 0, 0, 0), 2.0, 0.5)], view)
+    got, wanted = composited_parts(renderer, [*sheets, splats([(0, 0, 5)], (1, 0, 0, 0), 2.0, 0.5)], view)
     assert np.abs(got - wanted).max() < 1e-6
 
 
@@ -219,5 +223,5 @@ def test_planes_that_cross_each_other(renderer, seed):
 def test_a_real_marker_does_not_jump(renderer):
     cloud = fs.marker("apriltag:36h11:5", size=1.0, mixture="fitted").cloud
     for tilt in (0.0, 40.0):
-        assert largest_jump(renderer, turning(cloud, "auto", steps=3, tilt=tilt))[0] < SMOOTH
-    assert largest_jump(renderer, turning(cloud, "centre", steps=3))[0] > 0.2
+        assert largest_jump(renderer, camera_path(cloud, "auto", steps=3, tilt=tilt))[0] < SMOOTH
+    assert largest_jump(renderer, camera_path(cloud, "centre", steps=3))[0] > 0.2

@@ -9,7 +9,7 @@ from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.prepare import view_of as moved_view_of
 from fidsplat.backends.view import View
 from fidsplat.capture.views import views_of
-from fidsplat.selftest.clouds import splats, taken, turned
+from fidsplat.selftest.clouds import rotation, splats, subset_of
 from fidsplat.splats.rotations import quaternion_to_matrix
 
 CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.4, -0.2, -2.0), (0, 0, 0))
@@ -24,13 +24,13 @@ def some_planes(seed=0, ids=(7, 3, 2_000_000_000)):
     generator = np.random.default_rng(seed)
     parts = []
     for _ in ids:
-        turn = turned(generator.normal(size=3), generator.uniform(0, 70))
+        turn = rotation(generator.normal(size=3), generator.uniform(0, 70))
         axes = quaternion_to_matrix(turn)
         means = generator.uniform(-0.5, 0.5, (20, 2)) @ axes[:, :2].T + generator.uniform(-0.5, 0.5, 3)
         parts.append(splats(means.astype(np.float32), turn, generator.uniform(0.01, 0.2, (20, 2))))
     parts.append(splats(generator.uniform(-1, 1, (10, 3)), (1, 0, 0, 0), 0.1))
     cloud = fs.SplatCloud.concatenate(parts).with_coplanar_groups(np.repeat([*ids, -1], [20, 20, 20, 10]))
-    return taken(cloud, generator.permutation(len(cloud)))
+    return subset_of(cloud, generator.permutation(len(cloud)))
 
 
 @pytest.mark.parametrize("away", [(0, 0, 0), (3, -5, 8)])
@@ -59,7 +59,7 @@ def test_a_key_is_a_diameter_before_every_point_of_the_splats(cutoff, away):
 
 def test_the_key_of_boxes_is_before_their_corners():
     """Whatever the cut-off, at which a Gaussian would end within."""
-    turn = turned((0, 1, 0), 60)
+    turn = rotation((0, 1, 0), 60)
     cloud = splats([(0, 0, 3)], turn, [(0.5, 0.2)]).with_boxes().with_coplanar_groups(0)
     view = view_of(cloud, quality=fs.Quality(alpha_cutoff=0.9))
     axes = quaternion_to_matrix(cloud.quats)[0, :, :2] * cloud.scales[0]
@@ -80,7 +80,7 @@ def test_index_is_dense_whatever_the_ids():
 
 def test_keys_do_not_depend_on_the_order_of_splats():
     cloud = some_planes()
-    shuffled = taken(cloud, np.random.default_rng(5).permutation(len(cloud)))
+    shuffled = subset_of(cloud, np.random.default_rng(5).permutation(len(cloud)))
     assert np.array_equal(PlaneTable(cloud).keys(view_of(cloud)), PlaneTable(shuffled).keys(view_of(cloud)))
 
 

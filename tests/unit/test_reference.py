@@ -8,7 +8,7 @@ from combined import LENSES, SWITCHES
 import fidsplat as fs
 from fidsplat.backends.reference import backend
 from fidsplat.effects import OUTPUTS
-from fidsplat.selftest.agreement import Picture, truth_of
+from fidsplat.selftest.agreement import FrameSpec, reference_images
 from fidsplat.splats.rotations import rigid_matrix
 
 CAMERAS = {"pinhole": fs.Camera.pinhole(37, 22, 30.0, 30.0, 18.0, 11.0)}
@@ -48,11 +48,11 @@ def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camer
     monkeypatch.setattr(backend, "_BLOCK", 1 << 15)
     for lowpass in LOWPASSES:
         quality = fs.Quality(lowpass=lowpass, ellipsoid="exact")
-        picture = Picture(clouds()[kind], camera, quality, tuple(OUTPUTS))
+        picture = FrameSpec(clouds()[kind], camera, quality, tuple(OUTPUTS))
         monkeypatch.setattr(backend, "may_see", counted)
-        fewer = truth_of(picture)
+        fewer = reference_images(picture)
         monkeypatch.setattr(backend, "may_see", lambda setup, view, x, y: np.ones(len(setup.order), bool))
-        for name, image in truth_of(picture).items():
+        for name, image in reference_images(picture).items():
             assert np.allclose(fewer[name], image, rtol=1e-11, atol=1e-11, equal_nan=True), (lowpass, name)
     assert np.mean(shares) < 0.8
 
@@ -63,12 +63,12 @@ def test_pixels_that_are_far_apart_are_those_of_the_whole_picture(monkeypatch):
     chosen, choose = [], backend.may_see
     monkeypatch.setattr(backend, "may_see", lambda *asked: chosen.append(choose(*asked)) or chosen[-1])
     camera = fs.Camera.look_at(200, 150, 1.0, (0, 0, -2), (0, 0, 0))
-    picture = Picture(random_splats(100, 3, depth=(-0.5, 1.0)), camera, outputs=("rgb", "depth"))
-    whole = truth_of(picture)
+    picture = FrameSpec(random_splats(100, 3, depth=(-0.5, 1.0)), camera, outputs=("rgb", "depth"))
+    whole = reference_images(picture)
     rows, columns = np.random.default_rng(1).integers(0, (150, 200), (50, 2)).T
     tiles = len(np.unique(rows // 16 * 200 + columns // 16))
     chosen.clear()
-    for name, values in truth_of(picture, (rows, columns)).items():
+    for name, values in reference_images(picture, (rows, columns)).items():
         assert np.allclose(values, whole[name][rows, columns], rtol=1e-11, atol=1e-11), name
     assert 1 < len(chosen) < tiles / 3
     assert np.mean(chosen) < 0.9

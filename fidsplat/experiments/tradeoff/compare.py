@@ -18,7 +18,7 @@ from fidsplat.experiments.tradeoff.hard import CELLS, cell_window
 from fidsplat.experiments.tradeoff.scenes import GREY, HARD, PROTOCOL, SEED, TradeScene, made_marker
 from fidsplat.experiments.tradeoff.session import Session
 from fidsplat.images.files import to_uint8
-from fidsplat.selftest.agreement import Picture, truth_of
+from fidsplat.selftest.agreement import FrameSpec, reference_images
 from fidsplat.util.errors import FidsplatError
 from fidsplat.vision.metrics import flip, has_flip, psnr
 from fidsplat.vision.readback import corner_error, own_code
@@ -108,9 +108,9 @@ def beyond_certificates(off: np.ndarray, scene: TradeScene, quality: Quality) ->
     rows, columns = np.unravel_index(worst[:count], off.shape)
     # the reference knows no rounding: what only rounds is nothing to it
     plain = quality.with_(arithmetic="precise", blend_precision="float32")
-    picture = Picture(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
+    picture = FrameSpec(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
     try:
-        certified = truth_of(picture, (rows, columns))["certificate"]
+        certified = reference_images(picture, (rows, columns))["certificate"]
     except FidsplatError:
         return None
     # a certificate is per unit of colour
@@ -145,8 +145,8 @@ def check_truth(truth: np.ndarray, scene: TradeScene, full: Quality) -> dict:
     chosen = random.Random(SEED).sample(range(height * width), min(count, height * width))
     rows, columns = np.unravel_index(chosen, (height, width))
     plain = full.with_(blend_precision="float32")
-    picture = Picture(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
-    wanted = truth_of(picture, (rows, columns))["rgb"]
+    picture = FrameSpec(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
+    wanted = reference_images(picture, (rows, columns))["rgb"]
     return {"pixels": len(rows), "maximum": float(np.abs(truth[rows, columns] - wanted).max())}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.scenes.random_clouds import log_uniform
-from fidsplat.selftest.clouds import splats, turned
+from fidsplat.selftest.clouds import rotation, splats
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import quaternion_multiply
 
@@ -110,8 +110,8 @@ def _edge_on(generator: np.random.Generator, cell: int) -> SplatCloud:
         ray = mean / np.linalg.norm(mean)
         across = np.cross(ray, generator.normal(size=3))
         normal = math.radians(90 - 10 ** generator.uniform(-4, 0))
-        start = turned(np.cross((0, 0, 1), ray), math.degrees(math.acos(ray[2])))
-        quats.append(quaternion_multiply(turned(across, math.degrees(normal)), start))
+        start = rotation(np.cross((0, 0, 1), ray), math.degrees(math.acos(ray[2])))
+        quats.append(quaternion_multiply(rotation(across, math.degrees(normal)), start))
     return splats(
         means, np.array(quats), generator.uniform(0.02, 0.1, (count, 2)), 0.9,
         generator.uniform(0, 1, (count, 3)),
@@ -142,6 +142,6 @@ def _near(generator: np.random.Generator, cell: int) -> SplatCloud:
     count = 12
     across = np.linspace(0.42, 1.0, count)
     means = np.column_stack([across, np.full(count, 0.5), generator.uniform(0.5, 1.5, count)])
-    lying = turned((1, 0, 0), 90)
+    lying = rotation((1, 0, 0), 90)
     scales = np.column_stack([np.full(count, 0.03), generator.uniform(0.8, 1.6, count)])
     return splats(means, lying, scales, 0.7, generator.uniform(0, 1, (count, 3)))
