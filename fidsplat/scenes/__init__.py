@@ -1,4 +1,4 @@
-"""Scenes: splats, markers with poses, a camera, and the TOML files they are kept in."""
+"""Scenes: splats, markers with poses and a camera, and their TOML files."""
 
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.scene import Scene

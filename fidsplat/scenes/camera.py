@@ -1,4 +1,4 @@
-"""Lenses, shutters and keyframes in scene files: the tables of [camera] that switch one on."""
+"""Lenses, shutters and keyframes in scene files: the tables below [camera]."""
 
 import math
 from collections.abc import Callable
@@ -54,12 +54,12 @@ def read_focal_lengths(camera: Table, width: int, height: int, lens: Lens | None
         if "metres_wide" in table:
             wide = table.number("metres_wide")
             if not wide > 0:
-                raise table.error("metres_wide", f"must be above 0, not {wide!r}")
+                raise table.error("metres_wide", f"must be above 0, got {wide!r}")
             return width / wide, width / wide
     if isinstance(lens, Equirectangular) and "fx" not in camera and "fy" not in camera:
         if "fov_x_deg" in camera:
             raise camera.error(
-                "fov_x_deg", "and equirectangular exclude each other: it sees the whole sphere"
+                "fov_x_deg", "and equirectangular exclude each other: a panorama covers the sphere"
             )
         return width / (2 * math.pi), height / math.pi
     if "fov_x_deg" in camera:
@@ -69,7 +69,7 @@ def read_focal_lengths(camera: Table, width: int, height: int, lens: Lens | None
         if isinstance(lens, Orthographic):
             raise camera.error("fov_x_deg", "and orthographic exclude each other; give metres_wide there")
         angle = math.radians(camera.number("fov_x_deg"))
-        width = min(max(width, 1), 32767)  # the camera refuses others, by their own key
+        width = min(max(width, 1), 32767)  # the camera reports an invalid width with its own key
         with camera.at("fov_x_deg"):
             fisheye = isinstance(lens, Fisheye)
             f = fisheye_focal_length(width, angle, lens) if fisheye else focal_length(width, angle)
@@ -82,7 +82,7 @@ def read_focal_lengths(camera: Table, width: int, height: int, lens: Lens | None
 
 
 def lens_table(camera: Camera) -> tuple[str, dict[str, float]] | None:
-    """The name and content of the table that a camera's lens is written as; None for a pinhole."""
+    """Name and content of the table of a camera's lens; None for a pinhole."""
     lens = camera.lens
     if lens is None:
         return None
@@ -108,7 +108,7 @@ def read_shutter(camera: Table) -> Shutter | None:
 
 
 def shutter_table(shutter: Shutter) -> dict:
-    """What a shutter is written as."""
+    """Content of the table of a shutter."""
     return {
         "time": float(shutter.time),
         "exposure_time_ms": shutter.exposure_time * 1e3,
@@ -130,26 +130,26 @@ def read_keyframes(
     for before, frame, time in zip(times, frames[1:], times[1:], strict=False):
         if time <= before:
             raise frame.error(
-                "time", f"must be above that of the keyframe before, {before:g} s, not {time:g} s"
+                "time", f"must be above that of the keyframe before, {before:g} s, got {time:g} s"
             )
     return Trajectory(times, np.array([pose_of(frame) for frame in frames]))
 
 
 def keyframe_tables(motion: Any, who: str, camera: bool = False) -> list[dict]:
-    """What a trajectory is written as, one table for each keyframe.
+    """Tables of the keyframes of a trajectory.
 
     Raises:
-        InputError: it is a function, which a scene file cannot hold.
+        InputError: the motion is a function or smooth, which a scene file cannot contain.
     """
     if not isinstance(motion, Trajectory):
         raise InputError(
-            f"a scene file holds keyframes; the motion of {who} is a function. Sample it: "
+            f"the motion of {who} must be an fs.Trajectory to be saved, got a function; sample it: "
             "fs.Trajectory(times, [pose(time) for time in times])"
         )
     if motion.smooth:
         raise InputError(
-            f"a scene file moves in screw motions from keyframe to keyframe; the motion of {who} is smooth. "
-            "Sample it: motion.sampled(30)"
+            f"the motion of {who} must be piecewise screw motion to be saved, got a smooth one; sample it: "
+            "motion.sampled(30)"
         )
     tables = []
     for time, pose in zip(motion.times, motion.poses, strict=True):

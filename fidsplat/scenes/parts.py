@@ -1,4 +1,4 @@
-"""What a scene holds: markers with poses, splats, and how they are looked at."""
+"""Data of a scene: splats, markers with poses, and how they are captured."""
 
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PlacedMarker(PickledByFields):
-    """A marker somewhere in the world. Raises InputError when the pose is not rigid, the motion is no
-    function, or the bundle no name."""
+    """A marker with a pose in the world.
+
+    Raises InputError if the pose is not rigid, the motion is not a function, or the bundle is not a name.
+    """
 
     marker: Marker
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -38,22 +40,22 @@ class PlacedMarker(PickledByFields):
     label: int = 1
     """label of its splats; a Scene numbers its markers 1, 2, ..."""
     motion: Pose | None = None
-    """its pose at a time in seconds; None: it stays at `pose`"""
+    """its pose at a time in seconds; None: constant"""
     bundle: str | None = None
-    """name of the rigid thing that it is a part of; markers of one bundle give one pose"""
+    """name of the rigid object that it is attached to; markers of a bundle are detected as one pose"""
 
     def __post_init__(self) -> None:
         check_similarity(self.pose, "a marker's pose", rigid=True)
         if self.motion is not None and not callable(self.motion):
             raise InputError(
-                f"a marker's motion is a {type(self.motion).__name__}; it must be an fs.Trajectory or a "
-                "function of the time"
+                "a marker's motion must be an fs.Trajectory or a function of time, got a "
+                f"{type(self.motion).__name__}"
             )
         if self.bundle is not None and not (isinstance(self.bundle, str) and self.bundle):
-            raise InputError(f"a marker's bundle is {self.bundle!r}; it must be a name, or None")
+            raise InputError(f"a marker's bundle must be a name or None, got {self.bundle!r}")
         if not isinstance(getattr(self.marker, "cloud", None), SplatCloud):
             raise InputError(
-                f"marker is {self.marker!r}; it must be an fs.Marker, e.g. fs.marker('apriltag:36h11:5')"
+                f"marker must be an fs.Marker, got {self.marker!r}; e.g. fs.marker('apriltag:36h11:5')"
             )
         pose = np.array(self.pose, dtype=np.float64)
         pose.flags.writeable = False
@@ -72,7 +74,7 @@ class PlacedMarker(PickledByFields):
 
 @dataclass(frozen=True, eq=False)
 class SceneParts(PickledByFields):
-    """What is drawn and how. Raises InputError for a part of the wrong kind."""
+    """Data of a scene. Raises InputError for a field of the wrong type."""
 
     clouds: tuple[SplatCloud, ...] = ()
     """splats in the world, with labels of their own (0 unless given)"""
@@ -88,51 +90,48 @@ class SceneParts(PickledByFields):
     device: str | None = None
     """a device's name, or None for the default"""
     shutter: Shutter | None = None
-    """when the picture is taken, and how long that takes; None: at time 0, at once"""
+    """time, exposure and readout; None: an instantaneous shutter at time 0"""
     camera_motion: Pose | None = None
-    """world_to_camera at a time in seconds; None: the camera stands still"""
+    """world_to_camera at a time in seconds; None: constant"""
     sensor: Sensor | None = None
-    """what becomes of rgb on its way out"""
+    """sensor model applied to rgb"""
     fog: Fog | None = None
-    """between the camera and what it sees"""
+    """fog between camera and splats"""
     stores: tuple[Store, ...] = ()
-    """splats on disk, in the world, with labels of their own: views read what they see of them"""
+    """splats on disk, in the world, with labels of their own; visible chunks are read"""
     cloud_motions: Mapping[int, Pose] = field(default_factory=dict)
-    """number of a cloud that moves: the rigid motion of the world, at a time in seconds, that it makes from
-    where it is. Its splats have one label for all, above the markers', that no other splat has"""
+    """number of a moving cloud -> its rigid world motion at a time in seconds; the cloud gets a unique label,
+    above those of markers"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
         put(self, "stores", _all_of(self.stores, Store, "stores"))
-        Motion(self.camera_motion)  # which is refused here rather than when the scene is drawn
+        Motion(self.camera_motion)  # reports an invalid motion here rather than when rendering
         moving = self.cloud_motions
         if not isinstance(moving, Mapping) or not all(map(callable, moving.values())):
-            raise InputError(
-                "cloud_motions must be {number of the cloud: fs.Trajectory or function of the time}"
-            )
+            raise InputError("cloud_motions must be {number of the cloud: fs.Trajectory or function of time}")
         for number in moving:
             if isinstance(number, bool) or number not in range(len(self.clouds)):
                 raise InputError(
-                    f"cloud_motions: there is no cloud {number!r}; this scene has {len(self.clouds)}, "
-                    "counted from 0"
+                    f"cloud_motions must have numbers of clouds below {len(self.clouds)}, got {number!r}"
                 )
         put(self, "cloud_motions", dict(moving))
         placed = _all_of(self.markers, PlacedMarker, "markers")
         put(self, "markers", tuple(replace(marker, label=i + 1) for i, marker in enumerate(placed)))
         if not isinstance(self.shutter, Shutter | None):
-            raise InputError(f"shutter must be a Shutter, not {self.shutter!r}")
+            raise InputError(f"shutter must be a Shutter, got {self.shutter!r}")
         if not isinstance(self.camera, Camera | None):
-            raise InputError(f"camera must be a Camera, not {self.camera!r}")
+            raise InputError(f"camera must be a Camera, got {self.camera!r}")
         put(self, "background", background_of(self.background))
         for name, kind in (("sensor", Sensor), ("fog", Fog)):
             if not isinstance(getattr(self, name), kind | None):
-                raise InputError(f"{name} must be a {kind.__name__}, not {getattr(self, name)!r}")
+                raise InputError(f"{name} must be a {kind.__name__}, got {getattr(self, name)!r}")
         put(self, "outputs", output_names(self.outputs))
 
     @cached_property
     def motion(self) -> Motion:
-        """What moves: the camera, markers by their labels (and whatever else has these), and clouds."""
+        """Motion of the camera, and of markers and clouds by label."""
         groups = {
             marker.label: _MarkerMotion(marker.pose, marker.motion)
             for marker in self.markers
@@ -143,15 +142,17 @@ class SceneParts(PickledByFields):
 
     @cached_property
     def capture(self) -> Capture:
-        """How the scene's picture is taken. Raises InputError for a quality that does not exist."""
+        """Capture of the scene. Raises InputError for an unknown quality."""
         return Capture(
             self.camera, self.outputs, Quality.of(self.quality), self.background, self.motion,
             self.shutter or Shutter(), self.sensor or Sensor(), self.fog,
         )  # fmt: skip
 
     def cloud(self) -> SplatCloud:
-        """All splats in one cloud: those of stores, all of which are read, then the clouds' in their order,
-        with their own labels if they do not move by themselves, then each marker's."""
+        """All splats in one cloud: stores (read completely), clouds, then markers.
+
+        Clouds keep their labels unless they move.
+        """
         return self.splats.cloud() if isinstance(self.splats, ChunkedSplats) else self.splats
 
     @cached_property
@@ -174,7 +175,7 @@ class SceneParts(PickledByFields):
 
     @cached_property
     def _labels(self) -> dict[int, int]:
-        """The labels of clouds that move, by their numbers."""
+        """Labels of moving clouds, by their numbers."""
         if not self.cloud_motions:
             return {}
         still = [cloud.labels for i, cloud in enumerate(self.clouds) if i not in self.cloud_motions]
@@ -186,8 +187,7 @@ class SceneParts(PickledByFields):
 
 @dataclass(frozen=True, eq=False)
 class _MarkerMotion:
-    """The motion of the world that takes a marker from its pose to where it is at a time. It is plain data if
-    the marker's own motion is, so that `digest_of` accepts it."""
+    """World motion of a marker from its initial pose, as plain data for `digest_of`."""
 
     start: np.ndarray
     motion: Pose

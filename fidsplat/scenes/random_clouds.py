@@ -1,8 +1,7 @@
-"""Random clouds, each the same on every machine for the same seed.
+"""Random clouds, identical on every machine for the same seed.
 
-`load_scene`: the scenes on which renderers are timed, large and like captured ones. `random_splats`: small
-clouds with opacities that are hard on purpose, for tests. Scenes that are wrong or extreme on purpose are
-those of `fidsplat.selftest`."""
+`load_scene` returns large scenes for timing, similar to captured ones. `random_splats` returns small clouds
+with extreme opacities for tests. `fidsplat.selftest` has scenes with invalid or extreme values."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ HARD_OPACITIES = np.array([0.002, 0.05, 0.3, 0.5, 0.9, 0.99, 1.0], np.float32)
 
 @dataclass(frozen=True)
 class StandardScene:
-    """A cube of random splats 8 m wide whose middle is 8 m in front of the camera."""
+    """A cube of random splats, 8 m wide, with its centre 8 m in front of the camera."""
 
     count: int
     median_scale: float
@@ -27,7 +26,7 @@ class StandardScene:
     width: int
     height: int
     thick: bool = False
-    """whether the splats are 3D Gaussians, as those of captures are, and no disks"""
+    """whether the splats are 3D Gaussians, like those of captures, instead of disks"""
 
 
 SCENES = {
@@ -39,8 +38,8 @@ SCENES = {
     "r1m_1080p_3d": StandardScene(1_000_000, 0.012, 1920, 1080, thick=True),
     "r5m_1080p_3d": StandardScene(5_000_000, 0.006, 1920, 1080, thick=True),
 }
-"""What is timed. The camera stands at the origin and looks down +z, x right, y down, 60 degrees across,
-before black."""
+"""Scenes for timing. The camera is at the origin, looks along +z, x right, y down, with a field of view of 60
+degrees and a black background."""
 
 
 def load_scene(name: str, seed: int = 0) -> tuple[SplatCloud, Camera]:
@@ -60,7 +59,7 @@ def random_cloud(
     count: int, median_scale: float, seed: int = 0, extent: float = 4.0, thick: bool = False
 ) -> SplatCloud:
     """`count` splats: centres uniform in a cube, orientations uniform, scales log-normal, opacities beta(1.2,
-    1). thick: the same with a third scale."""
+    1). thick: with a third scale."""
     generator = np.random.default_rng(seed)
     means = generator.uniform(-extent, extent, (count, 3)).astype(np.float32)
     means[:, 2] += extent * 2.0

@@ -1,4 +1,4 @@
-"""Scene files: TOML in, the parts of a Scene out."""
+"""Reading scene files: TOML to the data of a Scene."""
 
 import math
 import os
@@ -15,9 +15,9 @@ from fidsplat.capture.quality import MarkerQuality, Quality, knobs
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats import Progress, load_splats
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
-from fidsplat.scenes.imaging import read_background, read_part
-from fidsplat.scenes.knobs import quality_of
+from fidsplat.scenes.environment import read_background, read_part
 from fidsplat.scenes.parts import PlacedMarker
+from fidsplat.scenes.quality_settings import read_quality
 from fidsplat.scenes.table import Table
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import rigid_matrix
@@ -28,8 +28,8 @@ from fidsplat.util.files import path_of, read_input
 
 MAX_BYTES = 16 * 2**20
 MAX_PARTS = 8
-"""parts of a dotted key, of which a scene file has at most three; the parser takes time and memory as their
-square"""
+"""limit on the parts of a dotted key (scene files have at most three): the parser takes quadratic time and
+memory"""
 TOP = ("camera", "splats", "markers", "render", "quality", "sensor", "fog", "background")
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
@@ -39,8 +39,8 @@ MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", 
 MARKERS = (*MARKER, *knobs(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 
-# A dotted key of too many parts, outside of strings and comments, which are matched to be passed over. What
-# is not closed ends with the file, and quantifiers are possessive: time is linear whatever the file holds.
+# Finds a dotted key of too many parts; strings and comments are matched to be skipped. Quantifiers are
+# possessive and unclosed strings end with the file, so that the time is linear for every input.
 _BASIC, _LITERAL = r'"(?:[^"\\\n]|\\.)*+"?', r"'[^'\n]*+'?"
 _LONG_KEY = re.compile(
     r"[\s\[\]{}=,]++"
@@ -57,12 +57,11 @@ def read_scene(
     quality: Quality | str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """What `SceneParts` takes, from a scene file and from the splat and image files that it names, which are
-    looked for beside it.
+    """Fields of `SceneParts` from a scene file and the files that it names, relative to its folder.
 
-    quality: instead of the file's; markers are made with it too. progress: as `load_splats` takes it.
+    quality: replaces the file's, also for markers. progress: called with the current step and its share done.
 
-    Raises InputError, naming the file and the key, for whatever is wrong.
+    Raises InputError, which names file and key.
     """
     file = path_of(path)
     top = Table(_parse(file), str(file), "", TOP)
@@ -76,8 +75,8 @@ def read_scene(
     render = top.table("render", RENDER)
     if "background" in top and "background" in render:
         raise render.error("background", "and the table [background] exclude each other")
-    quality = quality_of(top, render) if quality is None else quality
-    made_with = Quality.of(quality).marker
+    quality = read_quality(top, render) if quality is None else quality
+    marker_quality = Quality.of(quality).marker
     tables = top.tables("splats", SPLATS)
     on_disk = [table for table in tables if table.text("file").lower().endswith(SUFFIX)]
     splats = [_splats(table, file.parent, progress) for table in tables if table not in on_disk]
@@ -86,7 +85,7 @@ def read_scene(
         stores=tuple(_store(table, file.parent) for table in on_disk),
         camera=camera,
         markers=tuple(
-            _marker(table, file.parent, made_with, progress) for table in top.tables("markers", MARKERS)
+            _marker(table, file.parent, marker_quality, progress) for table in top.tables("markers", MARKERS)
         ),
         background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
         outputs=render.texts("outputs", ("rgb",)),
@@ -103,7 +102,7 @@ def read_scene(
 def _parse(file: Path) -> dict:
     content = read_input(file, MAX_BYTES)
     try:
-        text = content.decode("utf-8-sig")  # editors of Windows mark a file as UTF-8
+        text = content.decode("utf-8-sig")  # Windows editors add a byte-order mark
         if any(match["long"] for match in _LONG_KEY.finditer(text)):
             raise InputError(
                 f"{file} is not a scene file: a dotted key has more than {MAX_PARTS} parts; scene files have "
@@ -116,12 +115,12 @@ def _parse(file: Path) -> dict:
         raise InputError(f"{file} is not a scene file: its lists are nested too deeply") from None
     except InputError:
         raise
-    except ValueError as error:  # TOMLDecodeError, and what int() says to a number of thousands of digits
+    except ValueError as error:  # TOMLDecodeError, or int() of a number of thousands of digits
         raise InputError(f"{file} is not a scene file in TOML: {error}") from None
 
 
 def _camera(table: Table, first: np.ndarray | None) -> Camera:
-    """The camera of a table; first: its pose where it moves."""
+    """Camera of a table. first: the pose of the first keyframe, if it moves."""
     width, height = table.whole("width"), table.whole("height")
     near, far = table.number("near", 0.01), table.number("far", math.inf, infinite=True)
     lens = read_lens(table)
@@ -139,7 +138,7 @@ def _camera(table: Table, first: np.ndarray | None) -> Camera:
 
 
 def _camera_pose(table: Table):
-    """world_to_camera (4, 4), and the position if that is given."""
+    """world_to_camera (4, 4), and the position if given."""
     if "world_to_camera" in table:
         for key in ("position", "look_at", "up"):
             if key in table:
@@ -162,19 +161,19 @@ def _pose(table: Table, scale: float = 1.0):
 
 
 def _store(table: Table, folder: Path) -> Store:
-    """A store, which stands where it was built."""
+    """Store of a [[splats]] table."""
     for key in SPLATS[1:]:
         if key in table:
-            raise table.error(key, "is not for a store, which `fidsplat store place` moves")
+            raise table.error(key, "cannot be used with a store; use `fidsplat store place`")
     with table.at("file"):
         return Store(folder / table.text("file"))
 
 
 def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[SplatCloud, Trajectory | None]:
-    """A file's splats where they are put, and how they move from there."""
+    """Splats of a file at their pose, and their motion from there."""
     name, scale = table.text("file"), table.number("scale", 1.0)
     if not scale > 0:
-        raise table.error("scale", f"must be above 0, not {scale!r}")
+        raise table.error("scale", f"must be above 0, got {scale!r}")
     pose, motion = _pose(table, scale), read_keyframes(table, POSE, _pose)
     if motion is not None:
         motion = Trajectory(motion.times, motion.poses @ np.linalg.inv(_pose(table)))
@@ -187,13 +186,13 @@ def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[Spla
 def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progress | None) -> PlacedMarker:
     spec, size = table.text("spec"), table.number("size")
     if not size > 0:
-        raise table.error("size", f"must be above 0 metres, not {size!r}")
+        raise table.error("size", f"must be above 0 metres, got {size!r}")
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
     quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
     own = table.values(MarkerQuality)
     if quiet_zone is not None and quiet_zone < 0:
-        raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
-    from fidsplat.markers import marker, with_file  # late: it brings what makes markers
+        raise table.error("quiet_zone", f"must be 0 or more modules, got {quiet_zone}")
+    from fidsplat.markers import marker, with_file  # late: it imports heavy packages
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
     known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}

@@ -1,4 +1,4 @@
-"""Scene: its parts, and the files that they are kept in."""
+"""Scene: splats, markers, camera and capture, with loading and saving."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from fidsplat.util.summaries import Summarised, point
 
 
 class Scene(SceneParts, Summarised):
-    """What is drawn and how. Raises InputError for a part of the wrong kind."""
+    """Splats, markers, camera and capture. Raises InputError for a field of the wrong type."""
 
     def __repr__(self) -> str:
         words = (f"{len(cloud):,} splats" for cloud in (*self.stores, *self.clouds))
         return f"Scene({', '.join([*words, *(placed.marker.spec for placed in self.markers)])})"
 
     def summary(self) -> dict[str, str]:
-        """What it holds, in words."""
+        """Its content in words."""
         rows = {f"store {i}": f"{len(s):,} splats in {s.path}" for i, s in enumerate(self.stores)}
         rows |= {f"cloud {i}": f"{len(cloud):,} splats" for i, cloud in enumerate(self.clouds)}
         for placed in self.markers:
@@ -42,16 +42,16 @@ class Scene(SceneParts, Summarised):
     ) -> Scene:
         """Read a scene file (docs/scene-files.md).
 
-        quality: instead of the file's; its knobs of markers hold for markers that do not say theirs.
-        progress: called with what is being done and the share of it that is done, 0 to 1.
+        quality: replaces the file's; its marker settings apply to markers without their own.
+        progress: called with the current step and its share done, 0 to 1.
 
-        Raises InputError, naming file and key, for whatever is wrong.
+        Raises InputError, which names file and key.
         """
         return Scene(**read_scene(path, quality, progress))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a scene file, and beside it one PLY file STEM-splats-I.ply for each of ``clouds``.
+        """Write a scene file, and next to it a PLY file STEM-splats-I.ply for each of ``clouds``.
 
-        Raises InputError when a file cannot be written, or a marker cannot be said in a scene file.
+        Raises InputError if a file cannot be written, or a marker cannot be expressed in a scene file.
         """
         write_scene(self, path)

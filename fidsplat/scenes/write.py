@@ -1,4 +1,4 @@
-"""Scene files: Scene in, TOML and PLY files out."""
+"""Writing scene files: a Scene to TOML and PLY files."""
 
 import os
 from pathlib import Path
@@ -10,23 +10,22 @@ from fidsplat.formats import save_ply
 from fidsplat.markers import with_file
 from fidsplat.markers.printing import MAX_SPLATS
 from fidsplat.scenes.camera import keyframe_tables, lens_table, shutter_table
-from fidsplat.scenes.imaging import imaging_tables
-from fidsplat.scenes.knobs import marker_knobs, quality_tables
+from fidsplat.scenes.environment import environment_tables
 from fidsplat.scenes.parts import PlacedMarker, SceneParts
+from fidsplat.scenes.quality_settings import marker_settings, quality_tables
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of
 
 
 def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
-    """Write STEM-splats-I.ply for each cloud, then the scene file, so that it never names a file that is
-    missing.
+    """Write STEM-splats-I.ply for each cloud, then the scene file, so that no named file is missing.
 
-    Raises InputError when a file cannot be written, or a marker cannot be said in a scene file.
+    Raises InputError if a file cannot be written, or a marker cannot be expressed in a scene file.
     """
     file = path_of(path)
     render, qualities = _render(scene)
-    around = imaging_tables(scene, file.parent)
+    environment = environment_tables(scene, file.parent)
     markers = [_marker(placed, file.parent, scene.quality) for placed in scene.markers]
     motions = {
         i: {"motion": keyframe_tables(motion, f"cloud {i}")} for i, motion in scene.cloud_motions.items()
@@ -48,7 +47,7 @@ def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
         parts += [_table("[[camera.motion]]", frame) for frame in frames]
     parts += [_table("[[splats]]", table) for table in splats]
     parts += [_table("[[markers]]", table) for table in markers]
-    parts += [_table(f"[{name}]", table) for name, table in around.items()]
+    parts += [_table(f"[{name}]", table) for name, table in environment.items()]
     parts.append(_table("[render]", render))
     parts += [_table(f"[{name}]", table) for name, table in qualities.items()]
     try:
@@ -66,7 +65,7 @@ def _camera(scene: SceneParts) -> dict:
     assert camera is not None
     keys = ("width", "height", "fx", "fy", "cx", "cy", "near", "far")
     table = {key: getattr(camera, key) for key in keys}
-    # a camera that moves has its poses in the keyframes
+    # the poses of a moving camera are in the keyframes
     return table if scene.camera_motion else table | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
@@ -81,7 +80,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
         "size": float(marker.size),
         "position": placed.pose[:3, 3].tolist(),
         "quaternion": matrix_to_quaternion(placed.pose[:3, :3]).tolist(),
-        **marker_knobs(marker.quality, quality),
+        **marker_settings(marker.quality, quality),
         "quiet_zone": int(marker.quiet_zone),
         **limit,
         **bundle,
@@ -112,7 +111,7 @@ def _value(value) -> str:
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {_value(part)}" for key, part in value.items()) + "}"
     plain = value.item() if isinstance(value, np.generic) else value
-    return repr(plain)  # int and finite float are written alike in Python and TOML, and so is inf
+    return repr(plain)  # Python and TOML write int, float and inf alike
 
 
 def _string(text: str) -> str:

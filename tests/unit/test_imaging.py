@@ -149,7 +149,7 @@ def test_a_scene_file_keeps_the_low_pass_and_the_first_hit(tmp_path):
 
 
 def test_a_panorama_of_no_file_cannot_be_written(tmp_path):
-    with pytest.raises(fs.InputError, match="came from no file"):
+    with pytest.raises(fs.InputError, match="must be loaded from a file"):
         fs.Scene(background=fs.Panorama(np.zeros((4, 8, 3)))).save(tmp_path / "a.toml")
     assert not list(tmp_path.iterdir())
 

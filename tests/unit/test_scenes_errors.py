@@ -77,13 +77,13 @@ CHANGES = [
     ("48", "1" + "0" * 5000, "is not a scene file in TOML"),
     ("60.0", "180.0", "camera.fov_x_deg: camera fov_x must lie between 0 and pi radians (180 degrees)"),
     ("60.0", "0", "camera.fov_x_deg: camera fov_x must lie between"),
-    ("60.0", '"wide"', "camera.fov_x_deg must be a number, not 'wide'"),
+    ("60.0", '"wide"', "camera.fov_x_deg must be a number, got 'wide'"),
     ("60.0", "nan", "camera.fov_x_deg must be a finite number"),
     ("60.0", "60.0\nfx = 50.0", "camera.fx and fov_x_deg exclude each other"),
     ("near", "world_to_camera = []\nnear", "camera.position and world_to_camera exclude each other"),
-    ("[0.0, 0.0, -1.0]", "[0.0, -1.0]", "camera.position must be a list of 3 numbers, not a list of 2"),
-    ("[0.0, 0.0, -1.0]", "0.0", "camera.position must be a list of 3 numbers, not 0.0"),
-    ("[0.0, 0.0, -1.0]", '[0.0, "a", 1]', "camera.position[1] must be a number, not 'a'"),
+    ("[0.0, 0.0, -1.0]", "[0.0, -1.0]", "camera.position must be a list of 3 numbers, got a list of 2"),
+    ("[0.0, 0.0, -1.0]", "0.0", "camera.position must be a list of 3 numbers, got 0.0"),
+    ("[0.0, 0.0, -1.0]", '[0.0, "a", 1]', "camera.position[1] must be a number, got 'a'"),
     ("[0.0, 0.0, -1.0]", "[0.0, 0.0, inf]", "camera.position[2] must be a finite number"),
     ("[0.0, 0.0, -1.0]", "[0.0, 0.0, 1" + "0" * 400 + "]", "camera.position[2] must be a finite number"),
     ("[0.0, 0.0, -1.0]", "[0.0, 0.0, 0.0]", "camera.look_at: camera position and look_at are the same point"),
@@ -93,7 +93,7 @@ CHANGES = [
     ("near = 0.1", "far = nan", "camera.far must be a finite number"),
     ("empty.ply", "absent.ply", "splats[0].file: cannot read"),
     ("empty.ply", "scene.toml", "unknown ending of a splat file '.toml'"),
-    ('"empty.ply"', "7", "splats[0].file must be text, not 7"),
+    ('"empty.ply"', "7", "splats[0].file must be text, got 7"),
     ('"empty.ply"', '""', "splats[0].file must be text"),
     ("scale = 1.0", "scale = 0.0", "splats[0].scale must be above 0"),
     ("[1.0, 0.0, 0.0, 0.0]", "[0, 0, 0, 0]", "splats[0].quaternion: quaternion must be four"),
@@ -106,7 +106,7 @@ CHANGES = [
     ("samples = 1", "samples = 99", "render.samples: quality: samples must be"),
     ("samples = 1", "samples = 1.5", "render.samples must be a whole number"),
     ('"reference"', "1", "render.device must be text"),
-    ("[render]", "[[render]]", "render must be a table, not a list of 1"),
+    ("[render]", "[[render]]", "render must be a table, got a list of 1"),
     ("width = 64", "width =", "is not a scene file in TOML"),
 ]
 
@@ -122,7 +122,7 @@ def test_one_thing_wrong(refused, old, new, words):
     [
         ("size", "siez", "unknown key 'markers[0].siez' (did you mean 'size'?)"),
         ("size = 0.1\n", "", "markers[0].size is missing"),
-        ("0.1", '"big"', "markers[0].size must be a number, not 'big'"),
+        ("0.1", '"big"', "markers[0].size must be a number, got 'big'"),
         ("0.1", "0", "markers[0].size must be above 0 metres"),
         ("0.1", "-0.1", "markers[0].size must be above 0 metres"),
         ("0.1", "0.1\nquiet_zone = -1", "markers[0].quiet_zone must be 0 or more"),
@@ -146,10 +146,10 @@ def test_the_second_of_two_is_named(refused):
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ("[1, 2, 3, 4]", r"world_to_camera\[0\] must be a list of 4 numbers, not 1"),
+        ("[1, 2, 3, 4]", r"world_to_camera\[0\] must be a list of 4 numbers, got 1"),
         (
             "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]",
-            "must be a list of 4 rows of 4 numbers, not a list of 3",
+            "must be a list of 4 rows of 4 numbers, got a list of 3",
         ),
         (
             "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1], [0, 0, 0, 1]]",
@@ -164,7 +164,7 @@ def test_the_second_of_two_is_named(refused):
             "by 5e-05 where 1e-06 is allowed; give more digits",
         ),
         ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]", "must have the last row"),
-        ("{}", "must be a list of 4 rows of 4 numbers, not a table"),
+        ("{}", "must be a list of 4 rows of 4 numbers, got a table"),
     ],
 )
 def test_a_matrix_wrong(refused, rows, words):
@@ -183,8 +183,8 @@ def test_a_matrix_wrong(refused, rows, words):
         (b"a = {b = {" + b"'x'.\"y\"." * 4 + b"z = 1}}", "a dotted key has more than 8 parts"),
         (b"a = {b" * 100_000, "is not a scene file"),
         (b"a" * 10**6 + b" = 1", "unknown key 'a{900,} ... a+.*; known: camera, splats"),
-        (b"camera = 3", "camera must be a table, not 3"),
-        (b"splats = [3]", r"splats\[0\] must be a table, not 3"),
+        (b"camera = 3", "camera must be a table, got 3"),
+        (b"splats = [3]", r"splats\[0\] must be a table, got 3"),
         (b"splats = 'a'", r"splats must be written \[\[splats\]\]"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Knobs of quality in scene files: the table [quality], and a few keys of [render]."""
+"""Quality settings in scene files: the table [quality], and some keys of [render]."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Any
 from fidsplat.capture.quality import PRESETS, MarkerQuality, Quality, knobs
 from fidsplat.scenes.table import Table, names_of
 
-_OF_RENDER = ("samples", "lowpass", "first_hit")
+_RENDER_KEYS = ("samples", "lowpass", "first_hit")
 
 
-def quality_of(top: Table, render: Table) -> Quality | str | None:
-    """What a scene file says of quality: the table [quality], or [render]'s preset and those of its keys."""
-    given = [key for key in ("quality", *_OF_RENDER) if key in render]
+def read_quality(top: Table, render: Table) -> Quality | str | None:
+    """Quality of a scene file: the table [quality], or the preset and keys of [render]."""
+    given = [key for key in ("quality", *_RENDER_KEYS) if key in render]
     if "quality" in top:
         if given:
-            raise render.error(given[0], "and the table [quality] exclude each other; say it there")
+            raise render.error(given[0], "and the table [quality] exclude each other; write it there")
         table = top.table("quality", ("preset", *knobs(Quality), "marker"))
         with table.at("preset"):
             plain = Quality.named(table.text("preset", "standard"))
@@ -28,7 +28,7 @@ def quality_of(top: Table, render: Table) -> Quality | str | None:
     with render.at("quality"):
         quality = Quality.of(text)
     readers = {"samples": render.whole, "lowpass": render.text, "first_hit": render.number}
-    for key in _OF_RENDER:
+    for key in _RENDER_KEYS:
         if key in render:
             with render.at(key):
                 quality = quality.with_(**{key: readers[key](key)})
@@ -36,12 +36,12 @@ def quality_of(top: Table, render: Table) -> Quality | str | None:
 
 
 def quality_tables(quality: Quality | str | None) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """What [render] says of a quality, and the tables beside it, by name."""
+    """Keys of [render] for a quality, and additional tables by name."""
     if quality is None:
         return {}, {}
     if isinstance(quality, str):
         return {"quality": quality}, {}
-    own = {key: getattr(quality, key) for key in _OF_RENDER}
+    own = {key: getattr(quality, key) for key in _RENDER_KEYS}
     for name, preset in PRESETS.items():
         if preset.with_(**own) == quality:
             return {"quality": name} | _changes(quality, preset), {}
@@ -53,18 +53,18 @@ def quality_tables(quality: Quality | str | None) -> tuple[dict[str, Any], dict[
 
 
 def _changes(given: Quality | MarkerQuality, plain: Quality | MarkerQuality) -> dict[str, Any]:
-    """The knobs in which two differ, as the first has them. None cannot be said, and no preset says more."""
+    """Settings in which two differ, with the values of the first."""
     pairs = {name: (getattr(given, name), getattr(plain, name)) for name in knobs(type(given))}
     return {name: value for name, (value, before) in pairs.items() if value != before}
 
 
-def marker_knobs(made: MarkerQuality, scene: Quality | str | None) -> dict[str, Any]:
-    """What a marker's own table says of how it was made, where the scene's quality does not say the same."""
+def marker_settings(made: MarkerQuality, scene: Quality | str | None) -> dict[str, Any]:
+    """Settings of a marker that differ from the scene's quality."""
     changes = _changes(made, Quality.of(scene).marker)
-    if "growth" in changes and made.growth is None:  # the mixture's own, which a file cannot say
+    if "growth" in changes and made.growth is None:  # the default of the mixture, which a file cannot express
         from fidsplat.markers.mixture import fitted_growth
 
         changes["growth"] = fitted_growth() if made.mixture == "fitted" else 0.0
-    concern = {"fitted": ("growth", "template"), "paper": ("levels", "density", "growth"), "facets": ()}
-    mine = concern.get(made.mixture, ("template",))
-    return {"mixture": made.mixture} | {name: changes[name] for name in mine if name in changes}
+    relevant = {"fitted": ("growth", "template"), "paper": ("levels", "density", "growth"), "facets": ()}
+    names = relevant.get(made.mixture, ("template",))
+    return {"mixture": made.mixture} | {name: changes[name] for name in names if name in changes}

@@ -1,4 +1,4 @@
-"""The tables [sensor], [fog] and [background] of a scene file, in and out."""
+"""Sensor, fog and background in scene files: the tables [sensor], [fog] and [background]."""
 
 import os
 from pathlib import Path
@@ -41,9 +41,10 @@ def read_background(top: Table, folder: Path) -> Gradient | Panorama | None:
         return Gradient(**table.values(Gradient))
 
 
-def imaging_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
-    """Tables by name that say a scene's sensor, fog and background. Raises InputError for a panorama that
-    came from no file.
+def environment_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
+    """Tables of a scene's sensor, fog and background, by name.
+
+    Raises InputError for a panorama that was not loaded from a file.
     """
     tables: dict[str, dict] = {}
     around = scene.background
@@ -52,8 +53,8 @@ def imaging_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
     elif isinstance(around, Panorama):
         if around.file is None:
             raise InputError(
-                "the background is a panorama that came from no file, and a scene file names one; write it "
-                "as a picture and use Panorama.load"
+                "a background panorama must be loaded from a file to be saved; write it as an image and use "
+                "Panorama.load"
             )
         tables["background"] = {"image": os.path.relpath(around.file, folder)}
     if scene.fog is not None:
