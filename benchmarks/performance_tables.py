@@ -1,13 +1,12 @@
-"""Turns measured figures into the Markdown tables of docs/performance.md and of devlog/.
+"""Write the Markdown tables of docs/performance.md and devlog/ from measurements.
 
     python benchmarks/performance_tables.py benchmarks/results/*.json*
     python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/*.md devlog/*.md
 
-Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
-benchmarks/listing_ways.py --json, benchmarks/large_scenes.py --json, benchmarks/batches.py --json and
-benchmarks/growth.py write, in any mixture; other figures are left alone. Without --into the tables are
-printed. With it, each replaces what stands between `<!-- begin NAME -->` and `<!-- end NAME -->` in those of
-the pages that have such lines; a table for which nothing was measured is left alone.
+Reads the files of `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
+benchmarks/batches.py --json and benchmarks/growth.py, and ignores others. Without --into the tables are
+printed. With it, each table replaces the text between `<!-- begin NAME -->` and `<!-- end NAME -->` in the
+pages that have these lines; a table without measurements is left as it is.
 """
 
 from __future__ import annotations
@@ -28,9 +27,9 @@ from fidsplat.util.files import atomic_write
 
 
 def load(files: Iterable[Path]) -> dict[str, list[dict]]:
-    """Records by kind; of `peers` and `peer_batches`, a fidsplat's is followed by the peer's; of `backends`,
-    which are those of a file where two drew each scene on one machine, OpenCL's by Warp's."""
-    kinds = ("frames", "backends", "peers", "first", "ways", "large", "growth", "batches", "peer_batches")
+    """Records by kind. `peers`, `peer_batches` and `backends` hold pairs: ours and the peer's, or OpenCL's
+    and Warp's on one machine."""
+    kinds = ("frames", "backends", "peers", "first", "growth", "batches", "peer_batches")
     found: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for file in files:
         if file.suffix == ".jsonl":
@@ -39,7 +38,7 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
         content = json.loads(file.read_text("utf-8"))
         if isinstance(content, list):
             batches = "peer_batches" if "renderer" in content[0] else "batches"
-            kinds = {"way": "ways", "budget_gib": "large", "caches": "first", "batch": batches}
+            kinds = {"caches": "first", "batch": batches}
             for kind in (kinds[key] for key in kinds if key in content[0]):
                 found[kind] += content
             continue
@@ -48,27 +47,13 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
         both = len({(record["scene"], record["title"]) for record in results}) < len(results)
         found["peers" if with_peer else "backends" if both else "frames"] += results
     scenes = list(BENCH_SCENES)
-    for kind in (
-        "frames",
-        "backends",
-        "peers",
-    ):  # devices of one scene stand together, whichever file they come from
+    for kind in ("frames", "backends", "peers"):  # group the devices of a scene
         found[kind].sort(key=lambda record: scenes.index(record["scene"]))
     return found
 
 
-AIMS = {
-    "H100": {
-        **{"tag": 0.10, "r100k_720p": 0.22, "r1m_1080p": 0.70, "r5m_1080p": 1.7, "r20m_4k": 6.5},
-        "qr_wall": 15,
-    },
-    "EPYC": {"r100k_720p": 30, "r1m_1080p": 190, "r5m_1080p": 650},
-}
-"""milliseconds of a frame that were aimed at, by a part of the device's name and by scene"""
-
-
 def markdown(rows: Iterable[dict[str, str]]) -> str:
-    """Rows, each with its cells by their heads, as a Markdown table; a dash where a row has none."""
+    """Markdown table of rows {column: cell}; a dash for a missing cell."""
     frame = pd.DataFrame(list(rows)).fillna("-")
     if frame.empty:
         return ""
@@ -77,7 +62,7 @@ def markdown(rows: Iterable[dict[str, str]]) -> str:
 
 
 def rates(record: dict) -> dict[str, str]:
-    """What each device can do at best."""
+    """Peak rates of a device."""
     best = record["rates"]
     return {
         "device": record["title"],
@@ -89,7 +74,7 @@ def rates(record: dict) -> dict[str, str]:
 
 
 def frames(record: dict) -> dict[str, str]:
-    """Whole frames."""
+    """Frame times."""
     low, high = record["quartiles_ms"]
     memory, rate = record["memory_bytes"], record["splats_per_second"]
     return {
@@ -105,43 +90,20 @@ def frames(record: dict) -> dict[str, str]:
 
 
 def stages(record: dict) -> dict[str, str]:
-    """Stages, each with how many times its roofline it takes."""
+    """Stage times, with the ratio to the roofline in brackets."""
     cells = {name: f"{ms(taken)} ({times(record, name)})" for name, taken in record["stages_ms"].items()}
     return {"scene": record["scene"], "device": f"{record['device']}: {record['title']}"} | cells
 
 
-def aimed_at(record: dict) -> float | None:
-    """Milliseconds that a frame may take; None where nothing was aimed at."""
-    wanted = (own.get(record["scene"]) for part, own in AIMS.items() if part in record["title"])
-    return next(wanted, None)
-
-
-def aims(record: dict) -> dict[str, str]:
-    """A whole frame beside what was aimed at, and how far each stage is from the device's best."""
-    at_most, taken = aimed_at(record), record["frame_ms"]
-    assert at_most is not None
-    cells = {name: f"{ms(own)} ({times(record, name)})" for name, own in record["stages_ms"].items()}
-    whole = {
-        "scene": record["scene"],
-        "device": f"{record['device']}: {record['title']}",
-        "at most": ms(at_most),
-        "ms per frame": ms(taken),
-        "met": "yes" if taken <= at_most else f"no: {taken / at_most:.2f} x",
-        **({"host": ms(record["host_ms"])} if "host_ms" in record else {}),
-        "all stages": ms(sum(record["stages_ms"].values())),
-    }
-    return whole | cells
-
-
 def counts(record: dict) -> dict[str, str]:
-    """What there is to draw in each scene."""
-    heads = {"splats": "splats", "visible": "visible", "drawn fragments": "fragments"}
+    """Numbers of splats and fragments of a scene."""
+    heads = {"splats": "splats", "visible": "visible", "fragments": "fragments"}
     cells = {head: f"{record[name]:,}" for head, name in heads.items() if name in record}
-    return {"scene": record["scene"], "picture": f"{record['width']} x {record['height']}"} | cells
+    return {"scene": record["scene"], "image": f"{record['width']} x {record['height']}"} | cells
 
 
 def peers(pair: tuple[dict, dict]) -> dict[str, str]:
-    """Another beside us in one run."""
+    """A peer and fidsplat in one run."""
     ours, its = pair
     return {
         "scene": its["scene"],
@@ -149,13 +111,13 @@ def peers(pair: tuple[dict, dict]) -> dict[str, str]:
         "its ms": ms(its["frame_ms"]),
         "our ms": f"{ours['title']}: {ms(ours['frame_ms'])}",
         "its / ours": f"{its['times_ours']:.3g}",
-        "PSNR of the two pictures": f"{its['psnr_db']:.1f} dB",
+        "PSNR of the two images": f"{its['psnr_db']:.1f} dB",
         "date": its["date"],
     }
 
 
 def backends(pair: tuple[dict, dict]) -> dict[str, str]:
-    """Two backends on one machine in one run; in brackets the host's part of frames, the first's stages."""
+    """Two backends on one machine in one run; in brackets host time, and stages of the first."""
     names = [record["device"].removesuffix(":0") for record in pair]
     of_stages = [record["stages_ms"] for record in pair]
     lists = {"project": ("project",), "sort and bin": ("sort", "bin"), "blend": ("blend", "resolve")}
@@ -176,7 +138,7 @@ def backends(pair: tuple[dict, dict]) -> dict[str, str]:
 
 
 def first(record: dict) -> dict[str, str]:
-    """First frames of new processes."""
+    """First frame of a new process."""
     low, high = record["range"]
     parts: dict[str, float] = {**record["seconds"]}
     total = parts.pop("total")
@@ -192,39 +154,8 @@ def first(record: dict) -> dict[str, str]:
     }
 
 
-def ways(record: dict) -> dict[str, str]:
-    """Both ways of listing, sort and bin together."""
-    sort, bins = record["stages_ms"]["sort"], record["stages_ms"]["bin"]
-    return {
-        "scene": record["scene"],
-        "device": record["device"],
-        "lists": record["way"],
-        "sort": ms(sort),
-        "bin": ms(bins),
-        "both, ms": ms(sort + bins),
-        "date": record["date"],
-    }
-
-
-def large(record: dict) -> dict[str, str]:
-    """Tens of millions of splats."""
-    budget = "" if record["budget_gib"] is None else f", budget {record['budget_gib']:g} GiB"
-    return {
-        "splats": f"{record['millions']} M",
-        "device": record["device"] + budget,
-        "first, s": f"{record['first_s']:.3g}",
-        "next, s": f"{record['next_s']:.3g}",
-        "device memory": f"{record['device_bytes'] / 2**30:.3g} GiB",
-        "process": f"{record['peak_bytes'] / 2**30:.3g} GiB",
-        "chunks": "yes" if record["chunks"] else "no",
-        "visible": f"{record['visible']:,}",
-        "pairs": f"{record['pairs']:,}",
-        "date": record["date"],
-    }
-
-
 def batches(record: dict) -> dict[str, str]:
-    """Batches of views, and the same views one by one."""
+    """Batches of views, and the same views rendered one by one."""
     low, high = record["quartiles_us"]
     return {
         "views": f"{record['views']} of {record['width']} x {record['height']}",
@@ -239,7 +170,7 @@ def batches(record: dict) -> dict[str, str]:
 
 
 def peer_batches(pair: tuple[dict, dict]) -> dict[str, str]:
-    """Another's batches of views beside ours in one run."""
+    """Batches of a peer and of fidsplat in one run."""
     ours, its = pair
     return {
         "views": f"{its['views']} of {its['width']} x {its['height']}",
@@ -250,7 +181,7 @@ def peer_batches(pair: tuple[dict, dict]) -> dict[str, str]:
         "our constants": ours.get("constants", "batches.py's"),
         "our us per view": ms(ours["us_per_view"]),
         "its / ours": f"{its['times_ours']:.3g}",
-        "PSNR of the two pictures": f"{its['psnr_same_constants_db']:.1f} dB",
+        "PSNR of the two images": f"{its['psnr_same_constants_db']:.1f} dB",
         "date": its["date"],
     }
 
@@ -263,29 +194,26 @@ def growth(curve: tuple[str, str, dict[str, float | None]]) -> dict[str, str]:
 
 
 def first_of_each_scene(records: list[dict]) -> list[dict]:
-    """One record of each scene, in their order."""
+    """First record of each scene."""
     scenes = dict.fromkeys(record["scene"] for record in records)
     return [next(record for record in records if record["scene"] == scene) for scene in scenes]
 
 
 def tables(records: dict[str, list[dict]]) -> dict[str, str]:
-    """Every table for which something was measured, by its name."""
-    drawn = records["frames"]
+    """Tables with measurements, by name."""
+    measured = records["frames"]
     pairs, batch_pairs = (
         [pair for pair in pairwise(records[kind]) if not pair[1]["renderer"].startswith("fidsplat")]
         for kind in ("peers", "peer_batches")
     )
     rows = {
-        "counts": map(counts, first_of_each_scene(drawn)),
-        "rates": map(rates, {record["title"]: record for record in drawn if record.get("rates")}.values()),
-        "frames": map(frames, drawn),
+        "counts": map(counts, first_of_each_scene(measured)),
+        "rates": map(rates, {record["title"]: record for record in measured if record.get("rates")}.values()),
+        "frames": map(frames, measured),
         "backends": map(backends, zip(records["backends"][::2], records["backends"][1::2], strict=True)),
-        "aims": map(aims, (record for record in drawn if aimed_at(record) is not None)),
-        "stages": map(stages, drawn),
+        "stages": map(stages, measured),
         "peers": map(peers, pairs),
         "first": map(first, records["first"]),
-        "ways": map(ways, records["ways"]),
-        "large": map(large, records["large"]),
         "batches": map(batches, records["batches"]),
         "peer_batches": map(peer_batches, batch_pairs),
         "growth": map(growth, exponents(records["growth"])),
@@ -294,25 +222,13 @@ def tables(records: dict[str, list[dict]]) -> dict[str, str]:
 
 
 TABLES = (
-    *(
-        "counts",
-        "rates",
-        "frames",
-        "backends",
-        "aims",
-        "stages",
-        "peers",
-        "first",
-        "ways",
-        "large",
-        "batches",
-    ),
+    *("counts", "rates", "frames", "backends", "stages", "peers", "first", "batches"),
     *("peer_batches", "growth"),
 )
 
 
 def insert(page: str, name: str, text: str) -> str:
-    """The page with the text between the marks of that name, if it has them."""
+    """Replace the text between the marks of a name, if the page has them."""
     marks = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
     return marks.sub(lambda match: f"{match[1]}{text}\n{match[2]}", page)
 
@@ -323,7 +239,7 @@ def ms(value: float) -> str:
 
 
 def times(record: dict, name: str) -> str:
-    """How many times its roofline, or a dash."""
+    """Ratio to the roofline, or a dash."""
     value = record["times_roofline"].get(name)
     return "-" if value is None else f"{value:.3g}"
 

@@ -112,7 +112,7 @@ def rows(text: str) -> list[str]:
 
 def test_each_kind_of_figures_becomes_its_table(files):
     made = tables.tables(tables.load(files))
-    assert list(made) == [name for name in tables.TABLES if name not in ("aims", "ways", "large")]
+    assert list(made) == list(tables.TABLES)
     assert rows(made["counts"]) == ["| tag | 640 x 480 | 691 | 690 | 202,902 |"]
     assert rows(made["rates"]) == ["| a CPU | 45 GB/s | 250 G/s | 12.5 G/s | 50 G/s |"]
     assert rows(made["frames"]) == [
@@ -136,16 +136,6 @@ def test_each_kind_of_figures_becomes_its_table(files):
         "| rgb, depth | batches.py's | 900 | 2 | 69.6 dB | 2026-11-22 |"
     ]
     assert rows(made["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
-
-
-def test_frames_stand_beside_what_was_aimed_at():
-    drawn = RECORD | {"title": "NVIDIA H100 80GB", "host_ms": 0.5}
-    other = drawn | {"scene": "tag_in_million"}
-    made = tables.tables({**tables.load([]), "frames": [drawn, drawn | {"frame_ms": 0.1}, other, RECORD]})
-    assert rows(made["aims"]) == [
-        "| tag | d: NVIDIA H100 80GB | 0.1 | 1.23 | no: 12.34 x | 0.5 | 1 | 0.25 (-) | 0.75 (15.5) |",
-        "| tag | d: NVIDIA H100 80GB | 0.1 | 0.1 | yes | 0.5 | 1 | 0.25 (-) | 0.75 (15.5) |",
-    ]
 
 
 def test_a_table_replaces_what_stands_between_its_marks():
