@@ -36,9 +36,11 @@ def ssim(picture: np.ndarray, truth: np.ndarray) -> float:
     """Structural similarity (Wang et al. 2004) of two (h, w) pictures: Gaussian window of sigma 1.5, 11 px.
 
     The same as scikit-image's with gaussian_weights, sigma 1.5, data_range 1 and use_sample_covariance
-    False: windows that leave the picture do not count.
+    False: windows that leave the picture do not count. NaN for pictures smaller than a window.
     """
     a, b = np.asarray(picture, np.float64), np.asarray(truth, np.float64)
+    if min(a.shape) <= 2 * _RADIUS:
+        return math.nan
 
     def mean(values: np.ndarray) -> np.ndarray:
         size = (2 * _RADIUS + 1,) * 2

@@ -1,6 +1,7 @@
 """PSNR, SSIM, FLIP and LPIPS against their definitions."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -34,6 +35,14 @@ def test_ssim_is_that_of_its_definition():
             top = (2 * ma * mb + 1e-4) * (2 * shared + 9e-4)
             values.append(top / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
     assert ssim(PICTURE, TRUTH) == pytest.approx(np.mean(values), abs=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(10, 30), (30, 10), (1, 1)])
+def test_ssim_of_pictures_smaller_than_its_window_is_not_a_number(shape):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isnan(ssim(np.zeros(shape), np.ones(shape)))
+    assert np.isfinite(ssim(np.zeros((11, 11)), np.ones((11, 11))))
 
 
 def test_ssim_is_that_of_scikit_image():

@@ -1,37 +1,420 @@
-"""A short run of tools/hostile.py: inputs at random are used, or refused in one clear line."""
+"""Hostile input: damaged files of every kind, Python arguments and command lines.
+
+Every input is used, or refused in one line, within limits of time and memory. A longer run:
+
+    FIDSPLAT_HOSTILE=1000 python -m pytest -n 0 tests/unit/test_hostile.py --hypothesis-seed=33
+"""
 
 import contextlib
+import json
 import os
-import subprocess
-import sys
+import shutil
 import warnings
-from pathlib import Path
+import zlib
 
-import hostile
+import cv2
 import numpy as np
 import pytest
-from hostile_calls import CALLS
-from hostile_files import ground
-from hostile_inputs import KINDS
-from sampling import sampled
+from hostile import JUNK, NUMBERS, TEXTS, damaged, limits
+from hostile_calls import CALLS, DATASET, RENDERER, SETTINGS, _pictures_of
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from test_formats_sog import sog
+from test_sim_description import ROVER, URDF, WORLD
 
 import fidsplat as fs
+from fidsplat import cli
+from fidsplat.images.files import read_bits, read_image, write_png
+from fidsplat.sim import read_description
+from fidsplat.store.layout import NPY_HEADER, checksum, header_crc
+from fidsplat.train import Trainer, load_dataset
+from fidsplat.train.checkpoint import splats_of
+from fidsplat.vision.detect import detect
 
-ROOT = Path(__file__).parents[2]
+COUNT = int(os.environ.get("FIDSPLAT_HOSTILE", "0"))
+"""examples of each kind; 0: a few, the same in every run"""
+CAMERA = fs.Camera.look_at(24, 16, 1.0, (0.0, 0.0, -9.0), (0.0, 0.0, 0.0))
 
 
-def run(*words):
-    command = [sys.executable, str(ROOT / "tools" / "hostile.py"), *map(str, words)]
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path})
+def examples(few):
+    return settings(
+        max_examples=COUNT or few,
+        deadline=None,
+        derandomize=not COUNT,
+        database=None,
+        phases=[Phase.generate, Phase.shrink] if COUNT else [Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
 
 
-@pytest.mark.parametrize("seed", sampled(range(6), 1, 0))
-def test_inputs_at_random(seed):
-    """8 of each kind."""
-    done = run("--count", 8 * len(KINDS), "--seed", seed)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("\n| ") == len(KINDS)
+def cloud(count=12):
+    r = np.random.default_rng(count)
+    shapes = r.normal(size=(count, 3)), r.normal(size=(count, 4)), r.uniform(0.1, 1, (count, 2))
+    return fs.SplatCloud(*shapes, r.random(count), sh=r.normal(size=(count, 4, 3)))
+
+
+# --- files that are good
+
+
+def splats(suffix):
+    def make(folder):
+        fs.save_splats(cloud(), folder / f"a{suffix}")
+
+    return make
+
+
+def gltf(folder):
+    """The same splats as a GLB, with its buffer beside it."""
+    fs.save_splats(cloud(), folder / "a.glb")
+    data = (folder / "a.glb").read_bytes()
+    (folder / "a.glb").unlink()
+    size = int.from_bytes(data[12:16], "little")
+    said = json.loads(data[20 : 20 + size])
+    said["buffers"][0]["uri"] = "a.bin"
+    (folder / "a.bin").write_bytes(data[28 + size :])
+    (folder / "a.gltf").write_text(json.dumps(said))
+
+
+def packed_sog(folder):
+    sog(folder / "a.sog")
+
+
+SCENE = """[camera]
+width = 24
+height = 16
+fov_x_deg = 60.0
+near = 0.1
+[camera.distortion]
+k1 = 0.1
+[camera.shutter]
+exposure_time_ms = 5.0
+sub_poses = 2
+readout_ms = 3.0
+rows_per_band = 8
+[[camera.motion]]
+time = 0.0
+position = [0.0, 0.0, -1.0]
+look_at = [0.0, 0.0, 0.0]
+[[splats]]
+file = "good.ply"
+position = [0.0, 0.0, 1.0]
+quaternion = [1.0, 0.0, 0.0, 0.0]
+scale = 1.0
+[[markers]]
+spec = "aruco:4x4_50:7"
+size = 0.1
+label = 3
+[[markers]]
+spec = "svg-9:good.svg"
+size = 0.1
+quiet_zone = 1
+mixture = "exact"
+[sensor]
+exposure = 1.5
+full_well = 1000.0
+read_noise = 2.0
+response = 2.2
+bits = 8
+[fog]
+density = 0.1
+color = [0.5, 0.5, 0.5]
+[background]
+top = [0.0, 0.0, 1.0]
+bottom = [1.0, 1.0, 1.0]
+[render]
+outputs = ["rgb", "depth"]
+device = "reference"
+[quality]
+preset = "fast"
+samples = 2
+alpha_cutoff = 1e-3
+[quality.marker]
+template = 9
+"""
+DRAWING = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10">
+<rect x="1" y="2" width="3" height="4" fill="#123456"/>
+<circle cx="5" cy="5" r="3" fill="rgb(255, 0, 9)"/>
+<ellipse cx="5" cy="5" rx="3" ry="2"/>
+<polygon points="0,0 9,0 9,9" fill-rule="evenodd"/>
+<path d="M 1 1 h 5 v 5 l -1 1 C 1 2 3 4 5 6 S 1 2 3 4 Q 1 2 3 4 T 5 6 A 2 3 10 0 1 4 4 z" style="fill:navy"/>
+<g transform="translate(1, 2) rotate(30) scale(0.5)"><rect width="4" height="4"/></g>
+<g fill="none"><title>a</title><rect width="9" height="9" fill="lime"/></g>
+</svg>
+"""
+
+
+def ground(folder):
+    """Files for scenes and command lines to name."""
+    fs.save_ply(cloud(), folder / "good.ply")
+    random = np.random.default_rng(0)
+    write_png(folder / "good.png", random.integers(0, 255, (8, 16, 3)).astype(np.uint8))
+    write_png(folder / "bits.png", random.integers(0, 2, (6, 6)).astype(np.uint8) * 255)
+    (folder / "good.svg").write_text(DRAWING)
+
+
+def scene(folder):
+    ground(folder)
+    (folder / "a.toml").write_text(SCENE)
+
+
+def drawing(folder):
+    (folder / "a.svg").write_text(DRAWING)
+
+
+def pictures(folder):
+    random = np.random.default_rng(1)
+    colors = random.integers(0, 255, (9, 12, 3)).astype(np.uint8)
+    for suffix in (".png", ".jpg", ".tiff", ".bmp", ".webp", ".hdr", ".ppm"):
+        image = colors if suffix != ".hdr" else colors.astype(np.float32)
+        (folder / f"a{suffix}").write_bytes(cv2.imencode(suffix, image)[1].tobytes())
+    write_png(folder / "deep.png", colors.astype(np.uint16) * 257)
+
+
+def world(folder):
+    (folder / "rover").mkdir()
+    (folder / "rover/model.sdf").write_text(ROVER)
+    (folder / "world.sdf").write_text(WORLD)
+
+
+def robot(folder):
+    (folder / "a.urdf").write_text(URDF)
+
+
+def log(name):
+    def make(folder):
+        logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'")
+        with logs.RobotLog(folder / name) as log:
+            for time in (0.5, 1.0):
+                log.image(time, "eye", np.zeros((4, 6, 3)))
+                log.image(time, "eye", np.zeros((4, 6, 3)), compress="png")
+                log.transform(time, "eye", np.eye(4))
+
+    return make
+
+
+def store(folder):
+    fs.save_ply(cloud(400), folder / "a.ply")
+    fs.build_store([folder / "a.ply"], folder / "a.fss", chunk=64)
+    (folder / "a.ply").unlink()
+
+
+def checkpoint(folder):
+    trainer = Trainer(DATASET, RENDERER, SETTINGS, folder / "a.npz")
+    trainer.run()
+
+
+def views(folder):
+    _pictures_of(folder)
+
+
+COLMAP = {
+    "cameras": "1 OPENCV 12 8 10 11 6 4 0.1 0.01 0 0\n",
+    "images": "1 1 0 0 0 0 0 4 1 0.png\n1 2 1\n2 0.9 0.1 0 0 0 0 4 1 1.png\n\n",
+    "points3D": "1 0 0 1 255 0 9 0.5 1 0\n2 0 1 1 255 0 9 0.5 1 0 2 0\n",
+}
+
+
+def colmap_text(folder):
+    (folder / "sparse/0").mkdir(parents=True)
+    (folder / "images").mkdir()
+    for name, text in COLMAP.items():
+        (folder / f"sparse/0/{name}.txt").write_text(text)
+    for k in range(2):
+        write_png(folder / f"images/{k}.png", np.full((8, 12, 3), 90, np.uint8))
+
+
+def path_file(name):
+    def make(folder):
+        path = fs.Trajectory([0.0, 1.0], np.stack([np.eye(4)] * 2))
+        fs.save_trajectory(path, folder / name, CAMERA, ["a.png", "b.png"])
+
+    return make
+
+
+RUN = {"run": {"device": None, "seed": 0, "versions": {}, "code": "", "points": 1}}
+PART = {"dark": 3, "light": 4}
+POINT = {
+    "key": {"category": "apriltag", "index": 0, "repeats": 2},
+    "result": {key: PART for key in ("cells", "runs", "rectangles", "components")}
+    | {"gaussians": {"exact": {"rectangles": 7, "cells": 8}}, "seconds": {"exact": [0.1, 0.2]}},
+}
+
+
+def results(folder):
+    (folder / "counts.jsonl").write_text(f"{json.dumps(RUN)}\n{json.dumps(POINT)}\n")
+
+
+# --- their use
+
+
+def render(made):
+    if 0 < len(made) < 1000:
+        RENDERER.render(made, CAMERA, ["rgb", "depth"])
+
+
+def use_splats(file):
+    made = fs.load_splats(file)
+    render(made)
+    fs.save_ply(made, file.with_name("again.ply"))
+
+
+def use_scene(file):
+    made = fs.Scene.load(file)
+    camera = made.camera
+    if camera is not None and camera.width * camera.height < 10_000 and len(made.cloud()) < 10_000:
+        RENDERER.render(made)
+    made.save(file.with_name("again.toml"))
+    fs.Scene.load(file.with_name("again.toml"))
+
+
+def use_drawing(file):
+    for spec in ("svg", "svg-16"):
+        render(fs.marker(f"{spec}:{file}", size=0.1, mixture="exact").cloud)
+
+
+def use_picture(file):
+    ways = (
+        lambda: detect(read_image(file)),
+        lambda: read_image(file, deep=True),
+        lambda: read_bits(file),
+        lambda: fs.Panorama.load(file),
+        lambda: fs.marker(f"image:{file}", size=0.1),
+    )
+    for way in ways:
+        with limits():
+            way()
+
+
+def use_log(path):
+    from fidsplat.logs import log_pictures, log_poses
+
+    for _ in log_pictures(path):
+        pass
+    log_poses(path)
+
+
+def use_store(path):
+    made = fs.Store(path)
+    made.summary(), made.labels(), made.verify()
+    if len(made) < 1000:
+        with np.errstate(all="ignore"):  # values of splats are not read before they are rendered
+            RENDERER.render(fs.Scene([], CAMERA, stores=(made,)), outputs=["alpha"])
+
+
+def use_checkpoint(file):
+    with contextlib.suppress(fs.FidsplatError):
+        render(splats_of(file)[0])
+    Trainer(DATASET, RENDERER, SETTINGS, file, restart=False).run()
+
+
+def use_views(path):
+    load_dataset(path, random_points=3)
+
+
+def use_path(file):
+    made = fs.load_trajectory(file)
+    made(made.times[0])
+
+
+def use_results(file):
+    from fidsplat.experiments.results import load
+    from fidsplat.experiments.targets import targets
+
+    targets(load([file.parent]))
+
+
+def signed(folder):
+    """Give a damaged store the checksums that fit, as somebody who knows them."""
+    with contextlib.suppress(Exception):
+        header, nodes = json.loads((folder / "store.json").read_text()), np.load(folder / "nodes.npy")
+        with contextlib.suppress(Exception):
+            columns = {
+                name: np.memmap(folder / f"{name}.npy", kind, "r", NPY_HEADER).reshape(header["rows"], -1)
+                for name, kind in header["columns"].items()
+            }
+            for node in nodes:
+                part = slice(node["first"], node["first"] + node["count"])
+                node["crc"] = checksum({name: array[part] for name, array in columns.items()})
+        np.save(folder / "nodes.npy", nodes)
+        header["nodes_crc"] = zlib.crc32(nodes.tobytes())
+        (folder / "store.json").write_text(json.dumps(header | {"crc": header_crc(header)}))
+
+
+INPUTS = {
+    ".ply": (splats(".ply"), use_splats, "a.ply", 40),
+    ".splat": (splats(".splat"), use_splats, "a.splat", 20),
+    ".spz": (splats(".spz"), use_splats, "a.spz", 40),
+    ".glb": (splats(".glb"), use_splats, "a.glb", 40),
+    ".gltf": (gltf, use_splats, "a.gltf", 40),
+    ".sog": (packed_sog, use_splats, "a.sog", 40),
+    ".usda": (splats(".usda"), use_splats, "a.usda", 3),
+    ".usdc": (splats(".usdc"), use_splats, "a.usdc", 3),
+    "scene": (scene, use_scene, "a.toml", 40),
+    "drawing": (drawing, use_drawing, "a.svg", 30),
+    "pictures": (pictures, use_picture, "*", 30),
+    "SDF": (world, read_description, "world.sdf", 30),
+    "URDF": (robot, read_description, "a.urdf", 30),
+    "MCAP": (log("a.mcap"), use_log, "a.mcap", 30),
+    "bag": (log("a"), use_log, "a", 30),
+    "store": (store, use_store, "a.fss", 40),
+    "checkpoint": (checkpoint, use_checkpoint, "a.npz", 20),
+    "transforms.json": (views, use_views, ".", 30),
+    "COLMAP": (colmap_text, use_views, ".", 30),
+    ".tum": (path_file("a.tum"), use_path, "a.tum", 20),
+    ".kitti": (path_file("a.kitti"), use_path, "a.kitti", 20),
+    ".json": (path_file("a.json"), use_path, "a.json", 20),
+    "results": (results, use_results, "counts.jsonl", 30),
+}
+"""kind: (maker of good files in a folder, use of one, its name or a pattern, examples of a short run)"""
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    """Folder of good files of a kind, which must be used."""
+    made = {}
+
+    def of(kind):
+        if kind not in made:
+            make, use, name, _ = INPUTS[kind]
+            folder = tmp_path_factory.mktemp("good")
+            make(folder)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                for path in [folder] if name == "." else sorted(folder.glob(name)):
+                    copy = tmp_path_factory.mktemp("used") / "copy"
+                    shutil.copytree(folder, copy)
+                    use(copy if name == "." else copy / path.name)
+            made[kind] = folder
+        return made[kind]
+
+    return of
+
+
+@pytest.mark.parametrize("kind", list(INPUTS))
+def test_damaged_files_are_used_or_refused(kind, good, tmp_path):
+    if kind.startswith(".usd"):
+        pytest.importorskip("pxr.UsdVol", reason="pip install 'fidsplat[usd]'")
+    folder, (_, use, name, few) = good(kind), INPUTS[kind]
+    files = sorted(file.relative_to(folder) for file in folder.rglob("*") if file.is_file())
+    contents = {file: (folder / file).read_bytes() for file in files}
+    copy = tmp_path / "copy"
+
+    @examples(few)
+    @given(st.data())
+    def check(data):
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(folder, copy)
+        file = data.draw(st.sampled_from(files))
+        (copy / file).write_bytes(data.draw(damaged(file, contents[file])))
+        if kind == "store" and data.draw(st.booleans()):
+            signed(copy / name)
+        with limits():
+            use(copy / file if name == "*" else copy if name == "." else copy / name)
+
+    check()
+
+
+# --- Python
 
 
 ODD = (object(), np.zeros((0, 3)), 10**400, "\ud800", float("nan"))
@@ -53,52 +436,94 @@ def test_every_argument_is_validated(name, tmp_path, monkeypatch):
                     use(made)
 
 
-WAYS = (
-    ("raise TypeError('from inside')", "fault"),
-    ("raise fidsplat.InputError('one line\\ntwo') from None", "one line"),
-    ("__import__('warnings').warn('numpy', RuntimeWarning)", "fault"),
-    ("__import__('os')._exit(3)", "crash"),
-    ("bytearray(1 << 40)", "memory"),
-)
+@examples(40)
+@given(st.data())
+def test_arguments_that_nobody_expects(tmp_path, data):
+    if not (tmp_path / "good.ply").exists():
+        ground(tmp_path)
+    function, arguments, use = CALLS[data.draw(st.sampled_from(sorted(CALLS)))](tmp_path)
+    keys = st.lists(st.sampled_from(sorted(arguments)), min_size=1, max_size=2, unique=True)
+    odd = {key: data.draw(st.sampled_from(JUNK)) for key in data.draw(keys)}
+    with limits(), contextlib.chdir(tmp_path):
+        made = function(**arguments | odd)
+        if use is not None:
+            use(made)
 
 
-def with_broken_loader(folder, first, *words):
-    """A run of the tool whose loader of scenes ends in one of the WAYS after the other, from number `first`
-    on."""
-    count = folder / "count"
-    count.write_text("x" * first)
-    (folder / "sitecustomize.py").write_text(
-        "import fidsplat, fidsplat.scenes, pathlib\n"
-        f"WAYS, count = {[broken for broken, _ in WAYS]!r}, pathlib.Path({str(count)!r})\n"
-        "def load(path):\n"
-        "    done = count.read_text()\n"
-        "    count.write_text(done + 'x')\n"
-        "    exec(WAYS[len(done)])\n"
-        "fidsplat.scenes.Scene.load = staticmethod(load)\n"
-    )
-    command = [sys.executable, str(ROOT / "tools" / "hostile.py"), "--kinds", "scenes", *words]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
-    return subprocess.run(command, capture_output=True, text=True, env=env)
+# --- command lines
 
 
-def test_each_way_to_end_is_told(tmp_path):
-    """By the runner of the tool itself."""
-    done = with_broken_loader(tmp_path, 0, "--count", str(len(WAYS)))
-    told = [line.partition(" after")[0] for line in done.stdout.splitlines() if line.startswith("scenes ")]
-    bad = [f"scenes {i}: {ending}" for i, (_, ending) in enumerate(WAYS) if ending != "one line"]
-    assert told == bad, done.stdout + done.stderr
-    assert "| scenes | 0 | 1 | 2 | 0 | 1 | 1 |" in done.stdout
-    assert done.returncode == 1
+COMMANDS = [
+    "marker aruco:4x4_50:7 --size 0.1 -o tag.ply --mixture fitted --quality marker.template=9",
+    "marker qr:hello --json",
+    "marker image:bits.png --mixture exact --native-2dgs -o tag.ply",
+    "marker charuco:5x4:4x4_50 --json --max-splats 20000",
+    "marker gridboard:2x3:4x4_50 -o board.ply",
+    "marker aprilgrid:2x2:36h11 --size 0.4 --json",
+    "marker svg-16:good.svg -o drawing.ply",
+    "render a.toml -o frames --outputs rgb,label --device reference --quality fast,samples=2,order=pixel",
+    "render none.ply -o a.png --device reference --json",
+    "detect good.png --family 36h11 --scene a.toml --json",
+    "detect . --json",
+    "source a.toml --schedule group",
+    "info good.ply --json",
+    "convert good.ply out.spz --json",
+    "devices --json",
+]
+SLOW = [
+    "check --device nowhere",
+    "bench --scenes nothing --json out.json",
+    "tradeoff --scenes nothing -o out",
+    "tradeoff report nowhere -o out",
+    "experiment nothing -o out",
+    "experiment dataset --markers 9 -o out",
+    "experiment merge nowhere -o out",
+    "experiment report nowhere -o out",
+    "demo --out /proc/nowhere",
+    "warm nothing --device nowhere",
+]
+"""commands that would work for minutes, were their words good after all"""
+OPTIONS = ["--size", "--debugg", "--jsno", "-o", "--outputs", "--quality", "--seed"]
 
 
-def test_the_one_that_is_asked_for_is_told_though_it_ends_well(tmp_path):
-    done = with_broken_loader(tmp_path, 1, "--only", "3")
-    assert "scenes 3: one line " in done.stdout, done.stdout + done.stderr
-    assert done.returncode == 0
+@st.composite
+def command_lines(draw):
+    slow = draw(st.integers(0, 3)) == 0
+    words = draw(st.sampled_from(SLOW if slow else COMMANDS)).split()
+    for _ in range(draw(st.integers(1, 3))):
+        at = draw(st.integers(1, max(len(words), 1)))
+        match draw(st.integers(0, 1 if slow else 5)):
+            case 0:
+                words.insert(at, draw(st.sampled_from(TEXTS)))
+            case 1:
+                words.insert(at, draw(st.sampled_from(OPTIONS)))
+            case 2:
+                words[at - 1 : at] = [draw(st.sampled_from(TEXTS))]
+            case 3:
+                del words[at - 1 : at]
+            case 4 if words:
+                word = words[at - 1]
+                cut = draw(st.integers(0, len(word)))
+                words[at - 1] = word[:cut] + draw(st.sampled_from(TEXTS))[:9] + word[cut:]
+            case _ if words:
+                ending = draw(st.sampled_from(["", ",", "=", *NUMBERS]))
+                words[at - 1] = words[at - 1].replace("=", draw(st.sampled_from("=,:"))) + ending
+    return [word for word in words if word != "--debug"] + (["--debugg"] if slow else [])
 
 
-def test_an_error_may_follow_a_bar_and_nothing_else():
-    bad = ("fidsplat: a\nfidsplat: b", "fidsplat: a\nTraceback", "fidsplat: a (a fault of fidsplat)", "")
-    assert {hostile._ending_of_a_command(2, err)[0] for err in bad} == {"fault"}
-    good = ("fidsplat: a\n", "reading 50 %\nfidsplat: a\n", "fidsplat: warning: b\nfidsplat: a")
-    assert {hostile._ending_of_a_command(2, err)[0] for err in good} == {"one line"}
+@examples(40)
+@given(words=command_lines())
+def test_command_lines(tmp_path, capsys, words):
+    if not (tmp_path / "a.toml").exists():
+        scene(tmp_path)
+    capsys.readouterr()
+    with limits(), contextlib.chdir(tmp_path):
+        status = cli.main(words)
+        errors = capsys.readouterr().err
+        if status:
+            assert status in (1, 2)
+            last = errors.rstrip("\n").rpartition("\n")[2]
+            said = [line for line in errors.splitlines() if line.startswith("fidsplat: ")]
+            assert [line for line in said if not line.startswith("fidsplat: warning: ")] == [last], errors
+            assert "a fault of fidsplat" not in last
+            assert "Traceback" not in errors

@@ -1,4 +1,4 @@
-"""Public calls of fidsplat with arguments that are good, for hostile_inputs.py to exchange."""
+"""Public calls of fidsplat with good arguments, which tests exchange for bad ones."""
 
 from __future__ import annotations
 
