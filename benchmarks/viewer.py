@@ -52,7 +52,7 @@ def main() -> None:
         width,
         height,
     )
-    title = session.drawn.renderer.device.title
+    title = session.state.renderer.device.title
     print(f"{words.splats:,} splats, {width} x {height}, {title}")
     print(
         "| aim | pictures a second | scale | drag to JPEG, median | 95 % | drawn | JPEG | CPU time | size "
@@ -70,7 +70,7 @@ def measured(session: Session, start: Viewpoint, rate: float, seconds: float) ->
 
     def moving(viewpoint: Viewpoint, scale: float) -> Callable[[], None]:
         begun = asked
-        image = session.draw_moving(viewpoint, scale).to_uint8()
+        image = session.render_moving(viewpoint, scale).to_uint8()
         drawn.append(time.perf_counter() - begun)
 
         def send() -> None:
@@ -83,17 +83,17 @@ def measured(session: Session, start: Viewpoint, rate: float, seconds: float) ->
         return send
 
     def rest(viewpoint: Viewpoint) -> None:
-        encoded(session.draw(viewpoint).frame.to_uint8(), "png")
+        encoded(session.render(viewpoint).frame.to_uint8(), "png")
 
     stream = Stream(moving, rest, rate=rate)
     for warm in range(10):  # the scale finds its place
-        stream.look(turned(start, -STEP * (warm + 1)))
+        stream.set_viewpoint(turned(start, -STEP * (warm + 1)))
         asked = time.perf_counter()
         stream.step()
     del latencies[:], sizes[:], scales[:], drawn[:], encoding[:]
     begun, worked = time.perf_counter(), time.process_time()
     while time.perf_counter() - begun < seconds:
-        stream.look(turned(start, SWING * math.sin(STEP / SWING * len(drawn))))
+        stream.set_viewpoint(turned(start, SWING * math.sin(STEP / SWING * len(drawn))))
         asked = time.perf_counter()
         stream.step()
     fps = len(drawn) / (time.perf_counter() - begun)

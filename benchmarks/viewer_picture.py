@@ -1,7 +1,7 @@
 """The picture of the viewer in docs/viewer.md: the demo's scene in a headless Chromium.
 
-fidsplat demo && PYTHONPATH=.:tools python benchmarks/viewer_picture.py fidsplat-demo/scene.toml docs/images/viewer.jpg
-"""  # noqa: E501
+fidsplat demo && PYTHONPATH=.:tools python benchmarks/viewer_picture.py fidsplat-demo/scene.toml
+docs/images/viewer.jpg"""
 
 import sys
 import time
@@ -25,7 +25,7 @@ def main(source: str, out: str) -> None:
         page.evaluate(CLOSE)
         time.sleep(1.0)
         rests(viewer)
-        viewer.read(next(iter(viewer.server.get_clients().values())))
+        viewer.detect_markers(next(iter(viewer.server.get_clients().values())))
         time.sleep(1.0)
         cv2.imwrite(out, page.picture()[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
     viewer.close()

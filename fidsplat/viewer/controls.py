@@ -1,4 +1,4 @@
-"""The page's panel: sliders and selectors for how it is drawn, and buttons for what is done with it."""
+"""Panel of the page: sliders and selectors of the settings, and buttons."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from fidsplat.util.markdown import escaped
 from fidsplat.viewer.session import Session
 from fidsplat.viewer.settings import LENSES, Settings
 
-NOBODY = "none"
-OF_SCENE = "the scene's"
+NO_TARGET = "none"
+SCENE_QUALITY = "the scene's"
 
 
 class Actions(Protocol):
-    """What the buttons do; client is viser's handle of who pressed."""
+    """Actions of the buttons; client is viser's handle of the browser."""
 
-    def picture(self, client: Any) -> None: ...
-    def read(self, client: Any) -> None: ...
+    def save_image(self, client: Any) -> None: ...
+    def detect_markers(self, client: Any) -> None: ...
     def add_keyframe(self, client: Any) -> None: ...
     def save_keyframes(self, client: Any) -> None: ...
     def clear_keyframes(self, client: Any) -> None: ...
-    def movable(self, scene: Scene) -> list[str]: ...
-    def hold(self, name: str) -> None: ...
+    def target_names(self, scene: Scene) -> list[str]: ...
+    def select_target(self, name: str) -> None: ...
     def overlay(self, visible: bool) -> None: ...
 
 
@@ -33,54 +33,57 @@ class Controls:
     """The panel of a viser page (its `gui`).
 
     Args:
-        devices: names to choose from; the session's own is among them.
+        devices: names of the selector, including the session's device.
     """
 
     def __init__(self, gui: Any, session: Session, devices: list[str], actions: Actions) -> None:
         self._gui, self._session = gui, session
         self._sliders: dict[str, Any] = {}
-        drawn = session.drawn
-        self._drawing = gui.add_folder("Drawing")
-        with self._drawing:
+        state = session.state
+        self._rendering = gui.add_folder("Rendering")
+        with self._rendering:
             self.status = gui.add_markdown("")
-            self._choice("device", devices, drawn.device, lambda value: {"device": value})
+            self._choice("device", devices, state.device, lambda value: {"device": value})
             self._choice(
-                "quality", [OF_SCENE, *PRESETS], OF_SCENE, lambda v: {"quality": None if v == OF_SCENE else v}
+                "quality",
+                [SCENE_QUALITY, *PRESETS],
+                SCENE_QUALITY,
+                lambda v: {"quality": None if v == SCENE_QUALITY else v},
             )
             self._lens = self._choice(
-                "lens", _lenses(drawn.scene), drawn.settings.lens, lambda value: {"lens": value}
+                "lens", _lenses(state.scene), state.settings.lens, lambda value: {"lens": value}
             )
             self._slider("fog", "fog [1/m]", 0.0, 2.0, 0.01)
             self._slider("exposure", "exposure", 0.0, 4.0, 0.05)
             self._slider("noise", "shot noise", 0.0, 0.3, 0.005)
-        self._offer_times(drawn.scene)
+        self._offer_times(state.scene)
         with gui.add_folder("Scene"):
-            names = [NOBODY, *actions.movable(drawn.scene)]
-            self._held = held = gui.add_dropdown("move", names, initial_value=NOBODY)
-            held.on_update(lambda _: actions.hold(held.value))
+            names = [NO_TARGET, *actions.target_names(state.scene)]
+            self._targets = targets = gui.add_dropdown("move", names, initial_value=NO_TARGET)
+            targets.on_update(lambda _: actions.select_target(targets.value))
             shown = gui.add_checkbox("outlines", True)
             shown.on_update(lambda _: actions.overlay(shown.value))
-            self._button("What a detector sees", actions.read)
-            self._button("Picture", actions.picture)
+            self._button("Detect markers", actions.detect_markers)
+            self._button("Save image", actions.save_image)
         with gui.add_folder("Trajectory"):
             self._button("Add keyframe", actions.add_keyframe)
             self._button("Save keyframes", actions.save_keyframes)
             self._button("Clear keyframes", actions.clear_keyframes)
-        self.say("")
+        self.show_status("")
 
-    def say(self, problem: str) -> None:
-        """How it is drawn now, and what went wrong, if anything did."""
-        drawn = self._session.drawn
-        lines = [f"{len(drawn.resident):,} splats, {escaped(drawn.renderer.device.title)}"]
+    def show_status(self, problem: str) -> None:
+        """Show the number of splats, the device and an error message, which may be empty."""
+        state = self._session.state
+        lines = [f"{len(state.resident):,} splats, {escaped(state.renderer.device.title)}"]
         self.status.content = "\n\n".join(lines + ([f"**{escaped(problem)}**"] if problem else []))
 
-    def offer(self, names: list[str]) -> None:
-        """Let what another scene has be moved; none of it is held at first."""
-        self._held.value = NOBODY
-        self._held.options = [NOBODY, *names]
+    def offer_targets(self, names: list[str]) -> None:
+        """Replace the names of the gizmo's selector; none is selected."""
+        self._targets.value = NO_TARGET
+        self._targets.options = [NO_TARGET, *names]
 
-    def follow(self, scene: Scene, settings: Settings) -> None:
-        """Stand where settings are that came with another scene, not from here."""
+    def update_from(self, scene: Scene, settings: Settings) -> None:
+        """Set the sliders and selectors to the settings of another scene."""
         self._offer_times(scene)
         for name, slider in self._sliders.items():
             value = float(getattr(settings, name))
@@ -91,23 +94,23 @@ class Controls:
             self._lens.value = settings.lens
 
     def _offer_times(self, scene: Scene) -> None:
-        """Have sliders of the clock where something moves, and none elsewhere."""
+        """Show sliders for the shutter if the scene moves."""
         if not scene.motion.groups:
             for name in {"time", "exposure_ms", "readout_ms"} & self._sliders.keys():
                 self._sliders.pop(name).remove()
         elif "time" in self._sliders:
             self._sliders["time"].min, self._sliders["time"].max = _span(scene)
         else:
-            with self._drawing:
+            with self._rendering:
                 self._slider("time", "time [s]", *_span(scene), 0.01)
                 self._slider("exposure_ms", "exposure time [ms]", 0.0, 200.0, 1.0)
                 self._slider("readout_ms", "readout [ms]", 0.0, 100.0, 1.0)
 
     def _change(self, **changes: Any) -> None:
-        _, settings = self._session.wanted()
+        _, settings = self._session.requested()
         changed = replace(settings, **changes)
         if changed != settings:
-            self._session.wish(settings=changed, done=lambda why: self.say(why or ""))
+            self._session.request(settings=changed, done=lambda why: self.show_status(why or ""))
 
     def _choice(self, label: str, options: list[str], value: str, of: Callable[[str], dict[str, Any]]) -> Any:
         handle = self._gui.add_dropdown(label, options, initial_value=value)
@@ -115,7 +118,7 @@ class Controls:
         return handle
 
     def _slider(self, name: str, label: str, low: float, high: float, step: float) -> None:
-        value = float(getattr(self._session.drawn.settings, name))
+        value = float(getattr(self._session.state.settings, name))
         handle = self._gui.add_slider(label, min(low, value), max(high, value), step, value)
         handle.on_update(lambda _: self._change(**{name: float(handle.value)}))
         self._sliders[name] = handle
@@ -130,7 +133,7 @@ def _lenses(scene: Scene) -> list[str]:
 
 
 def _span(scene: Scene) -> tuple[float, float]:
-    """The times between which keyframes of the scene lie; 0 to 1 where motions are functions."""
+    """Time range of the scene's keyframes; 0 to 1 for motions that are functions."""
     motions = [*scene.cloud_motions.values(), *(p.motion for p in scene.markers if p.motion is not None)]
     times = [float(time) for motion in motions for time in getattr(motion, "times", ())]
     return (min(times), max(times)) if len(set(times)) > 1 else (0.0, 1.0)

@@ -1,8 +1,9 @@
-"""Who may speak to a viewer's server: its own pages, and programs that are no browser.
+"""Origin check and content security policy of the viewer's server.
 
-A browser lets any page open a WebSocket to any address, this machine's among them, and viser does not ask
-which page it was: another site in the same browser could move markers in an open scene. Browsers name the
-page's origin, and the host that was asked for, so both are checked.
+A browser lets any page open a WebSocket to any address, including this machine's, and viser does not check
+the page's origin: another site in the same browser could move markers of an open scene. Browsers send the
+origin of the page and the requested host; both are checked. Programs other than browsers send no origin and
+are accepted.
 """
 
 from __future__ import annotations
@@ -29,22 +30,22 @@ from fidsplat.util.errors import FidsplatError
 _LOCK = threading.Lock()
 
 
-def refused(origin: str | None, host: str | None, listens: str) -> str:
-    """Why a request is refused; empty where it is not.
+def refusal(origin: str | None, host: str | None, listens: str) -> str:
+    """Reason to refuse a request; empty if it is accepted.
 
     Args:
         origin, host: headers of the request; a browser sends both.
-        listens: address that the server listens on. On this machine's own, pages that were asked for by
-            another name are refused: their name was made to point here.
+        listens: address that the server listens on. If it is local, other host names are refused, as a
+            foreign name may have been made to point here (DNS rebinding).
     """
     if origin is None:
         return ""
     try:
         site, name = urlsplit(origin).netloc, urlsplit(f"//{host}").hostname
     except ValueError:
-        return "this page says of itself what is no address"
+        return "the origin of this page must be a valid address"
     if site.lower() != (host or "").lower():
-        return "this page is of another site"
+        return "this page is from another site"
     if not _ours(name or "", listens):
         return "this machine is known by another name; open the address that fidsplat view printed"
     return ""
@@ -68,11 +69,11 @@ def _local(listens: str) -> bool:
 
 
 def guarded(make: Callable[[], Any], listens: str) -> Any:
-    """The server of websockets that `make` starts and returns, which answers pages of others with 403. viser
-    has no setting for it, so what it starts its server with is exchanged meanwhile.
+    """The WebSocket server that `make` starts, with an origin check that answers other sites with 403. viser
+    has no setting for it, so websockets' `serve` is replaced while the server starts.
 
     Raises:
-        FidsplatError: what was started is not guarded, and was stopped.
+        FidsplatError: the server could not be guarded and was stopped.
     """
     from websockets.asyncio import server
 
@@ -99,9 +100,9 @@ def guarded(make: Callable[[], Any], listens: str) -> Any:
 
 
 async def _answer(listens: str, further: Callable[..., Any] | None, connection: Any, request: Any) -> Any:
-    """The refusal of a request, or what the server itself says to it."""
+    """A refusal, or the server's own response."""
     headers = request.headers
-    if why := refused(headers.get("Origin"), headers.get("Host"), listens):
+    if why := refusal(headers.get("Origin"), headers.get("Host"), listens):
         return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
     found = None if further is None else further(connection, request)
     response = await found if inspect.isawaitable(found) else found
@@ -113,13 +114,13 @@ async def _answer(listens: str, further: Callable[..., Any] | None, connection: 
 
 @cache
 def policy() -> str:
-    """The content security policy of the page: it runs viser's own scripts alone, and shows no other pages.
-    Markup that got into the page runs nothing.
+    """The content security policy of the page: only viser's own scripts run, and no frames are allowed, so
+    that injected markup cannot run code.
 
-    viser's page is one file: a loader, and the program, which the loader decodes from its attributes.
+    viser's page is one file: a loader, and a program that the loader decodes from its attributes.
 
     Raises:
-        FidsplatError: the page is built in another way.
+        FidsplatError: the page of this viser version has another form.
     """
     import viser
     import zstandard

@@ -1,5 +1,4 @@
-"""What the page shows over our pictures: outlines and names of markers, camera frusta, and the gizmo that
-moves a marker."""
+"""Overlays of the page: outlines and names of markers, camera frusta, and the gizmo."""
 
 from __future__ import annotations
 
@@ -15,11 +14,11 @@ from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 _OUTLINE = (255, 60, 200)
 _CAMERA, _KEYFRAME = (40, 120, 255), (255, 160, 0)
 _MANY = 60
-"""frusta of one trajectory at most"""
+"""maximum number of frusta of a trajectory"""
 
 
 class Nodes:
-    """The nodes of a viser page (its `scene`), by the scene that is drawn."""
+    """Nodes of a viser page (its `scene`)."""
 
     def __init__(self, page: Any) -> None:
         self._page = page
@@ -29,8 +28,8 @@ class Nodes:
         self.visible = True
 
     def show(self, scene: Scene, overlay: bool) -> None:
-        """Outlines and names of the scene's markers, and its camera; none where the lens is not the page's
-        own (overlay False), as they would lie beside what is drawn."""
+        """Show outlines and names of the scene's markers, and its camera. Without overlay show none: with
+        another lens than the page's they would not match the image."""
         for node in self._shown:
             node.remove()
         self._shown = []
@@ -43,7 +42,7 @@ class Nodes:
             self._shown.append(self._frustum("/scene camera", scene.camera, pose, _CAMERA, 0.1))
 
     def show_keyframes(self, camera: Camera | None, poses: Iterable[np.ndarray]) -> None:
-        """Frusta of keyframes, camera to world (4, 4)."""
+        """Show frusta of camera-to-world poses (4, 4)."""
         for node in self._frusta:
             node.remove()
         poses = list(poses)
@@ -52,9 +51,15 @@ class Nodes:
             self._frustum(f"/keyframes/{k}", camera, pose, _KEYFRAME, 0.05) for k, pose in enumerate(some)
         ]
 
-    def hold(self, pose: np.ndarray | None, size: float, moved: Callable[[np.ndarray, bool], None]) -> None:
-        """A gizmo of so many metres at a pose (4, 4); moved is called with the pose to which it was dragged
-        and whether it was let go. None: none."""
+    def show_gizmo(
+        self, pose: np.ndarray | None, size: float, moved: Callable[[np.ndarray, bool], None]
+    ) -> None:
+        """Show a gizmo at a pose (4, 4), or none for None.
+
+        Args:
+            size: in metres.
+            moved: called with the new pose and whether the gizmo was released.
+        """
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
@@ -69,15 +74,15 @@ class Nodes:
         )
         self._gizmo = gizmo
 
-        def tell(event: Any) -> None:
+        def update(event: Any) -> None:
             position, wxyz = np.asarray(gizmo.position, float), np.asarray(gizmo.wxyz, float)
-            if np.isfinite([*position, *wxyz]).all() and wxyz.any():  # a message may say anything
+            if np.isfinite([*position, *wxyz]).all() and wxyz.any():  # messages of a browser are untrusted
                 moved(rigid_matrix(position, wxyz), event.phase == "end")
 
-        gizmo.on_update(tell)
+        gizmo.on_update(update)
 
     def _outline(self, placed: PlacedMarker) -> Any:
-        """Its edges; its name goes with them."""
+        """The edges of a marker, with its name as a child."""
         name = f"/markers/{placed.label}"
         corners = np.asarray(placed.marker.corners, np.float64)
         around = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
@@ -86,7 +91,7 @@ class Nodes:
             name, around, _OUTLINE, thickness=2.0, thickness_units="screen", **frame
         )
         spec = placed.marker.spec
-        top = (corners[0] + corners[1]) / 2  # above its upper edge, where it covers no module
+        top = (corners[0] + corners[1]) / 2  # above the upper edge, so that no module is covered
         text = spec if len(spec) <= 40 else f"{spec[:37]}..."
         self._page.add_label(f"{name}/name", text, position=top, anchor="bottom-center")
         return lines
@@ -99,7 +104,7 @@ class Nodes:
             aspect=width / height,
             scale=scale,
             thickness=2.0,
-            thickness_units="screen",  # from inside, where the page begins, only its edges are seen
+            thickness_units="screen",  # thin edges, as the page starts inside this frustum
             color=color,
             wxyz=matrix_to_quaternion(pose[:3, :3]),
             position=pose[:3, 3],

@@ -1,4 +1,4 @@
-"""The page: viser's server, a stream for each browser, and what they do."""
+"""The viewer's page: viser's server, an image stream per browser, and the actions of the controls."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from fidsplat.scenes import Scene
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.markdown import escaped
-from fidsplat.viewer.controls import NOBODY, Controls
-from fidsplat.viewer.edits import Body, SceneFile
+from fidsplat.viewer.controls import NO_TARGET, Controls
+from fidsplat.viewer.gizmo import GizmoTarget, find_target, target_names
 from fidsplat.viewer.guard import guarded
-from fidsplat.viewer.held import Held, held_by, movable
 from fidsplat.viewer.nodes import Nodes
-from fidsplat.viewer.session import Session, View
+from fidsplat.viewer.scene_file import SceneFile, SplatFile
+from fidsplat.viewer.session import Session, StillImage
 from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
 from fidsplat.vision.readback import read_back
 
-LOOK = 1.0
-"""seconds between two looks at the scene file"""
+POLL_INTERVAL = 1.0
+"""seconds between two checks of the scene file"""
 JPEG = 75
-"""quality of pictures while moving; at rest they are PNG, without a loss"""
+"""quality of images while moving; images at rest are lossless PNG"""
 
 
 def check_port(host: str, port: int) -> None:
-    """Raises InputError where the port cannot be had: viser would take the next one in silence; likewise for
-    a port that is none, and a host that is empty, by which the whole network would be let in."""
+    """Raise InputError for a port that is invalid or in use, as viser would silently use the next one, and
+    for an empty host, which would open the page to the whole network."""
     if not 0 <= port <= 65535:
-        raise InputError(f"--port is {port}; give a number from 1 to 65535, or 0 for any that is free")
+        raise InputError(f"--port must be 1 to 65535, or 0 for any free port, got {port}")
     if not host:
-        raise InputError("--host is empty; give an address to listen on, 127.0.0.1 for this machine alone")
+        raise InputError("--host must be an address, got ''; 127.0.0.1 is this machine only")
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -59,18 +59,18 @@ def check_port(host: str, port: int) -> None:
 
 
 class Viewer:
-    """A scene in the browsers that look at it.
+    """An interactive view of a scene in one or more browsers.
 
     Args:
-        scene: what is shown.
-        file: the scene file that it is of: read again when it changes, and written when a marker is moved.
-        device, memory_budget: as `Session`.
-        host: 127.0.0.1, which nobody else reaches, unless told otherwise.
-        port: 0 takes a free one.
-        rate: pictures a second to aim at while moving.
-        keyframes: whose poses, camera to world, stand there at first.
+        scene: scene to show.
+        file: its scene file; loaded again when it changes, and written when a marker is moved.
+        device, memory_budget: see `Session`.
+        host: address to listen on; other machines cannot reach 127.0.0.1.
+        port: 0 selects a free port.
+        rate: target frames per second while moving.
+        keyframes: camera-to-world poses shown as keyframes.
         reload: called once a second; returns a newer scene of a running training, or None.
-        quality: instead of the scene file's, when it is read again.
+        quality: quality that replaces the scene file's when it is loaded again.
 
     Raises:
         InputError: the port is in use, or the extra `viewer` is missing.
@@ -94,19 +94,19 @@ class Viewer:
         check_port(host, port)
         self._rate, self._lock = rate, threading.Lock()
         self._streams: dict[int, Stream] = {}
-        self._views: dict[int, View] = {}
-        self._said: dict[int, Any] = {}
+        self._views: dict[int, StillImage] = {}
+        self._messages: dict[int, Any] = {}
         self._keyframes: list[np.ndarray] = [] if keyframes is None else list(keyframes.poses)
         self._file = None if file is None else SceneFile(file)
         self._reload, self._quality = reload, quality
-        self._held: Held | None = None
+        self._target: GizmoTarget | None = None
         self._saved: Path | None = None
         self.session = Session(scene, device, memory_budget, self._changed)
         with _silent():
             self.server: Any = guarded(
                 lambda: viser.ViserServer(host, port, label="fidsplat", verbose=False), host
             )
-        if port and self.server.get_port() != port:  # taken by another since it was looked at
+        if port and self.server.get_port() != port:  # taken by another process since the check
             with _silent():
                 self.server.stop()
             self.session.close()
@@ -115,7 +115,7 @@ class Viewer:
         self.server.gui.configure_theme(dark_mode=True, show_logo=False)
         self.server.gui.main_panel.dock_right()
         self._nodes = Nodes(self.server.scene)
-        own = self.session.drawn.device
+        own = self.session.state.device
         names = [d.name for d in devices() if d.usable and not d.always_float64]
         self._controls = Controls(self.server.gui, self.session, list(dict.fromkeys([own, *names])), self)
         self._start_camera(scene)
@@ -130,12 +130,12 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """Where browsers find it."""
+        """Address of the page."""
         host = self.server.get_host()
         return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def close(self) -> None:
-        """Let all go."""
+        """Stop the streams, the session and the server."""
         self._closed.set()
         for stream in list(self._streams.values()):
             stream.close()
@@ -143,15 +143,15 @@ class Viewer:
         with _silent():
             self.server.stop()
 
-    # browsers come and go
+    # connections
 
     def _enter(self, client: Any) -> None:
-        with client.gui.add_folder("What is seen"):
-            self._said[client.client_id] = client.gui.add_markdown("Click into the picture.")
+        with client.gui.add_folder("Pixel"):
+            self._messages[client.client_id] = client.gui.add_markdown("Click into the image.")
         stream = Stream(
             lambda viewpoint, scale: self._draw(client, viewpoint, scale),
             lambda viewpoint: self._send_exact(client, viewpoint),
-            self._controls.say,
+            self._controls.show_status,
             self._rate,
         )
         self._streams[client.client_id] = stream
@@ -160,32 +160,32 @@ class Viewer:
         self._look(stream, client.camera)
 
     def _look(self, stream: Stream, camera: Any) -> None:
-        """Take over a browser's camera; one that no image can be rendered from changes nothing."""
+        """Use a browser's camera; one that cannot render changes nothing."""
         try:
-            stream.look(_viewpoint(camera))
+            stream.set_viewpoint(_viewpoint(camera))
         except FidsplatError as error:
-            self._controls.say(str(error))
+            self._controls.show_status(str(error))
 
     def _leave(self, client: Any) -> None:
         stream = self._streams.pop(client.client_id, None)
         if stream is not None:
             stream.close()
         self._views.pop(client.client_id, None)
-        self._said.pop(client.client_id, None)
+        self._messages.pop(client.client_id, None)
 
     def _draw(self, client: Any, viewpoint: Viewpoint, scale: float) -> Callable[[], None]:
-        image = self.session.draw_moving(viewpoint, scale).to_uint8()
+        image = self.session.render_moving(viewpoint, scale).to_uint8()
         return partial(client.scene.set_background_image, image, "jpeg", jpeg_quality=JPEG)
 
     def _send_exact(self, client: Any, viewpoint: Viewpoint) -> None:
-        view = self.session.draw(viewpoint)
+        view = self.session.render(viewpoint)
         client.scene.set_background_image(view.frame.to_uint8(), "png")
-        if client.client_id in self._streams:  # else it has left meanwhile
+        if client.client_id in self._streams:  # else it has disconnected
             self._views[client.client_id] = view
 
     def _changed(self) -> None:
-        """What is drawn has changed."""
-        self._nodes.show(self.session.drawn.scene, self._overlay)
+        """Update the overlays and images after a change of the state."""
+        self._nodes.show(self.session.state.scene, self._overlay)
         self._refresh()
 
     def _refresh(self) -> None:
@@ -194,9 +194,9 @@ class Viewer:
 
     @property
     def _overlay(self) -> bool:
-        drawn = self.session.drawn
-        plain = drawn.scene.camera is None or drawn.scene.camera.lens is None
-        return drawn.settings.lens == "pinhole" or (drawn.settings.lens == "scene" and plain)
+        state = self.session.state
+        plain = state.scene.camera is None or state.scene.camera.lens is None
+        return state.settings.lens == "pinhole" or (state.settings.lens == "scene" and plain)
 
     def _start_camera(self, scene: Scene) -> None:
         camera = scene.camera
@@ -210,158 +210,161 @@ class Viewer:
         start.near, start.far = max(camera.near, 1e-3), min(camera.far, 1e4)
         self.server.scene.set_up_direction(-pose[:3, 1])
 
-    # what the page's buttons do; `Actions`
+    # actions of the buttons (`Actions`)
 
     def _click(self, event: Any) -> None:
-        said, view = self._said.get(event.client_id), self._views.get(event.client_id)
-        if said is None:
+        message, view = self._messages.get(event.client_id), self._views.get(event.client_id)
+        if message is None:
             return
         if view is None:
-            said.content = "Wait until the picture is still, then click again."
+            message.content = "Wait for the exact image, then click again."
             return
-        found = view.at(*event.screen_pos)
+        found = view.pick(*event.screen_pos)
         depth = "nothing" if found["depth"] is None else f"{found['depth']:.4f} m"
         rows = [f"pixel {found['pixel']}", f"depth {depth}", f"label {found['label']}"]
         rows += [f"splat {found['splat_id']}", f"marker {escaped(found['marker'] or '-')}"]
-        said.content = "  \n".join(rows)
+        message.content = "  \n".join(rows)
 
-    def read(self, client: Any) -> None:
-        """Read the markers in the picture at rest, with their errors."""
-        said, view = self._said.get(client.client_id), self._views.get(client.client_id)
-        if said is None:
+    def detect_markers(self, client: Any) -> None:
+        """Detect the markers in the exact image and show their errors."""
+        message, view = self._messages.get(client.client_id), self._views.get(client.client_id)
+        if message is None:
             return
         if view is None:
-            said.content = "Wait until the picture is still, then ask again."
+            message.content = "Wait for the exact image, then detect again."
             return
         try:
-            readings, others = read_back(view.frame, view.drawn.scene)
+            readings, others = read_back(view.frame, view.state.scene)
         except FidsplatError as error:
-            said.content = escaped(error)
+            message.content = escaped(error)
             return
         lines = ["| marker | mm | deg |", "|---|---|---|"]
         for facts in (reading.as_dict() for reading in readings):
             errors = (facts["position_error_mm"], facts["angle_error_deg"])
             cells = ["not read", ""] if errors[0] is None else [f"{value:.2f}" for value in errors]
             lines.append(f"| {escaped(facts['marker'])} | {' | '.join(cells)} |")
-        lines += [f"\nnot of the scene: {escaped(code.name)}" for code in others]
-        said.content = "\n".join(lines)
+        lines += [f"\nnot in the scene: {escaped(code.name)}" for code in others]
+        message.content = "\n".join(lines)
 
-    def picture(self, client: Any) -> None:
-        """The picture as this browser sees it, for its user to keep."""
+    def save_image(self, client: Any) -> None:
+        """Download the image of this browser's viewpoint as PNG."""
         stream = self._streams.get(client.client_id)
         if stream is None:
             return
         try:
-            image = self.session.draw(_viewpoint(client.camera)).frame.to_uint8()
+            image = self.session.render(_viewpoint(client.camera)).frame.to_uint8()
         except (FidsplatError, MemoryError) as error:
-            self._controls.say(str(error) or "not enough memory for this picture")
+            self._controls.show_status(str(error) or "not enough memory for this image")
             return
         client.send_file_download("fidsplat.png", png_bytes(image))
 
     def add_keyframe(self, client: Any) -> None:
-        """Keep where this browser looks from."""
+        """Add this browser's viewpoint as a keyframe."""
         try:
             self._keyframes.append(_viewpoint(client.camera).pose)
         except FidsplatError as error:
-            self._controls.say(str(error))
-        self._nodes.show_keyframes(self.session.drawn.scene.camera, self._keyframes)
+            self._controls.show_status(str(error))
+        self._nodes.show_keyframes(self.session.state.scene.camera, self._keyframes)
 
     def clear_keyframes(self, client: Any) -> None:
-        """Forget them."""
+        """Remove all keyframes."""
         self._keyframes = []
         self._nodes.show_keyframes(None, [])
 
     def save_keyframes(self, client: Any) -> None:
-        """Write them as a trajectory, a second apart, beside the scene file or into the current folder."""
+        """Write the keyframes as a trajectory, one second apart, next to the scene file or to the current
+        folder."""
         if not self._keyframes:
-            self._controls.say("no keyframe to save; add some first")
+            self._controls.show_status("no keyframe to save; add some first")
             return
         file = self._saved = self._saved or self._free_name()
         try:
             save_trajectory(Trajectory(range(len(self._keyframes)), np.array(self._keyframes)), file)
-            self._controls.say(f"{file}: fidsplat fly SCENE --trajectory {file} --smooth")
+            self._controls.show_status(f"{file}: fidsplat fly SCENE --trajectory {file} --smooth")
         except FidsplatError as error:
-            self._controls.say(str(error))
+            self._controls.show_status(str(error))
 
     def _free_name(self) -> Path:
-        """Of the file of keyframes; another's is not written over."""
+        """A new file for the keyframes; an existing one is not overwritten."""
         stem = Path("view") if self._file is None else self._file.path.with_suffix("")
         names = (f"{stem.name}-trajectory{'' if k == 1 else f'-{k}'}.tum" for k in count(1))
         return next(file for name in names if not (file := stem.with_name(name)).exists())
 
-    def movable(self, scene: Scene) -> list[str]:
-        """Names of what the gizmo may move."""
-        return movable(scene, self._bodies)
+    def target_names(self, scene: Scene) -> list[str]:
+        """Names of the markers and splat files that the gizmo can move."""
+        return target_names(scene, self._splat_files)
 
     @property
-    def _bodies(self) -> list[Body]:
-        return [] if self._file is None else self._file.bodies()
+    def _splat_files(self) -> list[SplatFile]:
+        return [] if self._file is None else self._file.splat_files()
 
-    def hold(self, name: str) -> None:
-        """Put the gizmo at a marker or a splat file, by its name in the selector."""
-        scene, _ = self.session.wanted()
-        self._held = None if name == NOBODY else held_by(scene, self._bodies, name)
-        if self._held is not None and self._held.moves:
-            self._controls.say(f"{name} moves by keyframes; it is not moved by hand")
-            self._held = None
-        held = self._held
-        self._nodes.hold(None if held is None else held.pose, 0.0 if held is None else held.size, self._move)
+    def select_target(self, name: str) -> None:
+        """Show the gizmo at a marker or a splat file, by its name in the selector."""
+        scene, _ = self.session.requested()
+        self._target = None if name == NO_TARGET else find_target(scene, self._splat_files, name)
+        if self._target is not None and self._target.animated:
+            self._controls.show_status(f"{name} is moved by keyframes, not by hand")
+            self._target = None
+        target = self._target
+        self._nodes.show_gizmo(
+            None if target is None else target.pose, 0.0 if target is None else target.size, self._move
+        )
 
     def overlay(self, visible: bool) -> None:
         """Show or hide outlines, names and frusta."""
         self._nodes.visible = visible
-        self._nodes.show(self.session.drawn.scene, self._overlay)
+        self._nodes.show(self.session.state.scene, self._overlay)
 
-    def _move(self, pose: np.ndarray, let_go: bool) -> None:
-        """The gizmo is dragged; once it is let go its pose is written into the scene file."""
+    def _move(self, pose: np.ndarray, released: bool) -> None:
+        """Move the target while the gizmo is dragged; on release write its pose to the scene file."""
         with self._lock:
-            scene, _ = self.session.wanted()
-            held = self._held
-            if held is None or not (let_go or held.light):
+            scene, _ = self.session.requested()
+            target = self._target
+            if target is None or not (released or target.live):
                 return
-            moved = held.moved(scene, pose)
+            moved = target.moved(scene, pose)
             if moved is None:
                 return
             problem = ""
-            if let_go and self._file is not None:
+            if released and self._file is not None:
                 try:
-                    self._file.place(held.number, pose, held.kind)
+                    self._file.write_pose(target.number, pose, target.kind)
                 except FidsplatError as error:
                     problem = str(error)
-                    if held.splats is not None:  # where they are is known from the file alone
-                        moved = held.moved(scene, held.pose)
-            self.session.wish(scene=moved, done=lambda why: self._controls.say(why or problem))
+                    if target.splats is not None:  # the position of splats is known only from the file
+                        moved = target.moved(scene, target.pose)
+            self.session.request(scene=moved, done=lambda why: self._controls.show_status(why or problem))
 
     def _watch(self) -> None:
-        """Read the scene file again when somebody else has written it, and ask for a run's newest splats."""
-        while not self._closed.wait(LOOK):
+        """Load the scene file when another program has changed it, and the newest splats of a training."""
+        while not self._closed.wait(POLL_INTERVAL):
             try:
                 if self._reload is not None and (newer := self._reload()) is not None:
-                    self.session.wish(scene=newer, done=lambda why: self._controls.say(why or ""))
+                    self.session.request(scene=newer, done=lambda why: self._controls.show_status(why or ""))
                 with self._lock:
                     text = None if self._file is None else self._file.changed()
                 if self._file is not None and text is not None:
                     scene = Scene.load(self._file.path, self._quality)
-                    shown, settings = self.session.wanted()
-                    settings = settings.following(shown, scene)
-                    self.session.wish(scene, settings, partial(self._edited, scene, text))
+                    shown, settings = self.session.requested()
+                    settings = settings.updated_from(shown, scene)
+                    self.session.request(scene, settings, partial(self._edited, scene, text))
             except FidsplatError as error:
-                self._controls.say(f"{error}; what was read before is shown")
+                self._controls.show_status(f"{error}; the previous scene is shown")
 
     def _edited(self, scene: Scene, text: str, problem: str | None) -> None:
-        """Another scene, of that text, is shown, unless there was a problem. Until then, and while what the
-        file holds cannot be shown, no marker is written into it: it may be another's place."""
+        """Accept the text of an edited scene file once its scene is shown. Until then, and while the scene
+        cannot be shown, no pose is written to the file, as its tables may have changed."""
         if problem is None and self._file is not None:
             with self._lock:
                 self._file.text = text
-            self.hold(NOBODY)
-            self._controls.offer(self.movable(scene))
-            self._controls.follow(scene, self.session.wanted()[1])
-        self._controls.say(problem or "")
+            self.select_target(NO_TARGET)
+            self._controls.offer_targets(self.target_names(scene))
+            self._controls.update_from(scene, self.session.requested()[1])
+        self._controls.show_status(problem or "")
 
 
 def _silent() -> contextlib.AbstractContextManager[Any]:
-    """viser says on stdout where it listens and that it stopped; so do commands, in their own words."""
+    """Discard viser's messages on stdout; commands print their own."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
@@ -370,12 +373,12 @@ def _viser() -> Any:
         import viser
     except ImportError:
         raise InputError("the viewer needs viser; pip install 'fidsplat[viewer]'") from None
-    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # browsers leave in the middle
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # browsers may disconnect at any time
     return viser
 
 
 def _viewpoint(camera: Any) -> Viewpoint:
-    """The viewpoint of viser's camera of a browser. Raises InputError for numbers that make none."""
+    """The viewpoint of a browser's viser camera. Raises InputError for unusable numbers."""
     position, wxyz = np.asarray(camera.position, float), np.asarray(camera.wxyz, float)
     away = float(np.linalg.norm(np.asarray(camera.look_at, float) - position))
     return Viewpoint(
@@ -389,7 +392,7 @@ def _viewpoint(camera: Any) -> Viewpoint:
 
 
 def _distance(scene: Scene, pose: np.ndarray) -> float:
-    """Metres before the camera about which the page turns: to the nearest marker, else to the middle of the
+    """Metres from the camera to the page's centre of rotation: the nearest marker, else the middle of the
     splats."""
     targets = [placed.pose[:3, 3] for placed in scene.markers]
     if not targets and isinstance(scene.splats, ChunkedSplats):

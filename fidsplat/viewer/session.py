@@ -1,5 +1,5 @@
-"""A session: the scene that is shown and what draws it. Settings and scenes are exchanged in a thread: the
-old ones draw until the kernels of the new ones are compiled."""
+"""The scene, settings and renderer of a viewer. A thread compiles the kernels of new settings and scenes
+while the old ones still render."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _FIRST = Viewpoint((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """What pictures are drawn with."""
+class RenderState:
+    """Everything that an image is rendered from."""
 
     scene: Scene
     settings: Settings
@@ -30,45 +30,48 @@ class Drawn:
     renderer: Renderer
     resident: ResidentCloud
     compiled: frozenset[FeatureSet]
-    """what the renderer's kernels are compiled for"""
+    """feature sets whose kernels are compiled"""
     version: int = 0
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A picture, and what it is of."""
+class StillImage:
+    """An exact image with its scene and viewpoint."""
 
     frame: Frame
-    drawn: Drawn
+    state: RenderState
     viewpoint: Viewpoint
 
-    def at(self, x: float, y: float) -> dict[str, object]:
-        """What is seen at a place, 0 to 1 from the left and from the top: label, depth in metres, splat_id
-        and, where it is of a marker, its spec. Depth is None where nothing is."""
+    def pick(self, x: float, y: float) -> dict[str, object]:
+        """Label, depth in metres (None for the background), splat_id and marker spec of a pixel.
+
+        Args:
+            x, y: position in the image, 0 to 1 from the left and from the top.
+        """
         h, w = self.frame["label"].shape
         row, column = min(max(int(y * h), 0), h - 1), min(max(int(x * w), 0), w - 1)
         label, splat = (int(self.frame[name][row, column]) for name in ("label", "splat_id"))
         depth = float(self.frame["depth"][row, column])
-        markers = {placed.label: placed.marker.spec for placed in self.drawn.scene.markers}
+        markers = {placed.label: placed.marker.spec for placed in self.state.scene.markers}
         found: dict[str, object] = {"label": label, "splat_id": splat, "depth": depth if depth > 0 else None}
         return found | {"marker": markers.get(label), "pixel": (column, row)}
 
 
 @dataclass
-class _Wish:
+class _Request:
     scene: Scene | None = None
     settings: Settings | None = None
     done: list[Callable[[str | None], None]] = field(default_factory=list)
 
 
 class Session:
-    """What is shown to everybody who looks.
+    """The render state that all browsers share.
 
     Args:
-        scene: at first.
-        device: instead of the scene's.
-        memory_budget: as `Renderer` takes it.
-        changed: called, in whichever thread, when what is drawn has changed.
+        scene: first scene.
+        device: device that replaces the scene's.
+        memory_budget: bytes of device memory, see `Renderer`.
+        changed: called in any thread when the state has changed.
 
     Raises:
         DeviceError: the device cannot be used.
@@ -82,93 +85,100 @@ class Session:
         changed: Callable[[], None] = lambda: None,
     ) -> None:
         self.changed, self._budget = changed, memory_budget
-        self._wish, self._granting, self._wake = _Wish(), _Wish(), threading.Condition()
+        self._pending, self._applying, self._wake = _Request(), _Request(), threading.Condition()
         self._working = self._closed = False
-        self.drawn = self._made(scene, Settings.of(scene, device), None)
+        self.state = self._prepare(scene, Settings.of(scene, device), None)
         self._thread = threading.Thread(target=self._work, name="viewer session", daemon=True)
         self._thread.start()
 
-    def wish(
+    def request(
         self,
         scene: Scene | None = None,
         settings: Settings | None = None,
         done: Callable[[str | None], None] | None = None,
     ) -> None:
-        """Draw another scene, or by other settings, as soon as its kernels are compiled. Only the newest wish
-        of each kind is granted. done: called afterwards with None, or with what went wrong, in which case all
-        stays as it is."""
+        """Render another scene or other settings once their kernels are compiled. A newer request replaces an
+        older one of its kind.
+
+        Args:
+            done: called afterwards with None, or with an error message if the old state remains.
+        """
         with self._wake:
-            self._wish.scene = scene or self._wish.scene
-            self._wish.settings = settings or self._wish.settings
+            self._pending.scene = scene or self._pending.scene
+            self._pending.settings = settings or self._pending.settings
             if done is not None:
-                self._wish.done.append(done)
+                self._pending.done.append(done)
             self._wake.notify_all()
 
-    def wanted(self) -> tuple[Scene, Settings]:
-        """The scene and the settings that are drawn, or soon will be."""
+    def requested(self) -> tuple[Scene, Settings]:
+        """The newest requested scene and settings, else the current ones."""
         with self._wake:
-            wish, drawn = self._wish, self.drawn
-            return wish.scene or self._granting.scene or drawn.scene, (
-                wish.settings or self._granting.settings or drawn.settings
+            request, state = self._pending, self.state
+            return request.scene or self._applying.scene or state.scene, (
+                request.settings or self._applying.settings or state.settings
             )
 
     def settle(self, timeout: float = 60.0) -> bool:
-        """Wait until all wishes are granted; whether they are."""
+        """Wait until no request is pending; False at the timeout."""
         with self._wake:
-            return self._wake.wait_for(lambda: not (self._working or self._wanted()), timeout)
+            return self._wake.wait_for(lambda: not (self._working or self._has_pending()), timeout)
 
-    def draw(self, viewpoint: Viewpoint) -> View:
-        """The picture from there that is looked at and asked."""
-        drawn = self.drawn
-        camera = viewpoint.camera(drawn.scene, drawn.settings.lens)
-        frame = drawn.renderer.render(drawn.resident, drawn.settings.capture(drawn.scene, camera))
-        return View(frame, drawn, viewpoint)
+    def render(self, viewpoint: Viewpoint) -> StillImage:
+        """The exact image of a viewpoint."""
+        state = self.state
+        camera = viewpoint.camera(state.scene, state.settings.lens)
+        frame = state.renderer.render(state.resident, state.settings.capture(state.scene, camera))
+        return StillImage(frame, state, viewpoint)
 
-    def draw_moving(self, viewpoint: Viewpoint, scale: float) -> Frame:
-        """The colours from there while one moves, that much smaller than the page, by coarser constants."""
-        drawn = self.drawn
-        camera = viewpoint.camera(drawn.scene, drawn.settings.lens, scale)
-        return drawn.renderer.render(drawn.resident, drawn.settings.moving(drawn.scene, camera))
+    def render_moving(self, viewpoint: Viewpoint, scale: float) -> Frame:
+        """The colours of a viewpoint at a coarser quality, scaled down, while the camera moves."""
+        state = self.state
+        camera = viewpoint.camera(state.scene, state.settings.lens, scale)
+        return state.renderer.render(state.resident, state.settings.moving(state.scene, camera))
 
     def close(self) -> None:
-        """Grant no more wishes."""
+        """Stop applying requests."""
         with self._wake:
             self._closed = True
             self._wake.notify_all()
         self._thread.join(timeout=10.0)
 
-    def _wanted(self) -> bool:
-        return self._wish.scene is not None or self._wish.settings is not None or bool(self._wish.done)
+    def _has_pending(self) -> bool:
+        return (
+            self._pending.scene is not None or self._pending.settings is not None or bool(self._pending.done)
+        )
 
     def _work(self) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._closed or self._wanted())
+                self._wake.wait_for(lambda: self._closed or self._has_pending())
                 if self._closed:
                     return
-                wish, self._wish = self._wish, _Wish()
-                self._granting, self._working = wish, True
-            problem = self._grant(wish)
+                request, self._pending = self._pending, _Request()
+                self._applying, self._working = request, True
+            problem = self._apply(request)
             with self._wake:
-                self._granting, self._working = _Wish(), False
+                self._applying, self._working = _Request(), False
                 self._wake.notify_all()
-            for done in wish.done:
+            for done in request.done:
                 done(problem)
 
-    def _grant(self, wish: _Wish) -> str | None:
-        before = self.drawn
+    def _apply(self, request: _Request) -> str | None:
+        before = self.state
         try:
-            self.drawn = self._made(wish.scene or before.scene, wish.settings or before.settings, before)
+            self.state = self._prepare(
+                request.scene or before.scene, request.settings or before.settings, before
+            )
         except FidsplatError as error:
             return str(error)
         except MemoryError:
-            return "not enough memory for this; all stays as it is"
+            return "not enough memory for this change; the previous state remains"
         self.changed()
         return None
 
-    def _made(self, scene: Scene, settings: Settings, before: Drawn | None) -> Drawn:
-        """All that is needed to draw, compiled. What draws now is used where nothing new is to be compiled;
-        else another renderer is opened, whose lock holds no picture up."""
+    def _prepare(self, scene: Scene, settings: Settings, before: RenderState | None) -> RenderState:
+        """A compiled render state. A new renderer is opened if kernels must be compiled, so that its lock
+        does not delay images; otherwise the current renderer is used."""
         device = settings.device or default_device()
         camera = _FIRST.camera(scene, settings.lens)
         captures = settings.moving(scene, camera), settings.capture(scene, camera)
@@ -183,4 +193,4 @@ class Session:
         for capture in captures:
             for name in (frame := renderer.render(resident, capture)).outputs:
                 np.asarray(frame[name])
-        return Drawn(scene, settings, device, renderer, resident, features, version)
+        return RenderState(scene, settings, device, renderer, resident, features, version)

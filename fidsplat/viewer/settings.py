@@ -1,4 +1,4 @@
-"""What a viewer's controls say, as plain data, and the captures that follow from it."""
+"""Settings of the viewer's controls as plain data, and the captures made from them."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError
 
 LENSES = ("pinhole", "fisheye", "panorama", "parallel", "scene")
-"""`fisheye` sees 180 degrees across; `scene` is the lens of the scene's own camera"""
+"""`fisheye` has a field of view of 180 degrees; `scene` is the lens of the scene's camera"""
 AT_REST = ("rgb", "depth", "label", "splat_id")
-"""outputs of the picture that one looks at and asks: what is there?"""
+"""outputs of the exact image, which a click reads"""
 _MOVING = Quality.named("fast")
-"""constants of the small pictures that are drawn while one moves, where the quality asked for is finer"""
+"""limits of the quality while the camera moves"""
 _FOG_COLOR = (0.7, 0.7, 0.7)
 _LEAST, _MOST = 16, 16384  # pixels a side
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """From where a browser looks. OpenCV's camera axes."""
+    """Camera of a browser, with OpenCV's axes."""
 
     position: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
@@ -38,7 +38,7 @@ class Viewpoint:
     """pixels of the page"""
     height: int
     distance: float = 1.0
-    """metres to what it turns about: as much is seen by parallel rays as at that distance by others"""
+    """metres to the centre of rotation; a parallel projection has the same width there as a pinhole camera"""
 
     def __post_init__(self) -> None:
         numbers = (*self.position, *self.quaternion, self.fov_y, self.distance)
@@ -60,7 +60,7 @@ class Viewpoint:
         return rigid_matrix(self.position, self.quaternion)
 
     def camera(self, scene: Scene, lens: str = "pinhole", scale: float = 1.0) -> Camera:
-        """The camera of its picture, that much smaller than the page.
+        """The camera of an image that is smaller than the page by a scale.
 
         Raises:
             InputError: an unknown lens, or the scene's where its camera has none.
@@ -93,27 +93,27 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the controls say."""
+    """Values of the controls."""
 
     device: str | None = None
-    """None: the scene's, or the default"""
+    """name; None: the scene's, or the default"""
     quality: str | None = None
     """None: the scene's"""
     lens: str = "pinhole"
     fog: float = 0.0
     """1 / metres"""
     exposure: float = 1.0
-    """the sensor's factor of light"""
+    """exposure factor of the sensor"""
     noise: float = 0.0
-    """shot noise of white, as a share of it; 0: none"""
+    """shot noise of white as a share of white; 0: none"""
     time: float = 0.0
-    """seconds, on the clock of what moves"""
+    """seconds on the clock of the scene's motions"""
     exposure_ms: float = 0.0
     readout_ms: float = 0.0
 
     @staticmethod
     def of(scene: Scene, device: str | None = None) -> Settings:
-        """Those with which a scene looks as its file says."""
+        """The settings of a scene's own capture."""
         capture = scene.capture
         well = capture.sensor.full_well
         return Settings(
@@ -127,25 +127,24 @@ class Settings:
             readout_ms=1e3 * capture.shutter.readout,
         )
 
-    def following(self, before: Scene, after: Scene) -> Settings:
-        """These for a scene file that was edited: what it says otherwise than before is taken from it, and
-        what it says as before stays as the controls have it; so does the device."""
+    def updated_from(self, before: Scene, after: Scene) -> Settings:
+        """Settings after an edit of the scene file: values that the edit changes come from the file, all
+        others and the device stay."""
         old, new = asdict(Settings.of(before)), asdict(Settings.of(after))
-        said = {name: value for name, value in new.items() if value != old[name] and name != "device"}
-        return replace(self, **said)
+        edited = {name: value for name, value in new.items() if value != old[name] and name != "device"}
+        return replace(self, **edited)
 
     def moving(self, scene: Scene, camera: Camera) -> Capture:
-        """How a picture is taken that is gone at once: its colours alone, by the constants of `fast` where
-        those asked for are finer, one sample a pixel.
+        """Capture while the camera moves: only rgb, one sample per pixel, at most the quality of `fast`.
 
         Raises:
             InputError: a value out of range.
         """
         capture = self.capture(scene, camera)
-        asked = capture.quality
-        coarse = asked.with_(
-            alpha_cutoff=max(asked.alpha_cutoff, _MOVING.alpha_cutoff),
-            transmittance_stop=max(asked.transmittance_stop, _MOVING.transmittance_stop),
+        quality = capture.quality
+        coarse = quality.with_(
+            alpha_cutoff=max(quality.alpha_cutoff, _MOVING.alpha_cutoff),
+            transmittance_stop=max(quality.transmittance_stop, _MOVING.transmittance_stop),
             setup_precision=_MOVING.setup_precision,
             arithmetic=_MOVING.arithmetic,
             blend_precision=_MOVING.blend_precision,
@@ -154,7 +153,7 @@ class Settings:
         return replace(capture, outputs=("rgb",), quality=coarse)
 
     def capture(self, scene: Scene, camera: Camera) -> Capture:
-        """How a scene's picture at rest is taken from a camera that the browser moves.
+        """Capture of the exact image from a browser's camera.
 
         Raises:
             InputError: a value out of range.
@@ -167,7 +166,7 @@ class Settings:
             exposure_time=self.exposure_ms / 1e3,
             readout=self.readout_ms / 1e3,
         )
-        # not for a noise whose square is 0
+        # the square of a smaller noise could underflow to 0
         full_well = max(1.0, 1 / self.noise**2) if self.noise > 1e-9 else math.inf
         read_noise = 0.0 if math.isinf(full_well) else min(own.sensor.read_noise, full_well)
         sensor = replace(own.sensor, exposure=self.exposure, full_well=full_well, read_noise=read_noise)

@@ -1,5 +1,5 @@
-"""A stream of pictures to one browser: the newest viewpoint only, smaller while it moves, one exact picture
-at rest, nothing while nothing changes."""
+"""Image stream to one browser: only the newest viewpoint, scaled down while it moves, one exact image at
+rest, nothing without changes."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ from dataclasses import dataclass
 from fidsplat.util.errors import FidsplatError
 from fidsplat.viewer.settings import Viewpoint
 
-SMALLEST, STEPS = 1 / 4, 32
-"""least scale, and in how many steps it goes to 1: buffers are not made again for every picture"""
-REST = 0.15
-"""seconds without a change after which the exact picture is drawn"""
+MIN_SCALE, SCALE_STEPS = 1 / 4, 32
+"""minimum scale and number of steps up to 1; few sizes, so that buffers are reused"""
+REST_DELAY = 0.15
+"""seconds without a change before the exact image"""
 
 
 @dataclass
 class Pace:
-    """How large pictures may be for a rate to be held: their time goes with their number of pixels."""
+    """Image scale for a target frame rate; time is proportional to the number of pixels."""
 
     rate: float = 30.0
-    """pictures a second to aim at"""
+    """target frames per second"""
     scale: float = 0.5
 
-    def took(self, seconds: float, scale: float) -> None:
-        """Learn from a picture of that scale."""
+    def update(self, seconds: float, scale: float) -> None:
+        """Adapt the scale to the time of an image."""
         aim = scale * (0.9 / self.rate / max(seconds, 1e-6)) ** 0.5
-        # half of the way: one slow picture, when the machine does something else, is no reason for less
-        self.scale = min(1.0, max(SMALLEST, (self.scale + aim) / 2))
+        # move half of the way, since another process may have slowed this image
+        self.scale = min(1.0, max(MIN_SCALE, (self.scale + aim) / 2))
 
     @property
-    def steps(self) -> float:
-        """The scale in whole steps."""
-        return max(SMALLEST, int(self.scale * STEPS + 1e-9) / STEPS)
+    def step_scale(self) -> float:
+        """The scale rounded down to a step."""
+        return max(MIN_SCALE, int(self.scale * SCALE_STEPS + 1e-9) / SCALE_STEPS)
 
 
 class Stream:
-    """Decides what is drawn next for one browser.
+    """Image scheduler of one browser.
 
     Args:
-        moving: draws a picture from a viewpoint, that much smaller than the page, and returns what sends it:
-            called in another thread, so that one picture is encoded while the next is drawn.
-        rest: draws and sends the exact one, after all others.
-        failed: told what went wrong with a picture; the stream goes on.
-        rate: pictures a second to aim at while moving.
-        clock: seconds.
+        moving: renders a viewpoint at a scale and returns a function that sends the image. That function runs
+            in another thread, so that one image is encoded while the next is rendered.
+        rest: renders and sends the exact image, after all others.
+        failed: called with an error message; the stream continues.
+        rate: target frames per second while moving.
+        clock: time in seconds.
     """
 
     def __init__(
@@ -67,15 +67,15 @@ class Stream:
         self._new = self._exact = self._closed = False
         self._since = -1e9
 
-    def look(self, viewpoint: Viewpoint) -> None:
-        """The browser looks from there now; what was not drawn yet is forgotten."""
+    def set_viewpoint(self, viewpoint: Viewpoint) -> None:
+        """Set the newest viewpoint, which replaces one that is not rendered yet."""
         with self._wake:
             if viewpoint != self._viewpoint:
                 self._viewpoint = viewpoint
                 self._refresh()
 
     def refresh(self) -> None:
-        """Something else has changed: draw again."""
+        """Render the viewpoint again after another change."""
         with self._wake:
             self._refresh()
 
@@ -84,39 +84,40 @@ class Stream:
         self._wake.notify_all()
 
     def step(self) -> float | None:
-        """Draw what is due; returns the seconds until something may be due, None: when something changes."""
+        """Render the image that is due. Returns the seconds until the next one may be due, or None to wait
+        for a change."""
         with self._wake:
-            viewpoint, new, left = self._viewpoint, self._new, REST - (self._clock() - self._since)
+            viewpoint, new, left = self._viewpoint, self._new, REST_DELAY - (self._clock() - self._since)
             if viewpoint is None or (not new and self._exact):
                 return None
             if not new and left > 0:
                 return left
             self._new = False
             self._exact = not new
-        begun, scale = self._clock(), self.pace.steps
+        begun, scale = self._clock(), self.pace.step_scale
         try:
             if new:
                 send = self._moving(viewpoint, scale)
-                self._sent()
+                self._wait_sent()
                 self._sending = self._sender.submit(send)
             else:
-                self._sent()
+                self._wait_sent()
                 self._rest(viewpoint)
         except (FidsplatError, MemoryError) as error:
-            self._failed(str(error) or "not enough memory for this picture")
+            self._failed(str(error) or "not enough memory for this image")
             return 0.0
         if new:
-            self.pace.took(self._clock() - begun, scale)
+            self.pace.update(self._clock() - begun, scale)
         return 0.0
 
-    def _sent(self) -> None:
-        """Waits until the picture before is sent; raises what went wrong with it."""
+    def _wait_sent(self) -> None:
+        """Wait until the previous image is sent; raises its error."""
         sending, self._sending = self._sending, None
         if sending is not None:
             sending.result()
 
     def run(self) -> None:
-        """Draw until closed."""
+        """Render until the stream is closed."""
         while True:
             wait = self.step()
             with self._wake:
@@ -129,7 +130,7 @@ class Stream:
                     self._wake.wait_for(lambda: self._closed or self._new, wait)
 
     def close(self) -> None:
-        """Draw no more."""
+        """End the stream."""
         with self._wake:
             self._closed = True
             self._wake.notify_all()

@@ -83,42 +83,42 @@ def test_a_moving_picture_has_coarser_constants_and_its_colours_alone():
 
 
 def test_a_picture_is_that_of_the_renderer(session):
-    view = session.draw(HERE)
+    view = session.render(HERE)
     camera = fs.Camera.look_at(48, 36, 2 * math.atan(48 / 36 * math.tan(0.4)), (0, 0, -1), (0, 0, 0))
     frame = fs.Renderer("reference").render(scene(), camera, outputs=AT_REST)
     np.testing.assert_allclose(view.frame["rgb"], frame["rgb"], atol=1e-6)
-    middle = view.at(0.5, 0.5)
+    middle = view.pick(0.5, 0.5)
     assert (middle["label"], middle["marker"]) == (1, "aruco:4x4_50:7")
     assert middle["depth"] == pytest.approx(1.0, abs=1e-3)
     assert middle["pixel"] == (24, 18)
-    corner = view.at(0.0, 1.0)
+    corner = view.pick(0.0, 1.0)
     assert (corner["label"], corner["depth"], corner["marker"], corner["pixel"]) == (-1, None, None, (0, 35))
 
 
 def test_settings_and_scenes_are_exchanged(session):
     told = []
-    before = session.draw(HERE).frame["rgb"]
-    session.wish(settings=replace(session.drawn.settings, fog=1.0), done=told.append)
+    before = session.render(HERE).frame["rgb"]
+    session.request(settings=replace(session.state.settings, fog=1.0), done=told.append)
     assert session.settle()
-    foggy = session.draw(HERE).frame["rgb"]
+    foggy = session.render(HERE).frame["rgb"]
     assert np.abs(foggy - before).max() > 0.1
-    _, settings = session.wanted()
-    moved = replace(session.drawn.scene, markers=[PlacedMarker(TAG, rigid_matrix((0.2, 0, 0)))])
-    session.wish(scene=moved, done=told.append)
+    _, settings = session.requested()
+    moved = replace(session.state.scene, markers=[PlacedMarker(TAG, rigid_matrix((0.2, 0, 0)))])
+    session.request(scene=moved, done=told.append)
     assert session.settle()
-    assert session.draw(HERE).at(0.05, 0.5)["label"] == -1
-    assert session.drawn.settings == settings  # a new scene keeps the controls
-    assert session.drawn.version == 2
+    assert session.render(HERE).pick(0.05, 0.5)["label"] == -1
+    assert session.state.settings == settings  # a new scene keeps the controls
+    assert session.state.version == 2
     assert told == [None, None]
 
 
 def test_what_cannot_be_drawn_changes_nothing(session):
     told = []
-    drawn = session.drawn
+    drawn = session.state
     for wrong in ({"device": "opencl:nowhere"}, {"quality": "best"}, {"fog": -1.0, "exposure": -1.0}):
-        session.wish(settings=replace(drawn.settings, **wrong), done=told.append)
+        session.request(settings=replace(drawn.settings, **wrong), done=told.append)
         assert session.settle()
-    assert session.drawn is drawn
+    assert session.state is drawn
     assert "nowhere" in told[0]
     assert "unknown quality 'best'" in told[1]
     assert "exposure" in told[2]
@@ -136,24 +136,24 @@ def test_a_switch_never_blocks(session, monkeypatch):
 
     monkeypatch.setattr(session_module, "Renderer", slow)
     changed = []
-    session.changed = lambda: changed.append(session.drawn.settings.fog)
-    session.wish(settings=replace(session.drawn.settings, fog=0.5))
+    session.changed = lambda: changed.append(session.state.settings.fog)
+    session.request(settings=replace(session.state.settings, fog=0.5))
     assert compiling.wait(20)
-    assert session.draw(HERE).drawn.settings.fog == 0
-    assert session.wanted()[1].fog == 0.5  # the next control builds upon it
+    assert session.render(HERE).state.settings.fog == 0
+    assert session.requested()[1].fog == 0.5  # the next control builds upon it
     assert changed == []
     go_on.set()
     assert session.settle()
-    assert session.draw(HERE).drawn.settings.fog == 0.5
+    assert session.render(HERE).state.settings.fog == 0.5
     assert changed == [0.5]
 
 
 def test_numbers_alone_open_no_renderer(session, monkeypatch):
-    session.wish(settings=replace(session.drawn.settings, fog=0.5))
+    session.request(settings=replace(session.state.settings, fog=0.5))
     assert session.settle()
     monkeypatch.setattr(session_module, "Renderer", None)
-    resident = session.drawn.resident
-    session.wish(settings=replace(session.drawn.settings, fog=0.7))
+    resident = session.state.resident
+    session.request(settings=replace(session.state.settings, fog=0.7))
     assert session.settle()
-    assert session.drawn.settings.fog == 0.7
-    assert session.drawn.resident is resident
+    assert session.state.settings.fog == 0.7
+    assert session.state.resident is resident

@@ -67,13 +67,13 @@ def test_a_browser_sees_drags_asks_and_changes(tmp_path):
             page.evaluate("document.querySelectorAll('[role=slider]')[0].focus()")
             for _ in range(30):
                 page.key("ArrowRight")
-            until(lambda: viewer.session.drawn.settings.fog > 0.1)
-            until(lambda: next(iter(viewer._views.values())).drawn.settings.fog > 0.1)
+            until(lambda: viewer.session.state.settings.fog > 0.1)
+            until(lambda: next(iter(viewer._views.values())).state.settings.fog > 0.1)
             until(lambda: shown(viewer, page) < 6)
 
             for kind in ("mousePressed", "mouseReleased"):
                 page.mouse(kind, *middle)
-            (said,) = viewer._said.values()
+            (said,) = viewer._messages.values()
             until(lambda: "label" in said.content)
         until(lambda: not viewer._streams)  # the browser has left, and is forgotten
     finally:

@@ -8,7 +8,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.viewer.edits import SceneFile, placed
+from fidsplat.viewer.scene_file import SceneFile, with_pose
 
 FILE = """# a scene, with words of its own
 [camera]   # where from
@@ -33,7 +33,7 @@ POSE = rigid_matrix((0.25, -0.5, 1 / 3), (math.cos(0.3), 0, math.sin(0.3), 0))
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_moved_marker_goes_back_into_its_file(number):
-    new = placed(FILE, number, POSE, "scene.toml")
+    new = with_pose(FILE, number, POSE, "scene.toml")
     said, before = tomllib.loads(new), tomllib.loads(FILE)
     marker = said["markers"][number]
     np.testing.assert_allclose(rigid_matrix(marker["position"], marker["quaternion"]), POSE, atol=1e-8)
@@ -42,12 +42,12 @@ def test_a_moved_marker_goes_back_into_its_file(number):
     assert said == before
     for words in ("# a scene, with words", "# the first", "# the second", "# where from"):
         assert words in new
-    assert placed(new, number, POSE, "") == new
+    assert with_pose(new, number, POSE, "") == new
 
 
 def test_the_mark_of_an_editor_stays():
-    new = placed("\ufeff" + FILE, 0, POSE, "scene.toml")
-    assert new == "\ufeff" + placed(FILE, 0, POSE, "scene.toml")
+    new = with_pose("\ufeff" + FILE, 0, POSE, "scene.toml")
+    assert new == "\ufeff" + with_pose(FILE, 0, POSE, "scene.toml")
 
 
 @pytest.mark.parametrize(
@@ -55,10 +55,8 @@ def test_the_mark_of_an_editor_stays():
     [(FILE, 2), ('markers = [{spec = "a", size = 1.0}]\n', 0), ("x = '''\n[[markers]]\n'''", 0), ("[", 0)],
 )
 def test_a_file_that_is_written_otherwise_is_left_alone(text, number):
-    with pytest.raises(
-        fs.InputError, match=rf"s.toml: the pose of marker {number} is not written.*put position"
-    ):
-        placed(text, number, POSE, "s.toml")
+    with pytest.raises(fs.InputError, match=rf"s.toml: marker {number} must be a plain .*write position"):
+        with_pose(text, number, POSE, "s.toml")
 
 
 def test_a_file_that_was_edited_meanwhile_is_not_written(tmp_path):
@@ -66,20 +64,20 @@ def test_a_file_that_was_edited_meanwhile_is_not_written(tmp_path):
     path.write_text(FILE)
     file = SceneFile(path)
     assert not file.changed()
-    file.place(0, POSE)
+    file.write_pose(0, POSE)
     assert not file.changed()  # our own hand
     assert "position = [0.25, -0.5, 0.333333333]" in path.read_text()
     path.write_text(FILE + "\n# edited")
-    with pytest.raises(fs.InputError, match="was edited meanwhile; it is read again"):
-        file.place(0, POSE)
+    with pytest.raises(fs.InputError, match="was edited by another program; it is loaded again"):
+        file.write_pose(0, POSE)
     assert path.read_text() == FILE + "\n# edited"
     text = file.changed()
     assert text == FILE + "\n# edited"
     assert file.changed() is None
-    with pytest.raises(fs.InputError, match="was edited meanwhile"):
-        file.place(0, POSE)  # until the scene of that text is shown
+    with pytest.raises(fs.InputError, match="was edited by another program"):
+        file.write_pose(0, POSE)  # until the scene of that text is shown
     file.text = text
-    file.place(0, POSE)
+    file.write_pose(0, POSE)
     path.unlink()
     with pytest.raises(fs.InputError, match="cannot read"):
         file.changed()
@@ -89,6 +87,6 @@ def test_a_link_to_a_scene_file_stays_one(tmp_path):
     (tmp_path / "real.toml").write_text(FILE)
     link = tmp_path / "scene.toml"
     link.symlink_to("real.toml")
-    SceneFile(link).place(0, POSE)
+    SceneFile(link).write_pose(0, POSE)
     assert link.is_symlink()
     assert "position = [0.25" in (tmp_path / "real.toml").read_text()

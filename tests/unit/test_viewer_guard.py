@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 import fidsplat as fs
-from fidsplat.viewer.guard import guarded, refused
+from fidsplat.viewer.guard import guarded, refusal
 
 
 @pytest.mark.parametrize(
@@ -17,12 +17,12 @@ from fidsplat.viewer.guard import guarded, refused
         ("http://127.0.0.1:9", "127.0.0.1:9", "127.0.0.1", ""),  # a tunnel has a port of its own
         ("http://[::1]:8080", "[::1]:8080", "::1", ""),
         ("https://LOCALHOST", "localhost", "localhost", ""),
-        ("http://evil.test", "localhost:8080", "127.0.0.1", "of another site"),
-        ("http://localhost:3000", "localhost:8080", "127.0.0.1", "of another site"),
-        ("null", "localhost:8080", "127.0.0.1", "of another site"),
-        ("http://localhost:8080", None, "127.0.0.1", "of another site"),
+        ("http://evil.test", "localhost:8080", "127.0.0.1", "from another site"),
+        ("http://localhost:3000", "localhost:8080", "127.0.0.1", "from another site"),
+        ("null", "localhost:8080", "127.0.0.1", "from another site"),
+        ("http://localhost:8080", None, "127.0.0.1", "from another site"),
         ("null", None, "127.0.0.1", "another name"),
-        ("http://[x", "localhost:8080", "127.0.0.1", "no address"),
+        ("http://[x", "localhost:8080", "127.0.0.1", "valid address"),
         # a name of theirs that was made to point here
         ("http://evil.test:8080", "evil.test:8080", "127.0.0.1", "another name"),
         ("http://evil.test:8080", "evil.test:8080", "0.0.0.0", "another name"),
@@ -33,7 +33,7 @@ from fidsplat.viewer.guard import guarded, refused
     ],
 )
 def test_pages_of_others_are_refused(origin, host, listens, words):
-    found = refused(origin, host, listens)
+    found = refusal(origin, host, listens)
     assert words in found
     assert bool(words) == bool(found)
 
@@ -57,7 +57,9 @@ def test_a_port_in_use_is_said():
             check_port("127.0.0.1", port)
     check_port("127.0.0.1", port)
     for none in (-1, 65536, 99999):
-        with pytest.raises(fs.InputError, match=f"--port is {none}; give a number from 1 to 65535, or 0"):
+        with pytest.raises(
+            fs.InputError, match=f"--port must be 1 to 65535, or 0 for any free port, got {none}"
+        ):
             check_port("127.0.0.1", none)
 
 
@@ -85,7 +87,7 @@ def test_a_port_that_another_takes_meanwhile_is_said(monkeypatch):
 @pytest.mark.parametrize(
     ("host", "words"),
     [
-        ("", "--host is empty"),  # which would let the whole network in
+        ("", "--host must be an address"),  # which would let the whole network in
         ("192.0.2.1", "--host must be an address of this machine"),
         ("a..b", "--host must be an address of this machine"),
     ],

@@ -15,8 +15,8 @@ from viewing import HERE, Client, scene, until
 
 import fidsplat as fs
 from fidsplat.splats.rotations import rigid_matrix
-from fidsplat.viewer.edits import Body
-from fidsplat.viewer.session import View
+from fidsplat.viewer.scene_file import SplatFile
+from fidsplat.viewer.session import StillImage
 from fidsplat.viewer.settings import Settings
 from fidsplat.viewer.stream import Stream
 
@@ -27,7 +27,7 @@ def viewer(tmp_path, monkeypatch):
     from fidsplat.viewer import server
     from fidsplat.viewer.server import Viewer
 
-    monkeypatch.setattr(server, "LOOK", 0.1)
+    monkeypatch.setattr(server, "POLL_INTERVAL", 0.1)
     (tmp_path / "scene.toml").write_text(
         '[[markers]]\nspec = "aruco:4x4_50:7"\nsize = 0.4\n[render]\nbackground = [0.2, 0.3, 0.4]\n'
     )
@@ -47,7 +47,7 @@ def test_what_a_browser_gets_and_asks(viewer):
     assert "marker aruco:4x4_50:7" in client.said.content
     assert "depth 1.0000 m" in client.said.content
     viewer._click(SimpleNamespace(client_id=9, screen_pos=(0.5, 0.5)))  # a browser that has left
-    viewer.picture(client)
+    viewer.save_image(client)
     assert client.files[0][0] == "fidsplat.png"
     assert client.files[0][1].startswith(b"\x89PNG")
     client.camera.image_width, client.camera.image_height = 320, 240
@@ -55,11 +55,11 @@ def test_what_a_browser_gets_and_asks(viewer):
     client.turned(client.camera)
     assert until(lambda: client.sent[count:] and client.sent[-1][0].shape == (240, 320, 3))
     assert until(lambda: viewer._views[1].frame["rgb"].shape == (240, 320, 3))
-    viewer.read(client)
+    viewer.detect_markers(client)
     assert "| aruco:4x4_50:7 | 0." in client.said.content
     viewer._leave(client)
     viewer._leave(client)
-    viewer.read(client)
+    viewer.detect_markers(client)
 
 
 def test_a_marker_that_moves_is_read_where_it_is_at_the_time_of_the_image(viewer):
@@ -68,12 +68,12 @@ def test_a_marker_that_moves_is_read_where_it_is_at_the_time_of_the_image(viewer
 
     (still,) = scene().markers
     moving = fs.Scene(markers=[replace(still, motion=slide)], background=(0.2, 0.3, 0.4))
-    drawn = replace(viewer.session.drawn, scene=moving, settings=replace(Settings.of(moving), time=1.0))
+    drawn = replace(viewer.session.state, scene=moving, settings=replace(Settings.of(moving), time=1.0))
     capture = drawn.settings.capture(moving, replace(HERE, width=320, height=240).camera(moving, "scene"))
     client = Client()
-    viewer._said[1] = client.said
-    viewer._views[1] = View(drawn.renderer.render(moving, capture), drawn, HERE)
-    viewer.read(client)
+    viewer._messages[1] = client.said
+    viewer._views[1] = StillImage(drawn.renderer.render(moving, capture), drawn, HERE)
+    viewer.detect_markers(client)
     assert "| aruco:4x4_50:7 | 0." in client.said.content  # millimetres, not 100 of them
 
 
@@ -83,14 +83,14 @@ def test_texts_of_a_scene_are_no_markup(viewer, monkeypatch):
     hostile = "qr:<iframe srcdoc='<script>x</script>'>![a](/etc/passwd)[b](javascript:x) | &lt;\n\n<b>"
     shown = " ".join(hostile.split())
     client, box = Client(), viewer.session
-    drawn = box.drawn
+    drawn = box.state
     marker = replace(drawn.scene.markers[0].marker, spec=hostile)
     placed = replace(drawn.scene.markers[0], marker=marker)
     viewer._enter(client)
     assert until(lambda: 1 in viewer._views)
     view = viewer._views[1]
     scene = replace(drawn.scene, markers=(placed,))
-    viewer._views[1] = replace(view, drawn=replace(view.drawn, scene=scene))
+    viewer._views[1] = replace(view, state=replace(view.state, scene=scene))
 
     def is_text(content, text):
         assert text in html.unescape(content)
@@ -103,18 +103,18 @@ def test_texts_of_a_scene_are_no_markup(viewer, monkeypatch):
     )
     code = SimpleNamespace(name=hostile)
     monkeypatch.setattr("fidsplat.viewer.server.read_back", lambda *_: ([reading], [code]))
-    viewer.read(client)
+    viewer.detect_markers(client)
     is_text(client.said.content, f"| {shown} | 1.00 | 2.00 |")
-    is_text(client.said.content, f"not of the scene: {shown}")
+    is_text(client.said.content, f"not in the scene: {shown}")
     assert client.said.content.count("|") == 12  # three cells a row
 
     def fails(*_):
         raise fs.InputError(hostile)
 
     monkeypatch.setattr("fidsplat.viewer.server.read_back", fails)
-    viewer.read(client)
+    viewer.detect_markers(client)
     is_text(client.said.content, shown)
-    viewer._controls.say(hostile)
+    viewer._controls.show_status(hostile)
     is_text(viewer._controls.status.content, f"**{shown}**")
 
 
@@ -146,11 +146,11 @@ def test_a_camera_that_is_none_does_not_end_a_stream(viewer):
         {"image_width": 10**6},
     ):
         vars(client.camera).update(before | changes)
-        viewer._controls.say("")
+        viewer._controls.show_status("")
         client.turned(client.camera)
         assert "the page" in viewer._controls.status.content
         viewer.add_keyframe(client)
-        viewer.picture(client)
+        viewer.save_image(client)
         assert viewer._keyframes == client.files == []
     vars(client.camera).update(before | {"position": (0, 0, -2)})
     client.turned(client.camera)
@@ -161,33 +161,33 @@ def test_a_camera_that_is_none_does_not_end_a_stream(viewer):
 
 def test_what_a_button_cannot_do_is_said(viewer, monkeypatch):
     client = Client()
-    viewer._said[1] = client.said
-    viewer.read(client)
-    assert client.said.content == "Wait until the picture is still, then ask again."
-    viewer.picture(client)  # of a browser that has left
+    viewer._messages[1] = client.said
+    viewer.detect_markers(client)
+    assert client.said.content == "Wait for the exact image, then detect again."
+    viewer.save_image(client)  # of a browser that has left
     viewer._streams[1] = Stream(lambda *_: None, lambda *_: None)
 
     def fails(viewpoint):
         raise MemoryError
 
-    monkeypatch.setattr(viewer.session, "draw", fails)
-    viewer.picture(client)
-    assert "**not enough memory for this picture**" in viewer._controls.status.content
+    monkeypatch.setattr(viewer.session, "render", fails)
+    viewer.save_image(client)
+    assert "**not enough memory for this image**" in viewer._controls.status.content
     assert client.files == []
 
 
 def test_a_gizmo_moves_a_marker_and_its_file(viewer, tmp_path):
-    viewer.hold("1: aruco:4x4_50:7")
+    viewer.select_target("1: aruco:4x4_50:7")
     pose = rigid_matrix((0.1, 0.0, 0.2))
     viewer._move(pose, False)
     assert viewer.session.settle()
-    np.testing.assert_allclose(viewer.session.drawn.scene.markers[0].pose, pose)
+    np.testing.assert_allclose(viewer.session.state.scene.markers[0].pose, pose)
     assert "position" not in (tmp_path / "scene.toml").read_text()
     viewer._move(pose, True)
     assert viewer.session.settle()
     again = fs.Scene.load(tmp_path / "scene.toml")
     np.testing.assert_allclose(again.markers[0].pose, pose, atol=1e-8)
-    viewer.hold("none")
+    viewer.select_target("none")
     viewer._move(np.eye(4), True)
     np.testing.assert_allclose(fs.Scene.load(tmp_path / "scene.toml").markers[0].pose, pose, atol=1e-8)
 
@@ -209,62 +209,66 @@ def test_a_gizmo_moves_a_splat_file(viewer, tmp_path):
     viewer = type(viewer)(fs.Scene.load(path), path, "reference", port=0)
     viewer._closed.set()  # nobody looks at the file meanwhile
     try:
-        assert viewer._controls._held.options[2:] == ("file 1: box.ply", "file 2: box.ply", "file 3: box.ply")
-        viewer.hold("file 2: box.ply")
-        np.testing.assert_allclose(viewer._held.pose, rigid_matrix((0, 0, 1)))
+        assert viewer._controls._targets.options[2:] == (
+            "file 1: box.ply",
+            "file 2: box.ply",
+            "file 3: box.ply",
+        )
+        viewer.select_target("file 2: box.ply")
+        np.testing.assert_allclose(viewer._target.pose, rigid_matrix((0, 0, 1)))
         pose = rigid_matrix((0.5, 0, 2), (0, 0, 1, 0))
-        for let_go in (False, True):
-            viewer._move(pose, let_go)
+        for released in (False, True):
+            viewer._move(pose, released)
             assert viewer.session.settle()
-            moved = viewer.session.drawn.scene.clouds
+            moved = viewer.session.state.scene.clouds
             np.testing.assert_allclose(moved[1].world_means(), [(0.5, 0, 2), (-1.5, 0, 2)], atol=1e-6)
-            assert ("0.5" in path.read_text()) == let_go
+            assert ("0.5" in path.read_text()) == released
         assert "scale = 2.0 # twice" in path.read_text()
         again = fs.Scene.load(path)
         for one, other in zip(again.clouds, moved, strict=True):
             np.testing.assert_allclose(one.world_means(), other.world_means(), atol=1e-6)
-        viewer.hold("file 1: box.ply")  # which has no pose in the file
+        viewer.select_target("file 1: box.ply")  # which has no pose in the file
         viewer._move(rigid_matrix((0, 3, 0)), True)
         assert viewer.session.settle()
         np.testing.assert_allclose(fs.Scene.load(path).clouds[0].world_means()[0], (0, 3, 0))
-        viewer.hold("file 3: box.ply")
-        assert viewer._held is None
-        assert "moves by keyframes" in viewer._controls.status.content
+        viewer.select_target("file 3: box.ply")
+        assert viewer._target is None
+        assert "is moved by keyframes" in viewer._controls.status.content
         # what cannot be written stays where the file says that it is
-        viewer.hold("file 2: box.ply")
+        viewer.select_target("file 2: box.ply")
         before = path.read_text()
         path.write_text(before + "# edited\n")
         viewer._move(rigid_matrix((9, 9, 9)), True)
         assert viewer.session.settle()
         assert "nothing was written" in viewer._controls.status.content
         np.testing.assert_allclose(
-            viewer.session.drawn.scene.clouds[1].world_means()[0], (0.5, 0, 2), atol=1e-6
+            viewer.session.state.scene.clouds[1].world_means()[0], (0.5, 0, 2), atol=1e-6
         )
         assert path.read_text() == before + "# edited\n"
-        viewer.hold("file 9: none")
+        viewer.select_target("file 9: none")
         viewer._move(np.eye(4), True)
     finally:
         viewer.close()
 
 
 def test_large_splat_files_move_once_they_are_let_go(monkeypatch):
-    from fidsplat.viewer import held
+    from fidsplat.viewer import gizmo
 
     cloud = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1], colors=[[1, 0, 0]])
-    taken = held.held_by(fs.Scene([cloud]), [Body(0, "a.ply", np.eye(4))], "file 1: a.ply")
-    assert taken.light
-    monkeypatch.setattr(held, "LIGHT", 0)
-    assert not taken.light
+    taken = gizmo.find_target(fs.Scene([cloud]), [SplatFile(0, "a.ply", np.eye(4))], "file 1: a.ply")
+    assert taken.live
+    monkeypatch.setattr(gizmo, "LIVE_LIMIT", 0)
+    assert not taken.live
 
 
 def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
     text = (tmp_path / "scene.toml").read_text()
     (tmp_path / "scene.toml").write_text(text.replace("0.4\n", "0.2\n", 1))
-    assert until(lambda: viewer.session.drawn.scene.markers[0].marker.size == 0.2)
+    assert until(lambda: viewer.session.state.scene.markers[0].marker.size == 0.2)
     (tmp_path / "scene.toml").write_text(text.replace("size", "sise"))
-    assert until(lambda: "what was read before is shown" in viewer._controls.status.content)
+    assert until(lambda: "the previous scene is shown" in viewer._controls.status.content)
     assert "did you mean 'size'" in viewer._controls.status.content
-    assert viewer.session.drawn.scene.markers[0].marker.size == 0.2
+    assert viewer.session.state.scene.markers[0].marker.size == 0.2
 
 
 def test_what_an_edit_changes_is_taken_and_the_controls_follow(viewer, tmp_path):
@@ -280,14 +284,14 @@ def test_what_an_edit_changes_is_taken_and_the_controls_follow(viewer, tmp_path)
     path.write_text(edited)
     assert until(lambda: viewer._controls._lens.value == "scene")
     assert until(lambda: not viewer._controls._session._working)
-    settings = viewer.session.drawn.settings
+    settings = viewer.session.state.settings
     assert (settings.fog, settings.lens, settings.exposure) == (3.0, "scene", 2.0)
     assert (sliders["fog"].value, sliders["exposure"].value) == (3.0, 2.0)
     assert sliders["fog"].max >= 3.0
     path.write_text(edited.partition("[camera.distortion]")[0])
     assert until(lambda: "scene" not in viewer._controls._lens.options)
     assert viewer.session.settle()
-    settings = viewer.session.drawn.settings
+    settings = viewer.session.state.settings
     assert (settings.fog, settings.lens, settings.exposure) == (3.0, "pinhole", 2.0)
 
 
@@ -310,7 +314,7 @@ def test_a_scene_that_begins_to_move_gets_a_clock(viewer, tmp_path):
     assert until(lambda: "readout_ms" in sliders and len(shown) == before + 3)
     assert (sliders["time"].min, sliders["time"].max) == (0.0, 2.5), "of keyframes, and where the clock is"
     sliders["time"].value = 2.5
-    assert until(lambda: viewer.session.drawn.settings.time == 2.5)
+    assert until(lambda: viewer.session.state.settings.time == 2.5)
     write(moving(4.0))
     assert until(lambda: sliders["time"].max == 4.0)
     assert (sliders["time"].min, sliders["time"].value, len(shown)) == (0.5, 2.5, before + 3)
@@ -325,23 +329,23 @@ def test_a_marker_is_not_written_into_a_file_that_cannot_be_shown(viewer, tmp_pa
     """Its tables may be those of other markers."""
     file, table = tmp_path / "scene.toml", '[[markers]]\nspec = "aruco:4x4_50:8"\nsize = 0.4\n'
     edited = table.replace("0.4", "-1") + file.read_text()
-    viewer.hold("1: aruco:4x4_50:7")
+    viewer.select_target("1: aruco:4x4_50:7")
     file.write_text(edited)
-    assert until(lambda: "what was read before is shown" in viewer._controls.status.content)
+    assert until(lambda: "the previous scene is shown" in viewer._controls.status.content)
     viewer._move(rigid_matrix((0.1, 0.0, 0.2)), True)
     assert viewer.session.settle()
     assert file.read_text() == edited
     assert "nothing was written" in viewer._controls.status.content
     file.write_text(edited.replace("-1", "0.4"))
-    assert until(lambda: len(viewer._controls._held.options) == 3)
-    assert viewer._controls._held.options[2] == "2: aruco:4x4_50:7"
+    assert until(lambda: len(viewer._controls._targets.options) == 3)
+    assert viewer._controls._targets.options[2] == "2: aruco:4x4_50:7"
     viewer._move(np.eye(4), True)  # nothing is held any more
     assert "position" not in file.read_text()
-    viewer.hold("2: aruco:4x4_50:7")
+    viewer.select_target("2: aruco:4x4_50:7")
     viewer._move(rigid_matrix((0.1, 0.0, 0.2)), True)
     assert viewer.session.settle()
     np.testing.assert_allclose(fs.Scene.load(file).markers[1].pose[:3, 3], (0.1, 0, 0.2))
-    viewer.hold("9: nobody")
+    viewer.select_target("9: nobody")
     viewer._move(np.eye(4), True)
 
 

@@ -65,7 +65,7 @@ def test_a_scene_file_that_is_edited_keeps_the_quality_that_was_given(flight, mo
             file = self._file.path
             file.write_text(file.read_text().replace("0.4", "0.2"))
             for _ in range(100):
-                if self.session.drawn.scene.markers[0].marker.size == 0.2:
+                if self.session.state.scene.markers[0].marker.size == 0.2:
                     break
                 self._closed.wait(0.05)
             self.close()
@@ -74,7 +74,7 @@ def test_a_scene_file_that_is_edited_keeps_the_quality_that_was_given(flight, mo
     monkeypatch.setattr(server, "Viewer", Page)
     words = ["--quality", "samples=2", "--device", "reference", "--port", "0"]
     assert main(["view", str(flight.parents[1] / "scene.toml"), *words]) == 2
-    scene = made[0].drawn.scene
+    scene = made[0].state.scene
     assert (scene.markers[0].marker.size, scene.capture.quality.samples) == (0.2, 2)
 
 
@@ -146,10 +146,10 @@ def test_the_page_shows_the_newest_splats(trainer):
     viewer = Viewer(first, device="reference", port=0, reload=lambda: newer.pop() if newer else None)
     try:
         for _ in range(100):
-            if viewer.session.drawn.scene is not first:
+            if viewer.session.state.scene is not first:
                 break
             viewer._closed.wait(0.05)
-        assert viewer.session.drawn.scene.capture.background == (1, 1, 1)
+        assert viewer.session.state.scene.capture.background == (1, 1, 1)
     finally:
         viewer.close()
 

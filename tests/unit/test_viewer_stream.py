@@ -8,7 +8,7 @@ from viewing import HERE
 
 import fidsplat as fs
 from fidsplat.viewer.settings import Viewpoint
-from fidsplat.viewer.stream import REST, SMALLEST, Pace, Stream
+from fidsplat.viewer.stream import MIN_SCALE, REST_DELAY, Pace, Stream
 
 
 class Clock:
@@ -40,18 +40,18 @@ def test_the_newest_viewpoint_then_one_exact_picture_then_nothing():
     stream, clock, drawn = looked_at()
     assert stream.step() is None  # nobody looks yet
     for x in (1.0, 2.0, 3.0):
-        stream.look(at(x))
+        stream.set_viewpoint(at(x))
     assert stream.step() == 0.0
     assert drawn == [(3.0, 0.5)]
-    assert stream.step() == pytest.approx(REST)
+    assert stream.step() == pytest.approx(REST_DELAY)
     assert len(drawn) == 1
-    clock.now += REST
+    clock.now += REST_DELAY
     assert stream.step() == 0.0
     assert drawn[1:] == [(3.0, "exact")]
     for _ in range(3):
         clock.now += 60
         assert stream.step() is None
-    stream.look(at(3.0))  # the same again is no news
+    stream.set_viewpoint(at(3.0))  # the same again is no news
     assert stream.step() is None
     stream.refresh()
     assert stream.step() == 0.0
@@ -64,10 +64,10 @@ def test_the_scale_holds_the_rate(full):
     """Of a machine that takes so long for a picture of the page's size."""
     stream, _, drawn = looked_at(lambda scale: full * scale**2)
     for k in range(40):
-        stream.look(at(float(k)))
+        stream.set_viewpoint(at(float(k)))
         stream.step()
     last = drawn[-1][1]
-    assert last == stream.pace.steps
+    assert last == stream.pace.step_scale
     if full < 0.03:
         assert last == 1.0
     else:
@@ -77,11 +77,11 @@ def test_the_scale_holds_the_rate(full):
 def test_the_scale_has_an_end():
     pace = Pace()
     for _ in range(50):
-        pace.took(10.0, pace.steps)
-    assert pace.steps == SMALLEST
+        pace.update(10.0, pace.step_scale)
+    assert pace.step_scale == MIN_SCALE
     for _ in range(50):
-        pace.took(1e-9, pace.steps)
-    assert pace.steps == 1.0
+        pace.update(1e-9, pace.step_scale)
+    assert pace.step_scale == 1.0
 
 
 def test_a_picture_that_fails_is_told_and_the_stream_goes_on():
@@ -91,7 +91,7 @@ def test_a_picture_that_fails_is_told_and_the_stream_goes_on():
         raise fs.InputError("too large")
 
     stream = Stream(refused, refused, told.append, clock=Clock())
-    stream.look(HERE)
+    stream.set_viewpoint(HERE)
     assert stream.step() == 0.0
     assert told == ["too large"]
     assert stream.step() is not None
@@ -104,9 +104,9 @@ def test_a_picture_that_is_too_large_for_the_memory_is_told():
         raise MemoryError
 
     stream = Stream(draw, draw, told.append, clock=lambda: 0.0)
-    stream.look(HERE)
+    stream.set_viewpoint(HERE)
     stream.step()
-    assert told == ["not enough memory for this picture"]
+    assert told == ["not enough memory for this image"]
 
 
 def test_a_picture_is_sent_while_the_next_is_drawn_and_before_the_exact_one():
@@ -127,9 +127,9 @@ def test_a_picture_is_sent_while_the_next_is_drawn_and_before_the_exact_one():
 
     stream = Stream(moving, lambda viewpoint: done.append("exact"), clock=clock)
     for x in (1.0, 2.0, 3.0):
-        stream.look(at(x))
+        stream.set_viewpoint(at(x))
         stream.step()
-    clock.now += REST
+    clock.now += REST_DELAY
     stream.step()
     assert done == [0, 1, 2, "exact"]
 
@@ -142,7 +142,7 @@ def test_what_goes_wrong_while_a_picture_is_sent_is_told():
 
     stream = Stream(lambda *_: send, lambda *_: None, told.append, clock=Clock())
     for x in (1.0, 2.0):
-        stream.look(at(x))
+        stream.set_viewpoint(at(x))
         stream.step()
     assert told == ["nobody takes it"]
 
@@ -152,7 +152,7 @@ def test_a_stream_runs_in_a_thread_until_it_is_closed():
     stream = Stream(lambda *_: lambda: None, lambda *_: seen.set())
     thread = threading.Thread(target=stream.run)
     thread.start()
-    stream.look(HERE)
+    stream.set_viewpoint(HERE)
     assert seen.wait(20)
     stream.close()
     thread.join(20)

@@ -1,5 +1,5 @@
-"""A marker or a splat file that was moved goes back into its scene file: two lines change, all else stays as
-it was written."""
+"""Write the pose of a moved marker or splat file back to its scene file: two lines change, everything else
+stays."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _HEAD = re.compile(r"^[ \t]*\[.*$", re.MULTILINE)
 _TABLES = {
     kind: re.compile(rf"^[ \t]*\[\[[ \t]*{kind}[ \t]*\]\][ \t]*(?:#.*)?$") for kind in ("markers", "splats")
 }
-_WORDS = {"markers": "marker", "splats": "splat file"}
-_STILL = (1.0, 0.0, 0.0, 0.0)
+_NAMES = {"markers": "marker", "splats": "splat file"}
+_IDENTITY = (1.0, 0.0, 0.0, 0.0)
 DIGITS = 9
-"""of metres and quaternions in the file: nanometres"""
+"""decimal digits of metres and quaternions in the file"""
 
 
-class Body(NamedTuple):
-    """A splat file of a scene file."""
+class SplatFile(NamedTuple):
+    """A splat file of a scene."""
 
     table: int
-    """number of its [[splats]]"""
+    """index of its [[splats]] table"""
     file: str
     pose: np.ndarray
-    """(4, 4) where the file's frame lies, without its scale"""
+    """(4, 4) pose of the file's frame, without scale"""
 
 
 class SceneFile:
@@ -41,52 +41,52 @@ class SceneFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.text = self._read()
-        """that of the scene which is shown: it alone is written back"""
-        self._seen = self.text
+        """text of the scene on display; only this text is edited"""
+        self._last_read = self.text
 
     def changed(self) -> str | None:
-        """What it holds now, if somebody else has written it since this was last asked."""
+        """The text, if another program has changed it since the last call; else None."""
         text = self._read()
-        known, self._seen = self._seen, text
+        known, self._last_read = self._last_read, text
         return None if text == known else text
 
-    def bodies(self) -> list[Body]:
-        """The splat files, in the order of the scene's clouds; stores stay where they were built."""
+    def splat_files(self) -> list[SplatFile]:
+        """Splat files in the order of the scene's clouds; stores cannot be moved."""
         tables = (_parsed(self.text) or {}).get("splats", ())
         return [
-            Body(
+            SplatFile(
                 k,
                 table["file"],
-                rigid_matrix(table.get("position", (0, 0, 0)), table.get("quaternion", _STILL)),
+                rigid_matrix(table.get("position", (0, 0, 0)), table.get("quaternion", _IDENTITY)),
             )
             for k, table in enumerate(tables)
             if not table["file"].lower().endswith(STORE)
         ]
 
-    def place(self, number: int, pose: np.ndarray, kind: str = "markers") -> None:
-        """Write the pose (4, 4) of table number, counted from 0, of the markers or splats.
+    def write_pose(self, number: int, pose: np.ndarray, kind: str = "markers") -> None:
+        """Write the pose (4, 4) of a table, by its index among the markers or splats.
 
         Raises:
-            InputError: the file has changed meanwhile, cannot be written, or has its tables in a form in
-                which their poses are not found.
+            InputError: the file has changed, cannot be written, or has no plain table of that index.
         """
         if self._read() != self.text:
-            raise InputError(f"{self.path} was edited meanwhile; it is read again, and nothing was written")
-        text = placed(self.text, number, pose, str(self.path), kind)
-        with atomic_write(self.path.resolve()) as stream:  # a link stays one
+            raise InputError(
+                f"{self.path} was edited by another program; it is loaded again, and nothing was written"
+            )
+        text = with_pose(self.text, number, pose, str(self.path), kind)
+        with atomic_write(self.path.resolve()) as stream:  # a link stays a link
             stream.write(text.encode("utf-8"))
-        self.text = self._seen = text
+        self.text = self._last_read = text
 
     def _read(self) -> str:
         return read_input(self.path).decode("utf-8", "replace")
 
 
-def placed(text: str, number: int, pose: np.ndarray, name: str, kind: str = "markers") -> str:
-    """The text of a scene file in which table number, counted from 0, of the markers or splats has another
-    pose (4, 4).
+def with_pose(text: str, number: int, pose: np.ndarray, name: str, kind: str = "markers") -> str:
+    """Text of a scene file with another pose (4, 4) of a table, by its index among the markers or splats.
 
     Raises:
-        InputError: naming the file, where the table is not found.
+        InputError: no plain table of that index; the message names the file.
     """
     position = [round(float(v), DIGITS) + 0.0 for v in pose[:3, 3]]
     quaternion = [round(float(v), DIGITS) + 0.0 for v in matrix_to_quaternion(pose[:3, :3])]
@@ -102,8 +102,8 @@ def placed(text: str, number: int, pose: np.ndarray, name: str, kind: str = "mar
         new = text[: heads[k].end()] + table + text[end:]
     if _parsed(new) != _expected(text, kind, number, position, quaternion):
         raise InputError(
-            f"{name}: the pose of {_WORDS[kind]} {number} is not written, as its table is not a plain "
-            f"[[{kind}]]; put position = {position}, quaternion = {quaternion} there"
+            f"{name}: {_NAMES[kind]} {number} must be a plain [[{kind}]] table; write position = {position}, "
+            f"quaternion = {quaternion} there yourself"
         )
     return new
 
@@ -124,7 +124,7 @@ def _parsed(text: str) -> Any:
 
 
 def _expected(text: str, kind: str, number: int, position: list[float], quaternion: list[float]) -> Any:
-    """What the file is to say afterwards; something that no file says where there is no such table."""
+    """The content that the new text must have; a value that no file has if the table does not exist."""
     scene = _parsed(text)
     try:
         scene[kind][number] |= {"position": position, "quaternion": quaternion}
