@@ -10,7 +10,7 @@ from agreement import random_splats
 from test_memory import CAMERA, as_on_a_gpu, own_device
 
 import fidsplat as fs
-from fidsplat.backends.opencl import recording
+from fidsplat.backends.opencl import recorded_frame
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_a_batch_is_cut_where_no_buffer_holds_all_its_splats(opencl):
 
 def test_views_that_are_kept_ready_do_not_keep_what_was_around_them(opencl, monkeypatch):
     """Each view has a panorama of its own, as it may have a layer: their arrays are not kept without end."""
-    monkeypatch.setattr(recording, "_VIEWS_BYTES", 20_000)
+    monkeypatch.setattr(recorded_frame, "_VIEWS_BYTES", 20_000)
     machine, rng = as_on_a_gpu(opencl), np.random.default_rng(1)
     resident, known = machine.upload(random_splats(20, seed=1)), []
     for _ in range(12):
@@ -93,10 +93,10 @@ class Lost:
 
 def test_a_device_that_fails_is_one_sentence_wherever_it_is_noticed(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
-    frame._images._drawn.queue = Lost()
-    with pytest.raises(fs.DeviceError, match="failed while drawing"):
+    frame._images._rendered.queue = Lost()
+    with pytest.raises(fs.DeviceError, match="failed while rendering"):
         frame.wait()
-    with pytest.raises(fs.DeviceError, match="failed while drawing"):
+    with pytest.raises(fs.DeviceError, match="failed while rendering"):
         dict(frame.timings)
 
 

@@ -51,7 +51,7 @@ def test_a_picture_is_launched_again_for_each_view(opencl):
         for k, x in enumerate(places)
     ]
     kept = [machine.render(resident, capture) for _ in range(3) for capture in captures]
-    assert [each.recording is not None for each in resident.data.kept.values()] == [True, True]
+    assert [each.recorded is not None for each in resident.data.cached_frames.values()] == [True, True]
     for frame, capture in zip(kept, captures * 3, strict=True):
         wanted = own.render(some, capture)
         assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
@@ -66,11 +66,11 @@ def test_what_another_kind_of_picture_has_tallied_is_not_counted(opencl):
     machine = as_on_a_gpu(opencl)
     resident = machine.upload(random_splats(300, seed=4))
     first, *_ = (machine.render(resident, CAMERA)["rgb"] for _ in range(3))
-    (kept,) = resident.data.kept.values()
-    known, state = kept.recording, machine.backend.pool.state
+    (kept,) = resident.data.cached_frames.values()
+    known, state = kept.recorded, machine.backend.pool.state
     machine.render(resident, fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)))
     assert np.array_equal(machine.render(resident, CAMERA)["rgb"], first)
-    assert (kept.recording, machine.backend.pool.state) == (known, state)
+    assert (kept.recorded, machine.backend.pool.state) == (known, state)
     assert known is not None
 
 

@@ -12,7 +12,7 @@ from sampling import alternate
 
 import fidsplat as fs
 from fidsplat.backends.bands import cut
-from fidsplat.backends.opencl.lists import TiledLists
+from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
 
@@ -86,7 +86,7 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
         return bands
 
     monkeypatch.setattr(opencl.backend, "pair_budget", budget)
-    monkeypatch.setattr("fidsplat.backends.opencl.lists.cut", noted)
+    monkeypatch.setattr("fidsplat.backends.opencl.tiling.cut", noted)
     frame = opencl.render(cloud, CAMERA, ALL_OUTPUTS)
     assert len(bands) == 2
     assert max(pairs for _, _, pairs in bands) <= budget
@@ -108,15 +108,15 @@ def test_nothing_is_written_beyond_the_room_for_lists(opencl, monkeypatch, machi
     pairs, pool, queue = wanted.stats["pairs"], own.backend.pool, own.backend.queue
     words = {"lists": pairs}
     if machine is as_on_a_gpu:
-        words, room, again = {"pairs": 200, "lists": 100}, TiledLists.capacity, TiledLists._again
+        words, capacity, bands = {"pairs": 200, "lists": 100}, tiling.pair_capacity, tiling.unsorted_bands
 
-        def first_looked_at(self):
+        def first_looked_at(*given):
             look()
-            monkeypatch.setattr(TiledLists, "capacity", room)
-            return again(self)
+            monkeypatch.setattr(tiling, "pair_capacity", capacity)
+            return bands(*given)
 
-        monkeypatch.setattr(TiledLists, "capacity", staticmethod(lambda workspace: 100))
-        monkeypatch.setattr(TiledLists, "_again", first_looked_at)
+        monkeypatch.setattr(tiling, "pair_capacity", lambda workspace: 100)
+        monkeypatch.setattr(tiling, "unsorted_bands", first_looked_at)
     seen = []
 
     def look():
@@ -180,7 +180,7 @@ def test_a_budget_below_the_picture_is_an_error_with_a_remedy(opencl, cloud, bud
 
 def test_a_row_of_tiles_with_too_many_splats_is_an_error(opencl):
     crowd = random_splats(40000, seed=3, depth=(2.0, 3.0), scale=(1e-3, 1e-2), across=0.01)
-    with pytest.raises(fs.DeviceError, match=r"row of tiles sees more than the .* raise memory_budget"):
+    with pytest.raises(fs.DeviceError, match=r"splats of a row of tiles must be .* raise memory_budget"):
         small(opencl, 2).render(crowd, CAMERA)
 
 
@@ -363,8 +363,8 @@ def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
 
 def test_an_image_that_cannot_be_read_is_an_error_of_the_device(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
-    frame._images._drawn.leased[:] = [("rgb_out", opencl.backend.pool.fresh("too small", 16))]
-    with pytest.raises(fs.DeviceError, match="failed while drawing rgb"):
+    frame._images._rendered.leased[:] = [("rgb_out", opencl.backend.pool.fresh("too small", 16))]
+    with pytest.raises(fs.DeviceError, match="failed while rendering rgb"):
         frame["rgb"]
 
 

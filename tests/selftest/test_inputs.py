@@ -35,23 +35,23 @@ def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, bud
     """E3: a picture of more than 2^32 pairs keeps its places modulo 2^32. The places of a small one are moved
     up until they wrap amid its tiles.
     """
-    from fidsplat.backends.opencl import probe
-    from fidsplat.backends.opencl.lists import LISTS
+    from fidsplat.backends.opencl import probe, tiling
 
     backend = opencl(renderer)
     cloud = random_splats(60, seed=46, depth=(1.0, 4.0), scale=(0.05, 0.4))
     wanted = renderer.render(cloud, inputs.VIEW, ("rgb", "depth"))
-    method = {"ordered": "_tally", "tiled": "_starts"}[backend.shape.lists]
-    original = getattr(LISTS[backend.shape.lists], method)
+    stage = {"ordered": "count_pairs", "tiled": "start_lists"}[backend.shape.lists]
+    original = getattr(tiling, stage)
 
-    def moved(own, *args):
-        result, run = original(own, *args), own.picture
-        starts = run.read("starts", np.uint32, (run.tiles + 1,))
+    def moved(frame, *args):
+        result = original(frame, *args)
+        starts = frame.read("starts", np.uint32, (frame.tiles + 1,))
         starts += np.uint32(-(int(starts[-1]) // 2) % 2**32)
-        run.held["starts"], run.held["cursors"] = (probe.buffer_of(backend, s) for s in (starts, starts[:-1]))
+        frame.bind("starts", probe.buffer_of(backend, starts))
+        frame.bind("cursors", probe.buffer_of(backend, starts[:-1]))
         return result
 
-    monkeypatch.setattr(LISTS[backend.shape.lists], method, moved)
+    monkeypatch.setattr(tiling, stage, moved)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     frame = renderer.render(cloud, inputs.VIEW, ("rgb", "depth"))
     assert all(np.array_equal(frame[name], wanted[name]) for name in frame)

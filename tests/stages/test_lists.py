@@ -8,7 +8,7 @@ from agreement import ALL_OUTPUTS, random_splats
 from traces import CAMERA, CULLED, listing, traced
 
 import fidsplat as fs
-from fidsplat.backends.opencl.lists import GatheredLists
+from fidsplat.backends.opencl import tiling
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.view import View
 from fidsplat.capture.views import views_of
@@ -61,16 +61,16 @@ def test_views_of_a_batch_are_listed_apart(backend, monkeypatch, lists, budget):
     shape = listing(backend, "tiled" if lists == "gathered" else lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
     alone = [pipeline.render(resident, prepare(cloud, capture)[1]) for capture in captures]
-    gathered = GatheredLists._gather
+    gathered = tiling.launch_gathered
     launched = []
 
     def gather(self, kernel, **given):
         launched.append(kernel)
         gathered(self, kernel, **given)
 
-    monkeypatch.setattr(GatheredLists, "_gather", gather)
+    monkeypatch.setattr(tiling, "launch_gathered", gather)
     if lists == "tiled":
-        monkeypatch.setattr(GatheredLists, "TILES", 0)
+        monkeypatch.setattr(tiling, "GATHER_TILES", 0)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     pictures = pipeline.render_batch(resident, batch)
     assert (launched.count("emit_gathered") > (2 if budget else 0)) == (lists == "gathered")
@@ -97,13 +97,13 @@ def test_neighbours_that_share_tiles_are_counted_together(backend, monkeypatch, 
     pipeline, resident = backend.pipeline(features, listing(backend, "tiled")), backend.upload(cloud)
     wanted = pipeline.render(resident, view)
     assert 1000 < wanted.stats["visible"] < 2.2 * 4096
-    gathered, launched = GatheredLists._gather, []
+    gathered, launched = tiling.launch_gathered, []
 
     def gather(self, kernel, **given):
         launched.append(kernel)
         gathered(self, kernel, **given)
 
-    monkeypatch.setattr(GatheredLists, "_gather", gather)
+    monkeypatch.setattr(tiling, "launch_gathered", gather)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     resident = backend.upload(cloud)
     resident.neighbours = True

@@ -5,7 +5,6 @@ import numpy as np
 import pyopencl as cl
 
 import fidsplat as fs
-from fidsplat.backends.opencl.counts import pairs_of
 from fidsplat.backends.prepare import prepare
 from fidsplat.scenes.random_clouds import random_splats
 
@@ -31,4 +30,4 @@ def test_splats_have_a_place_for_each_tile_that_lists_them(renderer):
             pipeline.backward(images, {"rgb": np.ones((800, 800, 3), np.float32)})
             picture, words = images.picture, np.empty(1, np.uint32)
             cl.enqueue_copy(picture.queue, words, picture.pool.known("reserved"))
-            assert words[0] == pairs_of(picture) > 32, (shape, len(cloud))
+            assert words[0] == picture.count_pairs() > 32, (shape, len(cloud))

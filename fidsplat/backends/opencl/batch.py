@@ -11,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.opencl.images import Drawn
+from fidsplat.backends.opencl.images import Rendered
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects.catalogue import Output
 from fidsplat.util.errors import DeviceError, bytes_words
@@ -83,10 +83,12 @@ def parts(views: int, each: int, samples: int, kind: str, free: int) -> Iterator
 class OpenCLBatch:
     """Finished images of many views on the device."""
 
-    def __init__(self, workspace: Workspace, buffers: OutputBuffers, drawn: list[Drawn], splats: int) -> None:
-        self._workspace, self._buffers, self._drawn, self._splats = workspace, buffers, drawn, splats
+    def __init__(
+        self, workspace: Workspace, buffers: OutputBuffers, rendered: list[Rendered], splats: int
+    ) -> None:
+        self._workspace, self._buffers, self._rendered, self._splats = workspace, buffers, rendered, splats
         self.views = buffers.views
-        leased = [*buffers.leased, *(each for one in drawn for each in one.leased)]
+        leased = [*buffers.leased, *(each for one in rendered for each in one.leased)]
         weakref.finalize(self, workspace.pool.give_back, leased)
 
     def read(self, name: str) -> np.ndarray:
@@ -100,7 +102,7 @@ class OpenCLBatch:
         return self._read(name, image, number * image.nbytes)
 
     def _read(self, name: str, image: np.ndarray, offset: int) -> np.ndarray:
-        with self._workspace.failing(f"drawing {name}"):
+        with self._workspace.failing(f"rendering {name}"):
             buffer = self._buffers.held()[f"{name}_out"]
             cl.enqueue_copy(self._workspace.queue, image, buffer, src_offset=offset)
         return image
@@ -118,19 +120,19 @@ class OpenCLBatch:
 
     def wait(self) -> None:
         """Until the device has drawn all views."""
-        with self._workspace.failing("drawing"):
+        with self._workspace.failing("rendering"):
             self._workspace.queue.finish()
 
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds by stage, of all views together."""
-        return _added([one.timings() for one in self._drawn])
+        return _added([one.timings() for one in self._rendered])
 
     @property
     def stats(self) -> Mapping[str, int]:
         return (
             {"visible": 0, "pairs": 0}
-            | _added([one.stats() for one in self._drawn])
+            | _added([one.stats() for one in self._rendered])
             | {"splats": self._splats}
         )
 

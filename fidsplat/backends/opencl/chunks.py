@@ -258,17 +258,10 @@ class GatheredChunks:
         self.count = int(self._ends[-1])
         self.room = _roomy(self.count)
         """splats for which pictures have buffers: those of the next view, of about as many, are the same"""
-        self.origin, self.sh_degree, self.has_coplanar_groups = (
-            whole.origin,
-            whole.sh_degree,
-            whole.has_coplanar_groups,
-        )
-        self.footprint, self.ellipsoids, self.group_table = (
-            whole.footprint,
-            whole.ellipsoids,
-            whole.group_table,
-        )
-        self.kept: dict[Hashable, Any] = {}
+        self.origin, self.sh_degree, self.footprint = whole.origin, whole.sh_degree, whole.footprint
+        self.has_coplanar_groups, self.group_table = whole.has_coplanar_groups, whole.group_table
+        self.ellipsoids = whole.ellipsoids
+        self.cached_frames: dict[Hashable, Any] = {}
         """as that of a Resident"""
         self.fixed = True
         self.alike = cache.token

@@ -1,4 +1,4 @@
-"""Pictures with their derivatives: the stages of pipeline.py, and the kernels of the program `gradients`."""
+"""Frames with derivatives: the stages of frame.py, and the kernels of the program `gradients`."""
 
 from __future__ import annotations
 
@@ -26,10 +26,9 @@ from fidsplat.backends.opencl.assemble import (
     backward_items,
 )
 from fidsplat.backends.opencl.command_list import CommandList
-from fidsplat.backends.opencl.counts import pairs_of
+from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.gradients_again import Again
 from fidsplat.backends.opencl.images import OpenCLImages
-from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
@@ -46,7 +45,7 @@ _ZERO = np.zeros(1, np.uint32)  # of floats too
 class OpenCLDifferentiable(DifferentiableImages):
     """Output images of `OpenCLGradients.forward`."""
 
-    picture: Picture
+    picture: DeviceFrame
     images: OpenCLImages
 
     def device_array(self, name: str) -> Array:
@@ -56,11 +55,11 @@ class OpenCLDifferentiable(DifferentiableImages):
 
     def device_buffer(self, name: str) -> tuple[cl.Buffer, tuple[int, ...]]:
         """The image's buffer and shape: an array takes the host longer to make than a kernel to launch."""
-        return self.picture.held[f"{name}_out"], gradient_shape(name, self.picture.view)
+        return self.picture.named[f"{name}_out"], gradient_shape(name, self.picture.view)
 
 
 @contextmanager
-def _failing(picture: Picture) -> Iterator[None]:
+def _failing(picture: DeviceFrame) -> Iterator[None]:
     """Takes the device for oneself, and says what it fails at."""
     try:
         with picture.workspace.lock:
@@ -73,7 +72,7 @@ def _failing(picture: Picture) -> Iterator[None]:
 class TakenBack:
     """As `fidsplat.backends.derivatives.TakenBack`."""
 
-    def __init__(self, of: OpenCLGradients, images: OpenCLDifferentiable, picture: Picture) -> None:
+    def __init__(self, of: OpenCLGradients, images: OpenCLDifferentiable, picture: DeviceFrame) -> None:
         self._of, self._images, self._picture = of, images, picture
 
     def gradients(self) -> dict[str, Any]:
@@ -116,15 +115,14 @@ class OpenCLGradients:
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """As `DifferentiablePipeline`: GPUs need not wait where pictures were taken back before."""
-        if waits or not self._pairs:
-            return OpenCLDifferentiable(*self._pipeline.drawn(resident, view))
-        again = self._again
-        with self._pipeline.workspace.lock:
-            found = self._pipeline.drawn_by(lambda: again.draw(resident, view, self._pairs), view)
-            if found is None:
-                found = self._pipeline.drawn(resident, view, self._pairs, again.record())
-                again.keep(found[0])
-        return OpenCLDifferentiable(*found)
+        pipeline, again = self._pipeline, self._again
+        with pipeline.workspace.rendering():
+            if waits or not self._pairs:
+                frame = pipeline.render_complete(resident, view)
+            elif (frame := again.draw(resident, view, self._pairs)) is None:
+                frame = pipeline.render_complete(resident, view, self._pairs, again.record())
+                again.keep(frame)
+            return OpenCLDifferentiable(frame, pipeline.images_of(frame))
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """As `DifferentiablePipeline`: pyopencl arrays."""
@@ -140,7 +138,7 @@ class OpenCLGradients:
         with _failing(picture):
             return TakenBack(self, images, self._backward(picture, gradients))
 
-    def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> Picture:
+    def _backward(self, drawn: DeviceFrame, gradients: Mapping[str, Any]) -> DeviceFrame:
         if drawn.counted is not None and self._again.take_back(drawn, gradients, lambda: self._ask(drawn)):
             return self._with_slots(drawn)
         picture = self._with_slots(drawn)
@@ -153,7 +151,8 @@ class OpenCLGradients:
         picture.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
         reserved = picture.take("reserved", 8)
         if not in_groups:
-            picture.take("big_rows", 4 * picture.held["big_capacity"] * -(-view.height // shape.tile_height))
+            rows = -(-view.height // shape.tile_height)
+            picture.take("big_rows", 4 * picture.numbers["big_capacity"] * rows)
 
         cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 8)
         if count:
@@ -183,7 +182,7 @@ class OpenCLGradients:
         words = 2 * 8 * chunk + 1
         return 8 * chunk * shape.tile_width * shape.tile_height + -(-4 * words // vector) * vector
 
-    def _with_slots(self, drawn: Picture) -> Picture:
+    def _with_slots(self, drawn: DeviceFrame) -> DeviceFrame:
         """The picture with the kernels of the way back, and what those leave that go through tiles."""
         picture = copy(drawn)
         picture.commands = self._commands
@@ -192,7 +191,7 @@ class OpenCLGradients:
         picture.take("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * picture.tiles)
         return picture
 
-    def sum_up(self, picture: Picture) -> dict[str, Any]:
+    def sum_up(self, picture: DeviceFrame) -> dict[str, Any]:
         """The derivatives of a picture that was taken back."""
         picture = copy(picture)
         picture.commands = self._commands
@@ -217,7 +216,7 @@ class OpenCLGradients:
             source = assemble_step(self._pipeline.features, self._pipeline.shape)
             self._step = 0, CommandList(Program(self._pipeline.workspace, source))
 
-    def step(self, picture: Picture, given: Mapping[str, Any]) -> None:
+    def step(self, picture: DeviceFrame, given: Mapping[str, Any]) -> None:
         """The step of a training by a picture that was taken back, with arguments that are its own."""
         assert self._step is not None  # `prepare_step`
         known, commands = self._step
@@ -235,15 +234,15 @@ class OpenCLGradients:
         (event,) = commands.submit(picture.queue)
         picture.events.append(("project backward", event))
 
-    def _ask(self, drawn: Picture) -> None:
+    def _ask(self, drawn: DeviceFrame) -> None:
         """Whether there was room for all pairs: with too little of it lists were left empty, and splats have
         slots beyond the end. The device is busy meanwhile."""
-        if (pairs := pairs_of(drawn)) is None:
+        if (pairs := drawn.count_pairs()) is None:
             raise TooLittleRoom
         if self._pairs < pairs * 9 // 8:  # seldom: with another number nothing is launched as before
             self._pairs = pairs * 5 // 4
 
-    def _take_gradients(self, picture: Picture, gradients: Mapping[str, Any]) -> None:
+    def _take_gradients(self, picture: DeviceFrame, gradients: Mapping[str, Any]) -> None:
         """The derivatives by the images, as arguments of the kernels."""
         for name in GRADIENT_OUTPUTS:
             if f"by_{name}" not in self._wanted:
@@ -258,11 +257,11 @@ class OpenCLGradients:
             if isinstance(given, Array):
                 if given.dtype != _F32 or not given.flags.c_contiguous or given.offset:
                     raise InputError(f"the gradient of {name} must be a whole, contiguous float32 array")
-                picture.held[f"by_{name}"] = given.data
+                picture.bind(f"by_{name}", given.data)  # pyright: ignore[reportArgumentType]
             else:
                 picture.put(f"by_{name}", np.ascontiguousarray(given, np.float32))
 
-    def _room_for_results(self, picture: Picture) -> dict[str, Array]:
+    def _room_for_results(self, picture: DeviceFrame) -> dict[str, Array]:
         """Arrays for the results, the same from call to call."""
         count, features = picture.resident.count, self._pipeline.features
         shapes: dict[str, tuple[int, ...]] = {
@@ -277,5 +276,5 @@ class OpenCLGradients:
         for name, shape in shapes.items():
             argument = name if name == "screen" else f"by_{name}"
             found[name] = picture.pool.array(picture.queue, argument, shape)
-            picture.held[argument] = found[name].data
+            picture.named[argument] = found[name].data  # pyright: ignore[reportArgumentType]
         return found

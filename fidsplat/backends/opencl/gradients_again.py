@@ -8,6 +8,7 @@ import weakref
 from collections.abc import Callable, Iterable, Mapping, Set
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,11 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.opencl.command_list import CommandList
-from fidsplat.backends.opencl.images import stats_later
-from fidsplat.backends.opencl.picture import Picture, numbers_of
+from fidsplat.backends.opencl.counts import read_stats
+from fidsplat.backends.opencl.device_frame import DeviceFrame, FrameBuffers
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.uniforms import scalars_of
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 
@@ -31,7 +33,7 @@ _ZERO = np.zeros(1, np.uint32)
 class _Kind:
     """What one picture left to the next: no buffers, which the pool finds by their names."""
 
-    picture: Picture
+    picture: DeviceFrame
     """its numbers"""
     resident: weakref.ref[Resident]
     budgets: tuple[int, int]
@@ -82,11 +84,11 @@ class Again:
         self._backward.clear()
         return self._backward
 
-    def keep(self, picture: Picture) -> None:
+    def keep(self, picture: DeviceFrame) -> None:
         """Remembers a picture that was drawn, if the next can be launched as it was."""
         self._kind = self._back = None
         last, view = self._last, picture.view
-        self._last = view.width, view.height, picture.trusted, weakref.ref(picture.resident)
+        self._last = view.width, view.height, picture.pair_limit, weakref.ref(picture.resident)
         # what was no other a picture ago may stay so
         if self._last != last or picture.counted is None or picture.arrays.keys() != {"view", "slots"}:
             return
@@ -96,12 +98,12 @@ class Again:
         if len(set(kernels)) < len(kernels) or any(one.source in of_views for one in every):
             return
         leased = dict(picture.leased)
-        numbers = {name: held for name, held in picture.held.items() if not isinstance(held, cl.Buffer)}
-        names = [name for name in picture.held if name not in numbers and name not in {"view", *leased}]
+        names = [name for name in picture.bound if name not in {"view", *leased}]
         if not self._there(names, picture):
             return
         base = copy(picture)
-        base.held, base.events, base.leased, base.uploads = numbers, [], [], []
+        base.buffers, base.named = FrameBuffers(), {}
+        base.events, base.leased, base.uploads = [], [], []
         base.arrays, base.counted, base.stats = {}, None, dict
         base.resident = None  # pyright: ignore[reportAttributeAccessIssue]
         budgets = self._workspace.memory_budget, self._workspace.pair_budget
@@ -117,7 +119,7 @@ class Again:
             picture.arrays["slots"],
         )
 
-    def draw(self, resident: Resident, view: View, pairs: int) -> Picture | None:
+    def draw(self, resident: Resident, view: View, pairs: int) -> DeviceFrame | None:
         """The picture of another view, launched as the one that was kept; None where it does not fit."""
         kind, workspace = self._kind, self._workspace
         if kind is None or not self._fits(kind, resident, view, pairs):
@@ -128,8 +130,14 @@ class Again:
         picture.resident, picture.view = resident, view
         picture.arrays, picture.uploads = {}, []
         picture.leased = [(name, pool.lease(name, size)) for name, size in kind.leases]
-        given = {"view": self._record(picture), **dict(picture.leased), **numbers_of(view)}
-        picture.held = kind.picture.held | {name: pool.known(name) for name in kind.names} | given
+        picture.buffers, picture.named = FrameBuffers(), {}
+        picture.numbers = kind.picture.numbers | scalars_of(view)
+        buffers = {"view": self._record(picture), **dict(picture.leased)}
+        for name in kind.names:
+            picture.bind(name, self._known(name))
+        for name, buffer in buffers.items():
+            picture.bind(name, buffer)
+        given = buffers | scalars_of(view)
         picture.put("slots", kind.slots)  # pictures of other kinds have theirs in the same buffer
         tallies = pool.scratch("tallies", 0)  # which are not left as zeros
         cl.enqueue_fill_buffer(queue, tallies, _ZERO, 0, tallies.size)
@@ -138,12 +146,13 @@ class Again:
         queue.flush()
         picture.events = list(zip(kind.stages, events, strict=True))
         picture.counted = events[kind.counted]
-        picture.stats = stats_later(workspace, picture.held["counts"], events[-1], resident.count)
+        counts = picture.buffers.counts
+        picture.stats = partial(read_stats, workspace.read_queue, counts, events[-1], resident.count)
         return picture
 
     def keep_back(
         self,
-        picture: Picture,
+        picture: DeviceFrame,
         given: Mapping[str, Any],
         wanted: Set[str],
     ) -> None:
@@ -166,7 +175,7 @@ class Again:
         kind.state = self._workspace.pool.state
         self._back = _Back(kind, frozenset(given), self._backward.stages)
 
-    def take_back(self, picture: Picture, given: Mapping[str, Any], ask: Callable[[], None]) -> bool:
+    def take_back(self, picture: DeviceFrame, given: Mapping[str, Any], ask: Callable[[], None]) -> bool:
         """Launches the way back of a picture as that which was kept; whether it fits.
 
         ask: whether there was room for all pairs; called when all is launched.
@@ -178,8 +187,9 @@ class Again:
             return False
         if not all(isinstance(array, Array) for array in given.values()):
             return False
-        held = {name: picture.held[name] for name in ("view", *(name for name, _ in back.kind.leases))}
-        held |= numbers_of(picture.view) | {"log_ceiling": math.log(picture.view.ceiling)}
+        names = ("view", *(name for name, _ in back.kind.leases))
+        held: dict[str, Any] = {name: picture.buffer(name) for name in names}
+        held |= scalars_of(picture.view) | {"log_ceiling": math.log(picture.view.ceiling)}
         self._backward.set(held | {f"by_{name}": array.data for name, array in given.items()})
         queue = picture.queue
         cl.enqueue_fill_buffer(queue, pool.scratch("reserved", 4), _ZERO, 0, 4)
@@ -194,29 +204,35 @@ class Again:
         return (
             kind.state is workspace.pool.state
             and kind.resident() is resident
-            and pairs == kind.picture.trusted
+            and pairs == kind.picture.pair_limit
             and (view.width, view.height, view.samples) == (before.width, before.height, before.samples)
             and kind.budgets == (workspace.memory_budget, workspace.pair_budget)
             and not (view.groups or view.sub_frames or view.raster or view.band)
         )
 
-    def _is_like(self, kind: _Kind, picture: Picture) -> bool:
+    def _is_like(self, kind: _Kind, picture: DeviceFrame) -> bool:
         """Whether a picture that was drawn is like the one that was kept."""
         same = (
             picture.pairs == kind.picture.pairs
-            and picture.held["big_capacity"] == kind.picture.held["big_capacity"]
+            and picture.numbers["big_capacity"] == kind.picture.numbers["big_capacity"]
         )
         return (
             same
             and picture.counted is not None
-            and self._fits(kind, picture.resident, picture.view, picture.trusted)
+            and self._fits(kind, picture.resident, picture.view, picture.pair_limit)
         )
 
-    def _there(self, names: Iterable[str], picture: Picture) -> bool:
+    def _there(self, names: Iterable[str], picture: DeviceFrame) -> bool:
         """Whether a picture's buffers are those that the pool has by these names."""
-        return all(picture.held[name] is self._workspace.pool.known(name) for name in names)
+        return all(picture.buffer(name) is self._workspace.pool.known(name) for name in names)
 
-    def _record(self, picture: Picture) -> cl.Buffer:
+    def _known(self, name: str) -> cl.Buffer:
+        """A scratch buffer that is there."""
+        buffer = self._workspace.pool.known(name)
+        assert buffer is not None  # while the pool's state is the same
+        return buffer
+
+    def _record(self, picture: DeviceFrame) -> cl.Buffer:
         """The record `View` of a picture on the device; those of other views stay there."""
         view = picture.view
         if id(view) not in self._views:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.counts import fullness_of, read_counts, stats_of
-from fidsplat.backends.opencl.picture import Picture
-from fidsplat.backends.opencl.recording import Recording
+from fidsplat.backends.opencl.counts import Counts
+from fidsplat.backends.opencl.device_frame import DeviceFrame
+from fidsplat.backends.opencl.recorded_frame import RecordedFrame
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uint8 import read_uint8
 from fidsplat.backends.opencl.workspace import Workspace
@@ -22,32 +22,33 @@ from fidsplat.effects.catalogue import Output
 
 
 @dataclass
-class Drawn:
-    """A picture on a queue. Not the `Picture` itself, which holds the cloud and all scratch buffers."""
+class Rendered:
+    """What a submitted frame leaves: its own buffers and events, without the cloud and scratch buffers that
+    `DeviceFrame` holds."""
 
     queue: cl.CommandQueue
     leased: list[tuple[str, cl.Buffer]]
-    """what is the picture's own, by name: output images and, of some ways of listing, counts"""
+    """output images and counts by name"""
     stats: Callable[[], dict[str, int]]
     last: cl.Event
-    """of its last launch: all of it is drawn then, whatever else is on the queue"""
+    """of the last launch"""
     events: list[tuple[str, cl.Event]] | None = None
-    """of each launch, with its stage; None where nobody has taken the time"""
-    uploads: Any = None
-    """kept until the device has read them"""
+    """stage and event of each launch; None on a queue without profiling"""
+    uploads: list[cl.Event] | None = None
+    """kept until the device has read the arrays"""
 
     @staticmethod
-    def of(picture: Picture, timed: bool = True) -> Drawn:
-        """What a picture leaves."""
-        events, last = picture.events if timed else None, picture.events[-1][1]
-        return Drawn(picture.queue, picture.leased, picture.stats, last, events, picture.uploads)
+    def of(frame: DeviceFrame, timed: bool = True) -> Rendered:
+        """What a frame leaves."""
+        events, last = frame.events if timed else None, frame.events[-1][1]
+        return Rendered(frame.queue, frame.leased, frame.stats, last, events, frame.uploads)
 
     def buffer(self, name: str) -> cl.Buffer:
         """A leased buffer."""
         return dict(self.leased)[name]
 
     def done(self) -> list[cl.Event]:
-        """What is waited for by another queue that reads what it has left."""
+        """Events that another queue waits for before it reads the images."""
         self.queue.flush()
         return [self.last]
 
@@ -58,53 +59,58 @@ class Drawn:
 
 
 def _milliseconds(
-    events: Iterable[tuple[str, cl.Event]], of: Mapping[str, float] | None = None
+    events: Iterable[tuple[str, cl.Event]], earlier: Mapping[str, float] | None = None
 ) -> dict[str, float]:
-    """What launches that are done took by stage, and others before them."""
-    timings = dict(of or {})
+    """The time of completed launches by stage, added to that of earlier ones."""
+    timings = dict(earlier or {})
     for stage, event in events:
         timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
     return timings
 
 
-class Repeat:
-    """A picture that was launched without asking whether there is room for all of it, and how to draw it with
-    more."""
+class ReplayingPipeline(Protocol):
+    """The part of `OpenCLPipeline` that completes a replayed frame."""
+
+    workspace: Workspace
+
+    def render_again(self, resident: Resident, view: View) -> Rendered:
+        """Render with the buffers that the frame requires."""
+        ...
+
+    def profile(self, resident: Resident, view: View, recorded: RecordedFrame) -> dict[str, float]:
+        """Milliseconds by stage."""
+        ...
+
+
+class Replay:
+    """A replayed frame, whose capacity is checked when it is first read."""
 
     def __init__(
-        self,
-        draw: Callable[[Resident, View], Drawn],
-        time: Callable[[Resident, View, Recording], dict[str, float]],
-        workspace: Workspace,
-        resident: Resident,
-        view: View,
-        recording: Recording,
+        self, pipeline: ReplayingPipeline, resident: Resident, view: View, recorded: RecordedFrame
     ) -> None:
-        """Made when the picture is launched. draw: draws it again, with the room that it needs. time: tells
-        how long its stages take."""
-        self._draw, self._time, self._view, self._recording = draw, time, view, recording
-        self._workspace, self._number = workspace, workspace.pictures
-        self._room = recording.big, recording.capacity
+        self._pipeline, self._view, self._recorded = pipeline, view, recorded
+        self._number = pipeline.workspace.pictures
         self._resident: Resident | None = resident
-        self._known = weakref.ref(resident)
+        self._timed = weakref.ref(resident)
 
-    def settled(self, drawn: Drawn) -> Drawn | None:
-        """Once it is drawn: the picture drawn again, if there was too little room."""
-        resident = self._resident
+    def overflow(self, rendered: Rendered) -> Rendered | None:
+        """The frame rendered again, if its counts exceed the capacity; None if it is complete."""
+        resident, workspace = self._resident, self._pipeline.workspace
         if resident is None:
             return None
-        queue, after = drawn.queue, None  # sooner than a queue that waits for another
-        if self._workspace.pictures != self._number:  # beside those that were begun since
-            queue, after = self._workspace.read_queue, drawn.done()
-        big, pairs = fullness_of(read_counts(queue, drawn.buffer("counts"), after))
-        again = None if big <= self._room[0] and pairs <= self._room[1] else self._draw(resident, self._view)
-        self._resident = None  # it is held no longer than it may be needed
+        queue, after = rendered.queue, None  # faster than a queue that waits for another
+        if workspace.pictures != self._number:  # without waiting for frames that were submitted since
+            queue, after = workspace.read_queue, rendered.done()
+        counts = Counts.read(queue, rendered.buffer("counts"), after)
+        complete = self._recorded.capacity.holds(counts)
+        again = None if complete else self._pipeline.render_again(resident, self._view)
+        self._resident = None  # the cloud is held until the check only
         return again
 
     def timings(self) -> dict[str, float]:
-        """The picture is drawn once more to take the time; empty if its cloud is gone."""
-        resident = self._known()
-        return {} if resident is None else self._time(resident, self._view, self._recording)
+        """Milliseconds by stage, of another replay with profiling; empty if the cloud was released."""
+        resident = self._timed()
+        return {} if resident is None else self._pipeline.profile(resident, self._view, self._recorded)
 
 
 class OpenCLImages:
@@ -115,20 +121,20 @@ class OpenCLImages:
         workspace: Workspace,
         outputs: tuple[Output, ...],
         size: tuple[int, int],
-        drawn: Drawn,
-        repeat: Repeat | None = None,
+        rendered: Rendered,
+        replay: Replay | None = None,
         tiles: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0)),
         samples: int = 1,
     ) -> None:
         """size: rows and columns of pixels. tiles: rows and columns of them, and samples of one. samples:
         of a pixel, across."""
-        self._workspace, self._size, self._drawn, self._repeat = workspace, size, drawn, repeat
+        self._workspace, self._size, self._rendered, self._replay = workspace, size, rendered, replay
         self._outputs = {output.name: output for output in outputs}
         self._timings: dict[str, float] = {}
         self._tiles, self._samples = tiles, samples
         self._added: list[tuple[dict[str, int], list[tuple[str, cl.Event]]]] = []
         """counts and launches of the pictures of which tiles were taken"""
-        self._leased = drawn.leased
+        self._leased = rendered.leased
         weakref.finalize(self, workspace.pool.give_back, self._leased)
 
     def read(self, name: str) -> np.ndarray:
@@ -153,38 +159,38 @@ class OpenCLImages:
         """As `ReadsRows`. Raises DeviceError as `read`."""
         if first == end:
             return
-        with self._workspace.failing(f"drawing {name}"):
-            drawn, above = self.settle(), first * into[:1].nbytes
+        with self._workspace.failing(f"rendering {name}"):
+            rendered, above = self.settle(), first * into[:1].nbytes
             # beside what was put on its queue since: the next picture, say
-            queue, image = self._workspace.read_queue, drawn.buffer(f"{name}_out")
-            cl.enqueue_copy(queue, into[first:end], image, src_offset=above, wait_for=drawn.done())
+            queue, image = self._workspace.read_queue, rendered.buffer(f"{name}_out")
+            cl.enqueue_copy(queue, into[first:end], image, src_offset=above, wait_for=rendered.done())
 
     def read_uint8(self, name: str) -> np.ndarray:
         """As `GivesUint8`. Raises DeviceError as `read`."""
-        with self._workspace.failing(f"drawing {name}"):
-            drawn = self.settle()
-            image = drawn.buffer(f"{name}_out")
-            return read_uint8(self._workspace, image, self._shape(name), drawn.done())
+        with self._workspace.failing(f"rendering {name}"):
+            rendered = self.settle()
+            image = rendered.buffer(f"{name}_out")
+            return read_uint8(self._workspace, image, self._shape(name), rendered.done())
 
     def tile_ends(self) -> TerminationDepths:
         """As `GivesTileEnds`, of pictures whose features have the effect. Raises DeviceError as `read`."""
-        with self._workspace.failing("drawing"):
-            drawn, (grid, tile) = self.settle(), self._tiles
+        with self._workspace.failing("rendering"):
+            rendered, (grid, tile) = self.settle(), self._tiles
             keys = np.empty(grid, np.uint32)
             queue = self._workspace.read_queue
-            cl.enqueue_copy(queue, keys, drawn.buffer("tile_ends"), wait_for=drawn.done())
+            cl.enqueue_copy(queue, keys, rendered.buffer("tile_ends"), wait_for=rendered.done())
         return TerminationDepths.of_keys(keys, tile)
 
     def take_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
         """As `GivesTileEnds`. Raises DeviceError as `read`."""
-        with self._workspace.failing("drawing"):
+        with self._workspace.failing("rendering"):
             own, others = self.settle(), other.settle()
             queue, copied = self._workspace.read_queue, None
             after = [*own.done(), *others.done()]
             for output in self._outputs.values():
                 width = 4 * output.channels  # bytes of a pixel
                 row_bytes = self._size[1] * width
-                source, target = (drawn.buffer(f"{output.name}_out") for drawn in (others, own))
+                source, target = (one.buffer(f"{output.name}_out") for one in (others, own))
                 for top, bottom, left, right in self._pixels_of(tiles):
                     region, corner = ((right - left) * width, bottom - top, 1), (left * width, top, 0)
                     pitches = (row_bytes, row_bytes * self._size[0])
@@ -211,43 +217,35 @@ class OpenCLImages:
         Raises:
             DeviceError: as `read`.
         """
-        with self._workspace.failing("drawing"):
+        with self._workspace.failing("rendering"):
             self.settle().queue.finish()
 
     @property
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage. A picture that was launched again, by which nobody has taken the time, is
         drawn once more for that; the first time that they are asked for."""
-        with self._workspace.failing("drawing"):
-            drawn = self.settle()
-            if drawn.events is not None or self._repeat is None:
-                return _milliseconds((one for _, events in self._added for one in events), drawn.timings())
+        with self._workspace.failing("rendering"):
+            rendered = self.settle()
+            if rendered.events is not None or self._replay is None:
+                return _milliseconds((one for _, events in self._added for one in events), rendered.timings())
             with self._workspace.lock:
-                self._timings = self._timings or self._repeat.timings()
+                self._timings = self._timings or self._replay.timings()
             return self._timings
 
     @property
     def stats(self) -> Mapping[str, int]:
-        with self._workspace.failing("drawing"):
+        with self._workspace.failing("rendering"):
             stats = dict(self.settle().stats())
             for added, _ in self._added:
                 stats = {name: number + added[name] for name, number in stats.items()}
             return stats
 
-    def settle(self) -> Drawn:
+    def settle(self) -> Rendered:
         """What is drawn, for certain with room for all of it."""
-        if self._repeat is not None:
+        if self._replay is not None:
             with self._workspace.lock:
-                again = self._repeat.settled(self._drawn)
+                again = self._replay.overflow(self._rendered)
                 if again is not None:
                     self._leased.extend(again.leased)  # given back together
-                    self._drawn = again
-        return self._drawn
-
-
-def stats_later(
-    workspace: Workspace, counts: cl.Buffer, last: cl.Event, splats: int
-) -> Callable[[], dict[str, int]]:
-    """What a frame tells, read from a picture's buffer `counts` when it is wanted. last: of its launches, on
-    a queue that is flushed."""
-    return lambda: stats_of(splats, read_counts(workspace.read_queue, counts, [last]))
+                    self._rendered = again
+        return self._rendered

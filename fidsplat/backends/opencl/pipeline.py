@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers, parts
 from fidsplat.backends.opencl.command_list import CommandList
-from fidsplat.backends.opencl.drawing import Slots, draw
-from fidsplat.backends.opencl.images import Drawn, OpenCLImages, Repeat, stats_later
-from fidsplat.backends.opencl.lists import GatheredLists, TiledLists
+from fidsplat.backends.opencl.counts import read_stats
+from fidsplat.backends.opencl.device_frame import DeviceFrame
+from fidsplat.backends.opencl.frame import render
+from fidsplat.backends.opencl.images import OpenCLImages, Rendered, Replay
 from fidsplat.backends.opencl.memory_plan import (
     BIG,
     KEYS,
@@ -27,9 +29,8 @@ from fidsplat.backends.opencl.memory_plan import (
     plan_of,
     table_bytes,
 )
-from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.recording import Recording
+from fidsplat.backends.opencl.recorded_frame import RecordedFrame
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import RayBuffers, Workspace
@@ -41,21 +42,21 @@ from fidsplat.util.errors import DeviceError
 _OF_CAMERAS = ("ray", "vignette_center")
 """groups of uniforms that differ where cameras do"""
 _KINDS = 32
-"""of pictures of one cloud that are kept"""
+"""kinds of frames that are cached for a cloud"""
 _RASTERS = 4
-"""of lenses among them: as many as `raster_of` keeps"""
+"""lenses among them: as many as `raster_of` caches"""
 
 
 @dataclass
-class Kept:
-    """What is kept of a kind of picture that was drawn before."""
+class CachedFrame:
+    """A kind of frame that was rendered before, for a cloud."""
 
     plan: MemoryPlan
     kind: tuple[Any, ...]
     """for `BufferPool.make_way`"""
     raster: RayRaster | None
-    """whose rays stay on the device as long as it is kept"""
-    recording: Recording | None = None
+    """of the lens, whose rays stay on the device as long"""
+    recorded: RecordedFrame | None = None
 
 
 class OpenCLPipeline:
@@ -69,6 +70,7 @@ class OpenCLPipeline:
         shape: DeviceShape,
         other: Callable[[FeatureSet, DeviceShape], OpenCLPipeline],
     ) -> None:
+        """other: returns the pipeline of another shape."""
         self.workspace, self.source, self.features, self.shape = workspace, source, features, shape
         self.program = Program(workspace, source)
         self._commands = CommandList(self.program)
@@ -78,110 +80,223 @@ class OpenCLPipeline:
         self._view_arrays = {one.name for each in arguments.values() for one in each if one.source == "array"}
         self._slopes = any(one.name == "ray_slopes" for one in arguments["blend"])
         self._other = other
-        """gives the pipeline of another shape"""
 
     def render(self, resident: Resident, view: View) -> OpenCLImages:
-        """Draw one picture. One of a kind that was drawn before is launched without waiting for the device.
+        """Render one frame. A frame of a kind that was rendered before is replayed, without waiting for the
+        device.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        workspace = self.workspace
-        with workspace.lock:
-            # launches are kept of whole pictures alone
-            key = self._kind(view) if view.band is None else None
-            kept = resident.kept.get(key)
-            if kept is not None and (repeated := self._tried(self._repeat, resident, view, kept)) is not None:
-                return repeated
+        with self.workspace.rendering():
+            key = self._key(view) if view.band is None else None
+            cached = resident.cached_frames.get(key)
+            if cached is not None and (images := self._replay(resident, view, cached)) is not None:
+                return images
             if resident.neighbours and self.shape.lists == "tiled":
-                gathered = replace(self.shape, lists="gathered")
-                return self._other(self.features, gathered).render(resident, view)
+                return self._listing("gathered").render(resident, view)
             plan = self._plan(resident, view)
             if plan.chunk and self.shape.lists != "ordered":
-                # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
-                return self._other(self.features, replace(self.shape, lists="ordered")).render(resident, view)
-            return self._images(view, Drawn.of(self._tried(self._first, resident, view, plan, key)))
+                # chunks are rendered by one strategy only: where memory is short, sorting is fastest
+                return self._listing("ordered").render(resident, view)
+            frame = self._render_planned(resident, view, plan)
+            if key is not None and self._is_replayable(frame):
+                self._cache(resident, key, frame)
+            return self.images_of(frame)
 
     def fits(self, resident: Resident, view: View) -> bool:
-        """As `KnowsRoom`."""
+        """Whether the frame is rendered at once; otherwise the cloud is projected for each of its parts."""
         try:
             return not self._plan(resident, view).chunk
         except DeviceError:  # too little memory for any part of it
             return False
 
-    def drawn(
-        self, resident: Resident, view: View, trusted: int = 0, commands: CommandList | None = None
-    ) -> tuple[Picture, OpenCLImages]:
-        """One picture with all that its stages have left on the device, until another is drawn.
+    def render_complete(
+        self, resident: Resident, view: View, pair_limit: int = 0, commands: CommandList | None = None
+    ) -> DeviceFrame:
+        """One frame with all that its stages leave on the device until the next frame.
 
-        trusted: as `Picture` has it; `pairs_of` then says whether all was drawn. commands: records what is
-        launched, for replay.
+        Args:
+            pair_limit: pairs for which buffers are reserved without waiting for the counts
+                (`DeviceFrame.count_pairs` tells whether they sufficed); 0 to wait.
+            commands: records the launches for replay.
 
         Raises:
-            DeviceError: as `render`.
+            DeviceError: as `render`; or the frame does not fit the memory budget at once.
         """
-        with self.workspace.lock:
-            picture = self._tried(self._whole, resident, view, trusted, commands)
-            return picture, self._images(view, Drawn.of(picture))
+        with self.workspace.rendering():
+            plan, frame = self._plan(resident, view), None
+            if not plan.chunk:
+                frame = self._render_planned(resident, view, plan, pair_limit, commands)
+            if frame is None or frame.pairs > self.workspace.pair_budget:
+                raise DeviceError(
+                    "frames with derivatives must fit the memory budget at once, got chunks or bands of "
+                    f"{resident.count:,} splats; raise memory_budget, or use fewer splats or smaller frames"
+                )
+            return frame
 
-    def drawn_by(
-        self, launch: Callable[[], Picture | None], view: View
-    ) -> tuple[Picture, OpenCLImages] | None:
-        """As `drawn`, by who launches it (`lock` held); None where nothing was launched."""
-        picture = self._tried(launch)
-        return None if picture is None else (picture, self._images(view, Drawn.of(picture)))
+    def images_of(self, frame: DeviceFrame) -> OpenCLImages:
+        """The output images of a frame."""
+        return self._images(frame.view, Rendered.of(frame))
 
-    def _whole(self, resident: Resident, view: View, trusted: int, commands: CommandList | None) -> Picture:
-        """A picture that is drawn at once, not in chunks or bands."""
-        plan = self._plan(resident, view)
-        picture = None
-        if not plan.chunk:
-            picture = self._first(resident, view, plan, trusted=trusted, commands=commands)
-        if picture is None or picture.pairs > self.workspace.pair_budget:
-            raise DeviceError(
-                f"{resident.count:,} splats are drawn in chunks or bands within the memory budget, and such "
-                "pictures have no gradient; raise memory_budget, or use fewer splats or smaller pictures"
+    def render_again(self, resident: Resident, view: View) -> Rendered:
+        """A frame whose replay exceeded its capacity, with the buffers that it requires."""
+        with self.workspace.rendering():
+            return Rendered.of(self._render_planned(resident, view, self._plan(resident, view)))
+
+    def profile(self, resident: Resident, view: View, recorded: RecordedFrame) -> dict[str, float]:
+        """Milliseconds by stage, of a frame that is rendered once more on a queue with profiling."""
+        workspace = self.workspace
+        with workspace.rendering():
+            queue = workspace.turn_to(workspace.queue)
+            workspace.pictures += 1
+            if self._ready(recorded, resident, view, queue):
+                leased, events = recorded.submit(queue)
+                named = list(zip(recorded.commands.stages, events, strict=True))
+                rendered = Rendered(queue, leased, dict, events[-1], named)
+            else:
+                rendered = self.render_again(resident, view)
+            workspace.finish()
+            workspace.pool.give_back(rendered.leased)
+        return rendered.timings()
+
+    def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
+        """The next frame of a kind; None if the buffers of the last were released."""
+        workspace, recorded = self.workspace, cached.recorded
+        workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.held, resident.room)
+        if not tiling.pair_capacity(workspace):
+            return None
+        queue = workspace.turn_to(workspace.repeat_queue)
+        workspace.pictures += 1
+        if recorded is not None and self._ready(recorded, resident, view, queue):
+            leased, events = recorded.submit(queue)
+            stats = partial(
+                read_stats, workspace.read_queue, dict(leased)["counts"], events[-1], resident.count
             )
-        return picture
+            rendered = Rendered(queue, leased, stats, events[-1])
+        else:
+            commands = CommandList(self.program) if recorded is None else recorded.commands
+            cached.recorded = None  # an interrupt leaves a part of a recording
+            frame = self._frame(resident, view, cached.plan, commands, queue)
+            frame.lease_images(self.features.images)
+            render(frame)
+            rendered = Rendered.of(frame, timed=False)
+            cached.recorded = recorded = RecordedFrame(frame)
+        images = self._images(view, rendered, Replay(self, resident, view, recorded))
+        if not resident.fixed:
+            images.settle()
+        return images
+
+    def _ready(self, recorded: RecordedFrame, resident: Resident, view: View, queue: cl.CommandQueue) -> bool:
+        """Bind a view to a recorded frame; whether it can be submitted."""
+        if not recorded.valid:
+            return False
+        if not recorded.knows(view):
+            plan = MemoryPlan(0, 0, 0)
+            recorded.learn(self._frame(resident, view, plan, recorded.commands, queue))
+        return recorded.set_view(view, queue)
+
+    def _frame(
+        self,
+        resident: Resident,
+        view: View,
+        plan: MemoryPlan,
+        commands: CommandList,
+        replay_queue: cl.CommandQueue | None = None,
+        pair_limit: int = 0,
+    ) -> DeviceFrame:
+        return DeviceFrame(
+            *(self.workspace, commands, self.shape, resident, view, plan),
+            **{"replay_queue": replay_queue, "pair_limit": pair_limit},
+        )
+
+    def _render_planned(
+        self,
+        resident: Resident,
+        view: View,
+        plan: MemoryPlan,
+        pair_limit: int = 0,
+        commands: CommandList | None = None,
+    ) -> DeviceFrame:
+        """A frame with the buffers that it requires."""
+        # buffers of other kinds of frames are released; those of its own kind are part of the plan
+        free = self.workspace.memory_budget - plan.held
+        self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.room)
+        commands = self._commands if commands is None else commands
+        frame = self._frame(resident, view, plan, commands, pair_limit=pair_limit)
+        frame.lease_images(self.features.images)
+        render(frame)
+        return frame
+
+    def _buffer_kind(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
+        """Frames of one kind have buffers of the same sizes."""
+        alike = resident.alike if not plan.chunk else None
+        return self, view.width, view.height, alike or (resident.room, plan)
+
+    def _is_replayable(self, frame: DeviceFrame) -> bool:
+        """Whether the next frame of its kind can be recorded."""
+        resident, complete = frame.resident, not (frame.plan.chunk or frame.in_bands or frame.view.sub_frames)
+        return complete and self.shape.lists != "ordered" and resident.count > 0 and not resident.streamed
+
+    def _cache(self, resident: Resident, key: tuple[Any, ...], frame: DeviceFrame) -> None:
+        """Replay the next frame of this kind."""
+        cached, raster = resident.cached_frames, frame.view.raster
+        rasters = {each.raster for each in cached.values()} - {None, raster}
+        if len(cached) >= _KINDS or (raster is not None and len(rasters) >= _RASTERS):
+            cached.clear()
+        kind = self._buffer_kind(resident, frame.view, frame.plan)
+        cached[key] = CachedFrame(frame.plan, kind, raster)
+
+    def _key(self, view: View) -> tuple[Any, ...]:
+        """What frames have in common that differ in numbers only."""
+        labels = tuple(label for label, _ in view.groups)
+        budgets = self.workspace.memory_budget, self.workspace.pair_budget
+        return self, view.width, view.height, view.raster, labels, budgets
+
+    def _images(self, view: View, rendered: Rendered, replay: Replay | None = None) -> OpenCLImages:
+        size = view.height // view.samples, view.width // view.samples
+        tile = self.shape.tile_height, self.shape.tile_width
+        tiles = (-(-view.height // tile[0]), -(-view.width // tile[1])), tile
+        outputs = self.features.images
+        return OpenCLImages(self.workspace, outputs, size, rendered, replay, tiles, view.samples)
+
+    def _listing(self, lists: str) -> OpenCLPipeline:
+        """The pipeline with another tile-binning strategy."""
+        return self._other(self.features, replace(self.shape, lists=lists))
 
     def render_batch(self, resident: Resident, batch: ViewBatch) -> OpenCLBatch:
-        """Draw many views, as many at once as memory holds.
+        """Render many views, as many at once as memory holds.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        with self.workspace.lock:
-            return self._tried(self._batch, resident, batch)
-
-    def _batch(self, resident: Resident, batch: ViewBatch) -> OpenCLBatch:
-        workspace, pool, outputs = self.workspace, self.workspace.pool, self.features.images
-        workspace.turn_to(workspace.queue)
-        buffers = OutputBuffers(workspace, outputs, batch)
-        drawn: list[Drawn] = []
-        for first, end, plan in self._parts(resident, batch, buffers.nbytes):
-            views = batch.views
-            stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
-            shape = self._listing(resident, plan, stack)
-            pipeline = self if shape is self.shape else self._other(self.features, shape)
-            pool.make_way((pipeline, "views", resident.room, plan), workspace.memory_budget - plan.held)
-
-            def start(view: View, pipeline=pipeline, stack=stack, plan=plan) -> Picture:
-                return Picture(
-                    workspace, pipeline._commands, pipeline.shape, resident, view, plan, stack=stack
+        workspace, rendered = self.workspace, []
+        with workspace.rendering():
+            workspace.turn_to(workspace.queue)
+            buffers = OutputBuffers(workspace, self.features.images, batch)
+            for first, end, plan in self._parts(resident, batch, buffers.nbytes):
+                views = batch.views
+                stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
+                pipeline = self._for_part(resident, plan, stack)
+                kind = pipeline, "views", resident.room, plan
+                workspace.pool.make_way(kind, workspace.memory_budget - plan.held)
+                frame = DeviceFrame(
+                    *(workspace, pipeline._commands, pipeline.shape, resident, batch.one(first), plan),
+                    stack=stack,
                 )
+                frame.bind_images(buffers.held(), batch.slots[first:end].copy())
+                render(frame)
+                rendered.append(Rendered.of(frame))
+            return OpenCLBatch(workspace, buffers, rendered, resident.count)
 
-            into = Slots(batch.slots[first:end].copy(), buffers.held())
-            drawn.append(Drawn.of(draw(start, batch.one(first), outputs, into)))
-        return OpenCLBatch(workspace, buffers, drawn, resident.count)
-
-    def _listing(self, resident: Resident, plan: MemoryPlan, stack: ViewStack | None) -> DeviceShape:
-        """The shape that lists a part of a batch in the least time."""
+    def _for_part(self, resident: Resident, plan: MemoryPlan, stack: ViewStack | None) -> OpenCLPipeline:
+        """The pipeline that bins a part of a batch in the shortest time."""
         if self.shape.lists != "tiled":
-            return self.shape
+            return self
         if plan.chunk:
-            return replace(self.shape, lists="ordered")  # as `render`
-        few = stack is not None and self._tiles(stack.view) <= GatheredLists.TILES
-        return replace(self.shape, lists="gathered") if few or resident.neighbours else self.shape
+            return self._listing("ordered")  # as `render`
+        few = stack is not None and self._tiles(stack.view) <= tiling.GATHER_TILES
+        return self._listing("gathered") if few or resident.neighbours else self
 
     def _tiles(self, view: View) -> int:
         """That a view has."""
@@ -226,128 +341,6 @@ class OpenCLPipeline:
         tables = table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
         return resident.room * splat + tables + 4 * channels * samples, samples
 
-    def _kind(self, view: View) -> tuple[Any, ...]:
-        """What pictures have in common whose launches differ in numbers alone."""
-        labels = tuple(label for label, _ in view.groups)
-        budgets = self.workspace.memory_budget, self.workspace.pair_budget
-        return self, view.width, view.height, view.raster, labels, budgets
-
-    def _tried(self, work: Callable[..., Any], *given: Any) -> Any:
-        """Calls it; leaves the device idle if it fails."""
-        try:
-            return work(*given)
-        except BaseException as error:
-            workspace = self.workspace
-            workspace.pool.forget_zeros()
-            for queue in (workspace.queue, workspace.repeat_queue):
-                with suppress(cl.Error):
-                    queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
-            if isinstance(error, cl.Error):
-                raise DeviceError(f"{workspace.info.title} failed while drawing: {error}") from error
-            raise
-
-    def _images(self, view: View, drawn: Drawn, repeat: Repeat | None = None) -> OpenCLImages:
-        size = view.height // view.samples, view.width // view.samples
-        tile = self.shape.tile_height, self.shape.tile_width
-        tiles = (-(-view.height // tile[0]), -(-view.width // tile[1])), tile
-        outputs = self.features.images
-        return OpenCLImages(self.workspace, outputs, size, drawn, repeat, tiles, view.samples)
-
-    def _first(
-        self,
-        resident: Resident,
-        view: View,
-        plan: MemoryPlan,
-        key: tuple[Any, ...] | None = None,
-        trusted: int = 0,
-        commands: CommandList | None = None,
-    ) -> Picture:
-        """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
-        pool = self.workspace.pool
-        alike = resident.alike if not plan.chunk else None
-        kind = self, view.width, view.height, alike or (resident.room, plan)
-        # what this picture takes besides is planned for; that of its own kind is there already
-        pool.make_way(kind, self.workspace.memory_budget - plan.held, resident.room)
-        picture = self._draw(resident, view, plan, trusted, commands)
-        whole = not (plan.chunk or resident.streamed or view.sub_frames or picture.in_bands)
-        if key is not None and whole and self.shape.lists != "ordered" and resident.count:
-            rasters = {each.raster for each in resident.kept.values()} - {None, view.raster}
-            if len(resident.kept) >= _KINDS or (view.raster is not None and len(rasters) >= _RASTERS):
-                resident.kept.clear()
-            resident.kept[key] = Kept(plan, kind, view.raster)
-        return picture
-
-    def _repeat(self, resident: Resident, view: View, kept: Kept) -> OpenCLImages | None:
-        """The next picture of a kind; None where nothing is left of the last."""
-        workspace, plan = self.workspace, kept.plan
-        workspace.pool.make_way(kept.kind, workspace.memory_budget - plan.held, resident.room)
-        if not TiledLists.capacity(workspace):
-            return None
-        queue, recording = workspace.turn_to(workspace.repeat_queue), kept.recording
-        workspace.pictures += 1
-
-        commands = CommandList(self.program) if recording is None else recording.commands
-
-        def undrawn(view: View) -> Picture:
-            return Picture(workspace, commands, self.shape, resident, view, plan, queue)
-
-        if recording is not None and recording.fits(view, undrawn, queue):
-            leased, events = recording.launch(queue)
-            stats = stats_later(workspace, dict(leased)["counts"], events[-1], resident.count)
-            drawn = Drawn(queue, leased, stats, events[-1])
-        else:
-            kept.recording = None  # an interrupt leaves a part of one
-            picture = draw(undrawn, view, self.features.images)
-            drawn = Drawn.of(picture, timed=False)
-            recording = kept.recording = Recording(picture)
-        repeat = Repeat(self._redrawn, self._timed, workspace, resident, view, recording)
-        images = self._images(view, drawn, repeat)
-        if not resident.fixed:
-            images.settle()
-        return images
-
-    def _timed(self, resident: Resident, view: View, recording: Recording) -> dict[str, float]:
-        """Milliseconds of the stages, of the picture drawn once more."""
-        return self._tried(self._drawn_for_time, resident, view, recording).timings()
-
-    def _drawn_for_time(self, resident: Resident, view: View, recording: Recording) -> Drawn:
-        workspace = self.workspace
-        queue = workspace.turn_to(workspace.queue)
-        workspace.pictures += 1
-
-        def undrawn(view: View) -> Picture:
-            plan = MemoryPlan(0, 0, 0)
-            return Picture(workspace, recording.commands, self.shape, resident, view, plan, queue)
-
-        if recording.fits(view, undrawn, queue):
-            leased, events = recording.launch(queue)
-            stages = recording.commands.stages
-            drawn = Drawn(queue, leased, dict, events[-1], list(zip(stages, events, strict=True)))
-        else:
-            drawn = self._redrawn(resident, view)
-        workspace.finish()
-        workspace.pool.give_back(drawn.leased)
-        return drawn
-
-    def _redrawn(self, resident: Resident, view: View) -> Drawn:
-        """The picture drawn again, whatever it takes, and its time."""
-        return Drawn.of(self._tried(self._first, resident, view, self._plan(resident, view)))
-
-    def _draw(
-        self,
-        resident: Resident,
-        view: View,
-        plan: MemoryPlan,
-        trusted: int = 0,
-        commands: CommandList | None = None,
-    ) -> Picture:
-        commands = self._commands if commands is None else commands
-
-        def start(view: View) -> Picture:
-            return Picture(self.workspace, commands, self.shape, resident, view, plan, trusted=trusted)
-
-        return draw(start, view, self.features.images)
-
     def _plan(self, resident: Resident, view: View, beside: int = 0) -> MemoryPlan:
         """beside: bytes that something else holds meanwhile."""
         shape, source = self.shape, self.source
@@ -375,19 +368,23 @@ class OpenCLPipeline:
         return plan_of(resident.room, record, upload, fixed, shape.lists, budget, largest)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """Draw one picture and return what passes between the stages.
+        """Render one frame and return what the stages pass on.
 
         keys (n,) uint32; starts (tiles + 1,) uint32; lists (pairs,) uint32, of the last band; records (n,) of
         the record `Splat` (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
-        transmittance of the padded sample grid; and the finished outputs by name.
+        transmittance of the padded sample grid; and the output images by name.
         """
-        picture = self._draw(resident, view, MemoryPlan(0, resident.count, 0))
-        made = self._images(view, Drawn.of(picture))
+        with self.workspace.rendering():
+            plan = MemoryPlan(0, resident.count, 0)
+            frame = self._frame(resident, view, plan, self._commands)
+            frame.lease_images(self.features.images)
+            render(frame)
+        images = self.images_of(frame)
         return {
-            "keys": picture.read("keys", np.uint32, (resident.count,)),
-            "starts": picture.read("starts", np.uint32, (picture.tiles + 1,)),
-            "lists": picture.read("lists", np.uint32, (made.stats["pairs"],)),
-            "records": picture.read("splats", self.source.records["Splat"], (resident.count,)),
-            "raw": picture.read("raw", np.float32, (4, picture.rows, picture.stride)),
-            **{output.name: made.read(output.name) for output in self.features.images},
+            "keys": frame.read("keys", np.uint32, (resident.count,)),
+            "starts": frame.read("starts", np.uint32, (frame.tiles + 1,)),
+            "lists": frame.read("lists", np.uint32, (images.stats["pairs"],)),
+            "records": frame.read("splats", self.source.records["Splat"], (resident.count,)),
+            "raw": frame.read("raw", np.float32, (4, frame.rows, frame.stride)),
+            **{output.name: images.read(output.name) for output in self.features.images},
         }

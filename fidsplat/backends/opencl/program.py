@@ -102,7 +102,7 @@ class Program:
         """A new kernel object, whose arguments nobody else binds."""
         return cl.Kernel(self._kernels[name].program, name)
 
-    def types(self, name: str) -> list[Callable[[Any], Any] | None]:
+    def types(self, name: str) -> Sequence[Callable[[Any], Any] | None]:
         """The NumPy type of each argument of a kernel; None for a buffer."""
         return self._types[name]
 

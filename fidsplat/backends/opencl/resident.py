@@ -57,8 +57,8 @@ class Resident:
         elif cloud.sh is not None:  # always: a cloud has one of the two
             self._arrays["sh"] = cloud.sh
         self._buffers: dict[str, cl.Buffer] = {}
-        self.kept: dict[Hashable, Any] = {}
-        """what is kept of pictures that were drawn of it, by their kind"""
+        self.cached_frames: dict[Hashable, Any] = {}
+        """frames of the cloud that are replayed, by their kind"""
         self.fixed = True
         """whether its arrays stay as they are; a picture of others cannot be drawn again later"""
         self.alike: object = None

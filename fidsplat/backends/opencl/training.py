@@ -63,7 +63,7 @@ class ResidentArrays:
         self._buffers, self.count, self.origin = dict(buffers), count, origin
         self.room, self.alike = count, None
         self.sh_degree = sh_degree
-        self.kept: dict[Hashable, Any] = {}
+        self.cached_frames: dict[Hashable, Any] = {}
 
     @property
     def memory_bytes(self) -> int:

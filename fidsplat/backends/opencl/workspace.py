@@ -8,7 +8,7 @@ import math
 import threading
 import weakref
 from collections.abc import Collection, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -233,8 +233,28 @@ class Workspace:
         self._idle = True
 
     @contextmanager
+    def rendering(self) -> Iterator[None]:
+        """Use the device exclusively. After a failure the device is idle, since a CPU may be reading the
+        arrays of a cloud that is released.
+
+        Raises:
+            DeviceError: the device fails.
+        """
+        with self.lock:
+            try:
+                yield
+            except BaseException as error:
+                self.pool.forget_zeros()
+                for queue in (self.queue, self.repeat_queue):
+                    with suppress(cl.Error):
+                        queue.finish()
+                if isinstance(error, cl.Error):
+                    raise DeviceError(f"{self.info.title} failed while rendering: {error}") from error
+                raise
+
+    @contextmanager
     def failing(self, what: str) -> Iterator[None]:
-        """The device's failures as DeviceError. what: it was doing, as `drawing rgb`."""
+        """The device's failures as DeviceError. what: it was doing, as `rendering rgb`."""
         try:
             yield
         except cl.Error as error:

@@ -1,0 +1,328 @@
+"""The device state of one frame: its buffers, the arguments of its kernels and its launches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.opencl.assemble import Source
+from fidsplat.backends.opencl.command_list import CommandList
+from fidsplat.backends.opencl.counts import Capacity, Counts
+from fidsplat.backends.opencl.declare import Argument
+from fidsplat.backends.opencl.memory_plan import MemoryPlan
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.shapes import DeviceShape
+from fidsplat.backends.opencl.uniforms import frozen, scalars_of, view_records
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.view import View
+from fidsplat.effects.catalogue import Output
+
+_GRID = (16, 4)
+"""the work-group of kernels over pixels or samples"""
+_FIRST = frozen(np.zeros(1, np.uint32))
+
+
+@dataclass(init=False)
+class FrameBuffers:
+    """Buffers with the names of the kernel arguments; each exists once its stage has allocated it.
+
+    v views, n splats, t tiles of all views, s samples of all views.
+    """
+
+    view: cl.Buffer
+    """records `View` (groups + 1, v)"""
+    moving: cl.Buffer
+    """number and labels of the groups that move"""
+    plane_keys: cl.Buffer
+    """sort keys of the coplanar groups (groups, v)"""
+    splats: cl.Buffer
+    """records `Splat` (v, n)"""
+    keys: cl.Buffer
+    """sort keys by depth (v, n) uint32"""
+    windows: cl.Buffer
+    """tiles that a splat touches (v, n) uint2, or its place in `big`"""
+    tallies: cl.Buffer
+    """counters, then the length of each tile's list (8 + t) uint32"""
+    big: cl.Buffer
+    """splats that touch more tiles than a window holds (big_capacity) uint32"""
+    big_bounds: cl.Buffer
+    """records `Bounds` (big_capacity)"""
+    order: cl.Buffer
+    """splats by depth (v, n) uint32"""
+    starts: cl.Buffer
+    """start of each tile's list (t + 1) uint32"""
+    cursors: cl.Buffer
+    """next free place in each tile's list (t) uint32"""
+    pairs: cl.Buffer
+    """unsorted lists: depth key and splat (capacity) uint2"""
+    lists: cl.Buffer
+    """splats of each tile in depth order (capacity) uint32"""
+    counts: cl.Buffer
+    """words of `Counts`"""
+    raw: cl.Buffer
+    """samples (4, s) float32: r, g, b, transmittance"""
+    slots: cl.Buffer
+    """index of each view in the output images (v) uint32"""
+    tile_ends: cl.Buffer
+    """termination depth of each tile (t) uint32"""
+
+
+@dataclass(frozen=True)
+class SampleBuffer:
+    """A buffer of values per sample that the blend stage writes."""
+
+    name: str
+    channels: int
+    averaged: bool
+    """whether sub-frames are averaged (light); otherwise the middle sub-frame's values are taken"""
+
+
+class DeviceFrame:
+    """One frame, or several views that are rendered together, while its stages are submitted."""
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        commands: CommandList,
+        shape: DeviceShape,
+        resident: Resident,
+        view: View,
+        plan: MemoryPlan,
+        *,
+        stack: ViewStack | None = None,
+        replay_queue: cl.CommandQueue | None = None,
+        pair_limit: int = 0,
+    ) -> None:
+        """
+        Args:
+            commands: records the launches.
+            stack: the views of a batch; `view` then has what they have in common.
+            replay_queue: the queue of a frame that is recorded for replay: the host does not wait for its
+                counts.
+            pair_limit: pairs for which a frame with derivatives reserves buffers without waiting for its
+                counts; 0 to wait.
+        """
+        self.workspace, self.commands, self.shape = workspace, commands, shape
+        self.resident, self.view, self.plan = resident, view, plan
+        self.stack, self.views = stack, 1 if stack is None else len(stack)
+        self.recorded, self.pair_limit = replay_queue is not None, pair_limit
+        self.queue = workspace.turn_to(workspace.queue) if replay_queue is None else replay_queue
+        self.pool = workspace.pool
+        workspace.pictures += 1
+        self.tiles_x = -(-view.width // shape.tile_width)
+        self.tiles_y = -(-view.height // shape.tile_height)
+        self.tiles = self.views * self.tiles_x * self.tiles_y
+        """of all views, one view after the other"""
+        self.stride = self.tiles_x * shape.tile_width
+        self.rows = self.tiles_y * shape.tile_height
+        self.first_tile, self.end_tile = 0, self.tiles
+        """tiles of the rows that are requested"""
+        if view.band is not None and shape.lists == "ordered" and self.views == 1:
+            self.first_tile = view.band[0] // shape.tile_height * self.tiles_x
+            self.end_tile = -(-view.band[1] // shape.tile_height) * self.tiles_x
+        self.buffers = FrameBuffers()
+        self.named: dict[str, cl.Buffer] = {}
+        """buffers that depend on effects and outputs, by the names of the kernel arguments"""
+        self.numbers: dict[str, Any] = scalars_of(view) | {
+            "width": view.width,
+            "height": view.height,
+            "stride": self.stride,
+            "channel_stride": self.views * self.rows * self.stride,
+        }
+        """numbers by the names of the kernel arguments"""
+        self.samples = [
+            SampleBuffer("raw", 4, True),
+            *(SampleBuffer(one.name, one.channels, averaged) for one, averaged in self.source.samples),
+        ]
+        self.is_sub_frame = False
+        """whether it is one pose of a frame with a shutter, which resolves the samples of all"""
+        self.events: list[tuple[str, cl.Event]] = []
+        """stage and event of each launch"""
+        self.arrays: dict[str, np.ndarray] = {}
+        """arrays that were copied to the device for this view"""
+        self.uploads: list[cl.Event] = []
+        self.leased: list[tuple[str, cl.Buffer]] = []
+        self.counted: cl.Event | None = None
+        """completes when the device has counted the pairs, where the host did not wait"""
+        self.in_bands = False
+        """whether its lists exceeded the pair budget"""
+        self.pairs = 0
+        """pairs that were listed; the capacity of the lists where the host did not wait"""
+        self.stats: Callable[[], dict[str, int]] = dict
+        self._uniforms: dict[str, tuple[Any, ...]] = {}
+
+    def sub_frame(self, view: View) -> DeviceFrame:
+        """The frame of one pose of a shutter."""
+        frame = DeviceFrame(self.workspace, self.commands, self.shape, self.resident, view, self.plan)
+        frame.is_sub_frame = True
+        return frame
+
+    @property
+    def source(self) -> Source:
+        """The source of the program whose kernels are launched."""
+        return self.commands.program.source
+
+    @property
+    def bound(self) -> dict[str, cl.Buffer]:
+        """All buffers by the names of the kernel arguments."""
+        return vars(self.buffers) | self.named
+
+    @property
+    def capacity(self) -> Capacity:
+        """What the buffers hold."""
+        return Capacity(self.numbers["big_capacity"], self.pairs)
+
+    def takes(self, kernel: str, argument: str) -> bool:
+        """Whether a kernel of the program has an argument of this name."""
+        return any(one.name == argument for one in self.source.arguments.get(kernel, ()))
+
+    def count_pairs(self) -> int | None:
+        """The number of pairs; None if they exceeded the capacity, so that the frame is empty. Waits until
+        the device has counted, not until it has rendered."""
+        if self.counted is None:
+            return self.pairs
+        counts = self.read_counts(self.counted)
+        return counts.pairs if self.capacity.holds(counts) else None
+
+    def read_counts(self, counted: cl.Event) -> Counts:
+        """The counts as the launch `counted` leaves them, while later stages run."""
+        self.queue.flush()
+        return Counts.read(self.workspace.side_queue, self.buffers.counts, [counted])
+
+    def launch(
+        self, stage: str, kernel: str, items: int, group: int, views: int = 1, **given: Any
+    ) -> cl.Event:
+        """Submit a kernel with at least `items` work-items for each view; kernels check their index.
+
+        Arguments are `given`, or buffers and numbers of the frame, or numbers and arrays of its view.
+        """
+        size = -(-items // group) * group
+        if views == 1:
+            return self._launch(stage, kernel, (size,), (group,), given)
+        return self._launch(stage, kernel, (size, views), (group, 1), given)
+
+    def launch_grid(self, stage: str, kernel: str, width: int, height: int, **given: Any) -> cl.Event:
+        """Submit a kernel with a work-item for each pixel or sample of each view; its arguments `width` and
+        `height` are their numbers."""
+        size = (-(-width // _GRID[0]) * _GRID[0], -(-height // _GRID[1]) * _GRID[1])
+        given |= {"width": width, "height": height}
+        if self.views == 1:
+            return self._launch(stage, kernel, size, _GRID, given)
+        return self._launch(stage, kernel, (*size, self.views), (*_GRID, 1), given)
+
+    def _launch(
+        self, stage: str, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: dict[str, Any]
+    ) -> cl.Event:
+        arguments = self.source.arguments[kernel]
+        values = [given[one.name] if one.name in given else self.value(one) for one in arguments]
+        event = self.commands.launch(self.queue, kernel, size, group, values, stage)
+        self.events.append((stage, event))
+        return event
+
+    def value(self, argument: Argument) -> Any:
+        """The value of a kernel argument that is not given with the launch."""
+        name = argument.name
+        if argument.source == "uniform":
+            group, index = argument.uniform
+            if group not in self._uniforms:
+                self._uniforms[group] = self.view.uniform(group)
+            return self._uniforms[group][index]
+        for values in (vars(self.buffers), self.named, self.numbers):
+            if name in values:
+                return values[name]
+        if argument.source == "array":
+            return self.put(name, self.view.array(name))
+        raise KeyError(name)
+
+    def take(self, name: str, size: int) -> cl.Buffer:
+        """Bind a scratch buffer, which the next frame overwrites."""
+        return self.bind(name, self.pool.scratch(name, size))
+
+    def lease(self, name: str, size: int) -> cl.Buffer:
+        """Bind a buffer that belongs to the frame until its images are released."""
+        buffer = self.bind(name, self.pool.lease(name, size))
+        self.leased.append((name, buffer))
+        return buffer
+
+    def put(self, name: str, array: np.ndarray) -> cl.Buffer:
+        """Bind a scratch buffer with these contents; does not wait."""
+        self.arrays[name] = array
+        buffer, event = self.pool.put(self.queue, name, array)
+        if event is not None:
+            self.uploads.append(event)
+        return self.bind(name, buffer)
+
+    def bind(self, name: str, buffer: cl.Buffer) -> cl.Buffer:
+        """Use a buffer as the kernel argument of this name."""
+        if name in FrameBuffers.__annotations__:
+            setattr(self.buffers, name, buffer)
+        else:
+            self.named[name] = buffer
+        return buffer
+
+    def buffer(self, name: str) -> cl.Buffer:
+        """The buffer that is bound to the kernel argument of this name."""
+        return getattr(self.buffers, name) if name in FrameBuffers.__annotations__ else self.named[name]
+
+    def read(self, name: str, dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
+        """The contents of a buffer; waits for the device."""
+        array = np.empty(shape, dtype)
+        if array.size:
+            cl.enqueue_copy(self.queue, array, self.buffer(name))
+        return array
+
+    def lease_images(self, outputs: tuple[Output, ...]) -> None:
+        """Bind buffers for the output images of one view."""
+        view = self.view
+        pixels = (view.height // view.samples) * (view.width // view.samples)
+        for output in outputs:
+            self.lease(f"{output.name}_out", 4 * pixels * output.channels)
+        self.put("slots", _FIRST)
+
+    def bind_images(self, images: dict[str, cl.Buffer], indices: np.ndarray) -> None:
+        """Bind the output images of a batch. indices: (views,) uint32, of these views in the batch."""
+        self.named |= images
+        self.put("slots", indices)
+
+    def put_view(self, row: int, end: int) -> None:
+        """Copy the uniforms of the projection for the requested ones of rows of samples [row, end)."""
+        view = self.view
+        if view.band is not None:
+            row, end = max(row, view.band[0]), min(end, view.band[1])
+        self.put_rays()
+        self.put("view", frozen(self.record(row, end)))
+        if view.groups:
+            moving = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
+            self.put("moving", frozen(moving))
+        if self.resident.group_table is not None:
+            table, stack = self.resident.group_table, self.stack
+            # a copy, since it must own its memory to be recognised
+            keys = table.keys(view) if stack is None else table.keys_of(stack).T.copy()
+            self.put("plane_keys", frozen(keys))
+
+    def put_arrays(self) -> None:
+        """Copy the view's arrays that kernels read."""
+        for arguments in self.source.arguments.values():
+            for one in arguments:
+                if one.source == "array":
+                    self.value(one)
+
+    def put_rays(self) -> None:
+        """Bind the rays of a lens, and its map from directions to samples."""
+        if self.view.raster is not None:
+            slopes = self.takes("blend", "ray_slopes")
+            rays = self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)
+            self.named |= rays
+
+    def record(self, row: int, end: int) -> np.ndarray:
+        """The records `View` for rows of samples [row, end)."""
+        return view_records(self.stack or self.view, row, end, self.source.records["View"])
+
+    def is_of_view(self, argument: Argument) -> bool:
+        """Whether an argument is a number that changes with the view."""
+        return argument.source == "uniform" or argument.name in scalars_of(self.view)

@@ -1,0 +1,197 @@
+"""The stages of a frame in order: plan, project, bin, sort, blend, resolve.
+
+They are submitted to one in-order queue. A frame with more pairs of splats and tiles than the memory budget
+holds is listed and blended in bands of tiles; a frame with a shutter is blended pose by pose and resolved
+once. The images are bit-identical in every case.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.opencl import tiling
+from fidsplat.backends.opencl.counts import COUNTS, read_stats
+from fidsplat.backends.opencl.device_frame import DeviceFrame
+from fidsplat.backends.opencl.tiling import TileBand
+from fidsplat.backends.view import SubFrame
+
+_UNLIMITED = 2**32 - 1
+_NEVER = np.full(1, 0xFFFFFFFF, np.uint32)
+"""termination depth of a tile that is not rendered"""
+
+
+def render(frame: DeviceFrame) -> None:
+    """Submit all stages of a frame whose images are bound."""
+    if frame.view.sub_frames:
+        render_exposure(frame)
+    else:
+        render_pose(frame)
+
+
+def render_pose(frame: DeviceFrame) -> None:
+    """Submit all stages for one pose of the camera."""
+    frame.commands.clear()
+    allocate_samples(frame)
+    if frame.plan.chunk:
+        render_in_chunks(frame)
+    elif frame.shape.lists == "ordered":
+        render_sorted(frame)
+    else:
+        render_tiled(frame)
+
+
+def allocate_samples(frame: DeviceFrame) -> None:
+    """Bind buffers for what the blend stage writes."""
+    for one in frame.samples:
+        frame.take(one.name, 4 * frame.numbers["channel_stride"] * one.channels)
+    if frame.takes("blend", "tile_ends"):
+        ends = frame.lease("tile_ends", 4 * frame.tiles)
+        if frame.view.band is not None:
+            cl.enqueue_fill_buffer(frame.queue, ends, _NEVER, 0, 4 * frame.tiles)
+
+
+def render_sorted(frame: DeviceFrame) -> None:
+    """The stages on a CPU: the host waits for the number of pairs, and sizes the lists by it."""
+    count, big = frame.resident.count, 0
+    frame.put_view(0, frame.rows)
+    while True:
+        tiling.project_all(frame, big)
+        tiling.sort_by_depth(frame, count)
+        counts = tiling.count_pairs(frame, count)
+        if counts.big <= frame.numbers["big_capacity"]:
+            break
+        big = counts.big
+    for band in tiling.sorted_bands(frame, frame.first_tile, frame.end_tile, counts.pairs):
+        tiling.list_sorted(frame, band, count)
+        blend(frame, band)
+    resolve(frame)
+    frame.pairs, frame.stats = counts.pairs, partial(counts.stats, count)
+
+
+def render_tiled(frame: DeviceFrame) -> None:
+    """The stages on a GPU: all are submitted with the capacity of the last frames. If that was too little,
+    the lists are empty, and the stages are submitted again."""
+    frame.put_view(0, frame.rows)
+    frame.lease("counts", 4 * COUNTS)
+    capacity = tiling.pair_capacity(frame.workspace)
+    if frame.pair_limit:
+        capacity = min(capacity, frame.pair_limit)
+    tiling.project_and_count(frame)
+    counted = tiling.start_lists(frame, capacity)
+    if capacity:
+        every = TileBand(0, frame.tiles, capacity)
+        tiling.list_and_sort(frame, every, capacity, first_band=True)
+        blend(frame, every)
+        resolve(frame)
+    if frame.recorded or (frame.pair_limit and capacity):
+        frame.counted, frame.pairs = counted, capacity
+    else:
+        complete_tiled(frame, counted, capacity)
+    frame.queue.flush()
+    reader, last, count = frame.workspace.read_queue, frame.events[-1][1], frame.resident.count
+    frame.stats = partial(read_stats, reader, frame.buffers.counts, last, count)
+
+
+def complete_tiled(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None:
+    """Wait for the counts, and render again with the buffers that the frame requires if it has exceeded
+    `capacity`."""
+    counts = frame.read_counts(counted)
+    while counts.big > frame.numbers["big_capacity"]:
+        tiling.project_and_count(frame, counts.big)
+        counted, capacity = tiling.start_lists(frame, 0), 0
+        counts = frame.read_counts(counted)
+    frame.pairs = counts.pairs
+    if capacity and counts.pairs <= capacity:
+        return
+    tiling.start_lists(frame, _UNLIMITED)
+    bands = tiling.unsorted_bands(frame, counts.pairs)
+    roomy = min(counts.pairs * 5 // 4, frame.workspace.pair_budget)
+    capacity = max(roomy, *(band.pairs for band in bands))
+    for band in bands:
+        tiling.list_and_sort(frame, band, capacity, first_band=band is bands[0])
+        blend(frame, band)
+    resolve(frame)
+
+
+def render_in_chunks(frame: DeviceFrame) -> None:
+    """The stages where memory is short: the cloud is projected a chunk at a time, and only visible splats are
+    kept. If these are still too many, the cloud is projected again for each band of rows of tiles."""
+    rows = [(frame.first_tile // frame.tiles_x, frame.end_tile // frame.tiles_x)]
+    visible = pairs = 0
+    while rows:
+        top, end = rows.pop(0)
+        packed = tiling.pack_visible(frame, top, end)
+        if packed.count > frame.plan.capacity:
+            rows = tiling.split_rows(frame, top, end, packed.count) + rows
+            continue
+        tiling.sort_by_depth(frame, packed.count)
+        tiling.count_pairs(frame, packed.count)
+        first, last = top * frame.tiles_x, end * frame.tiles_x
+        listed = int(tiling.tile_pairs(frame)[first:last].sum(dtype=np.int64))
+        for band in tiling.sorted_bands(frame, first, last, listed):
+            tiling.list_sorted(frame, band, packed.count)
+            blend(frame, band)
+        visible, pairs = max(visible, packed.visible), pairs + listed
+    resolve(frame)
+    frame.stats = partial(dict, splats=frame.resident.count, visible=visible, pairs=pairs)
+
+
+def blend(frame: DeviceFrame, band: TileBand) -> None:
+    """Composite the splats of a band of tiles to samples."""
+    group = frame.shape.blend_items
+    frame.launch("blend", "blend", (band.end - band.first) * group, group, band_first=band.first)
+
+
+def resolve(frame: DeviceFrame) -> None:
+    """Put the surroundings behind the splats, and turn samples into pixels, unless the blend stage has."""
+    arguments, view = frame.source.arguments, frame.view
+    if "backdrop" in arguments and not view.sub_frames:
+        frame.launch_grid("resolve", "backdrop", view.width, view.height)
+    if "resolve" in arguments and not frame.is_sub_frame:
+        frame.launch_grid("resolve", "resolve", view.width // view.samples, view.height // view.samples)
+
+
+def render_exposure(frame: DeviceFrame) -> None:
+    """Blend the sub-frames of a shutter one after another, and resolve their samples together."""
+    for one in frame.samples:
+        size = 4 * frame.rows * frame.stride * one.channels
+        frame.bind(one.name, frame.pool.scratch(f"exposed {one.name}", size))
+    surroundings = {
+        one.name: frame.put(one.name, frame.view.array(one.name))
+        for one in frame.source.arguments.get("backdrop", ())
+        if one.source == "array"
+    }
+    stats = {"splats": frame.resident.count, "visible": 0, "pairs": 0}
+    for sub_frame in frame.view.sub_frames:
+        part = frame.sub_frame(sub_frame.view)
+        part.named |= surroundings
+        render_pose(part)
+        frame.events += part.events
+        accumulate(frame, part, sub_frame)
+        for name, value in part.stats().items():
+            stats[name] = max(stats[name], value)
+        frame.uploads += part.uploads
+        frame.pool.give_back(part.leased)
+    if frame.takes("resolve", "rays"):
+        frame.put_rays()
+    resolve(frame)
+    frame.stats = partial(dict, stats)
+
+
+def accumulate(frame: DeviceFrame, part: DeviceFrame, sub_frame: SubFrame) -> None:
+    """Add the samples of a sub-frame to those of the frame."""
+    size = sub_frame.view.width, sub_frame.view.height
+    given = {
+        **{"whole_stride": frame.stride, "whole_channel_stride": frame.rows * frame.stride},
+        **{"stride": part.stride, "channel_stride": part.rows * part.stride, "top": sub_frame.top},
+    }
+    for one in frame.samples:
+        if not (one.averaged or sub_frame.middle):
+            continue
+        buffers = {"raw": part.buffer(one.name), "exposed": frame.buffer(one.name), "channels": one.channels}
+        weights = {"weight": sub_frame.weight, "first": sub_frame.first} if one.averaged else {}
+        kernel = "expose" if one.averaged else "expose_middle"
+        frame.launch_grid("expose", kernel, *size, **given, **buffers, **weights)

@@ -1,0 +1,292 @@
+"""Tile binning: the splats of each tile, in depth order.
+
+On CPUs (`ordered`) all visible splats are sorted by depth, then listed per tile in that order, by counting
+sorts over a few contiguous chunks: long sequential loops and no atomics. On GPUs (`tiled`) the projection
+counts the splats of each tile, pairs of splats and tiles are written in any order, and each tile's list is
+sorted in local memory: few kernels, all of them wide. For many small views and for stores (`gathered`), tiles
+are counted for thousands of splats at a time in local memory, since atomics of neighbouring splats on one
+tile's counter serialise. devlog/growth.md compares the strategies on both kinds of device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.bands import cut
+from fidsplat.backends.opencl.counts import Counts
+from fidsplat.backends.opencl.device_frame import DeviceFrame
+from fidsplat.backends.opencl.memory_plan import BIG, KEYS, WINDOWS
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.util.errors import DeviceError
+
+GATHER_TILES = 4096
+"""most tiles of a view that are counted in local memory (as in tile_lists_local.cl)"""
+_GATHERED = 4096
+"""splats of a work-group there"""
+_ITEMS = 256
+"""BIN_ITEMS and SORT_ITEMS"""
+# words of the buffer `tallies`, as in prelude.cl
+_VISIBLE, _PAIRS, _BIG, _TALLIES = 0, 2, 6, 8
+_NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
+
+
+class TileBand(NamedTuple):
+    """Tiles [first, end) that are listed together, and their pairs."""
+
+    first: int
+    end: int
+    pairs: int
+
+
+def allocate_tallies(frame: DeviceFrame, words: int, big: int = 0) -> None:
+    """Zeroed counters, and buffers for at least `big` big splats."""
+    capacity = max(big * 5 // 4, frame.pool.size("big") // 4, BIG)
+    frame.numbers["big_capacity"] = capacity
+    frame.take("big", 4 * capacity)
+    frame.take("big_bounds", frame.source.records["Bounds"].itemsize * capacity)
+    if frame.recorded:  # the kernel tile_starts clears them for the next replay
+        frame.bind("tallies", frame.pool.zeroed("tallies", 4 * words, frame.queue))
+        return
+    tallies = frame.take("tallies", 4 * words)
+    cl.enqueue_fill_buffer(frame.queue, tallies, np.zeros(1, np.uint32), 0, 4 * words)
+
+
+def project(frame: DeviceFrame, first: int, end: int) -> None:
+    """Records, sort keys and tile windows of splats [first, end)."""
+    count, size = end - first, _splat_capacity(frame, end - first)
+    frame.take("splats", size * frame.source.records["Splat"].itemsize)
+    frame.take("keys", KEYS * size)
+    windows = frame.take("windows", WINDOWS * size)
+    if frame.view.band is not None and size:
+        # the kernel writes no window for splats outside the band: an empty window, of no big splat
+        cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOWS * size)
+    if count:
+        names = [one.name for one in frame.source.arguments["project"] if one.source == "cloud"]
+        arrays = {name: frame.resident.part(name, first, end) for name in names}
+        frame.launch("project", "project", count, 64, frame.views, count=count, **arrays)
+
+
+def _splat_capacity(frame: DeviceFrame, count: int) -> int:
+    """Elements of buffers per splat and view; those of a complete cloud are reused by larger clouds."""
+    resident = frame.resident
+    return frame.views * (resident.room if count == resident.count else count)
+
+
+# on CPUs: sort by depth, then list
+
+
+def project_all(frame: DeviceFrame, big: int) -> None:
+    """Project the cloud, with buffers for at least `big` big splats."""
+    allocate_tallies(frame, _TALLIES * frame.views, big)
+    project(frame, 0, frame.resident.count)
+
+
+def sort_by_depth(frame: DeviceFrame, count: int) -> None:
+    """Radix sort of the visible splats by depth, ties by index."""
+    views, chunks, bins = frame.views, frame.shape.chunks, 1 << frame.shape.radix_bits
+    table = frame.take("sort table", 4 * bins * chunks * views)
+    size = 4 * _splat_capacity(frame, count)
+    keys, order = frame.buffers.keys, frame.take("order 0", size)
+    for number, shift in enumerate(range(0, 32, frame.shape.radix_bits)):
+        keys_out = frame.take(f"sorted keys {number % 2}", size)
+        order_out = frame.take(f"order {(number + 1) % 2}", size)
+        digit = {"keys": keys, "count": count, "first": number == 0, "shift": shift, "table": table}
+        frame.launch("sort", "sort_count", chunks, 1, views, **digit)
+        starts = _prefix_sums(frame, "sort", table, bins, _VISIBLE, views)
+        out = {"starts": starts, "indices": order, "keys_out": keys_out, "indices_out": order_out}
+        frame.launch("sort", "sort_scatter", chunks, 1, views, **digit, **out)
+        keys, order = keys_out, order_out
+    frame.buffers.order = order
+
+
+def count_pairs(frame: DeviceFrame, count: int) -> Counts:
+    """Length of each tile's list; waits for the totals. `big` is the first view's."""
+    views = frame.views
+    table = frame.take("bin table", 4 * frame.tiles * frame.shape.chunks)
+    frame.launch("bin", "bin_count", frame.shape.chunks, 1, views, table=table, count=count)
+    # one list of all views' tiles: those of the second view follow those of the first
+    frame.buffers.starts = _prefix_sums(frame, "bin", table, frame.tiles // views, _PAIRS, 1)
+    words = frame.read("tallies", np.uint32, (views, _TALLIES))
+    pairs = int(words[0][_PAIRS]) | int(words[0][_PAIRS + 1]) << 32
+    return Counts(int(words[0][_BIG]), pairs, int(words[:, _VISIBLE].sum(dtype=np.int64)))
+
+
+def sorted_bands(frame: DeviceFrame, first: int, end: int, pairs: int) -> Iterable[TileBand]:
+    """Tiles [first, end) in as many bands as the pair budget requires."""
+    budget = frame.workspace.pair_budget
+    if pairs <= budget:
+        return [TileBand(first, end, pairs)]
+    return [TileBand(*band) for band in cut(tile_pairs(frame)[first:end], budget, first)]
+
+
+def tile_pairs(frame: DeviceFrame) -> np.ndarray:
+    """(tiles,) lengths of the lists, after `count_pairs`."""
+    return frame.read("bin totals", np.uint32, (frame.tiles,))
+
+
+def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
+    """Write the lists of a band, from splats that are sorted."""
+    allocated, budget = frame.pool.size("lists") // 4, frame.workspace.pair_budget
+    # a view that needs more than the last one is often followed by one that needs more still
+    grows = 0 < allocated < band.pairs
+    size = max(band.pairs, min(band.pairs * 9 // 8, budget)) if grows else band.pairs
+    frame.take("lists", 4 * size)
+    given = {"band_first": band.first, "band_end": band.end, "count": count}
+    table = frame.named["bin table"]
+    frame.launch("bin", "bin_emit", frame.shape.chunks, 1, frame.views, table=table, **given)
+
+
+def _prefix_sums(
+    frame: DeviceFrame, stage: str, table: cl.Buffer, bins: int, slot: int, lists: int
+) -> cl.Buffer:
+    """Turn the views' tables of counts into positions in `lists` lists, one for each view or one for all.
+    Returns the start of each bin (lists, all bins of the list + 1)."""
+    views, items = frame.views, frame.shape.scan_items
+    totals = frame.take(f"{stage} totals", 4 * bins * views)
+    each = bins * views // lists
+    starts = frame.take(f"{stage} starts", 4 * (each + 1) * lists)
+    frame.launch(stage, "scan_chunks", bins, 64, views, table=table, bins=bins, totals=totals)
+    scan = {"bins": each, "totals": totals, "starts": starts, "slot": slot}
+    frame.launch(stage, "scan_bins", items, items, lists, **scan)
+    return starts
+
+
+# on CPUs, where memory is short: project a chunk of splats at a time, and keep the visible ones
+
+
+class Packed(NamedTuple):
+    """Splats of a band of rows, projected in chunks."""
+
+    count: int
+    """an estimate where it exceeds the capacity"""
+    visible: int
+    """of the complete frame, as far as chunks were projected"""
+
+
+def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
+    """Project in chunks, and pack the visible splats of rows of tiles [top, end)."""
+    height, plan = frame.shape.tile_height, frame.plan
+    frame.put_view(top * height, end * height)
+    big = 0
+    while True:
+        allocate_tallies(frame, _TALLIES, big)
+        sizes = {"splats": frame.source.records["Splat"].itemsize, "keys": KEYS, "windows": WINDOWS}
+        packed = {name: frame.take(f"packed {name}", size * plan.capacity) for name, size in sizes.items()}
+        found, big = _pack_chunks(frame, packed)
+        if big <= frame.numbers["big_capacity"]:
+            break
+        big *= 2
+    if found.count <= plan.capacity:
+        for name, buffer in packed.items():
+            frame.bind(name, buffer)
+    return found
+
+
+def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Packed, int]:
+    """The splats found, and the number of big ones; ends early where either exceeds its capacity."""
+    count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.shape.chunks
+    out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
+    total = visible = 0
+    for start in range(0, count, chunk):
+        stop = min(start + chunk, count)
+        project(frame, start, stop)
+        frame.take("held", 8 * chunks)
+        frame.launch("project", "pack_count", chunks, 1, count=stop - start)
+        counts = frame.read("held", np.uint32, (2, chunks)).astype(np.int64)
+        visible += int(counts[1].sum())
+        places = np.concatenate([[0], np.cumsum(counts[0])]) + total
+        total = int(places[-1])
+        if total > frame.plan.capacity:
+            return Packed(-(-total * count // stop), visible), 0
+        big = int(frame.read("tallies", np.uint32, (_TALLIES,))[_BIG])
+        if big > frame.numbers["big_capacity"]:
+            return Packed(total, visible), big
+        frame.put("places", places[:-1].astype(np.uint32))
+        frame.launch("project", "pack_move", chunks, 1, count=stop - start, **out)
+    return Packed(total, visible), 0
+
+
+def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple[int, int]]:
+    """Rows of tiles [top, end), which show `count` splats, in bands that fit the capacity if splats are
+    spread evenly."""
+    capacity = frame.plan.capacity
+    if end - top == 1:
+        raise DeviceError(
+            f"the splats of a row of tiles must be at most {capacity:,} within the memory budget; raise "
+            "memory_budget or render fewer splats"
+        )
+    parts = min(max(2, -(-count * 11 // (10 * capacity))), end - top)
+    cuts = np.linspace(top, end, parts + 1).round().astype(int).tolist()
+    return list(pairwise(cuts))
+
+
+# on GPUs: list, then sort each list
+
+
+def pair_capacity(workspace: Workspace) -> int:
+    """Pairs that the buffers of the last frames hold."""
+    pool = workspace.pool
+    return min(pool.size("lists") // 4, pool.size("pairs") // 8, workspace.pair_budget)
+
+
+def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
+    """Project the cloud and count the pairs of each tile, with buffers for at least `big` big splats."""
+    count = frame.resident.count
+    allocate_tallies(frame, _TALLIES + frame.tiles, big)
+    project(frame, 0, count)
+    frame.launch("bin", "tally_big", _big_groups(frame) * _ITEMS, _ITEMS, count=count)
+    if frame.shape.lists == "gathered":
+        launch_gathered(frame, "tally_gathered")
+
+
+def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
+    """Start of each tile's list; all lists are empty if there are more pairs than `capacity`."""
+    items = frame.shape.scan_items
+    frame.take("starts", 4 * (frame.tiles + 1))
+    frame.take("cursors", 4 * frame.tiles)
+    given = {"tiles": frame.tiles, "capacity": capacity, "clear": frame.recorded}
+    return frame.launch("bin", "tile_starts", items, items, **given)
+
+
+def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
+    """Write and sort the lists of a band."""
+    frame.take("pairs", 8 * capacity)
+    frame.take("lists", 4 * capacity)
+    count, views, groups = frame.resident.count, frame.views, _big_groups(frame)
+    given = {"band_first": band.first, "band_end": band.end, "capacity": capacity, "first_band": first_band}
+    if frame.shape.lists == "gathered":  # big splats, then all others
+        frame.launch("bin", "emit", groups * _ITEMS, _ITEMS, views, count=count, splat_groups=0, **given)
+        launch_gathered(frame, "emit_gathered", **given)
+    else:
+        splat_groups = -(-count // _ITEMS)
+        items = (splat_groups + -(-groups // views)) * _ITEMS
+        frame.launch("bin", "emit", items, _ITEMS, views, count=count, splat_groups=splat_groups, **given)
+    frame.launch("sort", "sort_tiles", (band.end - band.first) * _ITEMS, _ITEMS, band_first=band.first)
+
+
+def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
+    """All tiles, in as many bands as the pair budget requires."""
+    budget = frame.workspace.pair_budget
+    if pairs <= budget:
+        return [TileBand(0, frame.tiles, pairs)]
+    frame.in_bands = True
+    tallies = frame.read("tallies", np.uint32, (_TALLIES + frame.tiles,))
+    return [TileBand(*band) for band in cut(tallies[_TALLIES:], budget)]
+
+
+def launch_gathered(frame: DeviceFrame, kernel: str, **given: Any) -> None:
+    """Submit a kernel of tile_lists_local.cl."""
+    count, items = frame.resident.count, frame.shape.scan_items
+    if count:
+        groups = -(-count // _GATHERED)
+        frame.launch("bin", kernel, groups * items, items, frame.views, count=count, **given)
+
+
+def _big_groups(frame: DeviceFrame) -> int:
+    """Work-groups that share the splats of many tiles."""
+    return 4 * frame.workspace.device.max_compute_units

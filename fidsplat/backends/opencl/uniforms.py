@@ -1,0 +1,64 @@
+"""Uniforms of views: the records `View` and the numbers that are kernel arguments of their own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.view import View
+
+
+def scalars_of(view: View) -> dict[str, float]:
+    """Numbers of a view that are kernel arguments of their own, by the names of the arguments."""
+    red, green, blue = view.background
+    return {
+        **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
+        **{"filter": 1.0 / view.samples**2},
+        **{"background_r": red, "background_g": green, "background_b": blue},
+    }
+
+
+def frozen(array: np.ndarray) -> np.ndarray:
+    """The array, made read-only: `BufferPool.put` copies a read-only array once."""
+    array.flags.writeable = False
+    return array
+
+
+def view_records(views: View | ViewStack, row: int, end: int, record: np.dtype) -> np.ndarray:
+    """(moving groups + 1, views) of the record `View` (layout.py) for rows of samples [row, end); the numbers
+    of a single view are in one row."""
+    real = record[0].base  # all members have one type
+    if isinstance(views, View):
+        every = [views, *(of for _, of in views.groups)]
+        return np.array([number for each in every for number in _numbers(each, row, end, record)], real)
+    made = np.empty(views.translation.shape[:2], record)
+    made[:] = np.array(_numbers(views.view, row, end, record), real).view(record)
+    made["rotation"] = views.rotation.reshape(*made.shape, 9)
+    made["translation"], made["eye"] = views.translation, views.eye
+    for name, values in views.numbers.items():
+        if name in (record.names or ()):
+            made[name] = values
+    return made
+
+
+def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
+    """The members of the record `View` of one view, in their order."""
+    values: dict[str, Any] = {
+        **{"rotation": view.rotation.ravel().tolist(), "translation": view.translation.tolist()},
+        **{"eye": view.eye.tolist(), "focal_x": view.focal_x, "focal_y": view.focal_y},
+        **{"center_x": view.center_x, "center_y": view.center_y, "near": view.near, "far": view.far},
+        **{"log_cut": view.log_cut, "width": view.width, "height": view.height},
+        **{"filter": 1.0 / view.samples**2, "band": row, "band_end": end, "slopes": view.slopes},
+    }
+    # the members of a lens and its map follow those of every view
+    lens = iter(() if view.raster is None else view.raster.uniforms)
+    flat: list[float] = []
+    for name in record.names or ():
+        if name in values:
+            value = values[name]
+            flat += value if isinstance(value, (list, tuple)) else (value,)
+        else:
+            flat += (next(lens) for _ in range(record[name].shape[0] if record[name].shape else 1))
+    return flat
