@@ -119,7 +119,7 @@ def _row(letter: str, results: "list[CaseResult]") -> tuple[str, ...]:
     from fidsplat.selftest.catalogue import GROUPS
     from fidsplat.selftest.check import rank_of
 
-    cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(one.pictures for one in results))]
+    cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(one.frames for one in results))]
     for outputs in (("rgb", "alpha"), ("depth",)):
         for errors in ("largest", "uncertified"):
             found = [getattr(one, errors) for one in results]

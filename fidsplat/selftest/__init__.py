@@ -1,2 +1,1 @@
-"""The catalogue of what can go wrong in splat rendering, as cases that tests and `fidsplat check` run on a
-device (`catalogue.all_cases`)."""
+"""Hard cases of splat rendering, run on a device by tests and by `fidsplat check` (`catalogue.all_cases`)."""

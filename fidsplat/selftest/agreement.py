@@ -95,18 +95,18 @@ def tolerance_of(name: str) -> float:
     return 0.0 if output.discontinuous else output.tolerance
 
 
-def render(renderer: Renderer, picture: FrameSpec) -> Frame:
+def render(renderer: Renderer, spec: FrameSpec) -> Frame:
     """Render the frame on a device."""
-    return renderer.render(picture.cloud, picture.capture)
+    return renderer.render(spec.cloud, spec.capture)
 
 
 def reference_images(
-    picture: FrameSpec, pixels: tuple[np.ndarray, np.ndarray] | None = None
+    spec: FrameSpec, pixels: tuple[np.ndarray, np.ndarray] | None = None
 ) -> dict[str, np.ndarray]:
     """Images of the reference with `alpha` and `certificate`: all pixels, or (k, ...) at (rows, columns)."""
     reference = ReferenceBackend()
-    features, view = picture.prepared("alpha")
-    pipeline, resident = reference.pipeline(features), reference.upload(picture.cloud)
+    features, view = spec.prepared("alpha")
+    pipeline, resident = reference.pipeline(features), reference.upload(spec.cloud)
     if pixels is not None:
         return pipeline.pixels(resident, view, *pixels)
     return pipeline.render(resident, view).images
@@ -153,15 +153,15 @@ def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tup
     return float(differs.mean()), float((differs & ~may_flip).mean())
 
 
-def trace(renderer: Renderer, picture: FrameSpec, shape=None) -> dict[str, np.ndarray]:
+def trace(renderer: Renderer, spec: FrameSpec, shape=None) -> dict[str, np.ndarray]:
     """Buffers between the stages of a device, and the outputs; `shape` replaces its build constants."""
-    features, view = picture.prepared()
+    features, view = spec.prepared()
     backend = renderer.backend
     if shape is not None and isinstance(backend, Reshapes):
         pipeline = backend.pipeline(features, shape)
     else:
         pipeline = backend.pipeline(features)
-    return pipeline.trace(backend.upload(picture.cloud), view)
+    return pipeline.trace(backend.upload(spec.cloud), view)
 
 
 def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], outputs) -> int:
@@ -177,12 +177,12 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
     return int(different.sum())
 
 
-def out_of_order(traced: Mapping[str, np.ndarray], wanted: np.ndarray) -> int:
-    """Number of splats of a trace that violate the order `wanted` (visible,) in lists or overall."""
+def out_of_order(traced: Mapping[str, np.ndarray], expected: np.ndarray) -> int:
+    """Number of splats of a trace that violate the order `expected` (visible,) in lists or overall."""
     if "lists" not in traced:
-        return int((traced["order"] != wanted).sum())
+        return int((traced["order"] != expected).sum())
     rank = np.full(len(traced["keys"]), -1)
-    rank[wanted] = np.arange(len(wanted))
+    rank[expected] = np.arange(len(expected))
     places, starts = rank[traced["lists"]], traced["starts"].astype(np.int64)
     follows = np.ones(len(places), bool)  # the one before it in the same list
     follows[starts[:-1][starts[:-1] < len(places)]] = False

@@ -1,4 +1,4 @@
-"""Group D of the catalogue: opacity, transmittance, depth outputs, colours and background."""
+"""Group D: opacity, transmittance, depth outputs, colours and background."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fidsplat.splats.cloud import SplatCloud
 
 CUT = 1.0 / 255.0
 FACING = (1.0, 0.0, 0.0, 0.0)
-# every ray of this camera that goes through the middle pixel's centre runs along the axis
+# the ray through the centre of the middle pixel is the optical axis
 SMALL = camera(25, 17, 20.0)
 MIDDLE = (8, 12)
 PARITY = ("gsplat", "surfel")
@@ -23,7 +23,7 @@ PARITY = ("gsplat", "surfel")
 def stack(
     opacities, colors=(0.0, 0.0, 0.0), first: float = 1.0, step: float = 0.1, size: float = 5.0
 ) -> SplatCloud:
-    """Layers across the view, one behind the other, each with its opacity on the axis."""
+    """Fronto-parallel layers one behind the other, each with its opacity on the axis."""
     n = len(opacities)
     means = np.zeros((n, 3))
     means[:, 2] = first + step * np.arange(n)
@@ -31,28 +31,28 @@ def stack(
 
 
 def near_values(value: float, ulps) -> np.ndarray:
-    """Float32 numbers that lie some steps from a value."""
+    """Float32 numbers at some ulps from a value."""
     bits = np.float32(value).view(np.int32) + np.asarray(ulps, np.int32)
     return bits.astype(np.int32).view(np.float32)
 
 
 @case(
     "D1",
-    "opaque layers hide what is behind them",
+    "opaque layers occlude the background",
     "1 to 4 layers of opacity 1; opacity 0.99 +- 3 ulp under the exclusive stop at T = 1e-4",
 )
 def d1(renderer: Renderer) -> Found:
     stripes = [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]
     for n in (1, 2, 4):
         yield FrameSpec(stack([1.0] * n, stripes[:n]), SMALL)
-    # the second layer takes the transmittance to 1e-4, give or take a few steps of the opacity
+    # the second layer lowers the transmittance to 1e-4 within a few ulps of opacity
     edge = near_values(0.99, [-3, -1, 0, 1, 3])
     for opacity in edge:
         layers = stack([opacity] * 3, stripes[:3])
         yield FrameSpec(layers, SMALL)
         yield FrameSpec(layers, SMALL, Quality.named("gsplat"))
     yield FrameSpec(stack([1.0, 0.999, 0.5], stripes[:3]), SMALL, Quality.named("surfel"))
-    # on one plane: opaque splats share what they cover
+    # in one coplanar group opaque splats share their pixels
     yield FrameSpec(
         stack([1.0, 1.0, 0.5, 1.0], stripes, step=0.0, size=0.3).with_coplanar_groups(0), camera(61, 45, 48.0)
     )
@@ -64,14 +64,14 @@ def d1(renderer: Renderer) -> Found:
     for n in (1, 2, 3, 4):
         yield Finding(f"light of the background through {n} opaque layers", light(n, None), 1e-4)
     for preset in PARITY:
-        # their second opaque layer is dropped, as it is in those systems
+        # their second opaque layer is dropped, as in those renderers
         worst = max(abs(light(n, preset) - 0.01) for n in (1, 2, 3))
-        yield Finding(f"{preset}: difference from the 1 % that its system lets through", worst, 1e-5)
+        yield Finding(f"{preset}: difference from the 1 % that its renderer transmits", worst, 1e-5)
 
 
 @case(
     "D2",
-    "the alpha cut-off is one radius, in bounds and pixels",
+    "the alpha cut-off is the same radius in bounds and pixels",
     "opacity 1/255 +- 7 ulp; 100 to 5000 layers of 0.0039; cut-offs 1e-6, 1e-4 and 0.1",
 )
 def d2(renderer: Renderer) -> Found:
@@ -91,19 +91,21 @@ def d2(renderer: Renderer) -> Found:
         frame = renderer.render(stack([opacity] * n, step=1e-3), small, ("alpha",), quality)
         return float(frame["alpha"][1, 1]), 1.0 - (1.0 - float(np.float32(opacity))) ** n
 
-    # the cut-off bites haze: that is its definition, and a knob
+    # the cut-off removes haze by definition; it is a quality setting
     lost = haze(1000, 0.0039, Quality(alpha_cutoff=CUT))[0]
     yield Finding("alpha of 1000 layers of 0.0039 at the cut-off 1/255", lost, 0.0)
     for n in (100, 1000, 5000):
-        drawn, wanted = haze(n, 0.0039, Quality.named("reference"))
-        yield Finding(f"error of alpha of {n} layers of 0.0039, drawn", abs(drawn - wanted), 2e-5)
-    drawn, wanted = haze(1000, 0.004, None)
-    yield Finding("error of alpha of 1000 layers of 0.004, above the cut-off", abs(drawn - wanted), 2e-5)
+        rendered, expected = haze(n, 0.0039, Quality.named("reference"))
+        yield Finding(
+            f"error of alpha of {n} layers of 0.0039 without cut-off", abs(rendered - expected), 2e-5
+        )
+    rendered, expected = haze(1000, 0.004, None)
+    yield Finding("error of alpha of 1000 layers of 0.004, above the cut-off", abs(rendered - expected), 2e-5)
 
 
 @case(
     "D3",
-    "transmittance underflows without harm",
+    "transmittance underflow",
     "400 layers of opacity 0.3 to 1 with no stop, ordered and coplanar",
 )
 def d3(renderer: Renderer) -> Found:
@@ -117,18 +119,18 @@ def d3(renderer: Renderer) -> Found:
         SMALL,
         unending,
     )
-    # transmittance runs into the denormals and to 0, in layers and in runs of coplanar splats
+    # transmittance falls through the denormals to 0, in layers and in coplanar groups
     layers = stack([0.9] * 400, [1.0, 0.5, 0.0], step=0.001)
     for cloud, name in ((layers, "layers"), (layers.with_coplanar_groups(0), "coplanar splats")):
         rgb = renderer.render(cloud, SMALL, quality="reference")["rgb"][MIDDLE]
         error = float(np.abs(rgb - (1.0, 0.5, 0.0)).max())
-        yield Finding(f"error of the colour of 400 {name} whose light underflows", error, 2e-5)
+        yield Finding(f"colour error of 400 {name} whose transmittance underflows", error, 2e-5)
 
 
 @case(
     "D4",
     "expected and median depth",
-    "layers at T = 1, 0.6, 0.36; T = 1/2 +- 2 ulp; the faintest splat drawn; silhouettes",
+    "layers at T = 1, 0.6, 0.36; T = 1/2 +- 2 ulp; the faintest rendered splat; silhouettes",
 )
 def d4(renderer: Renderer) -> Found:
     tilted = splats(
@@ -151,29 +153,29 @@ def d4(renderer: Renderer) -> Found:
         frame = renderer.render(cloud, SMALL, ALL_OUTPUTS)
         return float(frame["depth"][MIDDLE]), float(frame["depth_median"][MIDDLE])
 
-    # T in front of the layers: 1, 0.6, 0.36; the last in front of which more than half remains is the second
+    # T in front of the layers: 1, 0.6, 0.36; the second is the last with T above 1/2
     expected, median = middle([0.4, 0.4, 1.0], [1.0, 2.0, 4.0])
     yield Finding("expected depth of three layers, relative error", abs(expected / 2.32 - 1), 1e-6)
     yield Finding("median depth of three layers, error [m]", abs(median - 2.0), 0.0)
     expected, median = middle([0.3], [7.0])
     yield Finding("one faint layer: expected depth, relative error", abs(expected / 7 - 1), 1e-6)
     yield Finding("one faint layer: median depth, error [m]", abs(median - 7.0), 1e-6)
-    for opacity in near_values(0.5, [-2, 0, 2]):  # T is 1/2 within rounding: either layer is the median
+    for opacity in near_values(0.5, [-2, 0, 2]):  # T is 1/2 within rounding: both layers are valid medians
         median = middle([opacity, 1.0], [3.0, 5.0])[1]
         yield Finding(
             "T = 1/2: distance of the median from the nearer of its layers [m]",
             min(abs(median - 3), abs(median - 5)),
             1e-6,
         )
-    # the guard: what covers less than 1/255 is 0, the faintest that covers more has its own depth
+    # depth is 0 where alpha is below 1/255; the faintest splat above it has its own depth
     lone = splats([[0.0, 0.0, 3.0]], FACING, (0.05, 0.05), 1.01 / 255)
     frame = renderer.render(lone, SMALL, ALL_OUTPUTS, Quality(alpha_cutoff=1e-5))
     covered = frame["alpha"] >= np.float32(1 / 255)
-    yield Finding("pixels of the faintest splat that are missing", float(not covered[MIDDLE]), 0.0)
+    yield Finding("missing pixels of the faintest splat", float(not covered[MIDDLE]), 0.0)
     for name in names[1:]:
         depth = frame[name]
         stray = float(np.abs(depth[~covered]).max(initial=0.0))
-        yield Finding(f"{name} where less than 1/255 is covered [m]", stray, 0.0)
+        yield Finding(f"{name} where alpha is below 1/255 [m]", stray, 0.0)
         error = np.abs(depth[covered] / 3 - 1).max(initial=0.0)
         yield Finding(f"{name} of the faintest splat, relative error", float(error), 1e-6)
 
@@ -197,7 +199,7 @@ def d5(renderer: Renderer) -> Found:
     lit = renderer.render(cloud, camera(), names, background=behind)
     light = (1.0 - black["alpha"].astype(np.float64))[..., None]
     error = np.abs(lit["rgb"] - black["rgb"] - light * np.array(behind)).max()
-    yield Finding("colour less the splats' own, against T times the background", float(error), 1e-6)
+    yield Finding("difference of the background from T times its colour", float(error), 1e-6)
 
     fire = splats([[0.0, 0.0, 2.0]], FACING, (0.05, 0.05), 0.9, (1e15, 1e15, 1e15))
     for marked in (False, True):
@@ -205,16 +207,16 @@ def d5(renderer: Renderer) -> Found:
         both = both.with_coplanar_groups(0) if marked else both
         alone = cloud.with_coplanar_groups(0) if marked else cloud
         frame = renderer.render(both, camera(), names)
-        touched = renderer.render(fire, camera(), names)["alpha"] > 0
+        footprint = renderer.render(fire, camera(), names)["alpha"] > 0
         without = renderer.render(alone, camera(), names)
         name = "coplanar" if marked else "ordered"
         yield Finding(
-            f"{name}: pixels that are not finite beside a colour of 1e15",
+            f"{name}: non-finite pixels next to a colour of 1e15",
             float((~np.isfinite(frame["rgb"])).sum()),
             0.0,
         )
-        corrupted = (frame["rgb"] != without["rgb"]).any(-1) & ~touched
-        yield Finding(f"{name}: pixels that it changes without touching them", float(corrupted.sum()), 0.0)
+        changed = (frame["rgb"] != without["rgb"]).any(-1) & ~footprint
+        yield Finding(f"{name}: pixels that it changes outside of its footprint", float(changed.sum()), 0.0)
     dark = SplatCloud(fire.means, fire.quats, fire.scales, fire.opacities, sh=np.full((1, 1, 3), -9.0))
     lowest = float(renderer.render(dark, camera())["rgb"].min())
-    yield Finding("how far below 0 a negative SH colour goes", -lowest, 0.0)
+    yield Finding("negative part of a clamped SH colour", -lowest, 0.0)

@@ -1,5 +1,4 @@
-"""Group F of the catalogue: the device's own arithmetic, in units of the last place (ulp) over the ranges
-that rendering uses; barriers, sorting."""
+"""Group F: the device's arithmetic in ulp over the ranges that rendering uses; barriers, sorting."""
 
 from __future__ import annotations
 
@@ -19,8 +18,8 @@ from fidsplat.selftest.clouds import camera, splats
 from fidsplat.splats.cloud import SplatCloud
 
 _COUNT = 1 << 18
-# in ulp: what OpenCL C 1.2 (section 7.4) promises of each function, and of the short ones what they keep for
-# all arguments with and without a fused multiply-add (tools/fast_bounds.py)
+# in ulp: bounds of OpenCL C 1.2 (section 7.4), and of the fast functions over all arguments, with and without
+# a fused multiply-add (tools/fast_bounds.py)
 BOUNDS = {
     "exp": 3.0,
     "log": 3.0,
@@ -35,32 +34,32 @@ BOUNDS = {
 }
 VIEW = camera(60, 45, 48.0)
 UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
-"""words of build options that let go of IEEE arithmetic"""
+"""words of build options that violate IEEE arithmetic"""
 
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """What was measured on one device."""
+    """Measured arithmetic of a device."""
 
     float64: bool
-    """whether it has float64, for the per-splat set-up"""
+    """whether it has float64, for the per-splat setup"""
     denormals: bool
-    """whether it keeps float32 numbers below 1.2e-38"""
+    """whether float32 numbers below 1.2e-38 are not flushed to 0"""
     ulp: dict[str, float]
-    """largest error of each function of `BOUNDS` that the device has"""
+    """largest error of each available function of `BOUNDS`"""
 
     @property
     def findings(self) -> list[Finding]:
-        """Each function against its bound, with room for the rounding of the truth itself."""
+        """Each function against its bound, with a margin for the rounding of the exact value."""
         return [Finding(f"{name} [ulp]", ulp, BOUNDS[name] * 1.001) for name, ulp in self.ulp.items()]
 
 
 def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
-    """Measure a device on a quarter of a million arguments of each function; None for one that runs no
-    functions alone, as the reference.
+    """Measure a device on a quarter of a million arguments of each function; None for a backend without
+    kernels, such as the reference.
 
-    exp of -14 to 0 (1e-6, the least cut-off of a preset, to 1), log of 2^-24 to 1 (transmittances), quotients
-    of 1e-9 to 1e9 by the same, roots of the same.
+    exp on -14 to 0 (1e-6, the smallest cut-off of a preset, to 1), log on 2^-24 to 1 (transmittances),
+    quotients and roots of 1e-9 to 1e9.
 
     Raises:
         DeviceError: the device cannot compile or run the kernels.
@@ -89,14 +88,14 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
         "fast_log": np.log(shares),
     }
     ulp = {name: worst(got[name], truth[name]) for name in truth if name in got}
-    kept = bool(got["denormal"][0] > 0 and got["denormal"][1] == np.finfo(np.float32).tiny)
-    return Arithmetic(renderer.device.float64, kept, ulp)
+    denormals = bool(got["denormal"][0] > 0 and got["denormal"][1] == np.finfo(np.float32).tiny)
+    return Arithmetic(renderer.device.float64, denormals, ulp)
 
 
 def worst(got: np.ndarray, truth: np.ndarray) -> float:
-    """Largest error of `got` in ulp of its own type, both (n,); infinite where one is not finite."""
+    """Largest error of `got` in ulp of its type, both (n,); infinite if a value is not finite."""
     spacing = np.spacing(np.abs(truth).astype(got.dtype))
-    # not np.max of the errors alone: a NaN must not be lost
+    # np.max alone could hide a NaN
     errors = np.abs(got - truth) / spacing
     return float(errors.max()) if np.isfinite(errors).all() else float("inf")
 
@@ -104,10 +103,10 @@ def worst(got: np.ndarray, truth: np.ndarray) -> float:
 @case(
     "F1",
     "products are rounded before they are subtracted",
-    "a b - a b in float32 and in the set-up's precision; FMA where it is asked for",
+    "a b - a b in float32 and in the setup's precision; FMA where requested",
 )
 def f1(renderer: Renderer) -> Found:
-    # products that are subtracted round alike, and FMA fuses where the device is said to
+    # products are rounded before subtraction, and FMA fuses if the device declares it
     if not isinstance(renderer.backend, Probed):
         return
     probe = renderer.backend.probe()
@@ -115,13 +114,11 @@ def f1(renderer: Renderer) -> Found:
     a, b = generator.uniform(0.5, 2.0, (2, 4096)).astype(np.float32)
     difference, total, wide, fused = probe.contraction(a, b)
     yield Finding("a b - a b that is not 0", int(np.count_nonzero(difference)), 0)
-    yield Finding("the same in the set-up's precision", int(np.count_nonzero(wide)), 0)
+    yield Finding("the same in the setup's precision", int(np.count_nonzero(wide)), 0)
     yield Finding("a b + c that is not rounded twice", int(np.count_nonzero(total != a * b + a)), 0)
     product = a.astype(float) * b.astype(float)  # exact, and so is its rounding error
-    wanted = (product - (a * b)) if probe.fuses else np.zeros(len(a))
-    yield Finding(
-        "FMA(a, b, c) that is not rounded as it should be", int(np.count_nonzero(fused != wanted)), 0
-    )
+    expected = (product - (a * b)) if probe.fuses else np.zeros(len(a))
+    yield Finding("FMA(a, b, c) with wrong rounding", int(np.count_nonzero(fused != expected)), 0)
 
 
 @case(
@@ -130,32 +127,32 @@ def f1(renderer: Renderer) -> Found:
     "a quarter of a million arguments each: exp of -14 to 0, quotients and roots of 1e-9 to 1e9",
 )
 def f2(renderer: Renderer) -> Found:
-    # exp, log, division and square root against float64, by what OpenCL promises
+    # exp, log, division and square root against float64, by the bounds of OpenCL
     measured = measure(renderer)
     yield from measured.findings if measured else ()
 
 
-@case("F3", "NaN and infinity are no numbers", "quiet, negative and signalling NaN; the build options")
+@case("F3", "NaN and infinity are detected", "quiet, negative and signalling NaN; the build options")
 def f3(renderer: Renderer) -> Found:
-    # no build option lets go of NaN, and the compiler does not by itself
+    # neither a build option nor the compiler assumes that there is no NaN
     if not isinstance(renderer.backend, Probed):
         return
     probe = renderer.backend.probe()
     unsafe = [option for option in probe.options() if any(word in option for word in UNSAFE)]
-    yield Finding("build options that let go of IEEE arithmetic", len(unsafe), 0)
+    yield Finding("build options that violate IEEE arithmetic", len(unsafe), 0)
     quiet, signalling = [0x7FC00000, 0xFFC00000], [0x7F800001]
     bits = [*quiet, *signalling, 0x7F800000, 0xFF800000, 0, 0x80000000, 0x3F800000, 0xBF800000, 1]
     x = np.array(bits, np.uint32).view(np.float32)
     unequal, named, survives, infinite = probe.not_a_number(x)
     is_nan = np.isnan(x)
-    for name, seen in (("x != x", unequal), ("isnan(x)", named), ("a comparison that fails", survives)):
-        yield Finding(f"NaN taken wrongly by {name}", int((seen.astype(bool) != is_nan).sum()), 0)
-    yield Finding("infinities taken wrongly", int((infinite.astype(bool) != np.isinf(x)).sum()), 0)
+    for name, found in (("x != x", unequal), ("isnan(x)", named), ("a comparison that fails", survives)):
+        yield Finding(f"NaN misjudged by {name}", int((found.astype(bool) != is_nan).sum()), 0)
+    yield Finding("misjudged infinities", int((infinite.astype(bool) != np.isinf(x)).sum()), 0)
 
 
 @case("F4", "denormals", "opacities, scales, colours and backgrounds of 1e-45 to 1e-30")
 def f4(renderer: Renderer) -> Found:
-    # weights, scales, colours and positions at and below the smallest normal number
+    # weights, scales and colours at and below the smallest normal number
     quality = Quality(alpha_cutoff=1e-30, transmittance_stop=0.0)
     means = [[0.1 * k - 0.4, 0.05 * k - 0.2, 1.0 + 0.2 * k] for k in range(9)]
     opacities = [1e-38, 1e-40, 1e-30, 1e-20, 1e-10, 1e-5, 0.5, 1.0, 0.9]
@@ -167,21 +164,21 @@ def f4(renderer: Renderer) -> Found:
     yield FrameSpec(dark, VIEW, background=(1e-40, 0.0, 1e-45))
     measured = measure(renderer)
     if measured:
-        # either will do: nothing that is drawn is as small (the cut-off of the presets is at least 1e-6)
-        yield Finding("denormals are flushed to 0 (1) or kept (0)", float(not measured.denormals), 1)
+        # both are valid: rendered weights are larger (the presets' cut-off is at least 1e-6)
+        yield Finding("denormals are flushed to 0 (1) or preserved (0)", float(not measured.denormals), 1)
 
 
 @case(
     "F5",
     "barriers",
-    "tile lists of 0 to 300 splats with 64 staged at a time, pixels that finish at different times",
+    "tile lists of 0 to 300 splats with 64 staged at a time, pixels that terminate at different times",
 )
 def f5(renderer: Renderer) -> Found:
     # the schedule with barriers against the one without; on a GPU, against other sizes of its groups
     backend = renderer.backend
     if not isinstance(backend, Reshapes):
         return
-    # lists from none to several times what a group stages at once (128), and pixels that finish early
+    # lists of up to several batches of staged splats (128), and pixels that terminate early
     crowded = random_splats(260, 65, depth=(0.8, 1.5), scale=(0.02, 0.25), across=0.25)
     cloud = SplatCloud.concatenate([crowded, random_splats(60, 66, depth=(1.5, 6.0), scale=(0.05, 0.5))])
     features, view = prepare(cloud, Capture(VIEW, ALL_OUTPUTS, background=(0.1, 0.2, 0.3)))
@@ -197,7 +194,7 @@ def f5(renderer: Renderer) -> Found:
 
 
 def in_a_row(depths) -> SplatCloud:
-    """One splat on the axis for each depth."""
+    """One splat on the optical axis per depth."""
     means = np.zeros((len(depths), 3))
     means[:, 2] = depths
     return splats(means, (1, 0, 0, 0), (0.05, 0.05), 0.05)
@@ -233,17 +230,17 @@ def f6(renderer: Renderer) -> Found:
                 trace = pipeline.trace(backend.upload(in_a_row(depths)), view)
                 keys = trace["keys"]
                 visible = np.flatnonzero(keys != CULLED)
-                wanted = visible[np.argsort(keys[visible], kind="stable")]
-                unsorted += out_of_order(trace, wanted) > 0
+                expected = visible[np.argsort(keys[visible], kind="stable")]
+                unsorted += out_of_order(trace, expected) > 0
                 unsorted += not np.array_equal(visible, np.flatnonzero(depths > 0))
-                unlisted += not _lists_are_whole(trace, len(wanted))
+                unlisted += not _lists_are_complete(trace, len(expected))
                 tried += 1
-    yield Finding(f"of {tried} depth orders, those that are not the stable one", unsorted, 0)
-    yield Finding("sets of tile lists that lack a splat, or whose starts are wrong", unlisted, 0)
+    yield Finding(f"of {tried} depth orders, those that are not stable", unsorted, 0)
+    yield Finding("tile lists that lack a splat or have a wrong start", unlisted, 0)
 
 
-def _lists_are_whole(trace: dict[str, np.ndarray], visible: int) -> bool:
+def _lists_are_complete(trace: dict[str, np.ndarray], visible: int) -> bool:
     starts = trace["starts"].astype(np.int64)
-    whole = starts[0] == 0 and starts[-1] == len(trace["lists"]) and bool((np.diff(starts) >= 0).all())
-    # all lie on the axis: the tiles around the middle have every one of them
-    return whole and int(np.diff(starts).max()) == visible
+    complete = starts[0] == 0 and starts[-1] == len(trace["lists"]) and bool((np.diff(starts) >= 0).all())
+    # all splats are on the axis: the tiles around the centre list every one
+    return complete and int(np.diff(starts).max()) == visible

@@ -1,5 +1,4 @@
-"""A hard case: a name of the catalogue (numerics.md, A1 to G5), its trigger, and pictures and numbers that
-must hold."""
+"""Hard cases (docs/correctness.md): trigger values, frames to compare, and properties with bounds."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from fidsplat.selftest.agreement import FrameSpec
 
 @dataclass(frozen=True)
 class Finding:
-    """One number that a case measured, and what it may be at most."""
+    """A measured number and its upper bound."""
 
     what: str
     value: float
@@ -20,7 +19,7 @@ class Finding:
 
     @property
     def holds(self) -> bool:
-        """False for a NaN too."""
+        """Whether the number is within its bound; false for NaN."""
         return self.value <= self.bound
 
 
@@ -29,29 +28,26 @@ Found = Iterator[FrameSpec | Finding]
 
 @dataclass(frozen=True)
 class Case:
-    """One entry of the catalogue. It holds if all its pictures agree with the reference and all its findings
-    hold.
-    """
+    """A hard case. It passes if all its frames agree with the reference and all its findings hold."""
 
     name: str
     """e.g. "A1"; the letter is the group"""
     title: str
     trigger: str
-    """the values that bring it about, in words"""
+    """the values that trigger it"""
     run: Callable[[Renderer], Found]
-    """pictures to compare with the reference, and properties that are no picture: invariances, counts,
-    monotony"""
+    """yields frames to compare with the reference, and findings: invariances, counts, jumps"""
 
 
 CASES: list[Case] = []
-"""those of the modules that have been imported; `catalogue` imports all"""
+"""cases of all imported modules; `catalogue` imports all modules"""
 
 
 def case(name: str, title: str, trigger: str) -> Callable[[Callable[[Renderer], Found]], Callable]:
-    """Enters a function into the catalogue."""
+    """Register a function as a case."""
 
-    def enter(run: Callable[[Renderer], Found]) -> Callable[[Renderer], Found]:
+    def register(run: Callable[[Renderer], Found]) -> Callable[[Renderer], Found]:
         CASES.append(Case(name, title, trigger, run))
         return run
 
-    return enter
+    return register

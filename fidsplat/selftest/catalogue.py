@@ -1,8 +1,8 @@
-"""Every case, by the letters of the groups."""
+"""All cases by group."""
 
 from __future__ import annotations
 
-from fidsplat.selftest import (  # noqa: F401  each enters its cases
+from fidsplat.selftest import (  # noqa: F401  registers its cases
     alpha,
     arithmetic,
     bounds,
@@ -15,16 +15,16 @@ from fidsplat.selftest.case import CASES, Case
 
 GROUPS = {
     "A": "bounds, near plane",
-    "B": "homography",
+    "B": "intersection",
     "C": "order, ties",
     "D": "alpha, depth",
     "E": "inputs, sizes",
     "F": "arithmetic",
     "G": "3D Gaussians",
 }
-"""Letter of each group of the catalogue -> what it is about."""
+"""letter of each group -> topic"""
 
 
 def all_cases(groups: str = "ABCDEFG") -> tuple[Case, ...]:
-    """Every case of the groups named by their letters, in the catalogue's order."""
+    """Cases of the groups with these letters, sorted by name."""
     return tuple(sorted((case for case in CASES if case.name[0] in groups), key=lambda case: case.name))

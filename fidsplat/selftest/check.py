@@ -1,4 +1,4 @@
-"""The self-test of a device: all hard cases, its arithmetic, and a picture of the worst case."""
+"""Self-test of a device: all hard cases, its arithmetic, and an image of the worst case."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fidsplat.util.errors import DeviceError
 
 @dataclass(frozen=True)
 class Worst:
-    """The picture of the suite that is furthest from the reference."""
+    """The frame that differs most from the reference."""
 
     title: str
     device: np.ndarray
@@ -28,33 +28,33 @@ class Worst:
     certificate: np.ndarray
     """(h, w)"""
     rank: tuple[bool, float]
-    """whether it fails, and its largest error"""
+    """whether it fails, and its largest error: the sort key"""
 
 
 @dataclass
 class CaseResult:
-    """One case on one device."""
+    """Result of a case on a device."""
 
     case: Case
-    pictures: int = 0
+    frames: int = 0
     uncertified: dict[str, float] = field(default_factory=dict)
     """output -> largest error beyond the certificate"""
     largest: dict[str, float] = field(default_factory=dict)
     """output -> largest error, certified ones included"""
     findings: list[Finding] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
-    """what does not hold, in words; empty when all of it does"""
+    """failures as messages"""
     seconds: float = 0.0
 
     @property
     def passed(self) -> bool:
-        """Whether all of it holds."""
+        """Whether the case has no failure."""
         return not self.wrong
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What a device's self-test found."""
+    """Result of the self-test of a device."""
 
     device: DeviceInfo
     arithmetic: Arithmetic | None
@@ -64,13 +64,13 @@ class CheckResult:
 
     @property
     def groups(self) -> dict[str, list[CaseResult]]:
-        """The cases by letter."""
+        """Results by the letter of their group."""
         letters = dict.fromkeys(result.case.name[0] for result in self.cases)
         return {letter: [one for one in self.cases if one.case.name[0] == letter] for letter in letters}
 
     @property
     def failures(self) -> list[str]:
-        """What does not hold, in words."""
+        """Failures as messages."""
         measured = self.arithmetic.findings if self.arithmetic else []
         return [
             *(f"arithmetic: {f.what} is {f.value:.3g}, above {f.bound:.3g}" for f in measured if not f.holds),
@@ -79,11 +79,11 @@ class CheckResult:
 
     @property
     def passed(self) -> bool:
-        """Whether everything holds."""
+        """Whether there are no failures."""
         return not self.failures
 
     def as_dict(self) -> dict:
-        """Everything but the pictures, for JSON."""
+        """The result without images, for JSON."""
         arithmetic = self.arithmetic
         return {
             "device": self.device.name,
@@ -102,7 +102,7 @@ class CheckResult:
                     "title": result.case.title,
                     "trigger": result.case.trigger,
                     "passed": result.passed,
-                    "pictures": result.pictures,
+                    "frames": result.frames,
                     "uncertified_error": result.uncertified,
                     "largest_error": result.largest,
                     "findings": [asdict(found) | {"holds": found.holds} for found in result.findings],
@@ -114,33 +114,33 @@ class CheckResult:
 
 
 def run_check(
-    renderer: Renderer, cases: Iterable[Case], tell: Callable[[str], None] = lambda doing: None
+    renderer: Renderer, cases: Iterable[Case], report: Callable[[str], None] = lambda message: None
 ) -> CheckResult:
-    """Run cases on a device. What the device cannot do at all fails its case; the others go on.
+    """Run cases on a device. A case that the device cannot run fails; the other cases run.
 
     Args:
-        tell: called with what is being done, before each case.
+        report: called with a message before each case.
     """
     begun = time.perf_counter()
-    tell("arithmetic")
+    report("arithmetic")
     arithmetic = measure(renderer)
     results: list[CaseResult] = []
     worst: Worst | None = None
     for case in cases:
-        tell(f"{case.name}: {case.title}")
+        report(f"{case.name}: {case.title}")
         result, worst = run_case(renderer, case, worst)
         results.append(result)
     return CheckResult(renderer.device, arithmetic, results, worst, time.perf_counter() - begun)
 
 
 def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tuple[CaseResult, Worst | None]:
-    """Run one case on a device; returns what it found, and the worst of `worst` and its own pictures."""
+    """Run a case on a device; returns its result, and the worst of `worst` and the case's frames."""
     begun = time.perf_counter()
     result = CaseResult(case)
     try:
         for found in case.run(renderer):
             if isinstance(found, FrameSpec):
-                result.pictures += 1
+                result.frames += 1
                 worst = _compared(renderer, found, result, worst)
             else:
                 result.findings.append(found)
@@ -152,21 +152,19 @@ def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tupl
     return result, worst
 
 
-def _compared(
-    renderer: Renderer, picture: FrameSpec, result: CaseResult, worst: Worst | None
-) -> Worst | None:
-    frame, truth = render(renderer, picture), reference_images(picture)
-    for difference in compare(frame, truth, picture.outputs):
+def _compared(renderer: Renderer, spec: FrameSpec, result: CaseResult, worst: Worst | None) -> Worst | None:
+    frame, truth = render(renderer, spec), reference_images(spec)
+    for difference in compare(frame, truth, spec.outputs):
         name = difference.output
         raise_to(result.uncertified, name, difference.uncertified)
         raise_to(result.largest, name, difference.error)
         if not difference.agrees:
-            result.wrong.append(_in_words(result.pictures, difference))
+            result.wrong.append(_in_words(result.frames, difference))
         rank = not difference.agrees, rank_of(difference.error)
-        # what agrees is shown if it can be seen
-        seen = "rgb" in picture.outputs and (name in ("rgb", "alpha") or rank[0])
-        if seen and (worst is None or rank > worst.rank):
-            words = f"{result.case.name}, picture {result.pictures}, {name}: wrong by {difference.error:.0e}"
+        # frames that agree are candidates only if the error is visible in rgb
+        visible = "rgb" in spec.outputs and (name in ("rgb", "alpha") or rank[0])
+        if visible and (worst is None or rank > worst.rank):
+            words = f"{result.case.name}, frame {result.frames}, {name}: error {difference.error:.0e}"
             words += f", uncertified {difference.uncertified:.0e}"
             rgb = np.array(frame["rgb"], dtype=np.float64)
             worst = Worst(words, rgb, truth["rgb"], truth["certificate"], rank)
@@ -174,9 +172,9 @@ def _compared(
 
 
 def worst_image(worst: Worst) -> np.ndarray:
-    """Device, reference, difference and certificate side by side, (h, w, 3) uint8.
+    """Contact sheet of device, reference, difference and certificate, (h, w, 3) uint8.
 
-    The difference and the certificate are multiplied by a power of ten, so that they can be seen.
+    The difference and the certificate are scaled by a power of ten.
     """
     from fidsplat.images.files import to_uint8
     from fidsplat.images.visualize import contact_sheet
@@ -194,22 +192,22 @@ def worst_image(worst: Worst) -> np.ndarray:
 
 
 def _in_words(number: int, difference: Difference) -> str:
-    image = f"picture {number}, {difference.output}"
+    image = f"frame {number}, {difference.output}"
     if not difference.finite:
-        return f"{image} holds values that are not finite"
+        return f"{image} has values that are not finite"
     if difference.excess > 0:
         return (
-            f"{image} is wrong by {difference.uncertified:.1e} beyond its certificate, above "
+            f"{image} has an error of {difference.uncertified:.1e} beyond its certificate, above "
             f"{tolerance_of(difference.output):.0e}"
         )
     return f"{image}: {difference.risky:.1%} of the pixels have certificates above 0.05"
 
 
 def raise_to(largest: dict[str, float], name: str, value: float) -> None:
-    """Keep the larger of what stands under a name and a value."""
+    """Raise the value of a name to at least `value`."""
     largest[name] = max(largest.get(name, 0.0), value, key=rank_of)
 
 
 def rank_of(value: float) -> float:
-    """A NaN is worse than anything."""
+    """Sort key of an error; NaN is the largest."""
     return float("inf") if np.isnan(value) else value

@@ -1,4 +1,4 @@
-"""Splats and cameras that the cases are made of: the camera at the origin looks down +z, x right, y down."""
+"""Splats and cameras of the cases: the camera is at the origin and looks along +z, x right, y down."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ ORANGE = (0.9, 0.5, 0.2)
 
 
 def camera(width: int = 100, height: int = 80, focal: float = 80.0, **changes) -> Camera:
-    """A pinhole camera at the origin; `cx`, `cy`, `world_to_camera`, `near`, `far` may be given."""
+    """Pinhole camera at the origin; changes: `cx`, `cy`, `world_to_camera`, `near`, `far`."""
     center = {"cx": width / 2, "cy": height / 2}
     return Camera.pinhole(width, height, focal, focal, **center | changes)
 
 
 def quaternion(tangent_u, tangent_v) -> np.ndarray:
-    """(4,) of the splat whose tangents point along u and v (each (3,), made orthonormal, u first)."""
+    """Quaternion (4,) of a splat with tangents along u and v, each (3,), orthonormalised, u first."""
     u = np.asarray(tangent_u, float) / np.linalg.norm(tangent_u)
     v = np.asarray(tangent_v, float) - np.dot(tangent_v, u) * u
     v /= np.linalg.norm(v)
@@ -29,7 +29,7 @@ def quaternion(tangent_u, tangent_v) -> np.ndarray:
 
 
 def rotation(axis, degrees: float) -> np.ndarray:
-    """Quaternion (4,) of a turn by an angle about an axis (3,)."""
+    """Quaternion (4,) of a rotation by an angle about an axis (3,)."""
     half = math.radians(degrees) / 2
     unit = np.asarray(axis, float) / np.linalg.norm(axis)
     return np.array([math.cos(half), *(math.sin(half) * unit)])
@@ -38,8 +38,8 @@ def rotation(axis, degrees: float) -> np.ndarray:
 def splats(
     means, quats, scales, opacities: ArrayLike = 1.0, colors: ArrayLike = ORANGE, **more
 ) -> SplatCloud:
-    """A cloud of n splats: means (n, 3); the others (n, ...) or the value of them all; scales of three are
-    those of 3D Gaussians."""
+    """A cloud of n splats: means (n, 3); other arguments (n, ...) or one value for all; three scales make 3D
+    Gaussians."""
     n = len(means)
 
     def each(value, *shape) -> np.ndarray:
@@ -51,7 +51,7 @@ def splats(
 
 
 def subset_of(cloud: SplatCloud, index) -> SplatCloud:
-    """The splats at an index array, in its order."""
+    """The splats at an index array, in that order."""
     names = ("means", "quats", "scales", "opacities", "colors", "sh", "labels")
     arrays = {name: array[index] for name in names if (array := getattr(cloud, name)) is not None}
     if cloud.thickness is not None:

@@ -1,9 +1,8 @@
-"""Random scenes that are hard on purpose, each from its seed alone, and their comparison with the reference,
-in runs that go on where they were stopped.
+"""Fuzzing: random hard scenes, each determined by its seed, compared with the reference, in resumable runs.
 
-The distribution is that of numerics.md, section 3: scales log-uniform from 1e-6 to 1e3 m, anisotropy to 1e6,
-depths from -5 to 1e5 m, every tenth splat edge-on within 1e-6 rad, every tenth across the near plane, every
-tenth in a coplanar group, half of those that are known as planes tilted, opacities on the thresholds.
+Scales are log-uniform from 1e-6 to 1e3 m, anisotropy to 1e6, depths from -5 to 1e5 m, opacities at the
+thresholds. A tenth of the splats is edge-on within 1e-6 rad, a tenth crosses the near plane, a tenth is
+coplanar; half of the coplanar groups are tilted.
 """
 
 from __future__ import annotations
@@ -39,19 +38,19 @@ QUALITIES = (
     Quality.named("gsplat"),
 )
 SHARES = (0.5, 0.15, 0.15, 0.1, 0.1)
-"""of the scenes that are drawn with each quality"""
+"""share of the scenes with each quality"""
 _SAVE_EVERY = 5.0  # seconds
 
 
 def scene_of(seed: int) -> FrameSpec:
-    """The picture of a seed: 1 to 200 splats, at most 80 x 64 pixels, the camera anywhere."""
+    """The frame of a seed: 1 to 200 splats, at most 80 x 64 pixels, a random camera."""
     generator = np.random.default_rng(seed)
     count = int(generator.integers(1, LARGEST_SCENE + 1))
     width, height = (int(generator.integers(1, limit + 1)) for limit in (80, 64))
     focal = max(width, height) * float(log_uniform(generator, 0.4, 4.0))
     near = float(generator.choice([0.01, 0.01, 0.2, 1.0]))
 
-    kind = generator.choice(4, count, p=[0.7, 0.1, 0.1, 0.1])  # plain, edge-on, crossing near, coplanar
+    kind = generator.choice(4, count, p=[0.7, 0.1, 0.1, 0.1])  # plain, edge-on, across near, coplanar
     depth = np.where(
         generator.random(count) < 0.4,
         generator.uniform(-5, 5, count),
@@ -69,7 +68,7 @@ def scene_of(seed: int) -> FrameSpec:
     for k in np.flatnonzero(kind == 1):
         quats[k] = _edge_on(generator, means[k])
     for k in np.flatnonzero(kind == 2):
-        # the disk's reach along z is up to three standard deviations: the centre lies within it
+        # the disk extends three standard deviations along z; its centre is within that of the near plane
         axes = quaternion_to_matrix(quats[k])[2, :2] * scales[k]
         means[k, 2] = near + generator.uniform(-3, 3) * np.linalg.norm(axes)
     planes = _coplanar(generator, np.flatnonzero(kind == 3), means, quats)
@@ -78,7 +77,7 @@ def scene_of(seed: int) -> FrameSpec:
     pose = np.eye(4)
     if generator.random() < 0.5:
         if (planes >= 0).any():
-            _part(np.random.default_rng([seed, 3]), np.flatnonzero((kind == 3) & (planes < 0)), means)
+            _separate(np.random.default_rng([seed, 3]), np.flatnonzero((kind == 3) & (planes < 0)), means)
         turn = generator.normal(size=4)
         turn /= np.linalg.norm(turn)
         pose[:3, :3] = quaternion_to_matrix(turn)
@@ -99,7 +98,7 @@ def scene_of(seed: int) -> FrameSpec:
 
 
 def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:
-    """Quaternion (4,) of a splat at `mean` whose plane holds the camera within 1e-6 rad."""
+    """Quaternion (4,) of a splat at `mean` that is edge-on within 1e-6 rad."""
     ray = mean / np.linalg.norm(mean)
     across = np.cross(ray, generator.normal(size=3))
     across /= np.linalg.norm(across)
@@ -109,13 +108,13 @@ def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:
 
 
 def _coplanar(generator, chosen: np.ndarray, means: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """Puts the chosen splats on a few planes z = const, turned within them; returns ids of planes (n,)."""
+    """Move the chosen splats to a few planes z = const, rotated in them; returns group ids (n,)."""
     planes = np.full(len(means), -1)
     groups = generator.integers(0, 3, len(chosen))
     for group in range(3):
         members = chosen[groups == group]
         depth = float(np.float32(log_uniform(generator, 0.3, 30.0)))
-        # half of the groups are known to be coplanar, the others only happen to be
+        # half of the groups have an id
         known = generator.random() < 0.5
         for k in members:
             means[k, :2] *= depth / max(abs(means[k, 2]), 0.1)
@@ -127,7 +126,7 @@ def _coplanar(generator, chosen: np.ndarray, means: np.ndarray, quats: np.ndarra
 
 
 def _tilt(generator: np.random.Generator, planes: np.ndarray, means: np.ndarray, quats: np.ndarray) -> None:
-    """Turns half of the planes about their middle, so that they cross one another and what lies around."""
+    """Rotate half of the groups about their centres, so that they intersect each other and other splats."""
     for plane in np.unique(planes[planes >= 0]):
         axis = generator.normal(size=3) * [1, 1, 0.3]
         angle = generator.uniform(0, math.pi / 2)
@@ -140,19 +139,18 @@ def _tilt(generator: np.random.Generator, planes: np.ndarray, means: np.ndarray,
         quats[own] = quaternion_multiply(turn, quats[own])
 
 
-def _part(generator: np.random.Generator, chosen: np.ndarray, means: np.ndarray) -> None:
-    """Moves the chosen splats, which lie in one plane, up to 1/1000 away from the camera. Where order is by
-    depth at each pixel and their plane is turned, rounding would say which is in front, all over the picture
-    (docs/order.md), and there would be nothing to compare."""
+def _separate(generator: np.random.Generator, chosen: np.ndarray, means: np.ndarray) -> None:
+    """Move the chosen coplanar splats up to 1/1000 away from the camera. In a tilted plane without a group id
+    rounding would decide their order at every pixel (docs/correctness.md)."""
     means[chosen] *= 1 + generator.uniform(0, 1e-3, (len(chosen), 1))
 
 
 @dataclass
 class FuzzState:
-    """Figures over all scenes from seed 0 to `scenes` - 1."""
+    """Results of all scenes from seed 0 to `scenes` - 1."""
 
     key: str
-    """device, driver and sources that they hold for"""
+    """device, driver and sources of the results"""
     scenes: int = 0
     splats: int = 0
     pixels: int = 0
@@ -163,7 +161,7 @@ class FuzzState:
     largest: dict[str, tuple[float, int]] = field(default_factory=dict)
     """output -> largest error, certified ones included, and its seed"""
     failing: list[int] = field(default_factory=list)
-    """seeds with an error above its tolerance beyond the certificate, or a value that is not finite"""
+    """seeds with an error beyond tolerance and certificate, or a non-finite value"""
     seconds: float = 0.0
 
     @property
@@ -172,11 +170,11 @@ class FuzzState:
         return not self.failing and self.risky <= RARE * self.pixels
 
     def add(self, seed: int, renderer: Renderer) -> None:
-        """Draw the scene of the next seed and compare it."""
-        picture = scene_of(seed)
-        truth = reference_images(picture)
+        """Render the scene of the next seed and compare it."""
+        spec = scene_of(seed)
+        truth = reference_images(spec)
         failed = False
-        for difference in compare(render(renderer, picture), truth, ALL_OUTPUTS):
+        for difference in compare(render(renderer, spec), truth, ALL_OUTPUTS):
             name = difference.output
             failed |= not (difference.finite and difference.excess <= 0)
             errors = (self.uncertified, difference.uncertified), (self.largest, difference.error)
@@ -186,16 +184,16 @@ class FuzzState:
                     record[name] = value, seed
         if failed:
             self.failing.append(seed)
-        self.scenes, self.splats = seed + 1, self.splats + len(picture.cloud)
+        self.scenes, self.splats = seed + 1, self.splats + len(spec.cloud)
         self.pixels += truth["certificate"].size
         self.risky += int((truth["certificate"] > RISKY).sum())
 
 
 def fuzz_run(renderer: Renderer, splats: int, file: Path | None = None) -> Iterator[FuzzState]:
-    """Draw scenes until they hold `splats` splats; yields the state after each.
+    """Render scenes until they contain `splats` splats; yields the state after each.
 
-    A run that was stopped, with the same device and kernels, goes on from `file`; one that has reached its
-    number starts again. Raises InputError when the file cannot be written.
+    A stopped run with the same device and kernels resumes from `file`; a completed one starts again. Raises
+    InputError when the file cannot be written.
     """
     state = _load(file, _key(renderer))
     if state.splats >= splats:

@@ -1,4 +1,4 @@
-"""Group E of the catalogue: broken and extreme inputs, picture sizes, integers, memory never written."""
+"""Group E: broken and extreme inputs, image sizes, integer ranges, unwritten memory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ BROKEN = {
     "opacities": (NAN, INF, -INF, -DENORMAL, -0.5, 1.0000001, 2.0, 1e38),
     "colors": (NAN, INF, -INF, 1e38, -1e38),
 }
-"""field -> values with which a splat cannot be drawn"""
+"""field -> values of an invalid splat"""
 ODD = {
     "means": (0.0, -0.0, DENORMAL, -1e-39),
     "quats": (0.0, -0.0, DENORMAL, 1e38, -1e38),
@@ -41,11 +41,11 @@ ODD = {
     "opacities": (0.0, -0.0, DENORMAL, 1e-10, 1.0),
     "colors": (0.0, -0.0, DENORMAL, -DENORMAL, -2.0),
 }
-"""field -> values that look broken and are not"""
+"""field -> unusual valid values"""
 
 
 def crowd() -> SplatCloud:
-    """Splats of which the victim covers the middle of the picture."""
+    """Splats; the victim covers the image centre."""
     cloud = random_splats(40, 41, depth=(1.0, 5.0), scale=(0.03, 0.4), across=1.0)
     victim = splats([[0.05, 0.02, 1.2]], rotation((1, 1, 0), 30), (0.3, 0.2), 0.9, (0.2, 0.9, 0.4))
     before, after = subset_of(cloud, np.arange(VICTIM)), subset_of(cloud, np.arange(VICTIM, len(cloud)))
@@ -53,7 +53,7 @@ def crowd() -> SplatCloud:
 
 
 def corrupted(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
-    """The cloud from arrays in which fields of the victim have other values; it may be left out."""
+    """The cloud with other values in fields of the victim, which is dropped if invalid."""
     arrays = {name: getattr(cloud, name).copy() for name in BROKEN}
     for name, value in changes.items():
         arrays[name][VICTIM] = value
@@ -63,7 +63,7 @@ def corrupted(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
 
 
 def broken_fields(cloud: SplatCloud) -> Iterator[tuple[str, dict[str, Any]]]:
-    """A name and what to change, for every field, each of its components, and every broken value."""
+    """Name and changed fields, for each field, component and broken value."""
     for name, values in BROKEN.items():
         field = getattr(cloud, name)[VICTIM]
         for value in values:
@@ -95,27 +95,27 @@ def e1(renderer: Renderer) -> Found:
     yield FrameSpec(corrupted(cloud, {"means": (1e15, -1e15, 1e15)}), VIEW)
     cloud = crowd()
     without = subset_of(cloud, np.delete(np.arange(len(cloud)), VICTIM))
-    wanted = renderer.render(without, VIEW, ALL_OUTPUTS)
+    expected = renderer.render(without, VIEW, ALL_OUTPUTS)
     different = miscounted = tried = 0
     for _, changes in broken_fields(cloud):
         bad = corrupted(cloud, changes)
         frame = renderer.render(bad, VIEW, ALL_OUTPUTS)
-        same = all(np.array_equal(frame[name], wanted[name]) for name in ALL_OUTPUTS)
+        same = all(np.array_equal(frame[name], expected[name]) for name in ALL_OUTPUTS)
         different += not same
         counted = sum(bad.dropped.values()) == 1 and len(bad) == len(without)
-        miscounted += not (counted and frame.stats == wanted.stats)
+        miscounted += not (counted and frame.stats == expected.stats)
         tried += 1
-    yield Finding(f"of {tried} broken values, those that leave a trace in the picture", different, 0)
-    yield Finding("those that are not counted as one splat left out", miscounted, 0)
+    yield Finding(f"of {tried} broken values, those that change the image", different, 0)
+    yield Finding("those that are not counted as one dropped splat", miscounted, 0)
 
 
 @case(
     "E2",
-    "centres far off the picture",
-    "1e3 to 1e15 pixels off, with disks that reach into the picture and without",
+    "centres far outside of the image",
+    "1e3 to 1e15 pixels outside, with disks that reach into the image and without",
 )
 def e2(renderer: Renderer) -> Found:
-    # disks whose centres fall far off the picture and whose rims reach into it
+    # disks whose centres project far outside of the image and whose rims reach into it
     generator = np.random.default_rng(42)
     for pixels in (1e3, 1e6, 1e9, 1e12):
         n = 24
@@ -127,12 +127,12 @@ def e2(renderer: Renderer) -> Found:
         quats = [rotation((0, 0, 1), degrees) for degrees in generator.uniform(0, 180, n)]
         colors = generator.uniform(0, 1, (n, 3))
         yield FrameSpec(splats(means, quats, scales, generator.uniform(0.3, 1.0, n), colors), VIEW)
-    # the same far ahead: a centre that projects to 1e6 pixels and more because its depth is next to nothing
+    # centres that project to 1e6 pixels and more because of a tiny depth
     means = np.column_stack([generator.uniform(-2, 2, (40, 2)), 10 ** generator.uniform(-7, -1, 40)])
     yield FrameSpec(
         splats(means, generator.normal(size=(40, 4)), (0.5, 0.8), 0.8), camera(60, 45, 48.0, near=1e-8)
     )
-    # off the picture by 2 pixels to 1e15: no tile has them, and no edge tile is one off
+    # 2 to 1e15 pixels outside: no tile lists them
     pairs = visible = 0
     for pixels in (2.5, 1e2, 1e6, 1e9, 1e12, 1e15):
         for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1)):
@@ -141,17 +141,17 @@ def e2(renderer: Renderer) -> Found:
             stats = renderer.render(splats(mean, (1, 0, 0, 0), (1e-6, 1e-6)), VIEW, quality=CATALOGUED).stats
             pairs, visible = pairs + stats["pairs"], visible + stats["visible"]
     if not renderer.device.always_float64:  # the reference has no bounds
-        yield Finding("splats off the picture that are not culled", visible, 0)
+        yield Finding("splats outside of the image that are not culled", visible, 0)
     yield Finding("tiles that list them", pairs, 0)
 
 
 @case(
     "E3",
-    "more pairs of splats and tiles than an integer or the memory holds",
+    "more splat-tile pairs than an integer or the memory holds",
     "list lengths that add up to 2^31 - 1 .. 5 * 2^32 + 17; budgets from one pair upwards",
 )
 def e3(renderer: Renderer) -> Found:
-    # pairs of splats and tiles: sums beyond 32 bits, and a picture that is drawn in bands of tiles
+    # sums beyond 32 bits, and a frame that is rendered in bands of tiles
     backend = renderer.backend
     if not isinstance(backend, Probed):
         return
@@ -167,21 +167,21 @@ def e3(renderer: Renderer) -> Found:
             if lengths.max() >= 2**32:
                 continue
             starts, counted = backend.probe().scan(pipeline, lengths.astype(np.uint32))
-            places = np.concatenate([[0], np.cumsum(lengths)]) % 2**32
-            wrong += counted != total or not np.array_equal(starts, places)
-    yield Finding("sums of list lengths around 2^31 and 2^32 that are wrong", wrong, 0)
+            expected = np.concatenate([[0], np.cumsum(lengths)]) % 2**32
+            wrong += counted != total or not np.array_equal(starts, expected)
+    yield Finding("wrong sums of list lengths around 2^31 and 2^32", wrong, 0)
 
-    whole = renderer.render(cloud, VIEW, ALL_OUTPUTS)
+    unbanded = renderer.render(cloud, VIEW, ALL_OUTPUTS)
     budget = backend.pair_budget
     different = 0
     try:
-        for backend.pair_budget in (1, 37, whole.stats["pairs"] // 2, whole.stats["pairs"] - 1):
+        for backend.pair_budget in (1, 37, unbanded.stats["pairs"] // 2, unbanded.stats["pairs"] - 1):
             banded = renderer.render(cloud, VIEW, ALL_OUTPUTS)
-            different += not all(np.array_equal(banded[name], whole[name]) for name in ALL_OUTPUTS)
-            different += banded.stats != whole.stats
+            different += not all(np.array_equal(banded[name], unbanded[name]) for name in ALL_OUTPUTS)
+            different += banded.stats != unbanded.stats
     finally:
         backend.pair_budget = budget
-    yield Finding("budgets of 1 pair to all but one that change a bit of the picture", different, 0)
+    yield Finding("pair budgets from 1 to all but one that change the image", different, 0)
 
 
 SIZES = (
@@ -192,23 +192,23 @@ SIZES = (
 
 
 def sized(width: int, height: int) -> Camera:
-    """A camera that sees the crowd in a picture of any shape."""
+    """A camera that sees the crowd in an image of any shape."""
     focal = 0.8 * max(width, height)
     return Camera.pinhole(width, height, focal, focal, width / 2, height / 2)
 
 
 @case(
     "E4",
-    "empty and degenerate pictures",
+    "empty and degenerate images",
     "0 splats, 0 visible, 1 pair in 80 tiles; 1 x 1 to 16384 x 1 pixels, no multiples of a tile",
 )
 def e4(renderer: Renderer) -> Found:
     cloud = random_splats(12, 44, depth=(1.0, 4.0), scale=(0.05, 0.6), across=0.8)
     for width, height in SIZES:
         yield FrameSpec(cloud, sized(width, height))
-    dot = splats([[0.0, 0.0, 2.0]], (1, 0, 0, 0), (1e-3, 1e-3))
-    yield FrameSpec(dot, sized(160, 120))  # one pair, many tiles
-    yield FrameSpec(dot, sized(160, 120), outputs=ALL_OUTPUTS)
+    tiny = splats([[0.0, 0.0, 2.0]], (1, 0, 0, 0), (1e-3, 1e-3))
+    yield FrameSpec(tiny, sized(160, 120))  # one pair, many tiles
+    yield FrameSpec(tiny, sized(160, 120), outputs=ALL_OUTPUTS)
     nothing = SplatCloud.empty()
     behind = splats([[0.0, 0.0, -3.0]], (1, 0, 0, 0), (0.1, 0.1))
     clear = splats([[0.0, 0.0, 2.0]], (1, 0, 0, 0), (0.1, 0.1), 0.0)
@@ -216,7 +216,7 @@ def e4(renderer: Renderer) -> Found:
     background = (0.25, 0.5, 0.75)
     for cloud in (nothing, behind, clear):
         for width, height in ((1, 1), (60, 45), (3000, 1)):
-            # after a crowded picture, so that what it left behind would be seen
+            # after a crowded frame, so that stale buffers would be visible
             renderer.render(crowd(), sized(width, height), ALL_OUTPUTS)
             frame = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, background=background)
             empty = np.array_equal(frame["rgb"], np.broadcast_to(background, (height, width, 3)))
@@ -224,14 +224,14 @@ def e4(renderer: Renderer) -> Found:
             empty &= bool((frame["label"] == -1).all())
             wrong += not empty
             counted += frame.stats["visible"] + frame.stats["pairs"]
-    yield Finding("pictures of nothing that are not the background", wrong, 0)
+    yield Finding("empty frames that differ from the background", wrong, 0)
     if not renderer.device.always_float64:
         yield Finding("splats and pairs counted in them", counted, 0)
 
 
-@case("E5", "memory that nothing has written", "all buffers filled with 0xFF before the picture")
+@case("E5", "unwritten memory", "all buffers filled with 0xFF before the frame")
 def e5(renderer: Renderer) -> Found:
-    # buffers full of NaN before the picture is drawn: nothing of them may survive
+    # buffers full of NaN before the frame: none may survive
     backend = renderer.backend
     if not isinstance(backend, Probed):
         return
@@ -242,6 +242,6 @@ def e5(renderer: Renderer) -> Found:
                 clean = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, quality)
                 with backend.probe().poisoned():
                     frame = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, quality)
-                    drawn = {name: frame[name] for name in ALL_OUTPUTS}
-                different += not all(np.array_equal(drawn[name], clean[name]) for name in ALL_OUTPUTS)
-    yield Finding("pictures that change when their buffers held NaN", different, 0)
+                    poisoned = {name: frame[name] for name in ALL_OUTPUTS}
+                different += not all(np.array_equal(poisoned[name], clean[name]) for name in ALL_OUTPUTS)
+    yield Finding("frames that change when their buffers held NaN", different, 0)

@@ -55,7 +55,7 @@ def test_a_good_device_passes(renderer):
     assert result.failures == []
     assert said == ["arithmetic", "A1: a good case"]
     (only,) = result.groups["A"]
-    assert (only.pictures, only.passed) == (1, True)
+    assert (only.frames, only.passed) == (1, True)
     assert set(only.largest) == set(only.uncertified) == {"rgb", "alpha", "depth"}
     assert only.uncertified["rgb"] <= 2e-5
     assert result.worst is not None
@@ -67,8 +67,8 @@ def test_a_good_device_passes(renderer):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda name, plane: plane + (name == "alpha") * np.float32(1e-4), "alpha is wrong by"),
-        (lambda name, plane: plane * np.float32(1 + (name == "depth") * 1e-2), "depth is wrong by"),
+        (lambda name, plane: plane + (name == "alpha") * np.float32(1e-4), "alpha has an error of"),
+        (lambda name, plane: plane * np.float32(1 + (name == "depth") * 1e-2), "depth has an error of"),
         (lambda name, plane: np.where(plane > 9, plane, np.nan), "not finite"),
     ],
 )
