@@ -41,12 +41,13 @@ def made_stores(folder):
         return {name: made_store(folder, cloud, name) for name, cloud in clouds.items()}
 
 
-def look(fov=60.0, turn=(1.0, 0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0), **given):
+def look(fov=60.0, turn=(1.0, 0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0), aspect=1.0, **given):
+    """A camera of SIZE pixels. aspect: fy / fx."""
     camera = fs.Camera.look_at(*SIZE, math.radians(fov), position=(0, 0, 0), target=(0, 0, 1))
     pose = np.linalg.inv(rigid_matrix(at, turn))
     focal = given.pop("focal", camera.fx)
     center = given.pop("center", (SIZE[0] / 2, SIZE[1] / 2))
-    return fs.Camera.pinhole(*SIZE, focal, focal, *center, pose, **given)
+    return fs.Camera.pinhole(*SIZE, focal, aspect * focal, *center, pose, **given)
 
 
 TURNED = (0.8, 0.1, -0.5, 0.2)

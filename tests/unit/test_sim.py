@@ -93,6 +93,40 @@ def test_a_marker_is_read_where_its_body_is_by_a_fixed_camera_and_by_one_that_mo
     )
 
 
+def test_cameras_off_the_origin_have_the_images_of_a_scene_put_together_by_hand(scene, renderer):
+    """Pixels that are not square, a principal point aside, a camera mounted askew, and splats out of view."""
+    rng = np.random.default_rng(3)
+    mount = rigid_matrix((0.3, -0.2, 0.1), (0.9, 0.1, -0.05, 0.2))
+    base = rigid_matrix((1.0, -0.7, -2.0), (0.95, -0.05, 0.2, 0.1))
+    around = rng.uniform(-4, 4, (200, 3))  # most of them beside the image or behind it
+    sizes = rng.uniform(0.02, 0.2, (200, 2))
+    cloud = fs.SplatCloud(
+        around, rng.normal(size=(200, 4)), sizes, rng.random(200), sh=0.3 * rng.normal(size=(200, 9, 3))
+    )
+    made = fs.Scene([cloud], markers=scene.markers)
+
+    def seen_from(eye):
+        return fs.Camera.pinhole(*SIZE, 150, 190, 70, 66, np.linalg.inv(eye))
+
+    cameras = {"fixed": seen_from(base), "mounted": RigCamera(seen_from(mount), body="robot")}
+    own = Rig(made, {1: "box"}, cameras, renderer=renderer, outputs=("rgb", "depth"))
+    poses = {"box": np.stack([a_pose() for _ in range(2)])}
+    poses["robot"] = np.stack([compose(pose_of(base), a_pose(0.1, 0.05)) for _ in range(2)])
+    pictures = own.render(poses)
+    for i in range(2):
+        (tag,) = scene.markers
+        placed = PlacedMarker(tag.marker, matrix_of(poses["box"][i]) @ tag.pose)
+        eyes = {"fixed": base, "mounted": matrix_of(poses["robot"][i]) @ mount}
+        for name, eye in eyes.items():
+            alone = fs.Scene([cloud], seen_from(eye), [placed])
+            wanted = renderer.render(alone, outputs=("rgb", "depth"))
+            assert (wanted["rgb"] > 0).any(axis=2).mean() > 0.05
+            frame = pictures.of(name).frame(i)
+            for output, off in (("rgb", 1e-5), ("depth", 1e-4)):
+                wrong = np.abs(frame[output] - wanted[output]) > off
+                assert wrong.mean() < 2e-3, (name, i, output)  # float32 poses at thresholds
+
+
 def test_arrays_in_the_rigs_order_say_the_same_as_names(rig):
     poses = some_poses(1)
     assert rig.bodies == ("box", "robot")

@@ -24,6 +24,10 @@ from fidsplat.streaming.level_of_detail import select
 CAPTURES = {
     "pinhole": fs.Capture(look(turn=TURNED)),
     "off-centre": fs.Capture(look(center=(-30.0, 50.0), turn=TURNED)),
+    "aside": fs.Capture(look(50, turn=TURNED, at=(1.5, -0.8, -2.0), aspect=1.4, center=(12.0, 20.0))),
+    "fisheye, aside": fs.Capture(
+        look(focal=20.0, turn=TURNED, at=(-1.0, 2.5, 1.5), aspect=0.7, lens=fs.Fisheye(k1=0.02))
+    ),
     "near and far": fs.Capture(look(90, near=0.5, far=2.0)),
     "no low-pass": fs.Capture(look(at=(2, 1, -1), turn=TURNED), quality="lowpass=none"),
     "high cut-off": fs.Capture(look(turn=TURNED), quality="gsplat"),
@@ -61,7 +65,8 @@ def reference():
 
 @pytest.mark.parametrize("name", CAPTURES)
 def test_views_are_drawn_of_what_they_see(stores, reference, name):
-    kinds = ["thick"] if name in ("pinhole", "off-centre", "fisheye") else []
+    kinds = ["thick"] if name in ("pinhole", "off-centre", "fisheye", "aside") else []
+    kinds += ["sh"] if "aside" in name else []  # whose colours follow the position of the camera
     for kind in ["disks", *kinds]:
         store, capture = stores[kind], CAPTURES[name].with_(outputs=("rgb", "splat_id", "label"))
         resident = reference.upload(store)
@@ -71,7 +76,7 @@ def test_views_are_drawn_of_what_they_see(stores, reference, name):
         assert whole["rgb"].any()
         read, every = resident.data.nodes, store.chunks
         assert 0 < read <= every
-        if name in ("pinhole", "distorted", "pixel"):
+        if name in ("pinhole", "distorted", "pixel", "aside"):
             assert read < 0.75 * every
 
 
