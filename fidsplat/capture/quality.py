@@ -84,7 +84,7 @@ class MarkerQuality:
 @dataclass(frozen=True)
 class Quality:
     """Knobs of one rendering. What they leave out of an image has no bound that holds for every scene: the
-    output `error` bounds it for one frame (docs/quality.md).
+    output `error` bounds it for one frame (docs/accuracy.md).
 
     Raises:
         InputError: a value lies outside its range; the message names the range.

@@ -108,7 +108,7 @@ OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
 """outputs that captures can request and backends render"""
 COMPOSED = {
     "error": Output(
-        "error", 1, "float32", "certified upper bound of the error of rgb (docs/quality.md)", "count"
+        "error", 1, "float32", "certified upper bound of the error of rgb (docs/accuracy.md)", "count"
     ),
 }
 """outputs that are computed from two renderings (fidsplat/render/certified_error.py)"""

@@ -15,6 +15,8 @@ from fidsplat.util.files import atomic_write, printable, writable_folder
 from fidsplat.util.markdown import escaped
 
 NOTHING = "-"
+BEGIN, END = "<!-- begin generated -->", "<!-- end generated -->"
+"""lines around the generated block of a page that is otherwise written by hand"""
 
 
 def places(out: Path, name: str = "report.md") -> tuple[Path, Path]:
@@ -33,6 +35,28 @@ def write_page(page: Path, folder: Path, template: str, context: Mapping[str, An
         context: what the template needs; pandas tables are filtered by `table`. Text is escaped, as names of
             data sets and files may hold HTML; Markdown of our own is a `Markup`.
     """
+    _write(page, _filled(page, folder, template, context))
+
+
+def has_block(page: Path) -> bool:
+    """Whether a page exists and has a generated block."""
+    return page.is_file() and BEGIN in page.read_text("utf-8").splitlines()
+
+
+def write_block(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> None:
+    """Replace the generated block of a page. Arguments: as `write_page`."""
+    before, _, rest = page.read_text("utf-8").partition(f"{BEGIN}\n")
+    _, _, after = rest.partition(f"{END}\n")
+    block = _filled(page, folder, template, context)
+    _write(page, f"{before}{BEGIN}\n{block}{END}\n{after}")
+
+
+def _write(page: Path, text: str) -> None:
+    with atomic_write(page) as stream:
+        stream.write(printable(text).encode())
+
+
+def _filled(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> str:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
         undefined=jinja2.StrictUndefined,
@@ -43,9 +67,7 @@ def write_page(page: Path, folder: Path, template: str, context: Mapping[str, An
     )
     environment.filters |= {"table": markdown_table, "number": number, "percent": percent, "listed": listed}
     beside = "" if folder == page.parent else f"{folder.name}/"
-    text = environment.get_template(template).render(**context, folder=beside)
-    with atomic_write(page) as stream:
-        stream.write(printable(text).encode())
+    return environment.get_template(template).render(**context, folder=beside)
 
 
 def markdown_table(frame: Frame) -> Markup:

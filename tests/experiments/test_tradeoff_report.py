@@ -114,13 +114,13 @@ def write(folder, records: list[Record]) -> None:
 @pytest.mark.parametrize(
     ("setting", "wanted"),
     [
-        (("alpha_cutoff", "1/1024"), "buys accuracy"),
-        (("alpha_cutoff", "4/255"), "buys time"),
-        (("transmittance_stop", "1/512"), "free time"),
-        (("transmittance_stop", "0"), "waste"),
-        (("opacity_ceiling", "0.99"), "trap"),
+        (("alpha_cutoff", "1/1024"), "slower, more accurate"),
+        (("alpha_cutoff", "4/255"), "faster, less accurate"),
+        (("transmittance_stop", "1/512"), "faster"),
+        (("transmittance_stop", "0"), "slower"),
+        (("opacity_ceiling", "0.99"), "dominated"),
         (("setup_precision", "float32"), "no difference"),
-        (("arithmetic", "fast"), "free accuracy"),
+        (("arithmetic", "fast"), "more accurate"),
     ],
 )
 def test_a_verdict_follows_from_time_and_error(setting, wanted):
@@ -191,25 +191,35 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
     text = page.read_text()
     for words in (
         "**A processor**: `standard` is 100 times as accurate as gsplat's constants (+30 % time on r100k",
-        "At gsplat's error the quickest setting has -10.0 % time; in gsplat's time the most accurate one",
+        "At gsplat's error, the fastest setting has -10.0 % time; in gsplat's time, the most accurate one",
         "](accuracy/cpu.svg)",
         "](accuracy/gpu.svg)",
-        "| alpha below 1/255 is not drawn | 3DGS, 2DGS, gsplat | -40 % | -40 % | 0.019 | 0.019 | buys time |",
-        "| alpha is at most 0.99 | 3DGS, 2DGS, gsplat | +0.5 % | +0.5 % | 0.01 | 0.01 | trap |",
-        "at T = 1e-4 | our `standard` | +0.0 % | +0.0 % | 0.0001 | 0.0001 | no gain, invisible |",
-        "It is at most 0.0004 wrong on every scene here",
+        "is skipped | 3DGS, 2DGS, gsplat | -40 % | -40 % | 0.019 | 0.019 | faster, less accurate |",
+        "| alpha is clamped to 0.99 | 3DGS, 2DGS, gsplat | +0.5 % | +0.5 % | 0.01 | 0.01 | dominated |",
+        "at T = 1e-4 | our `standard` | +0.0 % | +0.0 % | 0.0001 | 0.0001 | no effect |",
+        "The largest error of `standard` on these scenes is 0.0004",
         "- cpu, random scenes: alpha_cutoff 1/1024 (r100k_720p +25 %)",
         "| exact | 25 | +0.0 % | 36.0 | 0.05 | 40 |",
         "| `ewa`: as 3DGS and gsplat | +0.0 % | 0.4 |",
         "| `exact` | +50 % | 0.01 |",
         "| 3 | - | - | - | 0.58 |",
-        "in gsplat's time the most accurate one is 20 times",
+        "in gsplat's time, the most accurate one is 20 times",
         "at most 2.5e-07 from the NumPy reference",
         "[cpu.csv](accuracy/cpu.csv), [gpu.csv](accuracy/gpu.csv)",
         "| A card, 34 | A card, driver 2 | abc/123 | 2026-11-21 |",
     ):
         assert words in text, words
     assert len(text.split()) < 1500
+
+    # a page with a generated block keeps the rest
+    other = tmp_path / "docs" / "block.md"
+    other.write_text("# Ours\n<!-- begin generated -->\nold\n<!-- end generated -->\nmore\n")
+    report.write_report([tmp_path / "cpu"], other)
+    kept = other.read_text()
+    assert kept.startswith("# Ours\n<!-- begin generated -->\n- **A processor**")
+    assert kept.endswith("<!-- end generated -->\nmore\n")
+    assert "old" not in kept.split()
+    assert "## Method" in (tmp_path / "docs" / "block" / "report.md").read_text()
 
     # the page can be made again from its own tables, and these are small
     before = {file: file.read_bytes() for file in (tmp_path / "docs").rglob("*.*")}
@@ -224,7 +234,7 @@ def test_a_device_that_drew_3d_gaussians_alone_takes_nothing_from_the_others(tmp
     report.write_report([tmp_path / "a", tmp_path / "b"], tmp_path / "page.md")
     text = (tmp_path / "page.md").read_text()
     for words in (
-        "| alpha below 1/255 is not drawn | 3DGS, 2DGS, gsplat | -40 % | 0.019 |",
+        "| alpha below 1/255 is skipped | 3DGS, 2DGS, gsplat | -40 % | 0.019 |",
         "| `exact` | +50 % | 0.01 |",
         "| A processor (cpu), 17 |",
         "| A processor (cpu-2), 5 |",
@@ -311,7 +321,7 @@ def test_refused_settings_are_named(tmp_path):
     write(tmp_path / "a", records)
     assert main(["tradeoff", "report", str(tmp_path / "a")]) == 0
     text = (tmp_path / "a" / "report.md").read_text()
-    assert "Not drawn: samples 3 (no such samples)." in text
+    assert "Not rendered: samples 3 (no such samples)." in text
 
 
 def test_a_few_results_are_enough(tmp_path):

@@ -22,7 +22,7 @@ COUNTS = (2, 70_000)
 
 _OUTPUTS = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
 _STANDARD = Quality()
-_SHARP = Quality(lowpass="none", samples=3)  # what docs/quality.md advises for dense codes
+_SHARP = Quality(lowpass="none", samples=3)  # what docs/accuracy.md advises for dense codes
 MARKER, DISKS, CAPTURE = "a marker", "disks", "a capture"
 """boxes on a plane, 2D splats, 3D Gaussians"""
 

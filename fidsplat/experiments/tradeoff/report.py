@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from fidsplat.experiments.charts import Axes, chart, label_points, literal, plain_ticks
-from fidsplat.experiments.pages import fixed, number, percent, places, write_page
+from fidsplat.experiments.pages import fixed, has_block, number, percent, places, write_block, write_page
 from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.tradeoff.linear import ANGLES, DISTANCES
 from fidsplat.experiments.tradeoff.points import ALONE, MARKER_KNOB, PRESETS_KNOB, TOGETHER
@@ -40,18 +40,14 @@ class Constant(NamedTuple):
 
 
 CONSTANTS = (
-    Constant("alpha below 1/255 is not drawn", "3DGS, 2DGS, gsplat", ALONE, "alpha_cutoff 1/255"),
-    Constant("a splat ends at 3 sigma", "3DGS, 2DGS (bounding boxes)", ALONE, "alpha_cutoff 3 sigma"),
-    Constant("a pixel is finished at T = 1e-4", "our `standard`", ALONE, "transmittance_stop 0.0001"),
-    Constant("a pixel is finished at T = 1/256", "our `fast`", ALONE, "transmittance_stop 1/256"),
-    Constant(
-        "stop at 1e-4, and the last fragment is dropped", "3DGS, 2DGS, gsplat", ALONE, "stop_rule exclusive"
-    ),
-    Constant("alpha is at most 0.99", "3DGS, 2DGS, gsplat", ALONE, "opacity_ceiling 0.99"),
-    Constant(
-        "set-up of each splat in float32", "3DGS, 2DGS, gsplat, our `fast`", ALONE, "setup_precision float32"
-    ),
-    Constant("exponentials by our own polynomials", "our `standard`, `fast`", ALONE, "arithmetic fast"),
+    Constant("alpha below 1/255 is skipped", "3DGS, 2DGS, gsplat", ALONE, "alpha_cutoff 1/255"),
+    Constant("splats are truncated at 3 sigma", "3DGS, 2DGS (bounding boxes)", ALONE, "alpha_cutoff 3 sigma"),
+    Constant("blending stops at T = 1e-4", "our `standard`", ALONE, "transmittance_stop 0.0001"),
+    Constant("blending stops at T = 1/256", "our `fast`", ALONE, "transmittance_stop 1/256"),
+    Constant("stop at 1e-4 without the last fragment", "3DGS, 2DGS, gsplat", ALONE, "stop_rule exclusive"),
+    Constant("alpha is clamped to 0.99", "3DGS, 2DGS, gsplat", ALONE, "opacity_ceiling 0.99"),
+    Constant("projection in float32", "3DGS, 2DGS, gsplat, our `fast`", ALONE, "setup_precision float32"),
+    Constant("exponentials by polynomials", "our `standard`, `fast`", ALONE, "arithmetic fast"),
     Constant("**`gsplat`**: gsplat's constants together", "gsplat, 2DGS", PRESETS_KNOB, "gsplat"),
     Constant("**`fast`**: 2/255, T = 1/256, float32 set-up", "ours", PRESETS_KNOB, "fast"),
     Constant("**`standard`**: 1e-5, T = 1e-4, exponentials", "ours", PRESETS_KNOB, "standard"),
@@ -80,6 +76,9 @@ _LABELLED = {
 def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
     """Write the page, and for each device a chart and its results as a table; returns the files, the page
     first. From the folder of those tables the same page can be made again.
+
+    A page that exists with a generated block (`pages.BEGIN`) keeps its text: the block is replaced by a
+    summary, and the complete report is written as report.md next to the tables.
 
     Args:
         folders: where results lie, see `load`.
@@ -131,8 +130,13 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
         "marker": f"{MARKER} at {TILT} degrees",
         "invisible": INVISIBLE,
     }
-    write_page(page, folder, "accuracy.md.j2", context)
-    return [page, *files]
+    if not has_block(page):
+        write_page(page, folder, "accuracy.md.j2", context | {"summary": False})
+        return [page, *files]
+    write_block(page, folder, "accuracy_summary.md.j2", context | {"summary": True})
+    complete = folder / "report.md"
+    write_page(complete, folder, "accuracy.md.j2", context | {"summary": False})
+    return [page, complete, *files]
 
 
 def write_plot(folders: Sequence[Path], file: Path) -> None:
@@ -205,7 +209,7 @@ def constants_table(devices: Sequence[Device]) -> Frame:
     for what nobody measured."""
     rows = []
     for constant in CONSTANTS:
-        row: dict[str, str] = {"constant": constant.words, "who has it": constant.users}
+        row: dict[str, str] = {"constant": constant.words, "used by": constant.users}
         there = False
         shared = _shared(devices)
         for scene in (shared, HARD) if any(HARD in device.scenes for device in devices) else (shared,):
@@ -222,7 +226,7 @@ def constants_table(devices: Sequence[Device]) -> Frame:
             there |= bool(worst)
             row[f"largest error, {scene}"] = number(max(worst, default=None))
         verdicts = [_verdict(device, constant) for device in devices]
-        row["so it is"] = " / ".join(dict.fromkeys(word for word in verdicts if word))
+        row["verdict"] = " / ".join(dict.fromkeys(word for word in verdicts if word))
         if there:
             rows.append(row)
     return pd.DataFrame(rows)
@@ -234,7 +238,7 @@ def _verdict(device: Device, constant: Constant) -> str:
     if point is None or exact is None:
         return ""
     verdict = device.verdict(point, exact)
-    return "no gain, invisible" if verdict == "trap" and point["maximum"] <= INVISIBLE / 2 else verdict
+    return "no effect" if verdict == "dominated" and point["maximum"] <= INVISIBLE / 2 else verdict
 
 
 def ways_table(devices: Sequence[Device]) -> Frame:

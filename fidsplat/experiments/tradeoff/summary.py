@@ -37,8 +37,9 @@ _NOTHING = "nothing"
 _TINY = 1e-6
 """errors below this are rounding, and equal"""
 _VERDICTS = {
-    (0, -1): "free accuracy", (-1, -1): "free accuracy", (1, -1): "buys accuracy", (-1, 0): "free time",
-    (-1, 1): "buys time", (0, 1): "trap", (1, 1): "trap", (1, 0): "waste", (0, 0): "no difference",
+    (0, -1): "more accurate", (-1, -1): "more accurate", (1, -1): "slower, more accurate", (-1, 0): "faster",
+    (-1, 1): "faster, less accurate", (0, 1): "dominated", (1, 1): "dominated", (1, 0): "slower",
+    (0, 0): "no difference",
 }  # fmt: skip
 
 
