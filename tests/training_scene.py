@@ -70,7 +70,7 @@ def write(made, folder):
     for place, views in ((folder, made.views), (folder / "test", made.held_out)):
         (place / "images").mkdir(parents=True)
         for view in views:
-            write_png(place / "images" / view.name, view.picture)
+            write_png(place / "images" / view.name, view.image)
         names, cameras = [view.name for view in views], [view.camera for view in views]
         save_colmap(place / "sparse" / "0", names, cameras, made.points, made.colors)
     (folder / "dataset.json").write_text(json.dumps({"background": BACKGROUND}))

@@ -34,7 +34,7 @@ import fidsplat as fs
 from fidsplat.images.files import to_uint8
 from fidsplat.train import Dataset, Trainer, TrainSettings, load_dataset
 from fidsplat.train.dataset import TrainingView
-from fidsplat.train.parameters import Splats, first_splats
+from fidsplat.train.parameters import Splats, initial_splats
 from fidsplat.vision.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -81,7 +81,7 @@ class Peer:
             (
                 tensor(view.camera.world_to_camera[None]),
                 tensor(view.camera.matrix[None]),
-                torch.tensor(view.picture, device="cuda").float() / 255,
+                torch.tensor(view.image, device="cuda").float() / 255,
             )
             for view in dataset.views
         ]
@@ -242,7 +242,7 @@ def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[
 def train(dataset: Dataset, iterations: int, kind: type[Peer]) -> tuple[Peer, float]:
     """A whole training by a peer, and its seconds."""
     settings = TrainSettings(iterations=iterations)
-    peer = kind(first_splats(dataset, settings), settings, dataset)
+    peer = kind(initial_splats(dataset, settings), settings, dataset)
     strategy = gsplat.DefaultStrategy(
         prune_opa=settings.prune_opacity, key_for_gradient="gradient_2dgs", verbose=False
     )
@@ -280,7 +280,7 @@ def score(peer: Peer, views: tuple[TrainingView, ...]) -> float:
         place = tensor(camera.world_to_camera[None]), tensor(camera.matrix[None])
         with torch.no_grad():
             image, _ = peer.draw(*place, (camera.width, camera.height), 3)
-        found.append(psnr(to_uint8(image.cpu().numpy()) / 255.0, view.picture / 255.0))
+        found.append(psnr(to_uint8(image.cpu().numpy()) / 255.0, view.image / 255.0))
     return float(np.mean(found))
 
 

@@ -67,8 +67,8 @@ def draw_curves(history: Mapping[str, np.ndarray], file: Path) -> None:
 
 def beside(view: TrainingView, score: ViewScore) -> np.ndarray:
     """The picture, the splats, and four times their difference around grey, side by side."""
-    difference = 4 * (score.picture.astype(float) - view.picture) + 128
-    return np.hstack([view.picture, score.picture, np.clip(difference, 0, 255).astype(np.uint8)])
+    difference = 4 * (score.image.astype(float) - view.image) + 128
+    return np.hstack([view.image, score.image, np.clip(difference, 0, 255).astype(np.uint8)])
 
 
 def _means(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

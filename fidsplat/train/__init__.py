@@ -2,9 +2,9 @@
 
 from fidsplat.train.checkpoint import splats_of
 from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.dataset_files import load_dataset
 from fidsplat.train.memory import splats_within
 from fidsplat.train.parameters import TrainingError
-from fidsplat.train.read import load_dataset
 from fidsplat.train.refining import RefineStep, refine
 from fidsplat.train.scores import ViewScore
 from fidsplat.train.settings import TrainSettings

@@ -15,7 +15,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import MAX_DEGREE
 from fidsplat.train.dataset import Dataset
 from fidsplat.train.parameters import NAMES, Arrays, Splats
-from fidsplat.train.settings import MOST_ITERATIONS, TrainSettings
+from fidsplat.train.settings import MAX_ITERATIONS, TrainSettings
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json
 from fidsplat.util.npy import load_npz
@@ -26,27 +26,27 @@ _GROUPS = ("values", "first", "second")
 _VALUES = tuple(f"values.{name}" for name in NAMES)
 _HISTORY = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
 _MAY_DIFFER = ("iterations",)
-"""settings that do not change what an iteration does: a run may be made longer"""
+"""settings that may change on resuming: a run may be extended"""
 
 
 @dataclass
-class Progressed:
-    """How far a run has come."""
+class TrainingState:
+    """Progress of a training run: splats and history."""
 
     iteration: int
-    """iterations that are done"""
+    """number of completed iterations"""
     splats: Splats
     history: Arrays
-    """`losses` and `psnrs` (iteration,) float32, `counts` (iteration,) int32 of splats"""
+    """`losses` and `psnrs` (iteration,) float32, and numbers of splats `counts` (iteration,) int32"""
 
     @staticmethod
-    def begun(splats: Splats) -> Progressed:
-        """A run of no iteration yet."""
-        return Progressed(0, splats, {name: np.zeros(0, dtype) for name, dtype in _HISTORY.items()})
+    def initial(splats: Splats) -> TrainingState:
+        """State before the first iteration."""
+        return TrainingState(0, splats, {name: np.zeros(0, dtype) for name, dtype in _HISTORY.items()})
 
 
 def save_checkpoint(
-    file: Path, made: Progressed, settings: TrainSettings, dataset: Dataset, device: str
+    file: Path, made: TrainingState, settings: TrainSettings, dataset: Dataset, device: str
 ) -> None:
     """Write a checkpoint.
 
@@ -66,7 +66,7 @@ def save_checkpoint(
         "by": _made_by(device),
     }
     arrays = {f"{group}.{name}": getattr(made.splats, group)[name] for group in _GROUPS for name in NAMES}
-    arrays |= {"gradients": made.splats.gradients, "seen": made.splats.seen, **made.history}
+    arrays |= {"gradients": made.splats.gradient_sums, "seen": made.splats.visible_counts, **made.history}
     with atomic_write(file, durable=True) as stream:
         np.savez(stream, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
 
@@ -85,7 +85,7 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
         degree = whole_number("sh_degree", facts["settings"]["sh_degree"], 0, MAX_DEGREE)
         splats = Splats.of(_group(arrays, "values", len(arrays["values.means"]), degree))
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{file} is no checkpoint of `fidsplat train` that can be read: {error}") from error
+        raise InputError(f"cannot read {file} as a checkpoint of `fidsplat train`: {error}") from error
     values, (red, green, blue) = splats.values, background.tolist()
     with np.errstate(over="ignore"):  # the cloud leaves out splats whose scales overflow
         shapes = values["means"], values["quats"], splats.scales, splats.opacities
@@ -95,7 +95,7 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
 
 def load_checkpoint(
     file: Path, settings: TrainSettings, digest: str, device: str
-) -> tuple[Progressed, list[str]]:
+) -> tuple[TrainingState, list[str]]:
     """Read a checkpoint of the same run. Every array is checked before a device uses it.
 
     Args:
@@ -111,19 +111,18 @@ def load_checkpoint(
     try:
         arrays = load_npz(file)
         facts = _facts(arrays)
-        iteration = whole_number("iteration", facts["iteration"], 0, MOST_ITERATIONS)
+        iteration = whole_number("iteration", facts["iteration"], 0, MAX_ITERATIONS)
         before = [str(facts["by"][name]) for name in _made_by(device)]
         differ = _differences(facts, settings, digest)
-        made = None if differ else Progressed(iteration, *_state(arrays, settings, iteration))
+        made = None if differ else TrainingState(iteration, *_state(arrays, settings, iteration))
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{file} is no checkpoint that can be read: {error}; remove it, or give --overwrite to begin "
-            "again"
+            f"cannot read {file} as a checkpoint: {error}; remove it, or give --overwrite to start again"
         ) from error
     if made is None:
         raise InputError(
-            f"{file} is of a run with another {' and another '.join(differ)}; give another name with -o, or "
-            "--overwrite to begin again"
+            f"checkpoint {file} must be of the same run, got another {' and another '.join(differ)}; give "
+            "another name with -o, or --overwrite to start again"
         )
     now = zip(_made_by(device).items(), before, strict=True)
     return made, [f"another {name} ({was}, not {here})" for (name, here), was in now if was != here]
@@ -132,7 +131,7 @@ def load_checkpoint(
 def _facts(arrays: Arrays) -> dict[str, Any]:
     facts = from_json(arrays["facts"].tobytes())
     if not isinstance(facts, dict) or facts.get("format") != _FORMAT:
-        raise ValueError("it is of another version of fidsplat")
+        raise ValueError("its format is of another version of fidsplat")
     return facts
 
 
@@ -160,15 +159,15 @@ def _checked(arrays: Arrays, name: str, shape: tuple[int, ...], dtype: type = np
     """A writable copy of an array, which `arrays` releases."""
     array = arrays.pop(name)
     if array.dtype != dtype or array.shape != shape:
-        wanted = f"{np.dtype(dtype)} of the shape {shape}"
-        raise ValueError(f"{name} must be {wanted}, got {array.dtype} of the shape {array.shape}")
+        expected = f"{np.dtype(dtype)} of the shape {shape}"
+        raise ValueError(f"{name} must be {expected}, got {array.dtype} of the shape {array.shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite")
     return np.array(array, order="C")
 
 
 def _made_by(device: str) -> dict[str, str]:
-    """On what the bits of a run depend beside its settings and its data."""
+    """Device and sources, on which results depend in addition to settings and data."""
     return {"device": device, "fidsplat": f"{__version__}, sources {code_hash()}"}
 
 

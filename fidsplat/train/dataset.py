@@ -1,4 +1,4 @@
-"""A data set to train on: pictures with their cameras, points to start from."""
+"""Training data set: images with their cameras, and initial points."""
 
 from __future__ import annotations
 
@@ -18,70 +18,71 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.scalars import real_array
 
 FAR = 1e4
-"""extents from the world's origin beyond which means have an origin of their own: float32 would blur them"""
-_FACING, _AHEAD = 0.5, 3.0
-"""cosine from which cameras look at a point; extents, to which they see where they look at none"""
-MOST_POINTS = 2**31 - 1
-_STILL = 1e-9
-"""share of a camera's distance from the world's origin, below which movements are what rounding leaves"""
+"""distance from the world origin, in scene extents, beyond which means are relative to another origin, since
+float32 would round them"""
+_FACING, _RANDOM_DEPTH = 0.5, 3.0
+"""minimum cosine of cameras that face a common point; depth of random points otherwise, in scene extents"""
+MAX_POINTS = 2**31 - 1
+_MIN_EXTENT = 1e-9
+"""extent relative to the distance from the world origin below which camera motion is rounding error"""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """One picture and where it was taken."""
+    """One image with its camera."""
 
     name: str
     camera: Camera
-    picture: np.ndarray
+    image: np.ndarray
     """(h, w, 3) uint8 display values"""
     mask: np.ndarray | None = None
-    """(h, w) bool, False where the picture does not matter"""
+    """(h, w) bool, False for ignored pixels"""
 
     def __post_init__(self) -> None:
         text("the name of a training view", self.name)
         instance(f"the camera of {self.name}", self.camera, Camera)
-        instance(f"the picture {self.name}", self.picture, np.ndarray, "an array (h, w, 3) of uint8")
-        camera, shape = self.camera, self.picture.shape
-        if self.picture.dtype != np.uint8 or shape != (camera.height, camera.width, 3):
-            size = f"{shape[1]} x {shape[0]}" if len(shape) >= 2 else f"of the shape {shape}"
+        instance(f"the image {self.name}", self.image, np.ndarray, "an array (h, w, 3) of uint8")
+        camera, shape = self.camera, self.image.shape
+        if self.image.dtype != np.uint8 or shape != (camera.height, camera.width, 3):
+            size = f"{shape[1]} x {shape[0]}" if len(shape) >= 2 else f"the shape {shape}"
             raise InputError(
-                f"the picture {self.name} is {size}, but its camera has {camera.width} x {camera.height} "
-                "pixels; give pictures of the size that their cameras were found for"
+                f"the image {self.name} must be {camera.width} x {camera.height} pixels of uint8, as its "
+                f"camera, got {size}; give images of the size for which their cameras were found"
             )
         mask = self.mask
         if mask is not None and not (isinstance(mask, np.ndarray) and mask.dtype == bool and mask.ndim == 2):
             raise invalid(f"the mask of {self.name}", "an array (h, w) of bool, or None", mask)
         if self.mask is not None and self.mask.shape != shape[:2]:
             raise InputError(
-                f"the mask of {self.name} is {self.mask.shape[1]} x {self.mask.shape[0]}, its picture "
-                f"{shape[1]} x {shape[0]}; make them of one size"
+                f"the mask of {self.name} must be {shape[1]} x {shape[0]}, the size of its image, got "
+                f"{self.mask.shape[1]} x {self.mask.shape[0]}; resize one of them"
             )
         if camera.lens is not None:
             raise InputError(
-                f"the camera of {self.name} has a lens ({camera.lens.kind}), and pictures are trained on "
-                "without; undistort them first"
+                f"the camera of {self.name} must be a pinhole camera, got a lens ({camera.lens.kind}); "
+                "undistort the image first"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Views to train on, views to compare with, and points to start from. Checked when it is made.
+    """Training views, held-out views and initial points, checked when created.
 
     Raises:
-        InputError: fewer than two views, cameras that all stand at one place, points that no view sees.
+        InputError: fewer than two views, all cameras at one position, or all points behind a camera.
     """
 
     name: str
-    """where it comes from, for messages"""
+    """source, for messages"""
     views: tuple[TrainingView, ...]
     held_out: tuple[TrainingView, ...]
-    """views that are not trained on"""
+    """views for evaluation only"""
     points: np.ndarray
-    """(m, 3) float64, metres, in the world"""
+    """(m, 3) float64, world coordinates [m]"""
     colors: np.ndarray
     """(m, 3) uint8"""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """display values behind everything"""
+    """background colour, display values"""
 
     def __post_init__(self) -> None:
         text("the name of a data set", self.name)
@@ -98,44 +99,44 @@ class Dataset:
         object.__setattr__(self, "background", three_numbers("background", self.background))
         if len(self.views) < 2:
             raise InputError(
-                f"{self.name} has {len(self.views)} view{'' if len(self.views) == 1 else 's'} to train on; a "
-                "scene needs at least two, from different places"
+                f"{self.name} must have at least two training views, from different positions, got "
+                f"{len(self.views)}"
             )
-        if not self.extent > _STILL * max(np.abs(view.camera.position).max() for view in self.views):
+        if not self.extent > _MIN_EXTENT * max(np.abs(view.camera.position).max() for view in self.views):
             raise InputError(
-                f"all {len(self.views)} cameras of {self.name} stand at one place, from which no depth can "
-                "be told; give views from different places"
+                f"the {len(self.views)} cameras of {self.name} must be at different positions, got one, "
+                "which determines no depth; give views from different positions"
             )
         if len(self.points) and not np.isfinite(self.points).all():
-            raise InputError(f"points of {self.name} are not finite; export the model again")
+            raise InputError(f"the points of {self.name} must be finite; export the model again")
         for view in self.views if len(self.points) else ():
             if not (_depths(view.camera, self.points) > view.camera.near).any():
                 raise InputError(
-                    f"all {len(self.points)} points of {self.name} lie behind the camera of {view.name}; "
-                    "check that poses and points are of one model, and poses of the convention that the "
-                    "format has (COLMAP: world to camera; transforms.json: camera to world, looking along -z)"
+                    f"points of {self.name} must be in front of the camera of {view.name}, got all "
+                    f"{len(self.points)} behind it; check that poses and points are of one model, and the "
+                    "pose convention (COLMAP: world to camera; transforms.json: camera to world, looking "
+                    "along -z)"
                 )
 
     @cached_property
     def extent(self) -> float:
-        """Metres: 1.1 times the largest distance of a camera from their mean, as the authors' trainer has
-        it."""
+        """Scene extent [m]: 1.1 times the largest distance of a camera from their mean, as in 2DGS."""
         centers = np.array([view.camera.position for view in self.views])
         return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 
     @cached_property
     def origin(self) -> np.ndarray:
-        """(3,) float64: what the splats' means are relative to; 0 but for scenes far from it."""
+        """(3,) float64: origin of the splats' means; not 0 in scenes far from the world origin."""
         center = np.mean([view.camera.position for view in self.views], axis=0)
         return np.rint(center) if np.abs(center).max() > FAR * self.extent else np.zeros(3)
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of all that training depends on."""
+        """SHA-256 of all inputs of training."""
         found = hashlib.sha256(json.dumps(self.background).encode())
 
         def update(*arrays: np.ndarray | None) -> None:
-            for array in arrays:  # with types and shapes: a mask is never taken for part of a picture
+            for array in arrays:  # types and shapes distinguish a mask from a part of an image
                 found.update(b"-" if array is None else f"{array.dtype.str} {array.shape}".encode())
                 found.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
 
@@ -143,32 +144,32 @@ class Dataset:
             camera = view.camera
             lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
             found.update(json.dumps([view.name, *lens, camera.near, camera.far]).encode())
-            update(camera.world_to_camera, view.picture, view.mask)
+            update(camera.world_to_camera, view.image, view.mask)
         update(self.points, self.colors)
         return found.hexdigest()
 
     def with_random_points(self, count: int, seed: int) -> Dataset:
-        """The data set with points at random places, in random colours, where its cameras look: in a cube,
-        or, where most of them look ahead or around, before each to three extents."""
-        count = whole_number("the number of random points", count, 0, MOST_POINTS)
+        """The data set with random points of random colours: in the cube that the cameras face, or, without a
+        common point, in each camera's frustum up to a depth of three scene extents."""
+        count = whole_number("the number of random points", count, 0, MAX_POINTS)
         seed = whole_number("the seed", seed, 0, 2**63 - 1)
         cameras, draws = [view.camera for view in self.views], uniform(seed, Purpose.POINTS, 0, count)
         shades = uniform(seed, Purpose.POINTS, 0, count, draw=1)
-        low, high, faced = looked_at(cameras)
+        low, high, faced = viewed_cube(cameras)
         if faced:
             points = low + draws[:, :3] * (high - low)
         else:
-            points = _before(cameras, draws[:, :3], _AHEAD * self.extent)
+            points = _points_in_frustums(cameras, draws[:, :3], _RANDOM_DEPTH * self.extent)
         return replace(self, points=points, colors=(shades[:, :3] * 256).astype(np.uint8))
 
 
-def looked_at(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Corners (3,), (3,) of the cube around the point that is nearest to the axes of all cameras, as large as
-    they see there; and whether it lies before most of them."""
+def viewed_cube(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Corners (3,), (3,) of the cube around the point nearest to the optical axes of all cameras, as large as
+    their field of view at that point; and whether most cameras face it."""
     centers = np.array([camera.position for camera in cameras])
     axes = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    # of parallel axes the shortest solution, from their middle
+    # parallel axes have the least-norm solution, from their middle
     middle = centers.mean(0)
     shift = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers - middle), rcond=1e-6)[0]
     focus = middle + shift
@@ -183,12 +184,12 @@ def looked_at(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool]:
     return focus - reach, focus + reach, bool(along.mean() > _FACING * away.mean())
 
 
-def _before(cameras: Sequence[Camera], draws: np.ndarray, reach: float) -> np.ndarray:
-    """Points (n, 3) in what the cameras see, in turn, at depths up to a reach; draws: (n, 3) in (0, 1)."""
+def _points_in_frustums(cameras: Sequence[Camera], draws: np.ndarray, depth: float) -> np.ndarray:
+    """Points (n, 3) in the frustums of the cameras, round robin, up to a depth; draws: (n, 3) in (0, 1)."""
     points = np.empty(draws.shape)
     for number, camera in enumerate(cameras):
         mine = draws[number :: len(cameras)]
-        rays = camera.rays(mine[:, :2] * (camera.width, camera.height)) * (mine[:, 2:] * reach)
+        rays = camera.rays(mine[:, :2] * (camera.width, camera.height)) * (mine[:, 2:] * depth)
         points[number :: len(cameras)] = camera.position + rays @ camera.world_to_camera[:3, :3]
     return points
 

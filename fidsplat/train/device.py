@@ -12,10 +12,10 @@ from fidsplat.backends.derivatives import TakenBack, TrainingKernels
 from fidsplat.backends.interface import Images, ResidentData
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
-from fidsplat.train.densify import Plan, reset_logits
+from fidsplat.train.densify import Densification, limited_logits
 from fidsplat.train.losses import Loss
-from fidsplat.train.mcmc import CLEAR, STEEP
-from fidsplat.train.optimiser import REST_SHARE
+from fidsplat.train.mcmc import NOISE_CUTOFF, NOISE_SLOPE
+from fidsplat.train.optimiser import HIGHER_SH_RATE
 from fidsplat.train.parameters import NAMES, SHAPES, Splats
 from fidsplat.train.random_numbers import Purpose
 from fidsplat.train.settings import TrainSettings
@@ -32,7 +32,7 @@ class DeviceWork:
     ) -> None:
         self._kernels, self._settings = kernels, settings
         self.late = kernels.late
-        kernels.take_views([(view.picture, view.mask) for view in views])
+        kernels.take_views([(view.image, view.mask) for view in views])
         self._cameras = [view.camera for view in views]
         self._number = 0
 
@@ -44,7 +44,7 @@ class DeviceWork:
             for prefix, group in zip(_PREFIXES, groups, strict=True)
             for name in NAMES
         }
-        self._kernels.load(arrays | {"gradients": splats.gradients, "seen": splats.seen})
+        self._kernels.load(arrays | {"gradients": splats.gradient_sums, "seen": splats.visible_counts})
         self._number = len(splats)
 
     def store(self) -> Splats:
@@ -58,16 +58,16 @@ class DeviceWork:
         arrays = self._kernels.store((*SHAPES, *_COUNTED))
         return Splats({name: arrays[name] for name in SHAPES}, {}, {}, *(arrays[name] for name in _COUNTED))
 
-    def make(self, made: Plan) -> None:
+    def make(self, made: Densification) -> None:
         """Goes on with the splats of a plan, most of which never leaves the device."""
-        self._kernels.pick(made.rows, made.kept)
-        self._kernels.write({"means": made.means, "log_scales": made.log_scales}, made.moved)
+        self._kernels.pick(made.rows, made.remaining)
+        self._kernels.write({"means": made.means, "log_scales": made.log_scales}, made.first_split)
         self._kernels.clear(_COUNTED)
         self._number = len(made.rows)
 
     def reset(self) -> None:
         """Makes all faint, and forgets how their opacities moved."""
-        logits = reset_logits(self._kernels.store(("logits",))["logits"], self._settings)
+        logits = limited_logits(self._kernels.store(("logits",))["logits"], self._settings)
         self._kernels.load({"logits": logits})
         self._kernels.clear(("first_logits", "second_logits"))
 
@@ -115,7 +115,7 @@ class DeviceWork:
         }
         share = 1 / (1 - settings.beta1**step)
         sizes = {name: share * rate[of] for name, of in by_names.items()}
-        sizes["rest"] = REST_SHARE * sizes["sh"]
+        sizes["rest"] = HIGHER_SH_RATE * sizes["sh"]
         mcmc = settings.strategy == "mcmc"
         numbers = {
             **{"beta1": settings.beta1, "beta2": settings.beta2, "epsilon": settings.epsilon},
@@ -127,7 +127,7 @@ class DeviceWork:
         self._kernels.step(taken, sizes, numbers, camera, origin)
 
     def shake(self, iteration: int, rate: float) -> None:
-        """Moves the means at random (`fidsplat.train.mcmc.shake`)."""
+        """Moves the means at random (`fidsplat.train.mcmc.add_noise`)."""
         seed = self._settings.seed
         words = (seed & 0xFFFFFFFF, seed >> 32, iteration, int(Purpose.NOISE))
-        self._kernels.shake(rate * self._settings.noise, STEEP, 1 - CLEAR, words)
+        self._kernels.shake(rate * self._settings.noise, NOISE_SLOPE, 1 - NOISE_CUTOFF, words)

@@ -12,9 +12,9 @@ from fidsplat.backends.interface import Backend, Images, ResidentData
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
-from fidsplat.train.densify import Plan, reset_logits
-from fidsplat.train.losses import Loss, normal_loss, picture_loss
-from fidsplat.train.optimiser import adam_step, inner_gradients, moved_by, sparse_adam_step
+from fidsplat.train.densify import Densification, limited_logits
+from fidsplat.train.losses import Loss, image_loss, normal_loss
+from fidsplat.train.optimiser import adam_step, contributing, parameter_gradients, sparse_adam_step
 from fidsplat.train.parameters import Splats
 from fidsplat.train.settings import TrainSettings
 
@@ -41,19 +41,19 @@ class HostWork:
         return self._splats
 
     def shapes(self) -> Splats:
-        """As `store`, to look at: harmonics and what is remembered may be missing."""
+        """As `store`, to look at: harmonics and what is moments may be missing."""
         return self._splats
 
-    def make(self, made: Plan) -> None:
+    def make(self, made: Densification) -> None:
         """Goes on with the splats of a plan."""
-        self._splats = made.made(self._splats)
+        self._splats = made.apply(self._splats)
 
     def reset(self) -> None:
         """Makes all faint, and forgets how their opacities moved."""
         splats = self._splats
-        splats.values["logits"] = reset_logits(splats.values["logits"], self._settings)
-        for remembered in (splats.first, splats.second):
-            remembered["logits"][:] = 0
+        splats.values["logits"] = limited_logits(splats.values["logits"], self._settings)
+        for moments in (splats.first, splats.second):
+            moments["logits"][:] = 0
 
     def __len__(self) -> int:
         return len(self._splats)
@@ -65,8 +65,8 @@ class HostWork:
     def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], np.ndarray]:
         """What gives the loss of a picture of a view, by its number, and its derivative (h, w, 3)."""
         of = self._views[view]
-        truth = of.picture * np.float32(1 / 255)
-        loss, slope = picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
+        truth = of.image * np.float32(1 / 255)
+        loss, slope = image_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
         return lambda: loss, slope
 
     def surface(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
@@ -86,8 +86,8 @@ class HostWork:
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""
         splats = self._splats
-        splats.gradients += on_host(gradients["screen"])
-        splats.seen += seen(splats, camera, origin)
+        splats.gradient_sums += on_host(gradients["screen"])
+        splats.visible_counts += seen(splats, camera, origin)
 
     def step(
         self,
@@ -101,15 +101,15 @@ class HostWork:
         if camera is not None:
             self.count(gradients, camera, origin)
         given = {name: on_host(array) for name, array in gradients.items()}
-        inner = inner_gradients(self._splats, given, self._settings)
+        inner = parameter_gradients(self._splats, given, self._settings)
         if self._settings.sparse_adam:
-            sparse_adam_step(self._splats, moved_by(given), inner, rate, self._settings, step)
+            sparse_adam_step(self._splats, contributing(given), inner, rate, self._settings, step)
         else:
             adam_step(self._splats, inner, rate, self._settings, step)
 
     def shake(self, iteration: int, rate: float) -> None:
         """Moves the means at random."""
-        mcmc.shake(self._splats, self._settings, iteration, rate)
+        mcmc.add_noise(self._splats, self._settings, iteration, rate)
 
 
 def seen(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:

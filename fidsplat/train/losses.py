@@ -1,8 +1,8 @@
-"""The loss of one picture and its gradient: (1 - w) L1 + w (1 - SSIM), as 3DGS and 2DGS have it.
+"""Image loss of 3DGS and 2DGS, (1 - w) L1 + w (1 - SSIM), normal consistency, and their gradients.
 
-SSIM (Wang et al. 2004) has a Gaussian window of 11 pixels and sigma 1.5 for each channel, zeros beyond the
-picture, and is the mean over all pixels. Masked pixels are the truth's own in both pictures: they add
-nothing, and their gradient is 0. The kernels' twin is kernels/opencl/train/loss.cl.
+SSIM (Wang et al. 2004) has a Gaussian window of 11 pixels and sigma 1.5 for each channel and zero padding,
+and is the mean over all pixels. Masked pixels have the value of the ground truth in both images: they add no
+loss, and their gradient is 0. The kernel version is kernels/opencl/train/loss.cl.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 class Loss(NamedTuple):
-    """What a picture was found to be worth."""
+    """Loss and mean squared error of one image."""
 
     value: float
     """the loss"""
-    squared: float
-    """mean squared difference, of which the PSNR is made"""
+    mse: float
+    """mean squared error, for the PSNR"""
 
     @property
     def psnr(self) -> float:
-        """dB; infinite for equal pictures."""
-        return math.inf if self.squared == 0 else -10 * math.log10(self.squared)
+        """dB; infinite for equal images."""
+        return math.inf if self.mse == 0 else -10 * math.log10(self.mse)
 
 
 def window() -> np.ndarray:
-    """Weights (11,) float64 of the window along one axis; their sum is 1."""
+    """Weights (11,) float64 of the SSIM window along one axis; their sum is 1."""
     weights = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SIGMA**2))
     return weights / weights.sum()
 
 
 def blurred(image: np.ndarray) -> np.ndarray:
-    """The window's mean around each pixel of (h, w, c), zeros beyond the picture."""
+    """Windowed mean of an image (h, w, c), with zero padding."""
     for _ in range(2):
         padded = np.pad(image, ((RADIUS, RADIUS), (0, 0), (0, 0)))
         total = np.zeros_like(image)
@@ -48,38 +48,38 @@ def blurred(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def picture_loss(
+def image_loss(
     image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, dssim_weight: float
 ) -> tuple[Loss, np.ndarray]:
-    """The loss of a picture and its derivative by each of its values.
+    """The loss of an image, and its gradient by the image.
 
     Args:
-        image: (h, w, 3) float as it was drawn, not clamped.
+        image: (h, w, 3) float, rendered, not clamped.
         truth: (h, w, 3) float display values.
-        mask: (h, w) bool, False where the picture does not matter; None: it matters everywhere.
+        mask: (h, w) bool, False for ignored pixels; None: none is ignored.
         dssim_weight: share of 1 - SSIM, 0 to 1.
 
     Returns:
-        the loss, and (h, w, 3) of the picture's type.
+        the loss, and its gradient (h, w, 3) in the dtype of the image.
     """
-    counted = np.ones(image.shape[:2], image.dtype) if mask is None else mask.astype(image.dtype)
-    counted = counted[:, :, None]
-    # not image * counted: a value that is not finite would stay
-    image = np.where(counted > 0, image, truth)
+    weight = np.ones(image.shape[:2], image.dtype) if mask is None else mask.astype(image.dtype)
+    weight = weight[:, :, None]
+    # not image * weight: a value that is not finite would remain
+    image = np.where(weight > 0, image, truth)
     number = float(image.size if mask is None else max(1, 3 * int(mask.sum())))
     difference = image - truth
     l1 = float(np.abs(difference).sum(dtype=np.float64)) / number
-    squared = float((difference * difference).sum(dtype=np.float64)) / number
+    mse = float((difference * difference).sum(dtype=np.float64)) / number
     gradient = np.sign(difference) * image.dtype.type((1 - dssim_weight) / number)
-    similar = 1.0
+    ssim = 1.0
     if dssim_weight:
-        similar, slope = _ssim(image, truth)
+        ssim, slope = _ssim(image, truth)
         gradient -= slope * image.dtype.type(dssim_weight)
-    return Loss((1 - dssim_weight) * l1 + dssim_weight * (1 - similar), squared), gradient * counted
+    return Loss((1 - dssim_weight) * l1 + dssim_weight * (1 - ssim), mse), gradient * weight
 
 
 def _ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
-    """Mean SSIM over all values of two pictures (h, w, 3), and its derivative by the first."""
+    """Mean SSIM of two images (h, w, 3), and its gradient by the first."""
     mean_a, mean_b = blurred(image), blurred(truth)
     var_a = blurred(image * image) - mean_a * mean_a
     var_b = blurred(truth * truth) - mean_b * mean_b
@@ -89,7 +89,7 @@ def _ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
     similar = a * b / (c * d)
     by_mean = 2 * (mean_b * b - mean_a * similar * d) / (c * d)
     by_var, by_shared = -similar / d, 2 * a / (c * d)
-    # the window is symmetric, so that the way back is the same blur
+    # the window is symmetric, so its transpose is the same blur
     slope = blurred(by_mean - 2 * mean_a * by_var - mean_b * by_shared)
     slope += 2 * image * blurred(by_var) + truth * blurred(by_shared)
     return float(similar.mean(dtype=np.float64)), slope / image.dtype.type(image.size)
@@ -102,22 +102,22 @@ def normal_loss(
     focal: tuple[float, float],
     middle: tuple[float, float],
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """How far a picture's normals are from those of the surface that its depths make: the mean over all
-    pixels of alpha (1 - n . N), much as the 2DGS authors have it (their n is a mean, not made unit).
+    """Normal consistency: the mean over all pixels of alpha (1 - n . N), as in 2DGS (whose n is not
+    normalised), and its gradients.
 
-    N is the direction of the cross product of the differences of the points that neighbours below and above,
-    right and left show; it is towards the camera. Pixels at the rim, and those of which a neighbour or they
-    themselves have no depth, add nothing. Nothing goes back through alpha. The kernels' twin is
+    N is the normal of the surface through the depths, towards the camera: the normalised cross product of
+    central differences of neighbouring points. Border pixels, and pixels that lack a depth or have a
+    neighbour that does, add nothing. alpha is a constant weight. The kernel version is
     kernels/opencl/train/surface.cl.
 
     Args:
-        depth: (h, w) metres along z, 0 where there is none.
+        depth: (h, w) metres along z, 0 without a surface.
         normal: (h, w, 3) unit, camera frame, towards the camera.
-        alpha: (h, w); 0 where the picture does not matter.
-        focal, middle: pixels, of x and y.
+        alpha: (h, w); 0 for ignored pixels.
+        focal, middle: focal lengths and principal point [px], x and y.
 
     Returns:
-        the loss, and its derivatives by `depth` and `normal`, of their shapes.
+        the loss, and its gradients by `depth` and `normal`, in their shapes.
     """
     h, w = depth.shape
     by_depth, by_normal = np.zeros_like(depth), np.zeros_like(normal)
@@ -131,15 +131,16 @@ def normal_loss(
     down, across = points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2]
     crossed = np.cross(down, across)
     length = np.linalg.norm(crossed, axis=2, keepdims=True)
-    seen = depth > 0
-    there = seen[1:-1, 1:-1] & seen[2:, 1:-1] & seen[:-2, 1:-1] & seen[1:-1, 2:] & seen[1:-1, :-2]
-    there = there[:, :, None] & (length > 0)
-    unit = np.where(there, crossed, 0) / np.where(there, length, 1)
+    has_depth = depth > 0
+    valid = has_depth[1:-1, 1:-1] & has_depth[2:, 1:-1] & has_depth[:-2, 1:-1]
+    valid &= has_depth[1:-1, 2:] & has_depth[1:-1, :-2]
+    valid = valid[:, :, None] & (length > 0)
+    unit = np.where(valid, crossed, 0) / np.where(valid, length, 1)
     own = normal[1:-1, 1:-1]
-    share = np.where(there, alpha[1:-1, 1:-1, None], 0) / depth.size
+    share = np.where(valid, alpha[1:-1, 1:-1, None], 0) / depth.size
     along = (unit * own).sum(2, keepdims=True)
     by_normal[1:-1, 1:-1] = -share * unit
-    by_crossed = -share * (own - along * unit) / np.where(there, length, 1)
+    by_crossed = -share * (own - along * unit) / np.where(valid, length, 1)
     by_down, by_across = np.cross(across, by_crossed), np.cross(by_crossed, down)
     by_points = np.zeros_like(points)
     by_points[2:, 1:-1] += by_down

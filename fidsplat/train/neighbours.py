@@ -1,4 +1,4 @@
-"""How far points are from those nearest to them."""
+"""Mean distance of points to their three nearest neighbours, by k-d tree boxes."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 _LEAF = 256
 _NEAREST = 3
 _PAIRS = 1 << 22
-"""of points that are compared at once"""
+"""pairs of points compared at once"""
 
 
 def mean_square_distances(points: np.ndarray) -> np.ndarray:
-    """Mean squared distance (n,) float64 of each point (n, 3) from the three nearest others, 0 for a point
-    alone.
+    """Mean squared distance (n,) float64 of each point (n, 3) to its three nearest neighbours; 0 for a
+    single point.
 
-    Points are put into boxes of some hundreds; those of a box are compared with the points of all boxes that
-    the farthest third neighbour found within it reaches.
+    Points are divided into boxes of at most 256. The points of a box are compared with those of all boxes
+    within the largest distance to a third neighbour inside the box.
     """
     points = np.asarray(points, np.float64)
     if len(points) < 2:
@@ -37,7 +37,7 @@ def mean_square_distances(points: np.ndarray) -> np.ndarray:
 
 
 def _boxes(points: np.ndarray) -> list[np.ndarray]:
-    """Indices of the points, cut in halves across the longest side until there are few in each."""
+    """Indices of the points of each box, halved along the longest side until it is small."""
     todo, done = [np.arange(len(points))], []
     while todo:
         box = todo.pop()
@@ -51,10 +51,10 @@ def _boxes(points: np.ndarray) -> list[np.ndarray]:
 
 
 def _nearest(mine: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Squared distances (n, at most 3), in their order, to the nearest of `among`, which holds `mine`."""
+    """Sorted squared distances (n, at most 3) to the nearest points of `among`, which contains `mine`."""
     count = min(_NEAREST + 1, len(among))
     nearest = np.empty((len(mine), count))
-    step = max(1, _PAIRS // len(among))  # a box of stray points may reach all the others
+    step = max(1, _PAIRS // len(among))  # a box of outliers may be compared with all others
     for first in range(0, len(mine), step):
         part = slice(first, first + step)
         squares = np.zeros((len(mine[part]), len(among)))

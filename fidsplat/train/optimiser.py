@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) on the splats' values before their activations. The kernels' twin is
+"""Adam (Kingma and Ba 2015) on the raw parameters of splats, before activation. The kernel version is
 kernels/opencl/project_step.cl."""
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from fidsplat.splats.harmonics import C0
 from fidsplat.train.parameters import Arrays, Splats
 from fidsplat.train.settings import TrainSettings
 
-REST_SHARE = 1 / 20
-"""of the colours' learning rate, for SH coefficients above degree 0"""
+HIGHER_SH_RATE = 1 / 20
+"""learning rate of SH coefficients above degree 0, relative to degree 0"""
 
 
-def rates(settings: TrainSettings, iteration: int, extent: float) -> dict[str, float]:
-    """Learning rates of an iteration by the arrays' names; `sh` is that of degree 0."""
+def learning_rates(settings: TrainSettings, iteration: int, extent: float) -> dict[str, float]:
+    """Learning rates of an iteration by array; `sh` is the rate of degree 0."""
     return {
         "means": settings.position_rate_at(iteration) * extent,
         "log_scales": settings.scale_rate,
@@ -27,15 +27,17 @@ def rates(settings: TrainSettings, iteration: int, extent: float) -> dict[str, f
     }
 
 
-def inner_gradients(splats: Splats, gradients: Mapping[str, np.ndarray], settings: TrainSettings) -> Arrays:
-    """Derivatives by the values before their activations, from those by the cloud's.
+def parameter_gradients(
+    splats: Splats, gradients: Mapping[str, np.ndarray], settings: TrainSettings
+) -> Arrays:
+    """Gradients by the raw parameters, from gradients by the activated values.
 
     Args:
-        gradients: `means`, `quats`, `scales`, `opacities`, and `colors` or `sh`, as a
-            `DifferentiablePipeline` gives them.
+        gradients: `means`, `quats`, `scales`, `opacities`, and `colors` or `sh`, of a
+            gradient pipeline.
 
     Returns:
-        by the names of a `Splats`; `sh` (n, k, 3) has the coefficients that were drawn.
+        arrays by the names of a `Splats`; `sh` (n, k, 3) has the rendered coefficients.
     """
     scales, opacities = splats.scales, splats.opacities
     by_scale, by_opacity = gradients["scales"], gradients["opacities"]
@@ -44,23 +46,23 @@ def inner_gradients(splats: Splats, gradients: Mapping[str, np.ndarray], setting
         by_opacity = by_opacity + np.float32(settings.opacity_penalty / len(splats))
     quats = splats.values["quats"]
     lengths = np.sqrt((quats * quats).sum(axis=1, keepdims=True))
-    turns, by_turn = quats / lengths, gradients["quats"]
+    units, by_unit = quats / lengths, gradients["quats"]
     if "sh" in gradients:
         by_color = gradients["sh"]
-    else:  # of degree 0 the plain colours are drawn, which end at 0
+    else:  # degree 0 is rendered as colours, which are clamped at 0
         shade = np.float32(C0) * splats.values["sh"][:, :1] + np.float32(0.5)
         by_color = np.float32(C0) * gradients["colors"][:, None] * (shade > 0)
     return {
         "means": gradients["means"],
         "log_scales": by_scale * scales,
-        "quats": (by_turn - turns * (turns * by_turn).sum(axis=1, keepdims=True)) / lengths,
+        "quats": (by_unit - units * (units * by_unit).sum(axis=1, keepdims=True)) / lengths,
         "logits": by_opacity * opacities * (1 - opacities),
         "sh": by_color,
     }
 
 
-def moved_by(gradients: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Which splats (n,) a picture depends on, by its derivatives as a `DifferentiablePipeline` gives them."""
+def contributing(gradients: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Mask (n,) of the splats that contribute to a frame, by their gradients."""
     color = gradients["sh"][:, 0] if "sh" in gradients else gradients["colors"]
     return (gradients["opacities"] != 0) | gradients["means"].any(axis=1) | color.any(axis=1)
 
@@ -73,9 +75,8 @@ def sparse_adam_step(
     settings: TrainSettings,
     step: int,
 ) -> None:
-    """As `adam_step`, of the splats `rows` (n,) bool alone: the others rest, with what is remembered of
-    them."""
-    part = splats.chosen(rows)
+    """One Adam step of the splats `rows` (n,) bool; the others keep their values and moments."""
+    part = splats.select(rows)
     adam_step(part, {name: array[rows] for name, array in gradients.items()}, rate, settings, step)
     for name in gradients:
         splats.values[name][rows] = part.values[name]
@@ -86,12 +87,12 @@ def sparse_adam_step(
 def adam_step(
     splats: Splats, gradients: Arrays, rate: Mapping[str, float], settings: TrainSettings, step: int
 ) -> None:
-    """One step of all values, those with a gradient of 0 among them, as the authors' trainer has it.
+    """One Adam step of all values, including those with a gradient of 0, as in the authors' trainer.
 
     Args:
-        gradients: of `inner_gradients`.
-        rate: of `rates`.
-        step: which it is, from 1 on.
+        gradients: result of `parameter_gradients`.
+        rate: result of `learning_rates`.
+        step: number of the step, from 1.
     """
     for name, gradient in gradients.items():
         value, first, second = (group[name] for group in (splats.values, splats.first, splats.second))
@@ -99,9 +100,9 @@ def adam_step(
             _adam(value, first, second, gradient, rate[name], settings, step)
             continue
         _adam(value[:, :1], first[:, :1], second[:, :1], gradient[:, :1], rate[name], settings, step)
-        rest = slice(1, gradient.shape[1])  # coefficients that were never drawn stay 0
-        of_rest = (value[:, rest], first[:, rest], second[:, rest], gradient[:, rest])
-        _adam(*of_rest, rate[name] * REST_SHARE, settings, step)
+        rest = slice(1, gradient.shape[1])  # coefficients above the current degree stay 0
+        higher = (value[:, rest], first[:, rest], second[:, rest], gradient[:, rest])
+        _adam(*higher, rate[name] * HIGHER_SH_RATE, settings, step)
 
 
 def _adam(

@@ -1,4 +1,4 @@
-"""What is trained: the splats' values before their activations, and what Adam remembers of each."""
+"""Raw parameters of splats in training, with the moments of Adam."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from fidsplat.util.errors import FidsplatError, InputError
 SHAPES = ("means", "log_scales", "quats", "logits")
 NAMES = (*SHAPES, "sh")
 """the arrays of a `Splats`"""
-_LEAST_SQUARE = 1e-7
-"""m^2, of the mean squared distance that first scales are made of"""
+_MIN_SQUARE_DISTANCE = 1e-7
+"""lower limit of the mean squared distance to neighbours, for initial scales [m^2]"""
 
-_SMALLEST = 1e-6
-"""opacity, and distance from 1, of splats that training begins with: beyond it nothing would move them"""
+_OPACITY_MARGIN = 1e-6
+"""distance of initial opacities from 0 and 1, beyond which their gradients vanish"""
 
 Arrays = dict[str, np.ndarray]
 
 
 class TrainingError(FidsplatError):
-    """A run that cannot go on. Exit status 1."""
+    """A training run that cannot continue. Exit status 1."""
 
 
 @dataclass
 class Splats:
-    """n splats in training, float32 all of them."""
+    """n splats in training, all arrays float32."""
 
     values: Arrays
     """means (n, 3) metres relative to the origin, log_scales (n, 2), quats (n, 4) of any length, logits (n,)
     of the opacities, sh (n, k, 3)"""
     first: Arrays
-    """Adam's running means of the gradients, of the same shapes"""
+    """Adam's first moments, in the same shapes"""
     second: Arrays
-    """Adam's running means of their squares"""
-    gradients: np.ndarray
-    """(n,) sum of the gradients on the screen since splats were last made"""
-    seen: np.ndarray
-    """(n,) in how many pictures of those a splat was"""
+    """Adam's second moments"""
+    gradient_sums: np.ndarray
+    """(n,) sums of screen gradients since the last densification"""
+    visible_counts: np.ndarray
+    """(n,) number of frames since then in which the splat was visible"""
 
     @classmethod
     def of(cls, values: Arrays) -> Splats:
-        """Splats that nothing is remembered of."""
+        """Splats with moments and statistics of 0."""
         values = {name: np.array(values[name], np.float32, order="C") for name in NAMES}
         count = len(values["means"])
         zero = np.zeros(count, np.float32)
@@ -67,29 +67,30 @@ class Splats:
         """(n, 2) float32, metres."""
         return np.exp(self.values["log_scales"])
 
-    def chosen(self, rows: np.ndarray) -> Splats:
-        """Some of the splats, by index or mask, with what is remembered of them."""
+    def select(self, rows: np.ndarray) -> Splats:
+        """Some of the splats, by index or mask, with their moments and statistics."""
         values, first, second = (
             {name: array[rows] for name, array in group.items()} for group in self._groups
         )
-        return Splats(values, first, second, self.gradients[rows], self.seen[rows])
+        return Splats(values, first, second, self.gradient_sums[rows], self.visible_counts[rows])
 
-    def with_more(self, values: Arrays) -> Splats:
-        """These splats and behind them new ones."""
+    def append(self, values: Arrays) -> Splats:
+        """These splats followed by new ones."""
         more = Splats.of(values)
         values, first, second = (
             {name: np.concatenate([a[name], b[name]]) for name in NAMES}
             for a, b in zip(self._groups, more._groups, strict=True)
         )
-        gradients = np.concatenate([self.gradients, more.gradients])
-        return Splats(values, first, second, gradients, np.concatenate([self.seen, more.seen]))
+        gradient_sums = np.concatenate([self.gradient_sums, more.gradient_sums])
+        visible_counts = np.concatenate([self.visible_counts, more.visible_counts])
+        return Splats(values, first, second, gradient_sums, visible_counts)
 
     def check(self, when: str) -> None:
         """Raises TrainingError where a number is not finite."""
-        remembered = {f"Adam's mean of {n}": a for n, a in self.first.items()}
-        remembered |= {f"Adam's mean square of {n}": a for n, a in self.second.items()}
-        remembered |= {"gradients": self.gradients}
-        for name, array in (self.values | remembered).items():
+        moments = {f"Adam's mean of {n}": a for n, a in self.first.items()}
+        moments |= {f"Adam's mean square of {n}": a for n, a in self.second.items()}
+        moments |= {"gradients": self.gradient_sums}
+        for name, array in (self.values | moments).items():
             if not np.isfinite(array).all():
                 rows = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(1))
                 raise TrainingError(
@@ -97,15 +98,15 @@ class Splats:
                 )
 
     def cloud(self, degree: int, origin: np.ndarray, shared: bool = False) -> SplatCloud:
-        """The splats as they are drawn, with SH of a degree that they have at least.
+        """The activated splats, with SH of `degree` or of a lower degree that they have.
 
-        shared: it may stand on the memory of these splats, and changes as they do.
+        shared: the cloud may share the memory of these splats and change with them.
         """
         values, coefficients = self.values, slice((degree + 1) ** 2)
         means, sh = values["means"][:], values["sh"][:, coefficients]
         return SplatCloud.of_checked(
             means if shared else means.copy(),
-            values["quats"].copy(),  # which are made unit where they lie
+            values["quats"].copy(),  # which are normalised in place
             self.scales,
             self.opacities,
             np.ascontiguousarray(sh) if shared else sh.copy(),
@@ -118,15 +119,15 @@ class Splats:
         return self.values, self.first, self.second
 
 
-def first_splats(dataset: Dataset, settings: TrainSettings) -> Splats:
-    """A splat at each of a data set's points: as large as its neighbours are far, turned at random.
+def initial_splats(dataset: Dataset, settings: TrainSettings) -> Splats:
+    """Initial splats at the points of a data set: scales by the distance to neighbours, random rotations.
 
-    At most `max_splats` points are taken, evenly among them.
+    At most `max_splats` points are used, evenly spaced in their order.
     """
     count = min(len(dataset.points), settings.max_splats)
     rows = np.arange(count) * len(dataset.points) // count
     points = dataset.points[rows]
-    scale = np.sqrt(np.maximum(mean_square_distances(points), _LEAST_SQUARE))
+    scale = np.sqrt(np.maximum(mean_square_distances(points), _MIN_SQUARE_DISTANCE))
     if settings.strategy == "mcmc":
         scale *= settings.mcmc_scale
     sh = np.zeros((count, (settings.sh_degree + 1) ** 2, 3))
@@ -136,24 +137,26 @@ def first_splats(dataset: Dataset, settings: TrainSettings) -> Splats:
             "means": points - dataset.origin,
             "log_scales": np.repeat(np.log(scale)[:, None], 2, axis=1),
             "quats": uniform(settings.seed, Purpose.ROTATIONS, 0, count),
-            "logits": np.full(count, logit(settings.first_opacity)),
+            "logits": np.full(count, logit(settings.start_opacity)),
             "sh": sh,
         }
     )
 
 
-def splats_from(cloud: SplatCloud, settings: TrainSettings, origin: np.ndarray) -> Splats:
-    """The splats of a cloud, with zeros for SH coefficients that it lacks; those beyond `sh_degree` go.
+def splats_from_cloud(cloud: SplatCloud, settings: TrainSettings, origin: np.ndarray) -> Splats:
+    """The splats of a cloud, with missing SH coefficients 0 and those above `sh_degree` dropped.
 
     Raises:
-        InputError: a cloud with boxes or 3D Gaussians, which are not trained, or with more than `max_splats`.
+        InputError: the cloud has boxes or 3D Gaussians, which are not trained, or more than `max_splats`.
     """
     if cloud.boxes is not None or cloud.thickness is not None:
-        raise InputError("only disks are trained, and the cloud has boxes or 3D Gaussians; see flattened()")
+        raise InputError(
+            "start must be a cloud of disks, got boxes or 3D Gaussians; convert it by flattened()"
+        )
     if not 0 < len(cloud) <= settings.max_splats:
         raise InputError(
-            f"the cloud to start from has {len(cloud)} splats; it must be 1 to max_splats, "
-            f"{settings.max_splats}"
+            f"start must have 1 to {settings.max_splats} splats (max_splats), got {len(cloud)}; "
+            "raise max_splats"
         )
     sh = np.zeros((len(cloud), (settings.sh_degree + 1) ** 2, 3))
     if cloud.sh is not None:
@@ -161,7 +164,7 @@ def splats_from(cloud: SplatCloud, settings: TrainSettings, origin: np.ndarray) 
         sh[:, :shared] = cloud.sh[:, :shared]
     elif cloud.colors is not None:
         sh[:, 0] = (cloud.colors.astype(np.float64) - 0.5) / C0
-    opacities = np.clip(cloud.opacities.astype(np.float64), _SMALLEST, 1 - _SMALLEST)
+    opacities = np.clip(cloud.opacities.astype(np.float64), _OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
     return Splats.of(
         {
             "means": cloud.world_means() - origin,
@@ -174,12 +177,12 @@ def splats_from(cloud: SplatCloud, settings: TrainSettings, origin: np.ndarray) 
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
-    """1 / (1 + exp(-x)), in x's type."""
+    """1 / (1 + exp(-x)), in the dtype of x."""
     return 1 / (1 + np.exp(-x))
 
 
 def logit(opacity: float) -> float:
-    """The number whose sigmoid it is."""
+    """Inverse of the sigmoid."""
     return float(np.log(opacity) - np.log1p(-opacity))
 
 

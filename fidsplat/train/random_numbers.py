@@ -1,9 +1,8 @@
-"""Random numbers by counter: what a splat draws depends on the seed, the iteration, the purpose and the
-splat's index, and on nothing that was drawn before. So a run that goes on after a kill draws what the run
-would have drawn.
+"""Counter-based random numbers: a number depends on the seed, the iteration, the purpose and the splat's
+index alone, so a resumed run has the numbers of an uninterrupted one.
 
-Philox 4x32-10: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011. The kernels' twin is
-kernels/opencl/train/philox.cl.
+Philox 4x32-10: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011. The kernel version is
+in kernels/opencl/train/position_noise.cl.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ _HALF = np.uint64(32)
 
 
 class Purpose(IntEnum):
-    """What random numbers are for; each has a stream of its own."""
+    """Purpose of random numbers; each has its own stream."""
 
     VIEWS = 0
     ROTATIONS = 1
@@ -31,7 +30,7 @@ class Purpose(IntEnum):
 
 
 def philox(counters: np.ndarray, key: int) -> np.ndarray:
-    """Four words (n, 4) uint32 for each counter (n, 4) uint32, by a key of 64 bits."""
+    """Four words (n, 4) uint32 for each counter (n, 4) uint32 and a key of 64 bits."""
     c0, c1, c2, c3 = np.asarray(counters, np.uint32).astype(np.uint64).T
     k0, k1 = key & 0xFFFFFFFF, key >> 32 & 0xFFFFFFFF
     for _ in range(10):
@@ -48,11 +47,11 @@ def philox(counters: np.ndarray, key: int) -> np.ndarray:
 
 
 def uniform(seed: int, purpose: Purpose, iteration: int, of: int | np.ndarray, draw: int = 0) -> np.ndarray:
-    """Four numbers (n, 4) float64 for each index, in (0, 1).
+    """Uniform numbers (n, 4) float64 in (0, 1), four for each index.
 
     Args:
-        of: the indices (n,), or their number where they are the first n.
-        draw: tells several calls of one purpose and iteration apart.
+        of: indices (n,), or n for the first n.
+        draw: distinguishes several calls for one purpose and iteration.
     """
     indices = np.arange(of) if isinstance(of, int) else of
     counters = np.empty((len(indices), 4), np.uint32)
@@ -62,12 +61,12 @@ def uniform(seed: int, purpose: Purpose, iteration: int, of: int | np.ndarray, d
 
 
 def normal(seed: int, purpose: Purpose, iteration: int, of: int | np.ndarray, draw: int = 0) -> np.ndarray:
-    """As `uniform`, of the standard normal distribution (Box and Muller)."""
+    """Standard normal numbers (n, 4) float64 (Box and Muller) for each index; arguments of `uniform`."""
     u = uniform(seed, purpose, iteration, of, draw)
     radius, angle = np.sqrt(-2 * np.log(u[:, :2])), 2 * np.pi * u[:, 2:]
     return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def permutation(seed: int, purpose: Purpose, iteration: int, count: int) -> np.ndarray:
-    """The numbers below count in a random order."""
+    """A random permutation of the numbers below count."""
     return np.argsort(uniform(seed, purpose, iteration, count)[:, 0], kind="stable")

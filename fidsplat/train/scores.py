@@ -1,4 +1,4 @@
-"""How well splats show a view."""
+"""Image metrics of a view."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from fidsplat.vision.metrics import psnr, ssim
 
 @dataclass(frozen=True)
 class ViewScore:
-    """How well the splats show one view."""
+    """Metrics of one rendered view against its image."""
 
     name: str
     psnr: float
-    """dB, of 8-bit pictures"""
+    """dB, of 8-bit images"""
     ssim: float
     """mean over the channels, of whole windows (`fidsplat.vision.metrics.ssim`)"""
-    picture: np.ndarray
-    """(h, w, 3) uint8, as it is drawn"""
+    image: np.ndarray
+    """(h, w, 3) uint8, rendered"""
 
 
-def scored(view: TrainingView, drawn: np.ndarray) -> ViewScore:
-    """Compares a picture (h, w, 3) float as it was drawn with a view, where its mask has it matter."""
-    picture = to_uint8(drawn)
-    ours, theirs = picture / 255.0, view.picture / 255.0
+def score_view(view: TrainingView, rendered: np.ndarray) -> ViewScore:
+    """Compare a rendered image (h, w, 3) float with a view, inside the view's mask."""
+    image = to_uint8(rendered)
+    ours, theirs = image / 255.0, view.image / 255.0
     if view.mask is not None:
         ours = np.where(view.mask[:, :, None], ours, theirs)
-    similar = float(np.mean([ssim(ours[:, :, c], theirs[:, :, c]) for c in range(3)]))
-    return ViewScore(view.name, psnr(ours, theirs), similar, picture)
+    similarity = float(np.mean([ssim(ours[:, :, c], theirs[:, :, c]) for c in range(3)]))
+    return ViewScore(view.name, psnr(ours, theirs), similarity, image)

@@ -25,16 +25,16 @@ from fidsplat.formats import save_ply
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import densify, mcmc
-from fidsplat.train.ahead import features_after
-from fidsplat.train.checkpoint import Progressed, load_checkpoint, save_checkpoint
+from fidsplat.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
 from fidsplat.train.losses import Loss
-from fidsplat.train.optimiser import rates
-from fidsplat.train.parameters import Splats, TrainingError, first_splats, splats_from
+from fidsplat.train.next_features import next_features
+from fidsplat.train.optimiser import learning_rates
+from fidsplat.train.parameters import Splats, TrainingError, initial_splats, splats_from_cloud
 from fidsplat.train.random_numbers import Purpose, permutation
-from fidsplat.train.scores import ViewScore, scored
+from fidsplat.train.scores import ViewScore, score_view
 from fidsplat.train.settings import TrainSettings, settings_with
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback, instance, invalid, items
@@ -205,7 +205,7 @@ class Trainer:
         if self.checkpoint is None:
             return
         self._made.splats = self._stored()
-        kept = Progressed(self.iteration, self._made.splats, self.history)
+        kept = TrainingState(self.iteration, self._made.splats, self.history)
         title = self.renderer.device.title
         save_checkpoint(self.checkpoint, kept, self.settings, self.dataset, title)
 
@@ -215,7 +215,7 @@ class Trainer:
         views = items("views", views, TrainingView, "a list of TrainingView")
         captures = [self._capture(view) for view in views]
         frames = self.renderer.render_views(self.cloud(), captures)
-        return [scored(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
+        return [score_view(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
 
     def _advance(self, late: bool) -> None:
         """An iteration. late: its loss may be asked for when others have followed."""
@@ -236,7 +236,7 @@ class Trainer:
         except TooLittleRoom:
             value, taken = self._compared(iteration, number, waits=True)
         self._waiting.append((iteration, view.name, value))
-        if not late or len(self._waiting) > self._work.late or settings.makes_splats_after(iteration):
+        if not late or len(self._waiting) > self._work.late or settings.densifies_after(iteration):
             self._settle()  # not before: the device goes on meanwhile
         self._change(taken, iteration, view)
         made.iteration = iteration
@@ -288,7 +288,7 @@ class Trainer:
             features = with_distortion(features)
         if features != self._features:
             self._features = features
-            later = features_after(self.settings, iteration, plain, solid)
+            later = next_features(self.settings, iteration, plain, solid)
             if later is not None and isinstance(backend := self.renderer.backend, CompilesAhead):
                 backend.compile_ahead(later)
         pipeline = self._differentiate(features)
@@ -299,7 +299,7 @@ class Trainer:
             slopes |= self._work.surface(images, number, by_normals)
         if by_distortions:
             view = self.dataset.views[number]
-            counts = np.ones(view.picture.shape[:2], np.float32) if view.mask is None else view.mask
+            counts = np.ones(view.image.shape[:2], np.float32) if view.mask is None else view.mask
             slopes["distortion"] = counts * np.float32(by_distortions / counts.size)
         return value, self._work.take_back(pipeline, images, slopes)
 
@@ -312,7 +312,7 @@ class Trainer:
     def _capture(self, view: TrainingView) -> Capture:
         return Capture(view.camera, quality=self._quality, background=self.dataset.background)
 
-    def _begin(self, start: SplatCloud | None, restart: bool) -> Progressed:
+    def _begin(self, start: SplatCloud | None, restart: bool) -> TrainingState:
         settings = self.settings
         if self.checkpoint is not None and self.checkpoint.exists() and not restart:
             title = self.renderer.device.title
@@ -326,11 +326,11 @@ class Trainer:
         else:
             dataset = self.dataset
             splats = (
-                first_splats(dataset, settings)
+                initial_splats(dataset, settings)
                 if start is None
-                else splats_from(start, settings, dataset.origin)
+                else splats_from_cloud(start, settings, dataset.origin)
             )
-            made = Progressed.begun(splats)
+            made = TrainingState.initial(splats)
         left = settings.iterations - made.iteration
         made.history = {name: np.append(a, np.zeros(left, a.dtype)) for name, a in made.history.items()}
         return made
@@ -348,10 +348,10 @@ class Trainer:
         that ends here keeps splats that were fitted, and opacities that were not reset, as the authors'
         trainer, which saves them first."""
         settings, iteration = self.settings, self.iteration
-        if settings.strategy == "mcmc" or not settings.makes_splats_after(iteration):
+        if settings.strategy == "mcmc" or not settings.densifies_after(iteration):
             return
         self._settle()
-        made = densify.plan(self._work.shapes(), settings, iteration, self.dataset.extent)
+        made = densify.densification(self._work.shapes(), settings, iteration, self.dataset.extent)
         with self._not_half():
             self._work.make(made)
             if iteration % settings.reset_every == 0:
@@ -362,16 +362,16 @@ class Trainer:
         which new splats have no gradient yet."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
         origin = self.dataset.origin
-        if not mcmc_runs and settings.makes_splats_after(iteration):
+        if not mcmc_runs and settings.densifies_after(iteration):
             self._work.count(taken, view.camera, origin)
             return
         camera = view.camera if not mcmc_runs and iteration < settings.densify_until else None
-        rate = rates(settings, iteration, self.dataset.extent)
+        rate = learning_rates(settings, iteration, self.dataset.extent)
         self._work.step(taken, rate, settings.adam_steps(iteration), camera, origin)
         if mcmc_runs:
             with self._not_half():
-                if settings.makes_splats_after(iteration):
-                    self._work.load(mcmc.moved(self._work.store(), settings, iteration))
+                if settings.densifies_after(iteration):
+                    self._work.load(mcmc.relocate_and_grow(self._work.store(), settings, iteration))
                 self._work.shake(iteration, rate["means"])
 
     @contextmanager

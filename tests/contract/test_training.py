@@ -48,8 +48,8 @@ def test_splats_are_made_by_kernels_as_by_numpy(renderer, dataset):
     for _ in range(17):  # harmonics too have moved
         trainer.step()
     work = trainer._work
-    made = densify.plan(work.shapes(), settings, 8, dataset.extent)
-    assert 0 < made.kept < 16 < len(made.rows)
+    made = densify.densification(work.shapes(), settings, 8, dataset.extent)
+    assert 0 < made.remaining < 16 < len(made.rows)
     expected = HostWork(renderer.backend, dataset.views, settings)
     expected.load(work.store())
     for each in (work, expected):
@@ -62,7 +62,9 @@ def test_splats_are_made_by_kernels_as_by_numpy(renderer, dataset):
     found = work.store()
     assert found.first["sh"][:, 1:].any()
     assert found.opacities.max() <= 0.5 + 1e-6
-    assert all(not array.any() for array in (found.first["logits"], found.gradients, found.seen))
+    assert all(
+        not array.any() for array in (found.first["logits"], found.gradient_sums, found.visible_counts)
+    )
 
 
 def test_depths_and_normals_without_distortions_have_the_references_derivatives(renderer):

@@ -19,8 +19,8 @@ from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.train import TrainSettings
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
-from fidsplat.train.losses import picture_loss
-from fidsplat.train.optimiser import moved_by, rates
+from fidsplat.train.losses import image_loss
+from fidsplat.train.optimiser import contributing, learning_rates
 from fidsplat.train.parameters import NAMES, Splats
 from fidsplat.util.errors import InputError
 
@@ -64,7 +64,7 @@ def splats():
     for group in (made.first, made.second):
         for array in group.values():
             array[:] = random.uniform(0.1, 1, array.shape)
-    made.gradients[:], made.seen[:] = random.uniform(size=(2, COUNT))
+    made.gradient_sums[:], made.visible_counts[:] = random.uniform(size=(2, COUNT))
     return made
 
 
@@ -84,8 +84,8 @@ def agree(device, host, rtol=2e-5, atol=2e-6):
         for name in NAMES:
             a, b = (getattr(each, group)[name] for each in (device, host))
             np.testing.assert_allclose(a, b, rtol=rtol, atol=atol, err_msg=f"{group} {name}")
-    np.testing.assert_allclose(device.gradients, host.gradients, rtol=1e-6)
-    np.testing.assert_array_equal(device.seen, host.seen)
+    np.testing.assert_allclose(device.gradient_sums, host.gradient_sums, rtol=1e-6)
+    np.testing.assert_array_equal(device.visible_counts, host.visible_counts)
 
 
 @pytest.mark.parametrize(("weight", "lanes"), [(0.0, 0), (0.2, 0), (1.0, 0), (0.2, 1)])
@@ -94,13 +94,13 @@ def test_loss(renderer, views, works, weight, lanes):
     work, _ = works(lanes, dssim_weight=weight)
     random = np.random.default_rng(1)
     for number in (0, 1, 0, 2):
-        truth = views[number].picture / 255.0
+        truth = views[number].image / 255.0
         image = (truth + random.normal(0, 0.2, truth.shape)).astype(np.float32)
         value, slope = work.loss(drawn(renderer, image), number)
         found = value()
-        wanted, wanted_slope = picture_loss(image.astype(np.float64), truth, views[number].mask, weight)
+        wanted, wanted_slope = image_loss(image.astype(np.float64), truth, views[number].mask, weight)
         assert found.value == pytest.approx(wanted.value, rel=1e-5)
-        assert found.squared == pytest.approx(wanted.squared, rel=1e-5)
+        assert found.mse == pytest.approx(wanted.mse, rel=1e-5)
         np.testing.assert_allclose(slope.get(), wanted_slope, rtol=1e-3, atol=2e-7)
         again, same = work.loss(drawn(renderer, image), number)
         assert (again(), same.get().tobytes()) == (found, slope.get().tobytes())
@@ -110,12 +110,12 @@ def test_the_loss_is_summed_piece_by_piece(renderer, views, works, monkeypatch):
     """As of large pictures, where a work-item adds up more than one value."""
     monkeypatch.setattr(training, "_SUMS", 2)
     work, _ = works(lanes=1)  # on CPUs it is summed strip by strip
-    truth = views[0].picture / 255.0
+    truth = views[0].image / 255.0
     image = (truth + np.random.default_rng(2).normal(0, 0.2, truth.shape)).astype(np.float32)
     found = work.loss(drawn(renderer, image), 0)[0]()
-    wanted, _ = picture_loss(image.astype(np.float64), truth, views[0].mask, TrainSettings().dssim_weight)
+    wanted, _ = image_loss(image.astype(np.float64), truth, views[0].mask, TrainSettings().dssim_weight)
     assert found.value == pytest.approx(wanted.value, rel=1e-5)
-    assert found.squared == pytest.approx(wanted.squared, rel=1e-5)
+    assert found.mse == pytest.approx(wanted.mse, rel=1e-5)
 
 
 def test_masked_values_that_are_not_finite_do_not_count(renderer, views, works):
@@ -172,7 +172,7 @@ def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lane
     device, host = works(lanes, strategy=strategy, sh_degree=3, sparse_adam=sparse)
     near = stretched(views[2].camera)
     view = replace(views[2], camera=moved_by_origin(near))
-    rate, counted = rates(TrainSettings(), 100, 1.5), view.camera if strategy == "default" else None
+    rate, counted = learning_rates(TrainSettings(), 100, 1.5), view.camera if strategy == "default" else None
     for step, degree in ((1, 0), (2, 0), (3, 2), (4, 3)):
         for work in (device, host):
             work.load(before_a_wall(near, 0.5 if step == 1 else -9.0, step < 4))
@@ -187,18 +187,18 @@ def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lane
         expected = derivatives(ReferenceBackend(), cloud, capture, {name: loss[name] for name in by}, False)
         off = [one for one in differences(gradients, expected) if one.norm > NORM or one.turned > COSINE]
         assert not off, (step, off)
-        idle = ~moved_by(gradients)
+        idle = ~contributing(gradients)
         assert step == 4 or (idle[::3].all() and idle.mean() < 0.6)
         assert idle[1] == (step > 2)
         if step < 3:
             by = {name: bool(gradients[name][1].any()) for name in ("opacities", "colors", "means")}
             assert by == {"opacities": False, "colors": step == 1, "means": step == 2}
-        before = host.store().chosen(np.flatnonzero(idle))
+        before = host.store().select(np.flatnonzero(idle))
         device.step(taken, rate, step, counted, ORIGIN)
         host.step(gradients, rate, step, counted, ORIGIN)
         agree(device, host)
         drawn_alike(renderer, device, host, degree, f"after step {step}", ORIGIN)
-        rested = device.store().chosen(np.flatnonzero(idle))
+        rested = device.store().select(np.flatnonzero(idle))
         same = [np.array_equal(rested.first[name], before.first[name]) for name in NAMES]
         assert all(same) == (sparse or not idle.any())
 
@@ -248,7 +248,7 @@ def taken_back(renderer, device, view, resident, lanes, outputs=("rgb",)):
 @pytest.mark.parametrize("sparse", [False, True])
 def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, views, works, sparse):
     """In every bit: after a stop it is made again from the values."""
-    rate, view = rates(TrainSettings(), 100, 1.5), views[2]
+    rate, view = learning_rates(TrainSettings(), 100, 1.5), views[2]
     device, _ = works(sh_degree=3, sparse_adam=sparse)
     device.load(before_a_wall(view.camera))
     names = ("means", "quats", "scales", "opacities", "sh")
@@ -268,7 +268,7 @@ def test_a_step_by_a_picture_that_was_followed_is_refused(renderer, views, works
     late, last = (taken_back(renderer, device, views[2], resident, 0) for _ in range(2))
     kept = device.store().values["means"].tobytes()
     with pytest.raises(InputError, match="before the next picture"):
-        device.step(late, rates(TrainSettings(), 100, 1.5), 1, None, np.zeros(3))
+        device.step(late, learning_rates(TrainSettings(), 100, 1.5), 1, None, np.zeros(3))
     with pytest.raises(InputError, match="before the next picture"):
         late.gradients()
     assert device.store().values["means"].tobytes() == kept
@@ -295,8 +295,8 @@ def test_who_is_seen(renderer, views, works):
     agree(device, host)
     kept = device.store()
     assert kept.values["means"].tobytes() == splats().values["means"].tobytes()
-    assert (kept.gradients > splats().gradients).any()
-    counted = host.store().seen - splats().seen
+    assert (kept.gradient_sums > splats().gradient_sums).any()
+    counted = host.store().visible_counts - splats().visible_counts
     assert {0.0, 1.0, 2.0, 3.0} >= set(np.rint(counted).tolist()) > {0.0}
 
 

@@ -163,8 +163,8 @@ def test_pictures_become_a_data_set_and_what_is_trained_a_plant(tmp_path, monkey
     data = asked["dataset"]
     assert (len(data.views), len(data.held_out), len(data.points)) == (3, 2, 200)
     assert data.background == plants.BACKGROUND
-    np.testing.assert_array_equal(data.views[0].picture[150, 75], (0, 200, 0))
-    np.testing.assert_array_equal(data.views[0].picture[0, 0], np.rint(255 * np.array(plants.BACKGROUND)))
+    np.testing.assert_array_equal(data.views[0].image[150, 75], (0, 200, 0))
+    np.testing.assert_array_equal(data.views[0].image[0, 0], np.rint(255 * np.array(plants.BACKGROUND)))
     assert (asked["settings"].iterations, asked["settings"].sh_degree) == (5, 0)
     (plant,) = load_plants(out)["lettuce"]
     assert len(plant) == 199

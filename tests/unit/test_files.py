@@ -21,7 +21,7 @@ from fidsplat.sim import read_description
 from fidsplat.store.build import build_store
 from fidsplat.store.store import Store
 from fidsplat.train import splats_of
-from fidsplat.train.read import load_dataset
+from fidsplat.train.dataset_files import load_dataset
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.util.npy import load_npy

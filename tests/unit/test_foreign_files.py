@@ -10,7 +10,7 @@ import fidsplat as fs
 from fidsplat.images.files import write_png
 from fidsplat.sim import read_description
 from fidsplat.splats.rotations import quaternion_multiply, quaternion_to_matrix, rigid_matrix
-from fidsplat.train.read import load_dataset
+from fidsplat.train.dataset_files import load_dataset
 
 RANDOM = np.random.default_rng(5)
 COUNT = 6

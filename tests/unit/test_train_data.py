@@ -13,7 +13,7 @@ from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import load_colmap
 from fidsplat.images.files import read_rgba, write_png
 from fidsplat.train import Dataset, TrainingView, load_dataset
-from fidsplat.train.dataset import looked_at
+from fidsplat.train.dataset import viewed_cube
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def transforms(made, folder, **more):
     folder.mkdir()
     frames = []
     for view in made.views:
-        write_png(folder / view.name, view.picture)
+        write_png(folder / view.name, view.image)
         pose = np.linalg.inv(view.camera.world_to_camera) @ np.diag([1, -1, -1, 1])
         frames.append({"file_path": f"./{view.name}", "transform_matrix": pose.tolist()})
     camera = made.views[0].camera
@@ -44,7 +44,7 @@ def transforms(made, folder, **more):
 def same_views(found, wanted):
     assert [view.name.removeprefix("./") for view in found] == [view.name for view in wanted]
     for a, b in zip(found, wanted, strict=True):
-        np.testing.assert_array_equal(a.picture, b.picture)
+        np.testing.assert_array_equal(a.image, b.image)
         np.testing.assert_allclose(a.camera.world_to_camera, b.camera.world_to_camera, atol=1e-12)
         assert (a.camera.fx, a.camera.cx) == (b.camera.fx, b.camera.cx)
 
@@ -118,7 +118,7 @@ def test_alpha_and_masks(made, tmp_path):
     import cv2
 
     folder = transforms(made, tmp_path / "nerf")
-    rgba = np.dstack([made.views[0].picture[:, :, ::-1], np.full(made.views[0].picture.shape[:2], 51)])
+    rgba = np.dstack([made.views[0].image[:, :, ::-1], np.full(made.views[0].image.shape[:2], 51)])
     cv2.imwrite(str(folder / "1.png"), rgba)
     table = json.loads((folder / "transforms.json").read_text())
     table["frames"][1]["mask_path"] = "mask.png"
@@ -126,7 +126,7 @@ def test_alpha_and_masks(made, tmp_path):
     mask = np.random.default_rng(0).uniform(size=rgba.shape[:2]) < 0.5
     write_png(folder / "mask.png", mask)
     found = load_dataset(folder, random_points=5)
-    np.testing.assert_array_equal(found.views[0].picture, np.rint(made.views[0].picture / 5))
+    np.testing.assert_array_equal(found.views[0].image, np.rint(made.views[0].image / 5))
     np.testing.assert_array_equal(found.views[1].mask, mask)
     assert read_rgba(folder / "mask.png").shape == (*mask.shape, 4)
 
@@ -156,28 +156,28 @@ def test_pictures_of_colmap_are_read_as_they_are_stored(made, folder):
     import cv2
 
     images = folder / "images"
-    picture = made.views[0].picture
+    picture = made.views[0].image
     turned = b"MM\0*\0\0\0\x08\0\1\x01\x12\0\3\0\0\0\1\0\3\0\0\0\0\0\0"  # orientation 3: upside down
     plain = cv2.imencode(".jpg", picture[:, :, ::-1])[1].tobytes()
     segment = b"Exif\0\0" + turned
     exif = plain[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + plain[2:]
     (images / "1.png").write_bytes(exif)
-    clear = np.dstack([made.views[1].picture[:, :, ::-1], np.full(picture.shape[:2], 51, np.uint8)])
+    clear = np.dstack([made.views[1].image[:, :, ::-1], np.full(picture.shape[:2], 51, np.uint8)])
     cv2.imwrite(str(images / "2.png"), clear)
-    cv2.imwrite(str(images / "3.png"), made.views[2].picture[:, :, ::-1].astype(np.uint16) * 257)
-    found = [view.picture.astype(int) for view in load_dataset(folder).views]
+    cv2.imwrite(str(images / "3.png"), made.views[2].image[:, :, ::-1].astype(np.uint16) * 257)
+    found = [view.image.astype(int) for view in load_dataset(folder).views]
     assert np.abs(found[0] - picture).mean() < 0.6 * np.abs(found[0] - picture[::-1, ::-1]).mean()
     np.testing.assert_array_equal(
-        found[1], np.rint(made.views[1].picture * 0.2 + 255 * 0.8 * np.array(BACKGROUND))
+        found[1], np.rint(made.views[1].image * 0.2 + 255 * 0.8 * np.array(BACKGROUND))
     )
-    np.testing.assert_array_equal(found[2], made.views[2].picture)
+    np.testing.assert_array_equal(found[2], made.views[2].image)
 
 
 def test_a_model_without_points_may_start_from_random_ones(folder):
     for file in folder.rglob("points3D.*"):
         file.unlink()
     assert len(load_dataset(folder, random_points=5).points) == 5
-    with pytest.raises(fs.InputError, match="has no points to start from; give --random-points"):
+    with pytest.raises(fs.InputError, match="must have initial points, got none; give --random-points"):
         load_dataset(folder)
 
 
@@ -215,7 +215,7 @@ def test_views_that_are_held_out(made, folder):
         place = folder / f"{count}"
         (place / "images").mkdir(parents=True)
         for name in names:
-            write_png(place / "images" / name, made.views[0].picture)
+            write_png(place / "images" / name, made.views[0].image)
         save_colmap(place / "sparse" / "0", names, cameras, made.points, made.colors)
         found = load_dataset(place)
         assert [view.name for view in found.held_out] == names[::8][:held_out]
@@ -239,7 +239,7 @@ def test_views_that_nerfstudio_holds_out(made, tmp_path):
             assert [view.name for view in views] == [f"./{name}.png" for name in wanted]
     for wrong, said in (
         ({"test_filenames": "2.png"}, "test_filenames must be a list"),
-        ({"val_filenames": ["no.png"]}, "val_filenames has no.png, which is no frame's file_path"),
+        ({"val_filenames": ["no.png"]}, "val_filenames must be file_paths of frames, got no.png"),
     ):
         folder = transforms(made, tmp_path / next(iter(wrong)), **wrong)
         with pytest.raises(fs.InputError, match=said):
@@ -247,7 +247,7 @@ def test_views_that_nerfstudio_holds_out(made, tmp_path):
 
 
 def test_random_points_lie_where_the_cameras_look(made):
-    low, high, faced = looked_at([view.camera for view in made.views])
+    low, high, faced = viewed_cube([view.camera for view in made.views])
     assert faced
     assert np.abs(low + high).max() < 1e-9  # all look at 0
     found = made.with_random_points(500, 3)
@@ -287,7 +287,7 @@ def test_scenes_far_from_the_origin_have_one_of_their_own(made):
         matrix[:3, 3] -= matrix[:3, :3] @ shift
         c = view.camera
         camera = fs.Camera.pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy, matrix)
-        return TrainingView(view.name, camera, view.picture)
+        return TrainingView(view.name, camera, view.image)
 
     far = Dataset("far", tuple(map(moved, made.views)), (), made.points + shift, made.colors)
     assert np.abs(far.origin - shift).max() < 10
@@ -297,24 +297,28 @@ def test_scenes_far_from_the_origin_have_one_of_their_own(made):
 def refusals(made):
     view, names = made.views[0], {}
     camera = view.camera
-    names["2 x 2.*give pictures of the size"] = lambda: TrainingView(
+    names["got 2 x 2; give images of the size"] = lambda: TrainingView(
         "a.png", camera, np.zeros((2, 2, 3), np.uint8)
     )
-    names["has 1 view to train on"] = lambda: Dataset("one", (view,), (), made.points, made.colors)
-    names["stand at one place"] = lambda: Dataset("still", (view, view), (), made.points, made.colors)
+    names["at least two training views, .* got 1"] = lambda: Dataset(
+        "one", (view,), (), made.points, made.colors
+    )
+    names["cameras of still must be at different positions"] = lambda: Dataset(
+        "still", (view, view), (), made.points, made.colors
+    )
     turned = []
     for k in range(5):  # a tripod: the place is what rounding leaves of it
         other = fs.Camera.look_at(24, 18, 0.9, (-1.7, 0.3, -2.1), (0.1 * k, 0.07 * k, 0))
         pinhole = (24, 18, other.fx, other.fy, other.cx, other.cy, other.world_to_camera)
-        turned.append(TrainingView(f"{k}.png", fs.Camera.pinhole(*pinhole), view.picture))
-    names["all 5 cameras of tripod stand at one place"] = lambda: Dataset(
+        turned.append(TrainingView(f"{k}.png", fs.Camera.pinhole(*pinhole), view.image))
+    names["the 5 cameras of tripod must be at different positions"] = lambda: Dataset(
         "tripod", tuple(turned), (), made.points, made.colors
     )
     behind = 9 * camera.position + made.points
-    names["all 6 points of back lie behind the camera"] = lambda: Dataset(
+    names["points of back must be in front of the camera of .*, got all 6 behind"] = lambda: Dataset(
         "back", made.views, (), behind, made.colors
     )
-    names["has a lens"] = lambda: TrainingView(
+    names["must be a pinhole camera, got a lens"] = lambda: TrainingView(
         "a.png", fs.Camera.fisheye(24, 18, 2.0), np.zeros((18, 24, 3), np.uint8)
     )
     return names
@@ -327,11 +331,11 @@ def test_data_sets_that_cannot_be_trained_on_are_refused(made):
 
 
 def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
-    with pytest.raises(fs.InputError, match="is not there"):
+    with pytest.raises(fs.InputError, match="path must be an existing data set"):
         load_dataset(tmp_path / "nothing")
-    with pytest.raises(fs.InputError, match="holds no data set"):
+    with pytest.raises(fs.InputError, match="must be a data set of COLMAP"):
         load_dataset(tmp_path)
-    with pytest.raises(fs.InputError, match="--hold-out is 1"):
+    with pytest.raises(fs.InputError, match=r"--hold-out must be .*, got 1"):
         load_dataset(folder, 1)
     (folder / "images" / "2.png").unlink()
     with pytest.raises(fs.InputError, match=r"cannot read .*2\.png"):
@@ -345,16 +349,19 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
                 load_dataset(folder)
         file.write_bytes(whole)
     nerf = transforms(made, tmp_path / "nerf")
-    with pytest.raises(fs.InputError, match="has no points to start from; give --random-points"):
+    with pytest.raises(fs.InputError, match="must have initial points, got none; give --random-points"):
         load_dataset(nerf)
     for change, words in (
-        ({"frames": 3}, "no list of frames"),
-        ({"frames": [{"file_path": "a"}]}, "frame 0 needs"),
+        ({"frames": 3}, "frames must be a list"),
+        ({"frames": [{"file_path": "a"}]}, "frame 0 must have"),
         ({"k1": "wide"}, "k1 must be a finite number"),
-        ({"k4": 0.1}, "k4 is 0.1, which the camera_model PINHOLE does not have .*; undistort the pictures"),
-        ({"fl_x": "far"}, "needs fl_x"),
-        ({"w": float("inf")}, "needs fl_x"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is 'EQUIRECTANGULAR'"),
+        (
+            {"k4": 0.1},
+            "of the camera_model PINHOLE must be .*, got k4 = 0.1; undistort the images",
+        ),
+        ({"fl_x": "far"}, "fl_x, or camera_angle_x, must be a finite"),
+        ({"w": float("inf")}, "fl_x, or camera_angle_x, must be a finite"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of .*, got 'EQUIRECTANGULAR'"),
     ):
         table = json.loads((nerf / "transforms.json").read_text())
         (tmp_path / "transforms.json").write_text(json.dumps(table | change))

@@ -10,7 +10,7 @@ from training_scene import scene, write
 import fidsplat as fs
 from fidsplat.images.files import write_png
 from fidsplat.train import load_dataset
-from fidsplat.train.flat import flat_view
+from fidsplat.train.undistorted_view import undistorted_view
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def flat_as_wanted(view, lens, mask):
     camera = view.camera
     assert camera.lens is None
     there = np.ones(mask.shape, bool) if view.mask is None else view.mask
-    off = np.abs(view.picture.astype(int) - taken(camera)).max(2)
+    off = np.abs(view.image.astype(int) - taken(camera)).max(2)
     # slopes bend a wave of 100 by 1000 at most; half a pixel's square of it, two roundings
     assert off[there].max() <= 2 + 1000 / (8 * camera.fx**2) * 8
     y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
@@ -104,13 +104,13 @@ def test_what_lenses_took_is_flat(folder, tmp_path, model):
     table = {"camera_model": model, "frames": frames, **names, **given}
     (folder / "transforms.json").write_text(json.dumps(table))
     for ours, theirs in zip(load_dataset(folder, random_points=9).views, found.views, strict=True):
-        np.testing.assert_array_equal(ours.picture, theirs.picture)
+        np.testing.assert_array_equal(ours.image, theirs.image)
         np.testing.assert_array_equal(ours.mask, theirs.mask)
 
 
 def test_a_lens_that_sees_all_of_a_flat_picture_leaves_no_mask():
     view = scene(count=6).views[0]
     camera = replace(view.camera, lens=BROWN(k1=-0.01))
-    assert flat_view("a.png", camera, view.picture, None).mask is None
-    with pytest.raises(fs.InputError, match=r"2 x 2.*give pictures of the size"):
-        flat_view("a.png", camera, np.zeros((2, 2, 3), np.uint8), None)
+    assert undistorted_view("a.png", camera, view.image, None).mask is None
+    with pytest.raises(fs.InputError, match=r"got 2 x 2; give images of the size"):
+        undistorted_view("a.png", camera, np.zeros((2, 2, 3), np.uint8), None)

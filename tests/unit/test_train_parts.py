@@ -7,9 +7,9 @@ import pytest
 import fidsplat as fs
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.train import TrainSettings, densify, mcmc, neighbours
-from fidsplat.train.losses import C1, C2, blurred, normal_loss, picture_loss, window
+from fidsplat.train.losses import C1, C2, blurred, image_loss, normal_loss, window
 from fidsplat.train.neighbours import mean_square_distances
-from fidsplat.train.optimiser import adam_step, inner_gradients
+from fidsplat.train.optimiser import adam_step, parameter_gradients
 from fidsplat.train.parameters import Splats, TrainingError, logit, sigmoid
 from fidsplat.train.random_numbers import Purpose, normal, permutation, philox, uniform
 
@@ -34,7 +34,7 @@ def splats_of(count, seed=0, degree=1):
 def test_the_gradient_of_the_loss_is_that_of_central_differences(weight, masked):
     image, truth = pictures()
     mask = np.random.default_rng(1).uniform(size=image.shape[:2]) < 0.6 if masked else None
-    _, gradient = picture_loss(image, truth, mask, weight)
+    _, gradient = image_loss(image, truth, mask, weight)
     random = np.random.default_rng(2)
     for _ in range(40):
         place = tuple(random.integers(image.shape))
@@ -42,7 +42,7 @@ def test_the_gradient_of_the_loss_is_that_of_central_differences(weight, masked)
         for change in (1e-5, -1e-5):
             moved = image.copy()
             moved[place] += change
-            values.append(picture_loss(moved, truth, mask, weight)[0].value)
+            values.append(image_loss(moved, truth, mask, weight)[0].value)
         assert gradient[place] == pytest.approx((values[0] - values[1]) / 2e-5, abs=1e-9)
         if masked and not mask[place[:2]]:
             assert gradient[place] == 0
@@ -105,21 +105,21 @@ def test_the_loss_is_what_its_definition_says():
                 shared = (weights * p * q).sum() - mean_p * mean_q
                 top = (2 * mean_p * mean_q + C1) * (2 * shared + C2)
                 similar.append(top / ((mean_p**2 + mean_q**2 + C1) * (var_p + var_q + C2)))
-    loss, _ = picture_loss(image, truth, None, 0.2)
+    loss, _ = image_loss(image, truth, None, 0.2)
     l1 = np.abs(image - truth).mean()
     assert loss.value == pytest.approx(0.8 * l1 + 0.2 * (1 - np.mean(similar)), rel=1e-12)
     assert loss.psnr == pytest.approx(-10 * np.log10(np.mean((image - truth) ** 2)))
-    assert picture_loss(truth, truth, None, 0.2)[0].psnr == np.inf
+    assert image_loss(truth, truth, None, 0.2)[0].psnr == np.inf
     np.testing.assert_allclose(blurred(np.ones((30, 30, 1)))[15, 15], 1)
 
 
 def test_a_value_that_is_not_finite_is_seen_unless_it_is_masked():
     image, truth = pictures()
     image[3, 4, 1] = np.nan
-    assert np.isnan(picture_loss(image, truth, None, 0.2)[0].value)
+    assert np.isnan(image_loss(image, truth, None, 0.2)[0].value)
     mask = np.ones(image.shape[:2], bool)
     mask[3, 4] = False
-    assert np.isfinite(picture_loss(image, truth, mask, 0.2)[0].value)
+    assert np.isfinite(image_loss(image, truth, mask, 0.2)[0].value)
 
 
 def test_adam_takes_the_step_that_is_written_out():
@@ -179,7 +179,7 @@ def test_gradients_by_inner_values_are_those_of_central_differences(strategy, pl
             total += 0.01 * found["opacities"].mean() + 0.01 * found["scales"].mean()
         return total
 
-    found = inner_gradients(splats, weights, settings)
+    found = parameter_gradients(splats, weights, settings)
     for name, array in start.items():
         for place in np.ndindex(array.shape):
             values = []
@@ -241,7 +241,7 @@ def ready(count=8):
     splats.values["logits"][:] = 0
     splats.values["log_scales"][:] = np.log(0.01)
     splats.values["sh"][:, 0, 0] = np.arange(count)
-    splats.seen[:] = 4
+    splats.visible_counts[:] = 4
     return splats
 
 
@@ -251,14 +251,14 @@ def ids(splats):
 
 def test_densification_keeps_the_order_and_puts_new_splats_behind():
     settings, splats = TrainSettings(), ready()
-    splats.gradients[[1, 2, 5]] = 4 * settings.gradient_threshold
-    splats.gradients[3] = 3.99 * settings.gradient_threshold  # in 4 pictures: below the threshold
+    splats.gradient_sums[[1, 2, 5]] = 4 * settings.gradient_threshold
+    splats.gradient_sums[3] = 3.99 * settings.gradient_threshold  # in 4 pictures: below the threshold
     splats.values["log_scales"][[2, 5]] = np.log(0.03)  # larger than a hundredth of the extent
     splats.values["logits"][7] = logit(0.04)
-    old = splats.chosen(slice(None))
-    made = densify.plan(splats, settings, 600, extent=2.0).made(splats)
+    old = splats.select(slice(None))
+    made = densify.densification(splats, settings, 600, extent=2.0).apply(splats)
     assert ids(made) == [0, 1, 3, 4, 6, 1, 2, 5, 2, 5]
-    kept = old.chosen(np.array([0, 1, 3, 4, 6]))
+    kept = old.select(np.array([0, 1, 3, 4, 6]))
     for name in kept.values:
         np.testing.assert_array_equal(made.values[name][:5], kept.values[name])
         np.testing.assert_array_equal(made.first[name][:5], kept.first[name])
@@ -272,23 +272,23 @@ def test_densification_keeps_the_order_and_puts_new_splats_behind():
     assert (np.abs(away).max(axis=1) > 0).all()
     turns = quaternion_to_matrix(old.values["quats"][[2, 5, 2, 5]])
     assert np.abs(np.einsum("ni,ni->n", away, turns[:, :, 2])).max() < 1e-6  # within their disks
-    assert not made.gradients.any()
-    assert not made.seen.any()
+    assert not made.gradient_sums.any()
+    assert not made.visible_counts.any()
 
 
 def test_a_faint_splat_goes_though_it_would_be_split():
     settings, splats = TrainSettings(), ready()
-    splats.gradients[[1, 2]] = 4 * settings.gradient_threshold
+    splats.gradient_sums[[1, 2]] = 4 * settings.gradient_threshold
     splats.values["log_scales"][[1, 2]] = np.log(0.03)
     splats.values["logits"][1] = logit(0.04)
-    made = densify.plan(splats, settings, 600, extent=2.0).made(splats)
+    made = densify.densification(splats, settings, 600, extent=2.0).apply(splats)
     assert ids(made) == [0, 3, 4, 5, 6, 7, 2, 2]
 
 
 def test_no_more_splats_are_made_than_allowed():
     settings, splats = TrainSettings(max_splats=10), ready()
-    splats.gradients[[1, 2, 5, 6]] = np.array([2, 1, 3, 2]) * 4 * settings.gradient_threshold
-    assert ids(densify.plan(splats, settings, 600, 2.0).made(splats)) == [*range(8), 1, 5]
+    splats.gradient_sums[[1, 2, 5, 6]] = np.array([2, 1, 3, 2]) * 4 * settings.gradient_threshold
+    assert ids(densify.densification(splats, settings, 600, 2.0).apply(splats)) == [*range(8), 1, 5]
 
 
 def test_large_splats_go_after_the_first_reset():
@@ -296,17 +296,17 @@ def test_large_splats_go_after_the_first_reset():
     for iteration, left in ((600, 8), (3000, 8), (3001, 7)):
         splats = ready()
         splats.values["log_scales"][4] = np.log(0.3)
-        assert len(densify.plan(splats, settings, iteration, 2.0).rows) == left
+        assert len(densify.densification(splats, settings, iteration, 2.0).rows) == left
     splats.values["logits"][:] = logit(0.01)
-    with pytest.raises(TrainingError, match=r"no splat is left after iteration 600"):
-        densify.plan(splats, settings, 600, 2.0)
+    with pytest.raises(TrainingError, match=r"all splats were pruned after iteration 600"):
+        densify.densification(splats, settings, 600, 2.0)
 
 
 def test_mcmc_moves_the_dead_and_grows_up_to_its_limit():
     settings = TrainSettings(strategy="mcmc", max_splats=41)
     splats = ready(40)
     splats.values["logits"][[3, 9]] = logit(0.004)
-    made = mcmc.moved(splats, settings, 600)
+    made = mcmc.relocate_and_grow(splats, settings, 600)
     assert len(made) == 41
     assert [i for i, new in enumerate(ids(made)[:40]) if i != new] == [3, 9]
     # two that stand for one let through what the one did
@@ -319,8 +319,8 @@ def test_mcmc_moves_the_dead_and_grows_up_to_its_limit():
     for place, source in zip((3, 9, 40), sources, strict=True):
         assert_looks_like(made, [source, place], ids(made).count(source))
     splats.values["logits"][:] = logit(0.004)
-    with pytest.raises(TrainingError, match=r"all splats are fainter"):
-        mcmc.moved(splats, settings, 600)
+    with pytest.raises(TrainingError, match=r"all splats are dead"):
+        mcmc.relocate_and_grow(splats, settings, 600)
 
 
 def assert_looks_like(splats, rows, copies):
@@ -337,28 +337,28 @@ def test_mcmc_moves_a_splat_of_exactly_the_dead_opacity():
     splats = ready(12)
     splats.values["logits"][4] = -3
     exactly = TrainSettings(strategy="mcmc", growth=1.0, dead_opacity=float(splats.opacities[4]))
-    assert ids(mcmc.moved(splats, exactly, 600))[4] != 4
+    assert ids(mcmc.relocate_and_grow(splats, exactly, 600))[4] != 4
 
 
 def test_densification_takes_a_gradient_of_exactly_the_threshold():
     splats = ready()
-    splats.gradients[2] = 1.0
+    splats.gradient_sums[2] = 1.0
     exactly = TrainSettings(gradient_threshold=0.25)
-    assert ids(densify.plan(splats, exactly, 600, 2.0).made(splats)) == [*range(8), 2]
+    assert ids(densify.densification(splats, exactly, 600, 2.0).apply(splats)) == [*range(8), 2]
 
 
 def test_mcmc_shakes_faint_splats_within_their_disks():
     settings, splats = TrainSettings(strategy="mcmc"), ready(40)
     splats.values["logits"][:20] = logit(0.001)
     before = splats.values["means"].copy()
-    mcmc.shake(splats, settings, 5, 1e-4)
+    mcmc.add_noise(splats, settings, 5, 1e-4)
     away = splats.values["means"] - before
     assert np.abs(away[:20]).max(axis=1).min() > 100 * np.abs(away[20:]).max()
     turns = quaternion_to_matrix(splats.values["quats"])
     assert np.abs(np.einsum("ni,ni->n", away, turns[:, :, 2])).max() < 1e-6
 
 
-def test_settings_say_what_they_take():
+def test_settings_outside_their_range_are_errors():
     assert TrainSettings().position_rate_at(7000) == pytest.approx(5.46e-5, rel=1e-3)
     assert [TrainSettings().degree_at(i) for i in (999, 1000, 9000)] == [0, 1, 3]
     wrong = {
@@ -376,7 +376,7 @@ def test_settings_say_what_they_take():
         "max_splats": True,
         "quality": "fine",
     }
-    with pytest.raises(fs.InputError, match="as text"):  # which a checkpoint could not hold
+    with pytest.raises(fs.InputError, match="must be text"):  # which a checkpoint could not hold
         TrainSettings(quality=fs.Quality())  # type: ignore[arg-type]
     for name, value in wrong.items():
         with pytest.raises(fs.InputError):

@@ -1,4 +1,4 @@
-"""What a run will draw next: known before, so that it can be compiled meanwhile."""
+"""Features of the next phase of a training run, for background compilation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fidsplat.train.settings import TrainSettings
 
 
 class _Disks(NamedTuple):
-    """What of splats in training decides the kernels."""
+    """Traits of splats in training, for `select`."""
 
     sh_degree: int
     has_coplanar_groups: bool = False
@@ -19,15 +19,14 @@ class _Disks(NamedTuple):
     ellipsoids: str = "none"
 
 
-def features_after(
+def next_features(
     settings: TrainSettings, iteration: int, plain: Capture, solid: Capture
 ) -> FeatureSet | None:
-    """The features of the pictures when the degree has grown or another loss has begun, whichever is next in
-    a run; None where neither will be.
+    """Features of frames after the next growth of the SH degree or start of a loss; None: no change follows.
 
     Args:
-        plain: a capture of the loss of colours.
-        solid: of that with normals.
+        plain: a capture for the colour loss.
+        solid: a capture for the normal loss.
     """
     change = settings.changes_after(iteration)
     if change is None:

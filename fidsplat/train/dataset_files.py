@@ -1,0 +1,130 @@
+"""Reader of data sets: COLMAP, nerfstudio's transforms.json, and COLMAP's layout with a note of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.formats.colmap_read import has_colmap, load_colmap
+from fidsplat.images.files import read_image, read_over
+from fidsplat.train.dataset import MAX_POINTS, Dataset, TrainingView
+from fidsplat.train.transforms import DatasetContents, has_transforms, load_transforms
+from fidsplat.train.undistorted_view import undistorted_view
+from fidsplat.util.arguments import callback, whole_number
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import from_json, path_of, read_text
+
+NOTES = ("dataset.json", "marker.json")
+"""files of our data sets with their `background`: one display value, or three"""
+_MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+"""folders of COLMAP's model in a data set"""
+HOLD_OUT, MIN_VIEWS_TO_HOLD_OUT = 8, 16
+"""every eighth view is held out in data sets of at least 16 views without held-out views"""
+
+Progress = Callable[[str, float], None]
+Background = tuple[float, float, float]
+
+
+def load_dataset(
+    path: str | Path,
+    hold_out: int | None = None,
+    random_points: int = 0,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Dataset:
+    """Read a data set.
+
+    Args:
+        path: a folder with COLMAP's model in `sparse/0` and images in `images`, or with `transforms.json` or
+            `transforms_train.json`; or one of these files.
+        hold_out: n holds out every n-th view in the order of names, 0 none. By default views in the folder
+            `test` or in `transforms_test.json`, otherwise every eighth of 16 and more views.
+        random_points: number of random initial points that replace those of the data set.
+        seed: seed of the random points.
+        progress: called with the item that is read and the share done.
+
+    Raises:
+        InputError: no data set, an image that is missing or of another size than its camera, no points.
+    """
+    folder = path_of(path)
+    if not folder.exists():
+        raise InputError(f"path must be an existing data set, got {folder}; give its folder")
+    if hold_out is not None and whole_number("--hold-out", hold_out, 0, 2**31) == 1:
+        raise InputError(f"--hold-out must be 0 (none), or 2 or more (every n-th view), got {hold_out}")
+    random_points = whole_number("--random-points", random_points, 0, MAX_POINTS)
+    report = callback("progress", progress) or (lambda words, share: None)
+    found = (load_transforms if has_transforms(folder) else _load_colmap)(folder, report)
+    views, held_out = _divided(found.views, found.held_out, hold_out)
+    points, colors = found.points, found.colors
+    if not len(points) and not random_points:
+        raise InputError(
+            f"{folder} must have initial points, got none; give --random-points 5000, or a model with points"
+        )
+    dataset = Dataset(str(folder), views, held_out, points, colors, found.background)
+    return dataset.with_random_points(random_points, seed) if random_points else dataset
+
+
+def _divided(
+    views: Sequence[TrainingView], held_out: Sequence[TrainingView], every: int | None
+) -> tuple[tuple[TrainingView, ...], tuple[TrainingView, ...]]:
+    if every is None:
+        every = 0 if held_out or len(views) < MIN_VIEWS_TO_HOLD_OUT else HOLD_OUT
+    if every == 0:
+        return tuple(views), tuple(held_out)
+    return (
+        tuple(view for i, view in enumerate(views) if i % every),
+        (*views[::every], *held_out),
+    )
+
+
+def _load_colmap(folder: Path, progress: Progress) -> DatasetContents:
+    model = next((folder / name for name in _MODELS if has_colmap(folder / name)), None)
+    if model is None:
+        raise InputError(
+            f"{folder} must be a data set of COLMAP (sparse/0/cameras.bin and images/) or nerfstudio "
+            "(transforms.json), got neither"
+        )
+    background = _background(folder)
+    views, points, colors = _model(folder, model, background, progress, "images")
+    held_out: list[TrainingView] = []
+    if has_colmap(folder / "test" / "sparse" / "0"):
+        test = folder / "test"
+        held_out, _, _ = _model(test, test / "sparse" / "0", background, progress, "test images")
+    return DatasetContents(views, held_out, points, colors, background)
+
+
+def _model(
+    folder: Path, place: Path, background: Background, progress: Progress, words: str
+) -> tuple[list[TrainingView], np.ndarray, np.ndarray]:
+    model = load_colmap(place)
+    views = []
+    for i, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
+        progress(words, i / len(model.names))
+        image = read_over(folder / "images" / name, background)
+        views.append(undistorted_view(name, camera, image, _mask(folder / "masks" / name)))
+    return views, model.points, model.colors
+
+
+def _mask(mask: Path) -> np.ndarray | None:
+    # COLMAP appends .png to the name of the image, others replace its suffix
+    candidates = (mask.with_name(f"{mask.name}.png"), mask.with_suffix(".png"))
+    file = next((one for one in candidates if one.is_file()), None)
+    return None if file is None else read_image(file).max(axis=2) > 0
+
+
+def _background(folder: Path) -> Background:
+    for name in NOTES:
+        file = folder / name
+        if file.exists():
+            text = read_text(file, "replace")
+            try:
+                value = from_json(text).get("background", 0.0)
+                red, green, blue = np.broadcast_to(np.asarray(value, float), 3).tolist()
+            except (ValueError, AttributeError, TypeError):
+                raise InputError(
+                    f"background of {file} must be one number or three, got another value"
+                ) from None
+            return red, green, blue
+    return (0.0, 0.0, 0.0)

@@ -1,0 +1,24 @@
+"""Training views of photographs with lens distortion, undistorted when they are read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.train.dataset import TrainingView
+from fidsplat.vision.undistort import flattened
+
+
+def undistorted_view(name: str, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> TrainingView:
+    """A training view. A photograph with lens distortion is resampled to a pinhole camera of the same focal
+    length; the mask excludes pixels outside the photograph.
+
+    Raises InputError as `TrainingView`.
+    """
+    size = (camera.height, camera.width)
+    if camera.lens is not None and image.shape[:2] == size and (mask is None or mask.shape == size):
+        image, inside = flattened(image, camera, np.ones(size, bool) if mask is None else mask)
+        mask, camera = None if inside.all() else inside, replace(camera, lens=None)
+    return TrainingView(name, camera, image, mask)
