@@ -128,7 +128,7 @@ class Quality:
     splat; splats that are printed on one plane (markers) are one layer, whose colour depends on no order.
     `centre`: every splat by the depth of its centre, as other renderers do and captured scenes were trained;
     large splats swap places as the camera turns. `auto`: `pixel` where splats are printed on planes, `centre`
-    elsewhere (docs/order.md says why)."""
+    elsewhere (docs/correctness.md says why)."""
 
     samples: int = 1
     """n, 1 to 8, default 1: each pixel is the mean of n x n samples on a regular grid. More smooth edges, and
@@ -146,7 +146,7 @@ class Quality:
 
     setup_precision: str = "float64"
     """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses; it moves
-    small and grazing splats (docs/numerics.md), and saves time on devices whose float64 is slow."""
+    small and grazing splats (docs/correctness.md), and saves time on devices whose float64 is slow."""
 
     arithmetic: str = "fast"
     """Exponentials and logarithms of blending. `fast`: our own polynomials, bit-identical wherever devices

@@ -6,8 +6,8 @@ those of the facets of a shallow dish, of which at every point the module's own 
 Gaussian lacks towards the corners of its module its copies make up, and what still comes through shows its
 neighbours.
 
-It takes a renderer that composites by depth at each pixel (docs/order.md). By the depth of centres the same
-splats hide each other (devlog/marker-opacity.md).
+It requires compositing by depth at each pixel (docs/correctness.md). With the depth of centres the same
+splats occlude each other (devlog/marker-opacity.md).
 """
 
 from __future__ import annotations

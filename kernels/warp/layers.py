@@ -1,4 +1,4 @@
-"""Splats of one plane are one layer at a sample (docs/order.md): its colour and depth are means of its
+"""Splats of one plane are one layer at a sample (docs/correctness.md): its colour and depth are means of its
 fragments by optical depth.
 
 They stand together in the lists, where the nearest point of the plane puts them; when another splat follows,

@@ -1,4 +1,4 @@
-"""Every entry of the catalogue (numerics.md) on every device, and that none is missing."""
+"""Every entry of the catalogue (docs/correctness.md) on every device, and that none is missing."""
 
 import pytest
 from agreement import reference_images

@@ -44,7 +44,7 @@ def test_a_scene_is_its_seed():
 
 
 def test_the_scenes_are_hard():
-    """The distribution of numerics.md, section 3, in what the splats turn out to be."""
+    """The declared distribution, measured on the splats of the scenes."""
     edge_on = near = total = grouped = tilted = 0
     largest, smallest, counts, flat, opacities = 0.0, np.inf, [], 1.0, set()
     for seed in range(150):

@@ -161,7 +161,7 @@ def test_of_equal_depths_that_wait_the_first_is_in_front(renderer):
 
 @pytest.mark.exhaustive
 def test_every_pixel_of_a_hundred_thousand_splats(renderer):
-    """Against the sort of every pixel in float64; docs/order.md has what `-s` prints."""
+    """Against the sort of every pixel in float64; docs/correctness.md has what `-s` prints."""
     cloud, _ = load_scene("r100k_720p")
     camera, quality = standard_camera(320, 180), fs.Quality(order="pixel")
     differences = against_reference(renderer, FrameSpec(cloud, camera, quality, ("rgb", "depth")))

@@ -1,6 +1,5 @@
-"""Mutated splat files: whatever the damage, a load ends in a cloud of good splats or in an InputError, soon,
-and within twice the memory of what the file holds (numerics.md E1, E3; the hangs and huge allocations of
-other readers).
+"""Mutated splat files: each load ends quickly in a cloud of valid splats or in an InputError, within
+twice the memory of the file's contents (docs/correctness.md, E1 and E3).
 """
 
 import re

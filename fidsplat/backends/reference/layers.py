@@ -1,5 +1,5 @@
-"""In which order samples composite what they see (docs/order.md): by the splats' centres, or by depth at each
-sample, where the splats of a printed plane are one layer.
+"""Depth order of a sample's fragments (docs/correctness.md): by splat centres, or by depth at each sample,
+with one layer per coplanar group.
 """
 
 from __future__ import annotations
