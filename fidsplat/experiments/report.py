@@ -17,7 +17,6 @@ from fidsplat.experiments.pictures import sheet_files
 from fidsplat.experiments.results import load
 from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
 from fidsplat.experiments.summary import Frame, Row, provenance
-from fidsplat.experiments.targets import targets
 from fidsplat.experiments.views import LINEAR, TRUTHS
 from fidsplat.util.files import atomic_write, open_input
 
@@ -47,10 +46,6 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     summaries = {
         name: summary.write(file) for (name, summary), file in zip(loaded.items(), files, strict=True)
     }
-    reached = targets(summaries)
-    missed = folder / "missed.csv"
-    with atomic_write(missed) as stream:
-        stream.write(reached[~reached["reached"]].drop(columns="reached").to_csv(index=False).encode())
     rows = {name: summary.rows for name, summary in summaries.items()}
     context: dict = dict.fromkeys((counts.NAME, angles.NAME, views.NAME, localisation.NAME, trained.NAME))
     for name, tables in (
@@ -69,9 +64,6 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
             with atomic_write(folder / sheet.name) as stream, open_input(sheet) as source:
                 shutil.copyfileobj(source, stream)
     context |= {
-        "targets": len(reached),
-        "reached": int(reached["reached"].sum()),
-        "kinds": _kinds(reached),
         "sheets": [sheet.name for sheet in sheets],
         "runs": provenance(
             {f"`{_COMMANDS.get(name, name)}`": summary for name, summary in summaries.items()}
@@ -80,13 +72,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
         "notes": list(dict.fromkeys(note for summary in summaries.values() for note in summary.notes)),
     }
     write_page(page, folder, "results.md.j2", context)
-    return [page, *files, missed, *sorted(folder.glob("*.svg"))]
-
-
-def _kinds(reached: Frame) -> Frame:
-    """Targets by kind: how many there are, and how many are reached."""
-    table = reached.groupby("kind", sort=False)["reached"].agg(["sum", "size"]).reset_index()
-    return table.set_axis(["target", "reached", "of"], axis=1)
+    return [page, *files, *sorted(folder.glob("*.svg"))]
 
 
 def category_order(names: Iterable[str]) -> list[str]:

@@ -317,8 +317,9 @@ def use_path(file):
 
 
 def use_results(file):
-    from fidsplat.experiments.results import load
     from fidsplat.experiments.targets import targets
+
+    from fidsplat.experiments.results import load
 
     targets(load([file.parent]))
 

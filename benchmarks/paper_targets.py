@@ -1,8 +1,15 @@
-"""What the experiments are to reach, and what results say of it."""
+"""Compare results of the paper's experiments with the targets of this project.
+
+    python benchmarks/paper_targets.py devlog/results [--missed devlog/paper-targets-missed.csv]
+
+Prints how many targets of each kind are reached, and writes those that are missed.
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import pandas as pd
@@ -10,15 +17,16 @@ import pandas as pd
 from fidsplat.experiments import angles, counts, trained, views
 from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.paper import ANGLES, VIEWS
-from fidsplat.experiments.results import ALLOWED_GAP, NEVER
+from fidsplat.experiments.results import ALLOWED_GAP, NEVER, load
 from fidsplat.experiments.summary import Frame, Summary
 from fidsplat.experiments.views import LINEAR
+from fidsplat.util.files import atomic_write
 
 EXACT_PSNR, EXACT_SSIM = 38.7, 0.99
 FITTED_GAIN = 3.0
 """dB above the paper's own method"""
 FITTED_SHARE = 0.25
-"""of the Gaussians of the paper's mixture"""
+"""largest share of the number of Gaussians of the paper's mixture"""
 HUGE_SECONDS = 0.15
 TRAINED_LOSS = 0.5
 """dB below the paper's figure of 2DGS"""
@@ -26,7 +34,7 @@ _SLACK = 1e-6
 
 
 class Target(NamedTuple):
-    """One thing to reach."""
+    """A target and the measured value."""
 
     kind: str
     what: str
@@ -36,7 +44,7 @@ class Target(NamedTuple):
 
 
 def targets(summaries: dict[str, Summary]) -> Frame:
-    """A row for each target of which anything was measured."""
+    """Table with a row for each target that has measurements."""
     found: list[Target] = []
     rows = {name: summary.rows for name, summary in summaries.items()}
     if angles.NAME in rows:
@@ -51,14 +59,14 @@ def targets(summaries: dict[str, Summary]) -> Frame:
 
 
 def _best(rows: Frame) -> Iterator[tuple[str, str, Frame]]:
-    """Of mixtures that have a target, drawn sharp: mixture, method, rows."""
+    """Mixture, method and rows of each mixture with a target, rendered with the filter `best`."""
     for mixture in ALLOWED_GAP:
         method = f"{mixture}/best"
         yield mixture, method, rows[rows["method"] == method]
 
 
 def _gaps(rows: Frame) -> Iterator[Target]:
-    """The paper's angle is the largest one; what is read without a miss up to it is the stricter question."""
+    """Gaps of the largest tilt, as in the paper, and of the largest without a miss."""
     for mixture, method, own in _best(rows):
         allowed = ALLOWED_GAP[mixture]
         for (protocol, category, reader), scans in own.groupby(
@@ -127,7 +135,7 @@ def _views(rows: Frame) -> Iterator[Target]:
 
     for truth, category in rows[["truth", "category"]].drop_duplicates().itertuples(index=False):
         ceiling = mean(IDEAL)
-        beside = "" if ceiling is None else f" (a perfect picture of display values: {ceiling:.2f})"
+        beside = "" if ceiling is None else f" (a perfect image of display values: {ceiling:.2f})"
         method = "exact/light" if truth in LINEAR else "exact/best"
         for metric, least, unit in (("psnr", EXACT_PSNR, " dB"), ("ssim", EXACT_SSIM, "")):
             value = mean(method, metric)
@@ -192,3 +200,23 @@ def _counts(rows: Frame) -> Iterator[Target]:
             f"{seconds.max():.3f} s, median of the slowest of {len(seconds)}",
             bool(seconds.max() <= HUGE_SECONDS),
         )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folders", nargs="+", type=Path, help="folders with results or their tables")
+    parser.add_argument("--missed", type=Path, metavar="FILE.csv", help="write the missed targets")
+    options = parser.parse_args()
+    found = targets(load(options.folders))
+    if options.missed is not None:
+        missed = found[~found["reached"]].drop(columns="reached")
+        with atomic_write(options.missed) as stream:
+            stream.write(missed.to_csv(index=False).encode())
+    print(found.groupby("kind", sort=False)["reached"].agg(["sum", "size"]).to_string())
+    print(f"{found['reached'].sum()} of {len(found)} targets are reached")
+
+
+if __name__ == "__main__":
+    main()
