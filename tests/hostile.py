@@ -7,6 +7,7 @@ files, members of ZIP files and the content of gzip files are changed inside val
 
 from __future__ import annotations
 
+import copy
 import gzip
 import io
 import json
@@ -166,7 +167,7 @@ def spoiled_json(draw: st.DrawFn, text: str) -> bytes:
                     st.sampled_from([-1, 0, 1, 2**31, 2**53, 1e300, -holder[key], holder[key] + 1, 0.5])
                 )
             case _:
-                holder[key] = draw(st.sampled_from(_JSON))
+                holder[key] = copy.deepcopy(draw(st.sampled_from(_JSON)))
     return json.dumps(root[0]).encode()
 
 
