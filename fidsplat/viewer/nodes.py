@@ -97,11 +97,11 @@ class Nodes:
         return lines
 
     def _frustum(self, name: str, camera: Camera | None, pose: np.ndarray, color: Any, scale: float) -> Any:
-        width, height, fy = (4, 3, 3) if camera is None else (camera.width, camera.height, camera.fy)
+        wide, tall = (4 / 3, 1.0) if camera is None else (camera.width / camera.fx, camera.height / camera.fy)
         return self._page.add_camera_frustum(
             name,
-            fov=float(2 * np.arctan(height / 2 / fy)),
-            aspect=width / height,
+            fov=float(2 * np.arctan(tall / 2)),
+            aspect=wide / tall,
             scale=scale,
             thickness=2.0,
             thickness_units="screen",  # thin edges, as the page starts inside this frustum
