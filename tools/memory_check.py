@@ -96,7 +96,7 @@ def plant() -> int:
 def draw() -> int:
     """Under oclgrind: pictures in both schedules, each compared with the reference."""
     import fidsplat as fs
-    from fidsplat.backends.opencl.workspace import BufferPool
+    from fidsplat.backends.opencl.buffers import BufferPool
 
     renderer = fs.Renderer("opencl:oclgrind")
     kept = []

@@ -9,7 +9,7 @@ from agreement import random_splats
 from test_memory import CAMERA, as_on_a_gpu, machines, own_device
 
 import fidsplat as fs
-from fidsplat.backends.opencl import batch
+from fidsplat.backends.opencl import memory_plan
 from fidsplat.capture.views import views_of
 
 
@@ -126,8 +126,8 @@ def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine
     asked = {"poses": poses[0], "groups": {2: poses[1]}, "mask": np.arange(7) != 3}
     resident = own.upload(some)
     for most in (1 << 31, 1 << 18):
-        monkeypatch.setattr(batch, "_MOST", {})
-        monkeypatch.setattr(batch, "_MOST_OTHERS", most)
+        monkeypatch.setattr(memory_plan, "PART_BYTES", {})
+        monkeypatch.setattr(memory_plan, "OTHER_PART_BYTES", most)
         drawn = own.render_batch(resident, capture, **asked)
         alone = own.render(resident, capture)
         for number in (0, 1, 2, 4, 5, 6):

@@ -61,7 +61,7 @@ def test_a_buffer_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer
     """E3: nothing is allocated beyond the device's limit, and the message says what to do."""
     backend = opencl(renderer)
     limit = renderer.device.largest_allocation_bytes
-    with pytest.raises(fs.DeviceError, match=r"lists needs \d+ MiB .* use fewer splats or a smaller picture"):
+    with pytest.raises(fs.DeviceError, match=r"lists must be at most .* use fewer splats or a smaller frame"):
         backend.pool.fresh("lists", limit + 1)
 
 

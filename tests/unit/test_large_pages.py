@@ -10,7 +10,7 @@ import pyopencl as cl
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.opencl import workspace
+from fidsplat.backends.opencl import buffers
 from fidsplat.backends.opencl.pages import large_pages
 
 
@@ -25,7 +25,7 @@ def test_advice_leaves_contents_as_they_are():
 def test_large_buffers_are_the_devices_own(monkeypatch):
     """Memory of the host's would be gone with the Python object, though a kernel still writes there."""
     asked = []
-    monkeypatch.setattr(workspace, "large_pages", lambda address, size: asked.append((address, size)))
+    monkeypatch.setattr(buffers, "large_pages", lambda address, size: asked.append((address, size)))
     pool = fs.Renderer("opencl:cpu").backend.pool
     small, large = pool.fresh("small", 1 << 12), pool.fresh("large", (1 << 22) + 20)
     for buffer in (small, large):

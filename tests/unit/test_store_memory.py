@@ -12,7 +12,7 @@ import pytest
 from store_views import TURNED, look, made_stores
 
 import fidsplat as fs
-from fidsplat.backends.opencl import chunks, workspace
+from fidsplat.backends.opencl import buffers, chunks
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.store.chunked_splats import ChunkedSplats
@@ -169,13 +169,13 @@ def test_a_budget_of_memory_makes_bands(stores):
 def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypatch):
     live, peak, store = weakref.WeakSet(), [0], stores["wall"]
 
-    class Counted(workspace.DeviceBuffer):
+    class Counted(buffers.DeviceBuffer):
         def __init__(self, *given, **words):
             super().__init__(*given, **words)
             live.add(self)
             peak[0] = max(peak[0], sum(buffer.size for buffer in live))
 
-    monkeypatch.setattr(workspace, "DeviceBuffer", Counted)
+    monkeypatch.setattr(buffers, "DeviceBuffer", Counted)
     for budget in (2200 << 10, 3 << 20):
         peak[0], limited = 0, fs.Renderer("opencl", memory_budget=budget)
         resident = limited.upload(store)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator, Mapping
-from itertools import pairwise
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,6 @@ from fidsplat.backends.opencl.images import Rendered
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects.catalogue import Output
 from fidsplat.util.errors import DeviceError, bytes_words
-
-_MOST = {"cpu": 1 << 28}
-"""bytes that the views of a part take together, beside their images: more is no faster"""
-_MOST_OTHERS = 1 << 31
-_MOST_SAMPLES = 1 << 30
-"""of all views of a part; kernels number them in 32 bits, several channels of them"""
 
 
 class OutputBuffers:
@@ -64,20 +57,6 @@ class OutputBuffers:
         """Of an image of one view."""
         channels = self.outputs[name].channels
         return self.size if channels == 1 else (*self.size, channels)
-
-
-def parts(views: int, each: int, samples: int, kind: str, free: int) -> Iterator[tuple[int, int]]:
-    """Ranges of views (first, end) that are drawn together.
-
-    Args:
-        each: bytes that a view takes. samples: of a view. kind: of the device. free: bytes that there are.
-    """
-    room = min(free, _MOST.get(kind, _MOST_OTHERS)) // each
-    together = max(1, min(room, _MOST_SAMPLES // samples))
-    # of equal size, so that they take buffers of one size
-    count = -(-views // together)
-    cuts = [views * k // count for k in range(count + 1)]
-    return pairwise(cuts)
 
 
 class OpenCLBatch:

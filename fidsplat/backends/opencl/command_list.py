@@ -7,8 +7,8 @@ from typing import Any
 
 import pyopencl as cl
 
+from fidsplat.backends.opencl.buffers import token_of
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.workspace import token_of
 
 _UNKNOWN = object()
 """the mark of an argument that is not bound, or whose binding was interrupted"""

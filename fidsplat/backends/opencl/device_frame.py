@@ -111,7 +111,7 @@ class DeviceFrame:
         self.resident, self.view, self.plan = resident, view, plan
         self.stack, self.views = stack, 1 if stack is None else len(stack)
         self.recorded, self.pair_limit = replay_queue is not None, pair_limit
-        self.queue = workspace.turn_to(workspace.queue) if replay_queue is None else replay_queue
+        self.queue = workspace.switch_to(workspace.queue) if replay_queue is None else replay_queue
         self.pool = workspace.pool
         workspace.pictures += 1
         self.tiles_x = -(-view.width // shape.tile_width)

@@ -124,7 +124,7 @@ class Again:
         kind, workspace = self._kind, self._workspace
         if kind is None or not self._fits(kind, resident, view, pairs):
             return None
-        pool, queue = workspace.pool, workspace.turn_to(workspace.queue)
+        pool, queue = workspace.pool, workspace.switch_to(workspace.queue)
         workspace.pictures += 1
         picture = copy(kind.picture)
         picture.resident, picture.view = resident, view

@@ -1,44 +1,159 @@
-"""How a picture is fitted into a memory budget: all at once, or in chunks of splats and bands of rows."""
+"""The memory plan: how frames and batches fit the memory budget.
+
+A frame is rendered at once if its buffers fit. If only its pairs of splats and tiles exceed the budget, it is
+listed and blended in bands of tiles (tiling.py). As the last resort the cloud is projected in chunks, of
+which only the visible splats are stored (frame.py). A batch is rendered in parts of as many views as fit.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple, Protocol
 
+from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.opencl.assemble import Source
+from fidsplat.backends.opencl.buffers import RayBuffers
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.shapes import DeviceShape
+from fidsplat.backends.view import View
+from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError, bytes_words
 
 CHUNK = 1 << 20
-"""most splats that are projected at once where a cloud is taken in chunks; a power of two, so that pieces of
-every array start where any device lets a buffer start"""
+"""most splats of a chunk; a power of two, so that parts of every array start at aligned addresses"""
 _LARGE = 1 << 23
-"""as many, where that takes a small part of the memory: the host has less to do"""
-_LEAST = 1 << 10
-
-KEYS, WINDOWS, SORTED, PAIR = 4, 8, 16, {"ordered": 4, "tiled": 12, "gathered": 12}
-"""bytes per splat of sort keys, of tile windows, and of keys and indices being sorted; bytes per pair"""
+"""most splats of a chunk that takes a small part of the memory: fewer launches"""
+_MINIMUM = 1 << 10
+KEYS, WINDOWS, SORTED = 4, 8, 16
+"""bytes per splat of sort keys, of tile windows, and of keys and indices while they are sorted"""
 BIG = 1 << 12
-"""big splats for which there is room at first"""
+"""initial capacity for big splats"""
 SMALL = 1 << 14
-"""bytes for all that is small: uniforms, counts, groups that move"""
+"""bytes for uniforms, counts and moving groups"""
+PART_BYTES = {"cpu": 1 << 28}
+"""bytes of the views of a part of a batch, without their images, by kind of device: more is no faster"""
+OTHER_PART_BYTES = 1 << 31
+_PART_SAMPLES = 1 << 30
+"""samples of the views of a part; kernels number them in 32 bits, several channels of them"""
+_OF_CAMERAS = ("ray", "vignette_center")
+"""groups of uniforms that differ between cameras"""
 
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """What one picture may hold at once."""
+    """The buffers of one frame, or of a part of a batch."""
 
     chunk: int
-    """splats that are projected at once; 0: all, without packing those that are seen"""
+    """splats that are projected at once; 0: all, without packing the visible ones"""
     capacity: int
-    """splats of one band that are kept, if in chunks"""
+    """visible splats of one band that are stored, if in chunks"""
     held: int
-    """bytes that all of it takes at most, the cloud included; more only if more than `BIG` splats are big"""
+    """bytes in total, with the cloud; more only if there are more than `BIG` big splats"""
 
 
-def table_bytes(lists: str, tiles: int, chunks: int, radix_bits: int) -> int:
-    """What listing takes beside splats and pairs: tables, places and tallies."""
-    if lists != "ordered":
-        return 4 * 3 * tiles
-    bins = 1 << radix_bits
-    return 4 * ((tiles + bins) * (chunks + 2) + 3 * chunks)
+class Part(NamedTuple):
+    """Views [first, end) of a batch that are rendered together."""
+
+    first: int
+    end: int
+    plan: MemoryPlan
+
+
+class Device(Protocol):
+    """The part of `Workspace` that limits memory."""
+
+    memory_budget: int
+
+    @property
+    def largest_buffer(self) -> int:
+        """Bytes of the largest buffer that the device allocates."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """cpu, gpu or other."""
+        ...
+
+
+class MemoryPlanner:
+    """Plans frames of one pipeline."""
+
+    def __init__(self, device: Device, source: Source, features: FeatureSet, shape: DeviceShape) -> None:
+        self._device, self._source, self._features, self._shape = device, source, features, shape
+        arguments = [one for each in source.arguments.values() for one in each]
+        self._cloud_arrays = [one.name for one in source.arguments["project"] if one.source == "cloud"]
+        self._view_arrays = {one.name for one in arguments if one.source == "array"}
+        self._slopes = any(one.name == "ray_slopes" for one in source.arguments["blend"])
+        self._of_cameras = any(one.uniform[0] in _OF_CAMERAS for one in arguments)
+        self._channels = 4 + sum(one.channels for one, _ in source.samples)
+        resolved = any(one.name == "rays" for one in source.arguments.get("resolve", ()))
+        self._separate = bool(self._view_arrays) or resolved or "backdrop" in source.arguments
+        """whether views differ in more than the record `View`"""
+
+    def tiles(self, view: View) -> int:
+        """Number of tiles of a view."""
+        return -(-view.width // self._shape.tile_width) * -(-view.height // self._shape.tile_height)
+
+    def frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
+        """The plan of one view. reserved: bytes of other buffers.
+
+        Raises:
+            DeviceError: the budget does not hold the frame in any way.
+        """
+        shape = self._shape
+        stays, upload = resident.bytes_for(self._cloud_arrays)
+        samples, tables = self._samples_and_tables(view)
+        fixed = reserved + stays + SMALL + tables
+        fixed += BIG * (4 + self._source.records["Bounds"].itemsize)
+        # sub-frames have samples of their own
+        fixed += 4 * samples * self._channels * (2 if view.sub_frames else 1)
+        pixels = view.width * view.height // view.samples**2
+        fixed += 4 * pixels * sum(output.channels for output in self._features.images)
+        fixed += sum(view.array(name).nbytes for name in self._view_arrays)
+        if view.raster is not None:
+            rasters = {view.raster, *(one.view.raster for one in view.sub_frames if one.view.raster)}
+            columns = -(-view.width // shape.tile_width) * shape.tile_width
+            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._slopes)
+        record = self._source.records["Splat"].itemsize
+        budget, largest = self._device.memory_budget, self._device.largest_buffer
+        return plan_of(resident.room, record, upload, fixed, shape.lists, budget, largest)
+
+    def parts(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[Part]:
+        """The parts of a batch. reserved: bytes of all output images."""
+        count, views = len(batch.slots), batch.views
+        if not count:
+            return
+        plan = self.frame(resident, batch.one(0), reserved)
+        if plan.chunk or not (isinstance(views, ViewStack) and self._goes_together(resident, views)):
+            for k in range(count):
+                yield Part(k, k + 1, self.frame(resident, batch.one(k), reserved))
+            return
+        samples, tables = self._samples_and_tables(views.view)
+        splat = self._source.records["Splat"].itemsize + KEYS + WINDOWS
+        splat += SORTED if self._shape.lists == "ordered" else 0
+        each = resident.room * splat + tables + 4 * self._channels * samples
+        free = min(self._device.memory_budget - plan.held + each, self._device.largest_buffer)
+        most = min(free, PART_BYTES.get(self._device.kind, OTHER_PART_BYTES)) // each
+        together = max(1, min(most, _PART_SAMPLES // samples))
+        # parts of equal size have buffers of equal size
+        parts = -(-count // together)
+        for first, end in pairwise(count * k // parts for k in range(parts + 1)):
+            yield Part(first, end, MemoryPlan(0, resident.count, plan.held + (end - first - 1) * each))
+
+    def _goes_together(self, resident: Resident, stack: ViewStack) -> bool:
+        """Whether views differ in the record `View` only."""
+        return not (resident.streamed or self._separate or (stack.numbers and self._of_cameras))
+
+    def _samples_and_tables(self, view: View) -> tuple[int, int]:
+        """Samples of whole tiles, and bytes of the tables of tile binning."""
+        shape, tiles = self._shape, self.tiles(view)
+        samples = tiles * shape.tile_width * shape.tile_height
+        if shape.lists != "ordered":
+            return samples, 4 * 3 * tiles
+        bins = 1 << shape.radix_bits
+        return samples, 4 * ((tiles + bins) * (shape.chunks + 2) + 3 * shape.chunks)
 
 
 def plan_of(
@@ -48,12 +163,12 @@ def plan_of(
 
     Args:
         record_bytes: of a splat's record.
-        upload_bytes: per splat, where the cloud itself does not stay on the device; else 0.
-        fixed_bytes: sample buffers, outputs, tables, and the cloud if it stays.
-        budget: bytes that everything may take together. largest: bytes that one buffer may take.
+        upload_bytes: per splat, where each frame copies the cloud to the device; else 0.
+        fixed_bytes: sample buffers, outputs, tables, and the cloud if it stays on the device.
+        budget: bytes of everything together. largest: bytes of the largest buffer.
 
     Raises:
-        DeviceError: the budget does not even hold the picture.
+        DeviceError: the budget does not even hold the frame.
     """
     direct = count * (record_bytes + KEYS + WINDOWS + (SORTED if lists == "ordered" else 0))
     pairs = budget // 8
@@ -65,14 +180,14 @@ def plan_of(
     chunk = CHUNK
     while chunk < _LARGE and chunk * (each + upload_bytes) < free // 64:
         chunk *= 2
-    while chunk > _LEAST and (chunk * (each + upload_bytes) > free // 4 or chunk > 2 * count):
+    while chunk > _MINIMUM and (chunk * (each + upload_bytes) > free // 4 or chunk > 2 * count):
         chunk //= 2
     capacity = (free - chunk * (each + upload_bytes)) // (each + SORTED)
     capacity = min(capacity, largest // record_bytes, count)
-    if capacity < min(_LEAST, count):
+    if capacity < min(_MINIMUM, count):
         raise DeviceError(
-            f"a memory budget of {bytes_words(budget)} is too small: the picture and the cloud alone take "
-            f"{bytes_words(fixed_bytes)}; raise memory_budget, or draw a smaller picture or fewer outputs"
+            f"a memory budget of {bytes_words(budget)} is too small: the frame and the cloud alone take "
+            f"{bytes_words(fixed_bytes)}; raise memory_budget, or render a smaller frame or fewer outputs"
         )
     held = fixed_bytes + pairs + chunk * (each + upload_bytes) + capacity * (each + SORTED)
     return MemoryPlan(chunk, capacity, held)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,34 +13,23 @@ import pyopencl as cl
 from fidsplat.backends.batched_views import ViewBatch, ViewStack
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.assemble import Source
-from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers, parts
+from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.frame import render
 from fidsplat.backends.opencl.images import OpenCLImages, Rendered, Replay
-from fidsplat.backends.opencl.memory_plan import (
-    BIG,
-    KEYS,
-    SMALL,
-    SORTED,
-    WINDOWS,
-    MemoryPlan,
-    plan_of,
-    table_bytes,
-)
+from fidsplat.backends.opencl.memory_plan import MemoryPlan, MemoryPlanner
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.recorded_frame import RecordedFrame
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
-from fidsplat.backends.opencl.workspace import RayBuffers, Workspace
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError
 
-_OF_CAMERAS = ("ray", "vignette_center")
-"""groups of uniforms that differ where cameras do"""
 _KINDS = 32
 """kinds of frames that are cached for a cloud"""
 _RASTERS = 4
@@ -75,10 +64,7 @@ class OpenCLPipeline:
         self.program = Program(workspace, source)
         self._commands = CommandList(self.program)
         """of frames that are not replayed"""
-        arguments = source.arguments
-        self._cloud_arrays = [one.name for one in arguments["project"] if one.source == "cloud"]
-        self._view_arrays = {one.name for each in arguments.values() for one in each if one.source == "array"}
-        self._slopes = any(one.name == "ray_slopes" for one in arguments["blend"])
+        self._planner = MemoryPlanner(workspace, source, features, shape)
         self._other = other
 
     def render(self, resident: Resident, view: View) -> OpenCLImages:
@@ -95,7 +81,7 @@ class OpenCLPipeline:
                 return images
             if resident.neighbours and self.shape.lists == "tiled":
                 return self._listing("gathered").render(resident, view)
-            plan = self._plan(resident, view)
+            plan = self._planner.frame(resident, view)
             if plan.chunk and self.shape.lists != "ordered":
                 # chunks are rendered by one strategy only: where memory is short, sorting is fastest
                 return self._listing("ordered").render(resident, view)
@@ -107,7 +93,7 @@ class OpenCLPipeline:
     def fits(self, resident: Resident, view: View) -> bool:
         """Whether the frame is rendered at once; otherwise the cloud is projected for each of its parts."""
         try:
-            return not self._plan(resident, view).chunk
+            return not self._planner.frame(resident, view).chunk
         except DeviceError:  # too little memory for any part of it
             return False
 
@@ -125,7 +111,7 @@ class OpenCLPipeline:
             DeviceError: as `render`; or the frame does not fit the memory budget at once.
         """
         with self.workspace.rendering():
-            plan, frame = self._plan(resident, view), None
+            plan, frame = self._planner.frame(resident, view), None
             if not plan.chunk:
                 frame = self._render_planned(resident, view, plan, pair_limit, commands)
             if frame is None or frame.pairs > self.workspace.pair_budget:
@@ -142,13 +128,13 @@ class OpenCLPipeline:
     def render_again(self, resident: Resident, view: View) -> Rendered:
         """A frame whose replay exceeded its capacity, with the buffers that it requires."""
         with self.workspace.rendering():
-            return Rendered.of(self._render_planned(resident, view, self._plan(resident, view)))
+            return Rendered.of(self._render_planned(resident, view, self._planner.frame(resident, view)))
 
     def profile(self, resident: Resident, view: View, recorded: RecordedFrame) -> dict[str, float]:
         """Milliseconds by stage, of a frame that is rendered once more on a queue with profiling."""
         workspace = self.workspace
         with workspace.rendering():
-            queue = workspace.turn_to(workspace.queue)
+            queue = workspace.switch_to(workspace.queue)
             workspace.pictures += 1
             if self._ready(recorded, resident, view, queue):
                 leased, events = recorded.submit(queue)
@@ -166,7 +152,7 @@ class OpenCLPipeline:
         workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.held, resident.room)
         if not tiling.pair_capacity(workspace):
             return None
-        queue = workspace.turn_to(workspace.repeat_queue)
+        queue = workspace.switch_to(workspace.replay_queue)
         workspace.pictures += 1
         if recorded is not None and self._ready(recorded, resident, view, queue):
             leased, events = recorded.submit(queue)
@@ -272,9 +258,9 @@ class OpenCLPipeline:
         """
         workspace, rendered = self.workspace, []
         with workspace.rendering():
-            workspace.turn_to(workspace.queue)
+            workspace.switch_to(workspace.queue)
             buffers = OutputBuffers(workspace, self.features.images, batch)
-            for first, end, plan in self._parts(resident, batch, buffers.nbytes):
+            for first, end, plan in self._planner.parts(resident, batch, buffers.nbytes):
                 views = batch.views
                 stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
                 pipeline = self._for_part(resident, plan, stack)
@@ -295,77 +281,8 @@ class OpenCLPipeline:
             return self
         if plan.chunk:
             return self._listing("ordered")  # as `render`
-        few = stack is not None and self._tiles(stack.view) <= tiling.GATHER_TILES
+        few = stack is not None and self._planner.tiles(stack.view) <= tiling.GATHER_TILES
         return self._listing("gathered") if few or resident.neighbours else self
-
-    def _tiles(self, view: View) -> int:
-        """That a view has."""
-        return -(-view.width // self.shape.tile_width) * -(-view.height // self.shape.tile_height)
-
-    def _parts(
-        self, resident: Resident, batch: ViewBatch, beside: int
-    ) -> Iterator[tuple[int, int, MemoryPlan]]:
-        """Ranges of views (first, end) that are drawn at once, and what they may hold. beside: bytes of all
-        output images."""
-        count, views, budget = len(batch.slots), batch.views, self.workspace.memory_budget
-        if not count:
-            return
-        plan = self._plan(resident, batch.one(0), beside)
-        if plan.chunk or not (isinstance(views, ViewStack) and self._goes_together(resident, views)):
-            yield from ((k, k + 1, self._plan(resident, batch.one(k), beside)) for k in range(count))
-            return
-        each, samples = self._bytes_of_view(resident, views.view)
-        # no buffer may be larger than the device gives in one piece
-        free = min(budget - plan.held + each, self.workspace.device.max_mem_alloc_size)
-        for first, end in parts(count, each, samples, self.workspace.info.kind, free):
-            yield first, end, MemoryPlan(0, resident.count, plan.held + (end - first - 1) * each)
-
-    def _goes_together(self, resident: Resident, stack: ViewStack) -> bool:
-        """Whether all that differs from view to view stands in the record `View`."""
-        arguments = self.source.arguments
-        every = [one for each in arguments.values() for one in each]
-        if resident.streamed or "backdrop" in arguments or any(one.source == "array" for one in every):
-            return False
-        if any(one.name == "rays" for one in arguments.get("resolve", ())):
-            return False
-        return not (stack.numbers and any(one.uniform[0] in _OF_CAMERAS for one in every))
-
-    def _bytes_of_view(self, resident: Resident, view: View) -> tuple[int, int]:
-        """What a view of a batch takes beside its images, and its samples."""
-        shape, source = self.shape, self.source
-        tiles = self._tiles(view)
-        samples = tiles * shape.tile_width * shape.tile_height
-        splat = source.records["Splat"].itemsize + KEYS + WINDOWS
-        splat += SORTED if shape.lists == "ordered" else 0
-        channels = 4 + sum(one.channels for one, _ in source.samples)
-        tables = table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
-        return resident.room * splat + tables + 4 * channels * samples, samples
-
-    def _plan(self, resident: Resident, view: View, beside: int = 0) -> MemoryPlan:
-        """beside: bytes that something else holds meanwhile."""
-        shape, source = self.shape, self.source
-        tiles_x = -(-view.width // shape.tile_width)
-        tiles = tiles_x * -(-view.height // shape.tile_height)
-        stays, upload = resident.bytes_for(self._cloud_arrays)
-        fixed = beside + stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
-        fixed += BIG * (4 + source.records["Bounds"].itemsize)
-        channels = 4 + sum(one.channels for one, _ in source.samples)
-        if view.sub_frames:
-            channels *= 2  # the picture's own beside those of a sub-frame
-        fixed += 4 * tiles * shape.tile_width * shape.tile_height * channels  # whole tiles
-        pixels = view.width * view.height // view.samples**2
-        fixed += 4 * pixels * sum(output.channels for output in self.features.images)
-        fixed += sum(view.array(name).nbytes for name in self._view_arrays)
-        if view.raster is not None:
-            rasters = {
-                view.raster,
-                *(sub_frame.view.raster for sub_frame in view.sub_frames if sub_frame.view.raster),
-            }
-            columns = tiles_x * shape.tile_width
-            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._slopes)
-        workspace, record = self.workspace, source.records["Splat"].itemsize
-        budget, largest = workspace.memory_budget, workspace.device.max_mem_alloc_size
-        return plan_of(resident.room, record, upload, fixed, shape.lists, budget, largest)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one frame and return what the stages pass on.

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.opencl.buffers import BufferPool
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import build_options, check_kernels
-from fidsplat.backends.opencl.workspace import BufferPool, Workspace
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
 

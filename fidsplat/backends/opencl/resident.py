@@ -12,7 +12,8 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.coplanar_groups import PlaneTable
-from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
+from fidsplat.backends.opencl.buffers import DeviceBuffer
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import color_range
 from fidsplat.util.errors import DeviceError
@@ -70,7 +71,7 @@ class Resident:
         device = workspace.device
         self._shared = workspace.info.kind == "cpu" and bool(device.host_unified_memory)
         if self._shared:
-            weakref.finalize(self, _finish, os.getpid(), workspace.queue, workspace.repeat_queue)
+            weakref.finalize(self, _finish, os.getpid(), workspace.queue, workspace.replay_queue)
         self.streamed = not self._shared and (
             total > workspace.memory_budget // 2 or widest > device.max_mem_alloc_size
         )

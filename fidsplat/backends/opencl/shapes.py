@@ -35,6 +35,11 @@ class DeviceShape:
     each for each core; lists of which more are drawn are walked twice"""
 
     @property
+    def pair_bytes(self) -> int:
+        """Bytes of a pair of a splat and a tile while it is listed."""
+        return 4 if self.lists == "ordered" else 12
+
+    @property
     def blend_items(self) -> int:
         """Work-items of a work-group of the blend stage."""
         return 1 if self.schedule == "lanes" else self.tile_width * self.tile_height // self.rows

@@ -289,7 +289,7 @@ class OpenCLTraining:
     @property
     def _queue(self) -> cl.CommandQueue:
         """The queue on which pictures with derivatives are drawn, after all that is on others."""
-        return self._workspace.turn_to(self._workspace.queue)
+        return self._workspace.switch_to(self._workspace.queue)
 
     def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
         self._enqueue(self._items(kernel, items, given or {}))

@@ -1,0 +1,231 @@
+"""Device buffers: a pool that reuses them from frame to frame, and the rays of lenses."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Collection, Hashable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pyopencl as cl
+from pyopencl.array import Array
+
+from fidsplat.backends.opencl.pages import large_pages
+from fidsplat.cameras.raster import RayRaster
+from fidsplat.util.errors import DeviceError, bytes_words
+
+_MINIMUM = 16  # bytes; OpenCL has no empty buffers
+_LARGE = 1 << 22  # bytes from which large pages are requested
+
+
+class DeviceBuffer(cl.Buffer):
+    """A buffer with an identity token that can be compared without keeping the buffer alive."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.token = object()
+
+
+def token_of(buffer: cl.Buffer) -> object:
+    """The identity of a buffer. A sub-buffer has another one each time."""
+    return buffer.token if type(buffer) is DeviceBuffer else object()
+
+
+class BufferPool:
+    """Scratch buffers by name, reused from frame to frame and replaced only when one is too small."""
+
+    def __init__(self, context: cl.Context, device: cl.Device) -> None:
+        self._context = context
+        self._device = device
+        self._is_host = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
+        """whether its memory is the host's"""
+        self._buffers: dict[str, cl.Buffer] = {}
+        self._arrays: dict[str, Array] = {}
+        self._contents: dict[str, weakref.ref[np.ndarray]] = {}
+        self._spare: dict[str, list[cl.Buffer]] = {}
+        self._zeroed: set[str] = set()
+        self._kind: Hashable = None
+        self._splats = 0
+        self.state = object()
+        """identity of the set of scratch buffers: another object whenever one is replaced or released"""
+
+    def size(self, name: str) -> int:
+        """Bytes of the scratch buffer of that name; 0 if there is none."""
+        return self._buffers[name].size if name in self._buffers else 0
+
+    def known(self, name: str) -> cl.Buffer | None:
+        """The scratch buffer of that name, unchanged."""
+        return self._buffers.get(name)
+
+    def lease(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
+        """A buffer that belongs to the caller until `give_back`. larger: whether it may have more bytes."""
+        # removed before it is looked at: images that die meanwhile may give back others
+        spare = self._spare.get(name, [])
+        while spare:
+            buffer = spare.pop()
+            if buffer.size == max(size, _MINIMUM) or (larger and buffer.size > size):
+                return buffer  # otherwise it is of a frame of another size, and is released
+        return self.fresh(name, size)
+
+    def give_back(self, buffers: list[tuple[str, cl.Buffer]]) -> None:
+        """Return leased buffers; one or two of each name are reused for frames of the same size."""
+        for name, buffer in buffers:
+            spare = self._spare.setdefault(name, [])
+            if not spare or (len(spare) == 1 and spare[0].size == buffer.size):
+                spare.append(buffer)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the scratch buffers, and of leased ones that were given back."""
+        # copied first: images that die meanwhile give back theirs
+        spare = [buffer for buffers in list(self._spare.values()) for buffer in list(buffers)]
+        return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
+
+    def make_way(self, kind: Hashable, size: int, splats: int = 0) -> None:
+        """Before a frame: release the buffers of other kinds of frames, if they take more than `size` bytes.
+        Frames of one kind have buffers of the same sizes, or smaller ones for fewer splats."""
+        if kind == self._kind and splats <= self._splats:
+            return
+        if self.memory_bytes > size:
+            self.clear()
+        self._kind, self._splats = kind, splats
+
+    def forget_zeros(self) -> None:
+        """After a failure: the contents of zero-filled buffers are unknown."""
+        self._zeroed.clear()
+        self.state = object()
+
+    def clear(self) -> None:
+        """Release all buffers."""
+        self._spare.clear()
+        self._arrays.clear()
+        self._buffers.clear()
+        self._contents.clear()
+        self._zeroed.clear()
+        self.state = object()
+
+    def put(self, queue: cl.CommandQueue, name: str, array: np.ndarray) -> tuple[cl.Buffer, cl.Event | None]:
+        """A scratch buffer with these contents, and the event of the copy; does not wait. A read-only array,
+        such as a panorama, is not copied again if it was copied there last."""
+        content = self._contents.get(name)
+        if content is not None and content() is array:
+            return self._buffers[name], None
+        buffer = self.scratch(name, array.nbytes)
+        event = cl.enqueue_copy(queue, buffer, array, is_blocking=False)
+        if not array.flags.writeable and array.flags.owndata:
+            self._contents[name] = weakref.ref(array)
+        return buffer, event
+
+    def scratch(self, name: str, size: int) -> cl.Buffer:
+        """A buffer of at least `size` bytes with undefined contents."""
+        self._contents.pop(name, None)
+        self._zeroed.discard(name)
+        buffer = self._buffers.get(name)
+        if buffer is None or buffer.size < size:
+            self._arrays.pop(name, None)
+            self._buffers.pop(name, None)
+            self.state = object()
+            buffer = self._buffers[name] = self.fresh(name, size)
+        return buffer
+
+    def array(self, queue: cl.CommandQueue, name: str, shape: tuple[int, ...]) -> Array:
+        """A scratch buffer as an array of float32. The array object is reused: to make one takes the host
+        longer than to submit a kernel."""
+        buffer = self.scratch(name, 4 * math.prod(shape))
+        known = self._arrays.get(name)
+        if known is None or known.base_data is not buffer or known.shape != shape or known.queue is not queue:
+            known = self._arrays[name] = Array(queue, shape, np.float32, data=buffer)
+        return known
+
+    def zeroed(self, name: str, size: int, queue: cl.CommandQueue) -> cl.Buffer:
+        """A zero-filled scratch buffer; the caller must leave it zeroed."""
+        if name not in self._zeroed or self._buffers[name].size < size:
+            buffer = self.scratch(name, size)
+            cl.enqueue_fill_buffer(queue, buffer, np.zeros(1, np.uint32), 0, buffer.size)
+            self._zeroed.add(name)
+        return self._buffers[name]
+
+    def fresh(self, name: str, size: int) -> cl.Buffer:
+        """A new buffer, which the pool does not hold.
+
+        Raises:
+            DeviceError: the device cannot allocate that much at once.
+        """
+        limit = self._device.max_mem_alloc_size
+        if size > limit:
+            raise DeviceError(
+                f"{name} must be at most {bytes_words(limit)}, the largest buffer of "
+                f"{self._device.name.strip()}, got {bytes_words(size)}; use fewer splats or a smaller frame"
+            )
+        try:
+            flags = cl.mem_flags.READ_WRITE
+            if self._is_host:
+                # otherwise PoCL allocates memory at the first use, and crashes there if none is left
+                flags |= cl.mem_flags.ALLOC_HOST_PTR
+            buffer = DeviceBuffer(self._context, flags, max(size, _MINIMUM))
+            if self._is_host and size >= _LARGE:
+                # random accesses to records otherwise miss the processor's address cache
+                self._request_large_pages(buffer)
+            return buffer
+        except cl.Error as error:
+            raise DeviceError(f"no memory for {name} ({bytes_words(size)}): {error}") from error
+
+    def _request_large_pages(self, buffer: cl.Buffer) -> None:
+        """Advise the system on a buffer's memory, which stays the device's."""
+        queue = cl.CommandQueue(self._context)  # of its own: work on other queues is not waited for
+        memory, _ = cl.enqueue_map_buffer(
+            queue, buffer, cl.map_flags.WRITE, 0, (buffer.size,), np.dtype(np.uint8)
+        )
+        with memory.base:
+            large_pages(memory.ctypes.data, memory.nbytes)
+
+
+class RayBuffers:
+    """The buffers `rays`, `ray_map` and so on (kernels/opencl/slot) of lenses in use."""
+
+    def __init__(self, pool: BufferPool, queue: cl.CommandQueue) -> None:
+        self._pool, self._queue = pool, queue
+        self._held: WeakKeyDictionary[RayRaster, dict[tuple[int, int], dict[str, cl.Buffer]]] = (
+            WeakKeyDictionary()
+        )
+
+    def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
+        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: also for boxes."""
+        sizes = self._held.setdefault(raster, {})
+        if (rows, columns) not in sizes:
+            sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
+            if raster.lens.kind != "equirectangular":
+                sizes[rows, columns]["ray_map"] = self._map(raster.whole or raster)
+        buffers = sizes[rows, columns]
+        if slopes and "ray_slopes" not in buffers:
+            flat = raster.slopes.reshape(raster.height, raster.width, 6)
+            buffers["ray_slopes"] = self._planar("ray_slopes", flat, rows, columns)
+            buffers["ray_step"] = self._put("ray_step", np.array([raster.step], np.float32))
+        return buffers
+
+    def _planar(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:
+        """An image (rows, columns, channels) as a buffer (channels, rows, columns), padded with NaN."""
+        channels = np.full((array.shape[2], rows, columns), np.nan, np.float32)
+        channels[:, : array.shape[0], : array.shape[1]] = np.moveaxis(array, 2, 0)
+        return self._put(name, channels)
+
+    @staticmethod
+    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:
+        """Bytes of the buffers of one frame's rasters, for grids that are padded to whole tiles."""
+        rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
+        one = next(iter(rasters))
+        each = 36 if slopes else 12
+        return each * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
+
+    def _map(self, raster: RayRaster) -> cl.Buffer:
+        maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})
+        if "ray_map" not in maps:
+            maps["ray_map"] = self._put("ray_map", raster.map[0])
+        return maps["ray_map"]
+
+    def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
+        buffer = self._pool.fresh(name, array.nbytes)
+        cl.enqueue_copy(self._queue, buffer, array)
+        return buffer
