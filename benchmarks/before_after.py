@@ -26,7 +26,7 @@ from measuring import PROGRESS, keep, options
 from rich.progress import Progress
 
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
-from fidsplat.util.timing import Clock, Timer, quartiles, ratios, take_turns
+from fidsplat.util.timing import Clock, Timer, quartiles, ratios, time_interleaved
 
 ARRAYS = ("means", "quats", "scales", "opacities", "colors", "boxes", "coplanar_groups")
 ROOT = Path(__file__).resolve().parent.parent
@@ -131,7 +131,7 @@ def measure(commit: str, scene: str, device: str, repeats: int, clock: str) -> d
         before, now = (Timer(tree.frame, tree.clock) for tree in trees)
         with Progress(console=PROGRESS) as progress:
             task = progress.add_task(scene, total=2 * repeats)
-            take_turns([before, now], repeats, warm_up=3, tick=lambda: progress.advance(task))
+            time_interleaved([before, now], repeats, warm_up=3, tick=lambda: progress.advance(task))
         for tree in trees:
             tree.close()
     low, middle, high = quartiles(ratios(now, before))

@@ -27,7 +27,7 @@ from fidsplat.accuracy.error import errors, reference_error, reference_image, re
 from fidsplat.scenes.random_clouds import random_cloud, standard_camera
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
-from fidsplat.util.timing import Timer, frame_timer, take_turns
+from fidsplat.util.timing import Timer, frame_timer, time_interleaved
 
 CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
 STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)
@@ -171,7 +171,7 @@ def all_costs(renderer: fs.Renderer, candidates: list[dict], repeats: int) -> np
         frames = [frame_timer(renderer, resident, camera, quality=each) for each in qualities]
         timers = [Timer(frame.run, clock) for frame in frames]
         say(f"times: {repeats} rounds, {count:,} splats")
-        take_turns(timers, repeats, warm_up=1)
+        time_interleaved(timers, repeats, warm_up=1)
         ratios.append(np.array([timer.median for timer in timers[1:]]) / timers[0].median)
     return np.mean(ratios, 0)
 

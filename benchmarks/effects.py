@@ -24,7 +24,7 @@ import fidsplat as fs
 from fidsplat.effects import OUTPUTS
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.scenes.random_clouds import SCENES, load_scene
-from fidsplat.util.timing import frame_timer, quartiles, ratios, take_turns
+from fidsplat.util.timing import frame_timer, quartiles, ratios, time_interleaved
 
 TABLE = tuple(np.linspace(0, 1, 64) ** 0.5)
 SENSORS = {
@@ -138,7 +138,7 @@ def measure(names: list[str], scene: str, device: str, repeats: int) -> list[dic
         resident = plain if what is None else renderer.upload(changed(cloud, what))
         base = frame_timer(renderer, plain, camera, quality=TIMED)
         mine = frame_timer(renderer, resident, **{"quality": TIMED, **call})
-        take_turns([mine, base], repeats)
+        time_interleaved([mine, base], repeats)
         low, middle, high = quartiles([100 * (ratio - 1) for ratio in ratios(mine, base)])
         rows.append(
             {

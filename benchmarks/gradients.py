@@ -32,7 +32,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.scenes.random_clouds import load_scene
 from fidsplat.util.errors import InputError
-from fidsplat.util.timing import Timer, take_turns
+from fidsplat.util.timing import Timer, time_interleaved
 
 
 def errors(backend: Differentiates, scenes: int) -> list[dict[str, float | str]]:
@@ -74,7 +74,7 @@ def times(backend: Differentiates, scene: str, quality: str | None, repeats: int
         return dict(images.timings)
 
     timer = Timer(step)
-    take_turns([timer], repeats)
+    time_interleaved([timer], repeats)
     stages = {name: float(np.median(ms)) for name, ms in timer.parts.items()}
     return {"scene": scene, "step": sum(stages.values()), **stages}
 

@@ -30,7 +30,7 @@ from fidsplat.experiments.sweep import Results, name_of, read_records
 from fidsplat.scenes.random_clouds import random_cloud, standard_camera
 from fidsplat.util.files import atomic_write
 from fidsplat.util.provenance import run_facts
-from fidsplat.util.timing import take_turns
+from fidsplat.util.timing import time_interleaved
 
 MILLION = 1_000_000
 
@@ -82,7 +82,7 @@ def measure(point: Point, device: str, rates: Rates | None, repeats: int) -> dic
     cloud, camera = point.make()
     run = SceneRun(f"{point.series} {point.x:g}", device, rates, cloud, camera)
     del cloud
-    take_turns([run.result.timer], repeats)
+    time_interleaved([run.result.timer], repeats)
     record = run.result.as_dict() | {"series": point.series, "x": point.x}
     if not record["error"]:
         del record["error"]

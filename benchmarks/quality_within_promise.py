@@ -27,7 +27,7 @@ from fidsplat.accuracy.error import errors, reference_image
 from fidsplat.accuracy.quality_within import choose
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.util.errors import InputError
-from fidsplat.util.timing import Timer, frame_timer, take_turns
+from fidsplat.util.timing import Timer, frame_timer, time_interleaved
 
 BOUNDS = (1e-2, 1e-3, 1e-4)
 SCENES = ("tag", "r100k_720p", "r1m_1080p")
@@ -120,7 +120,7 @@ def times_kept(renderer: fs.Renderer, names: list[str]) -> list[dict]:
             row = {"scene": name, "base_ms": usual, "budget_ms": ms}
             answers = []
             ask = partial(choose, ms=ms, scene=cloud, capture=camera, device=renderer)
-            calibration = Timer(lambda answers=answers, ask=ask: answers.append(ask()), drops_out=True)
+            calibration = Timer(lambda answers=answers, ask=ask: answers.append(ask()), catch_errors=True)
             seconds = calibration.run() / 1e3
             if calibration.error:
                 rows.append(row | {"refused": calibration.error})
@@ -145,7 +145,7 @@ def times_kept(renderer: fs.Renderer, names: list[str]) -> list[dict]:
 def timed(renderer: fs.Renderer, resident, camera, quality, count: int) -> Timer:
     """The times of so many frames, after one that does not count."""
     timer = frame_timer(renderer, resident, camera, quality=quality)
-    take_turns([timer], count, warm_up=1)
+    time_interleaved([timer], count, warm_up=1)
     return timer
 
 

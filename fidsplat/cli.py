@@ -7,7 +7,6 @@ import contextlib
 import errno
 import inspect
 import io
-import os
 import re
 import sys
 import traceback
@@ -16,8 +15,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fidsplat.commands import COMMANDS, CommandTable
-from fidsplat.util import interrupts
-from fidsplat.util.process_limits import check_imports
+from fidsplat.util import interrupts, streams
+from fidsplat.util.limits import check_imports
 
 ABOUT = """Make fiducial markers of 2D Gaussian splats, place them in scenes, render and detect them.
 
@@ -40,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status: 0 done, 1 failed, 2 bad input, 130 interrupted, 143
     terminated."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    _open_missing_streams()
+    streams.open_missing()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal may lack a character
@@ -69,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         terminated = isinstance(stop, interrupts.Terminated)
         return _fail(*(("terminated", 143) if terminated else ("interrupted", 130)))
     except BrokenPipeError:
-        _drop_output()  # the reader has closed the pipe
+        streams.discard_stdout()  # the reader has closed the pipe
         return 1
     except Exception as error:
         if debug:
@@ -85,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ):
             return _fail("not enough memory; use a smaller image or fewer splats", 1)
         if isinstance(error, OSError) and error.errno in _SHORTAGES:
-            _drop_output()
+            streams.discard_stdout()
             where = f" ({error.filename})" if error.filename else ""
             return _fail(f"{error.strerror}{where}; {_SHORTAGES[error.errno]}", 1)
         return _fail(f"{type(error).__name__}: {error} (a fault of fidsplat; --debug shows where)", 1)
@@ -101,21 +100,6 @@ _SHORTAGES = {
     errno.EIO: "the disk or the terminal failed",
 }
 """remedies for shortages of the machine, which any command may meet"""
-
-
-def _open_missing_streams() -> None:
-    """Replace a closed stdin, stdout or stderr by the null device. Otherwise the next opened file would take
-    its descriptor and receive the output."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            # takes the lowest free descriptor, which is the missing one
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 it stays open
-
-
-def _drop_output() -> None:
-    """Discard further output on stdout, including Python's final flush."""
-    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor is not flushed at the end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parse(words: list[str]):

@@ -23,7 +23,7 @@ import torch
 
 import fidsplat as fs
 from fidsplat.splats.rotations import quaternion_to_matrix
-from fidsplat.util.timing import Timer, take_turns
+from fidsplat.util.timing import Timer, time_interleaved
 from fidsplat.vision.metrics import psnr
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -111,7 +111,7 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
     by_cameras = quickest(draw)
     best = min(by_cameras, key=by_cameras.__getitem__)
     theirs = Timer(lambda: draw(best))
-    take_turns([*ours, theirs], repeats)
+    time_interleaved([*ours, theirs], repeats)
     same = renderer.render_batch(resident, capture.with_(quality=SAME, outputs=("rgb",)), poses=poses[:1])
     error = psnr(same["rgb"][0], draw(best).cpu().numpy())
 

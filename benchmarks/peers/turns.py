@@ -14,7 +14,7 @@ from rich.progress import Progress
 import fidsplat as fs
 from fidsplat.backends.interface import DeviceInfo
 from fidsplat.experiments.bench.measure import Result, SceneRun
-from fidsplat.util.timing import Timer, take_turns
+from fidsplat.util.timing import Timer, time_interleaved
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from measuring import PROGRESS, keep, options, show
@@ -60,7 +60,7 @@ def compared(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], repea
     error = np.mean((np.clip(picture, 0, 1).astype(np.float64) - np.clip(ours.picture, 0, 1)) ** 2)
     with Progress(console=PROGRESS) as progress:
         task = progress.add_task(peer.scene, total=2 * repeats)
-        take_turns([ours.result.timer, peer.timer], repeats, tick=lambda: progress.advance(task))
+        time_interleaved([ours.result.timer, peer.timer], repeats, tick=lambda: progress.advance(task))
     records = [ours.result.as_dict(), peer.as_dict()]
     records[1]["times_ours"] = records[1]["frame_ms"] / records[0]["frame_ms"]
     records[1]["psnr_db"] = -10 * math.log10(max(error, 1e-12))

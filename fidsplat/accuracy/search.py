@@ -19,7 +19,7 @@ from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import DeviceError, InputError
-from fidsplat.util.timing import Timer, frame_timer, take_turns
+from fidsplat.util.timing import Timer, frame_timer, time_interleaved
 
 REPEATS = 9
 """timed frames of each quality, interleaved with those of the others"""
@@ -93,7 +93,9 @@ class SceneMeasurement:
         """Frame times of qualities, interleaved, after one warm-up frame of each."""
         timers = [self.timer(quality) for quality in qualities]
         self._report(f"timing {len(timers)} candidates")
-        take_turns(timers, repeats, least=min(MIN_REPEATS, repeats), seconds=MAX_SECONDS, warm_up=1)
+        time_interleaved(
+            timers, repeats, min_rounds=min(MIN_REPEATS, repeats), seconds=MAX_SECONDS, warm_up=1
+        )
         return [Times(timer.median, float(np.quantile(timer.ms, 0.9))) for timer in timers]
 
     def timer(self, quality: Quality) -> Timer:

@@ -11,7 +11,7 @@ from importlib import import_module
 from fidsplat.backends.caches import ensure_caches
 from fidsplat.backends.interface import Backend, DeviceInfo
 from fidsplat.util.errors import DeviceError, UnknownDeviceError, unknown
-from fidsplat.util.process_limits import check_driver
+from fidsplat.util.limits import check_driver
 
 FAMILIES = {
     "opencl": "fidsplat.backends.opencl.device",

@@ -13,8 +13,8 @@ from typing import ClassVar, TypeAlias
 
 import numpy as np
 
+from fidsplat.util.arguments import real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import real_array
 
 FISHEYE_LIMIT = math.radians(100)
 """a fisheye sees no further from its axis: 200 degrees in all"""

@@ -13,9 +13,8 @@ import numpy as np
 
 from fidsplat.cameras.pinhole import Camera
 from fidsplat.splats.rotations import check_similarity
-from fidsplat.util.arguments import as_float, instance, number, whole_number
+from fidsplat.util.arguments import as_float, instance, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import own_scalars
 
 MAX_SUB_POSES = 1024
 

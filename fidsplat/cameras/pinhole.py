@@ -8,8 +8,8 @@ import numpy as np
 
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
 from fidsplat.splats.rotations import check_similarity
+from fidsplat.util.arguments import LARGEST, PickledByFields, real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import LARGEST, PickledByFields, real_array
 
 MAX_SIZE = 32767
 """largest width and height in pixels: pixel numbers fit 16 bits on every device"""

@@ -12,9 +12,8 @@ import numpy as np
 
 from fidsplat.cameras.screw import between, exponential, twist
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, rigid_matrix
-from fidsplat.util.arguments import as_float, number
+from fidsplat.util.arguments import PickledByFields, as_float, number, real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import PickledByFields, real_array
 
 UNIT = 1e-3
 """how far from 1 the length of a quaternion may be: files round them"""

@@ -11,8 +11,8 @@ from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture.environment import Background, ExternalDepth, Fog, background_of
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
+from fidsplat.util.arguments import PickledByFields
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.scalars import PickledByFields
 
 
 @dataclass(frozen=True, eq=False)

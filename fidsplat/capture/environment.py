@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.util.arguments import LARGEST, PickledByFields, own_scalars
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import LARGEST, PickledByFields, own_scalars
 
 MAX_PANORAMA = 16384
 """pixels along a side"""

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import as_float
+from fidsplat.util.arguments import as_float, own_scalars
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import own_scalars
 
 RESPONSES = ("linear", "srgb")
 BITS = (8, 16)

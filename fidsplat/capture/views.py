@@ -12,8 +12,8 @@ import numpy as np
 from fidsplat.cameras import Camera, Motion
 from fidsplat.capture.capture import Capture
 from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.util.arguments import LARGEST, real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import LARGEST, real_array
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from fidsplat.experiments.summary import Frame
 from fidsplat.util.files import atomic_write, printable, writable_folder
-from fidsplat.util.markdown import escaped
+from fidsplat.util.markup import escaped
 
 NOTHING = "-"
 BEGIN, END = "<!-- begin generated -->", "<!-- end generated -->"

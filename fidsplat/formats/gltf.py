@@ -31,7 +31,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, read_input
-from fidsplat.util.input_limit import check_expansion
+from fidsplat.util.limits import check_expansion
 
 EXTENSION = "KHR_gaussian_splatting"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942

@@ -19,7 +19,7 @@ from fidsplat.formats.plain import cloud_of
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, open_input
-from fidsplat.util.input_limit import check_expansion
+from fidsplat.util.limits import check_expansion
 
 MAX_PART, MAX_META = 2**30, 2**24
 """bytes of a picture within the zip and of meta.json: none of so many splats as fit a machine is larger"""

@@ -15,7 +15,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, regular_file
-from fidsplat.util.input_limit import check_expansion
+from fidsplat.util.limits import check_expansion
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _SEEN = 4096

@@ -31,7 +31,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError, bytes_words
 from fidsplat.util.files import atomic_path, open_input, regular_file, utf8_path
-from fidsplat.util.input_limit import VARIABLE, input_limit
+from fidsplat.util.limits import VARIABLE, input_limit
 
 _SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
 _KINDS = ("ParticleField", "ParticleField3DGaussianSplat")

@@ -11,8 +11,8 @@ import numpy as np
 
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of, read_input, utf8_path
-from fidsplat.util.input_limit import check_expansion
-from fidsplat.util.stderr import without_stderr
+from fidsplat.util.limits import check_expansion
+from fidsplat.util.streams import without_stderr
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")

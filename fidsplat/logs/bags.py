@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import open_input, read_input, regular_file
-from fidsplat.util.input_limit import check_expansion, input_limit
+from fidsplat.util.limits import check_expansion, input_limit
 
 try:
     import lz4.frame

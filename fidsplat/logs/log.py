@@ -14,9 +14,8 @@ from fidsplat.effects import IMAGES
 from fidsplat.images.files import encoded, pixels_of, to_uint8
 from fidsplat.logs.files import log_file, typestore
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
-from fidsplat.util.arguments import instance, invalid, items, number, text
+from fidsplat.util.arguments import instance, invalid, items, number, real_array, text
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.scalars import real_array
 from fidsplat.vision.detect import Detection
 
 PIXEL = 0.5

@@ -34,9 +34,8 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
-from fidsplat.util.arguments import text, whole_number
+from fidsplat.util.arguments import PickledByFields, text, whole_number
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import PickledByFields
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon

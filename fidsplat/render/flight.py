@@ -23,10 +23,10 @@ from fidsplat.images.visualize import contact_sheet
 from fidsplat.render.output_files import save_output, suffixes_of
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
+from fidsplat.util.arguments import real_array
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, path_of, read_text, writable_folder
 from fidsplat.util.provenance import digest_of
-from fidsplat.util.scalars import real_array
 
 RECORD = "flight.json"
 SHEET = "contact-sheet.png"

@@ -19,8 +19,8 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import check_similarity
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
+from fidsplat.util.arguments import PickledByFields
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import PickledByFields
 
 if TYPE_CHECKING:
     from fidsplat.cameras.motion import Pose

@@ -9,7 +9,7 @@ from fidsplat.formats import Progress
 from fidsplat.scenes.parts import SceneParts
 from fidsplat.scenes.read import read_scene
 from fidsplat.scenes.write import write_scene
-from fidsplat.util.summaries import Summarised, point
+from fidsplat.util.markup import Summarised, point
 
 
 class Scene(SceneParts, Summarised):

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from fidsplat.util.arguments import LARGEST, real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import LARGEST, real_array
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 UNIT = 1e-3

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from fidsplat.splats.rotations import quaternion_multiply
+from fidsplat.util.arguments import LARGEST
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import LARGEST
 
 F32 = np.dtype(np.float32)
 

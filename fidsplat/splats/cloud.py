@@ -32,10 +32,9 @@ from fidsplat.splats.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from fidsplat.util.arguments import number
+from fidsplat.util.arguments import LARGEST, PickledByFields, number
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import LARGEST, PickledByFields
-from fidsplat.util.summaries import Summarised, point
+from fidsplat.util.markup import Summarised, point
 
 __all__ = ["SplatCloud", "sh_basis"]
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from fidsplat.util.arguments import LARGEST, real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import LARGEST, real_array
 
 
 def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

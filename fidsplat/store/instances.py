@@ -14,9 +14,9 @@ from fidsplat.splats.rotations import check_similarity
 from fidsplat.store.layout import MAX_SPLATS, PLACES
 from fidsplat.store.staging import clear, refuse_existing, staged, store_folder
 from fidsplat.store.store import Store
+from fidsplat.util.arguments import real_array
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
-from fidsplat.util.scalars import real_array
 
 
 def place_store(

@@ -24,10 +24,10 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.util.arguments import LARGEST
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, open_input, read_input
 from fidsplat.util.npy import load_npy
-from fidsplat.util.scalars import LARGEST
 
 FORMAT, VERSION = "fidsplat store", 1
 SUFFIX = ".fss"

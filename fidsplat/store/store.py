@@ -18,13 +18,12 @@ from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.store import layout
 from fidsplat.store.detail_errors import DetailErrors, allowed_cell_size, load_detail_errors
 from fidsplat.store.partial_cloud import PartialCloud, concatenated, transformed
-from fidsplat.util.arguments import callback, flag, instance, invalid, whole_number
+from fidsplat.util.arguments import callback, flag, instance, invalid, real_array, whole_number
 from fidsplat.util.arguments import number as checked_number
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
+from fidsplat.util.markup import Summarised, point
 from fidsplat.util.npy import load_npy
-from fidsplat.util.scalars import real_array
-from fidsplat.util.summaries import Summarised, point
 
 
 class Store(Summarised):

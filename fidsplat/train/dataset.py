@@ -13,9 +13,8 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.capture.environment import three_numbers
 from fidsplat.train.random_numbers import Purpose, uniform
-from fidsplat.util.arguments import instance, invalid, items, text, whole_number
+from fidsplat.util.arguments import instance, invalid, items, real_array, text, whole_number
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import real_array
 
 FAR = 1e4
 """distance from the world origin, in scene extents, beyond which means are relative to another origin, since

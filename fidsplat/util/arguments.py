@@ -1,35 +1,40 @@
-"""Argument validation: what public functions are given, checked before anything is computed from it.
+"""Argument validation of public functions.
 
-Every function raises InputError with one message, `<what> must be <requirement>, got <value>; <remedy>`.
+Every check raises InputError with a message `<what> must be <requirement>, got <value>; <remedy>`.
 """
 
 import math
 import operator
 from collections.abc import Iterable
+from dataclasses import fields
 from numbers import Real
 from typing import Any, TypeVar
+
+import numpy as np
 
 from fidsplat.util.errors import InputError
 
 T = TypeVar("T")
+LARGEST = 1e15
+"""largest length [m] or colour; products of larger numbers would overflow in single precision"""
 _LONGEST = 200
-"""characters of a value that a message shows"""
+"""maximum number of characters of a value in a message"""
 
 
 def invalid(what: str, requirement: str, value: object, remedy: str = "") -> InputError:
     """The error for a value that does not meet a requirement."""
     try:
         shown = repr(value)
-    except Exception:  # an int of more digits than Python prints, a foreign object
+    except Exception:  # an int with too many digits to print, or a foreign object
         shown = f"a {type(value).__name__}"
     shown = shown if len(shown) <= _LONGEST else shown[:_LONGEST] + " ..."
     return InputError(f"{what} must be {requirement}, got {shown}{'; ' if remedy else ''}{remedy}")
 
 
 def as_float(value: Any) -> float:
-    """A real number as a float; NaN for anything else, an int that no float holds among it."""
+    """A real number as a float; NaN for anything else, including an int beyond the range of floats."""
     if getattr(value, "shape", None) == () and hasattr(value, "item"):
-        value = value.item()  # of NumPy
+        value = value.item()  # NumPy
     if not isinstance(value, Real) or isinstance(value, bool):
         return math.nan
     try:
@@ -78,7 +83,7 @@ def instance(what: str, value: Any, kind: type[T], requirement: str = "", remedy
 
 
 def text(what: str, value: Any) -> str:
-    """A string that files can hold: without half of a surrogate pair."""
+    """A string that can be encoded as UTF-8, that is, without half of a surrogate pair."""
     try:
         if isinstance(value, str):
             value.encode()
@@ -101,3 +106,36 @@ def items(what: str, value: Any, kind: type[T], requirement: str) -> tuple[T, ..
     if found is None or not all(isinstance(item, kind) for item in found):
         raise invalid(what, requirement, value)
     return found
+
+
+class PickledByFields:
+    """Base of frozen dataclasses that are pickled and copied by their fields, without cached values. Their
+    arrays are read-only afterwards."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+
+def own_scalars(data: Any) -> None:
+    """Replace NumPy scalars among the fields of a dataclass, frozen or not, by Python numbers."""
+    for field in fields(data):
+        value = getattr(data, field.name)
+        if isinstance(value, np.generic):
+            object.__setattr__(data, field.name, value.item())
+
+
+def real_array(what: str, value: Any, requirement: str = "an array of real numbers") -> np.ndarray:
+    """An array of real numbers, of any shape, as float64."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # for example rows of different lengths
+        array = np.empty(0, object)
+    if array.dtype.kind not in "fiub":
+        raise invalid(what, requirement, value)
+    return array.astype(np.float64)

@@ -1,26 +1,24 @@
-"""The two kinds of error that a user meets; the command line turns them into one line and an exit status."""
+"""Errors for users; the command line prints them as one line with an exit status."""
 
 import difflib
 from collections.abc import Iterable
 
 LONGEST = 2000
-"""characters of an error's text: one that quotes more of what it was given is cut in its middle"""
+"""maximum number of characters of a message; longer ones are cut in the middle"""
 
 
 class FidsplatError(Exception):
-    """Base of every error that fidsplat raises on purpose; its text says what was wrong and what would be
-    right."""
+    """Base of the errors that fidsplat raises deliberately. The text states the problem and the remedy."""
 
     exit_status = 1
 
     def __str__(self) -> str:
-        text = Exception.__str__(self)  # a KeyError's own would be a repr
+        text = Exception.__str__(self)  # KeyError's own text is a repr
         return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
 class InputError(FidsplatError, ValueError):
-    """The user's input (file, spec, pose, size, option) cannot be used. Exit status 2. Its text is one line,
-    whatever it quotes."""
+    """Unusable input: file, spec, pose, size or option. Exit status 2. The text is always one line."""
 
     exit_status = 2
 
@@ -29,28 +27,28 @@ class InputError(FidsplatError, ValueError):
 
 
 class MissingOutputError(InputError, KeyError):
-    """An output that a frame was not rendered with; to a Mapping, a key that is missing."""
+    """An output that was not requested when the frame was rendered; also a KeyError."""
 
 
 class DeviceError(FidsplatError, RuntimeError):
-    """A device is missing, unknown, or failed while it ran. Exit status 1 (2 for an unknown name)."""
+    """A missing or failed device. Exit status 1."""
 
     exit_status = 1
 
 
 class UnknownDeviceError(DeviceError):
-    """The name of a device that nothing here answers to."""
+    """An unknown device name. Exit status 2."""
 
     exit_status = 2
 
 
 def unknown(what: str, name: object, known: Iterable[str], within: str = "", likeness: float = 0.6) -> str:
-    """What an error says about a name that is none of those known, the nearest of which it offers.
+    """Message about an unknown name, with the nearest known name and a list of all.
 
     Args:
-        what: what was named: "output", "quality".
-        within: stands before the name, "camera." say, and has no part in the comparison.
-        likeness: how like the name the nearest must be to be offered, 0 to 1.
+        what: kind of the name, such as "output".
+        within: prefix of the name that is not compared, such as "camera.".
+        likeness: minimum similarity of the suggestion, 0 to 1.
     """
     names = list(known)
     near = difflib.get_close_matches(str(name)[:100].lower(), names, 1, likeness)
@@ -62,12 +60,12 @@ def unknown(what: str, name: object, known: Iterable[str], within: str = "", lik
 
 
 def bytes_words(size: float) -> str:
-    """Bytes as errors say them, to three digits where they are few."""
+    """A number of bytes for messages, with three digits if it is small."""
     if size < 2**20:
         return f"{size / 2**10:.3g} KiB"
     return f"{size / 2**20:.3g} MiB" if size < 100 * 2**20 else f"{size / 2**20:.0f} MiB"
 
 
 def several(count: int, things: str) -> str:
-    """A number of things, "1 chunk" of "chunks"."""
+    """A count with its noun in the singular or plural: "1 chunk" for "chunks"."""
     return f"{count:,} {things if count != 1 else things.removesuffix('s')}"

@@ -1,4 +1,4 @@
-"""Atomic writes of files, and reads of input files that refuse what is not a regular file."""
+"""Paths, atomic writes, and reads of regular files."""
 
 import json
 import math
@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from fidsplat.util import interrupts
-from fidsplat.util.errors import InputError
-from fidsplat.util.input_limit import check_expansion
+from fidsplat.util.errors import DeviceError, InputError
+from fidsplat.util.limits import check_expansion
 
 MAX_NAME, MAX_PATH = 255, 4095
-"""bytes of a file's name and of a path to it, on Linux"""
+"""bytes of a file name and of a path on Linux"""
 
 
 def path_of(path: str | os.PathLike[str]) -> Path:
-    """The path that is meant. Raises InputError for anything but text or a path that a file can have."""
+    """A path as pathlib.Path. Raises InputError for anything but a path that a file can have."""
     try:
         name = os.fspath(path)
     except TypeError:
@@ -27,23 +27,25 @@ def path_of(path: str | os.PathLike[str]) -> Path:
     try:
         if not isinstance(name, str) or b"\0" in os.fsencode(name):
             raise ValueError
-    except ValueError:  # or half of a surrogate pair, which no name has
-        raise InputError(f"{path!r} names no file; give a path as text or a pathlib.Path") from None
+    except ValueError:  # also for half of a surrogate pair
+        raise InputError(f"a path must be text or a pathlib.Path, got {path!r}") from None
     if len(os.fsencode(name)) > MAX_PATH or any(
         len(os.fsencode(part)) > MAX_NAME for part in Path(name).parts
     ):
-        raise InputError(f"{name!r} is too long for the name of a file; a name has at most {MAX_NAME} bytes")
+        raise InputError(
+            f"a file name must have at most {MAX_NAME} bytes and a path {MAX_PATH}, got {name!r}"
+        )
     return Path(name)
 
 
 def ordinary_file(path: str | os.PathLike[str]) -> Path:
-    """The path of a file, there or yet to be made.
+    """The path of a file that exists or can be created.
 
-    Raises InputError for a folder, a device or a pipe: moving a file onto one would replace it.
+    Raises InputError for a folder, a device or a pipe, which an atomic write would replace.
     """
     target = path_of(path)
     if target.exists() and not target.is_file():
-        raise InputError(f"cannot write {target}: it is not an ordinary file; give the name of a file")
+        raise InputError(f"cannot write {target}: it must be a regular file; give the name of a file")
     return target
 
 
@@ -59,8 +61,8 @@ _KINDS = {
 def regular_file(path: str | os.PathLike[str]) -> Path:
     """Check that a path is a regular file, for libraries that open files themselves.
 
-    Raises InputError when it is missing, and for a folder, a pipe or a device: to open or to read these may
-    wait for ever.
+    Raises InputError for a missing file, and for a folder, a pipe or a device, whose opening or reading may
+    block.
     """
     file = path_of(path)
     try:
@@ -74,10 +76,11 @@ def regular_file(path: str | os.PathLike[str]) -> Path:
 
 
 def open_input(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open an input file for binary reading. Raises InputError as `regular_file`, and when opening fails."""
+    """Open an input file for binary reading. Raises InputError if it is not a regular file or cannot be
+    opened."""
     file = regular_file(path)
     try:
-        # O_NONBLOCK: a pipe that has taken the file's place since the check is then empty, not waited for
+        # O_NONBLOCK: a pipe that has replaced the file since the check is then read as empty
         return os.fdopen(os.open(file, os.O_RDONLY | os.O_CLOEXEC | getattr(os, "O_NONBLOCK", 0)), "rb")
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from error
@@ -86,9 +89,11 @@ def open_input(path: str | os.PathLike[str]) -> BinaryIO:
 def read_input(path: str | os.PathLike[str], most: int | None = None, first: int | None = None) -> bytes:
     """Read an input file.
 
-    most: bytes that it may have. first: read so many of its first bytes alone.
+    Args:
+        most: maximum size in bytes.
+        first: read only this number of first bytes.
 
-    Raises InputError as `open_input`, for a longer file or one beyond `input_limit`, and when reading fails.
+    Raises InputError for a file that is not regular, too large, beyond `input_limit` or unreadable.
     """
     with open_input(path) as stream:
         size = os.fstat(stream.fileno()).st_size
@@ -103,14 +108,14 @@ def read_input(path: str | os.PathLike[str], most: int | None = None, first: int
 
 
 def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
-    """Read an input file as UTF-8, each line ended by \\n. Raises InputError as `read_input`, and ValueError
-    for bytes that are not UTF-8 unless `errors`, as of `bytes.decode`, allows them."""
+    """Read an input file as UTF-8 with \\n as line end. Raises InputError if it cannot be read, and
+    ValueError for bytes that are not UTF-8, unless `errors` (see `bytes.decode`) allows them."""
     return read_input(path).decode("utf-8", errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
 @contextmanager
 def utf8_path(path: Path) -> Iterator[Path]:
-    """A name of a file for libraries that crash on names other than UTF-8: a symbolic link to such a file."""
+    """A symbolic link to a file whose name is not UTF-8, for libraries that crash on such names."""
     try:
         os.fspath(path).encode()
     except UnicodeEncodeError:
@@ -123,13 +128,13 @@ def utf8_path(path: Path) -> Iterator[Path]:
 
 
 def printable(text: str) -> str:
-    """Text in which escapes stand for bytes of file names that are not UTF-8, for pages and charts."""
+    """Text with escapes for bytes of file names that are not UTF-8, for pages and charts."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def from_json(text: str | bytes, finite: bool = False) -> Any:
-    """What JSON says. Raises ValueError for all that is none, tables in a thousand tables among it; finite:
-    and for numbers that are not."""
+    """Parse JSON. Raises ValueError for anything else, including nesting that is too deep, and with
+    `finite` for infinities and NaN."""
     numbers: dict[str, Any] = {"parse_float": _finite, "parse_constant": _finite} if finite else {}
     try:
         return json.loads(text, **numbers)
@@ -145,13 +150,14 @@ def _finite(text: str) -> float:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], durable: bool = False) -> Iterator[BinaryIO]:
-    """Open a temporary file beside ``path`` for binary writing and move it onto ``path`` when all went well.
+    """Open a temporary file next to ``path`` for binary writing, and rename it to ``path`` after success.
 
-    A reader never sees half a file, and a run that is stopped leaves the old one as it was.
+    Readers never get an incomplete file, and an interrupted run keeps the old one.
 
-    durable: wait until the disk has the file, so that a power cut leaves the new file or the old one too.
+    Args:
+        durable: wait until the file is on the disk, so that a power cut leaves the new or the old file.
 
-    Raises InputError when the folder is missing or cannot be written.
+    Raises InputError if the folder is missing or not writable.
     """
     with atomic_path(path) as part, part.open("wb") as stream:
         yield stream
@@ -161,16 +167,17 @@ def atomic_write(path: str | os.PathLike[str], durable: bool = False) -> Iterato
     if durable:
         folder = os.open(path_of(path).parent, os.O_RDONLY)
         try:
-            os.fsync(folder)  # the name of the file
+            os.fsync(folder)  # the directory entry
         finally:
             os.close(folder)
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path]:
-    """As `atomic_write`, for libraries that open files themselves: an empty file of a temporary name.
+    """An empty temporary file that is renamed to ``path`` after success, for libraries that open files.
 
-    suffix: what that name ends with, for those that go by it.
+    Args:
+        suffix: ending of the temporary name, for libraries that depend on it.
     """
     interrupts.check()
     target = ordinary_file(path)
@@ -194,11 +201,9 @@ def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path
 
 
 def writable_folder(path: str | os.PathLike[str]) -> Path:
-    """Make the folder ``path`` with its parents and prove that a file can be written in it.
+    """Create a folder with its parents and check that a file can be written in it, before long work.
 
-    Asked before long work, so that nobody waits for a picture that cannot be kept.
-
-    Raises InputError when it cannot.
+    Raises InputError if the folder cannot be written.
     """
     folder = path_of(path)
     try:
@@ -213,7 +218,7 @@ def writable_folder(path: str | os.PathLike[str]) -> Path:
 
 
 def user_cache() -> Path:
-    """The user's cache folder; the one for temporary files where the user has no home."""
+    """The user's cache folder, or the folder for temporary files if the user has no home."""
     home = os.path.expanduser("~")
     return Path(
         os.environ.get("XDG_CACHE_HOME") or (tempfile.gettempdir() if home == "~" else f"{home}/.cache")
@@ -221,7 +226,23 @@ def user_cache() -> Path:
 
 
 def _umask() -> int:
-    # the only portable way to read the mask is to set it; a temporary file is made with 0600 whatever it is
+    # setting the mask is the only portable way to read it; temporary files are created with 0600
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def kernels_folder() -> Path:
+    """The folder of the kernels: `kernels/` next to the package in a checkout, `fidsplat/_kernels` in a
+    wheel.
+
+    Raises DeviceError if both are missing.
+    """
+    here = Path(__file__).resolve().parents[1]
+    places = (here / "_kernels", here.parent / "kernels")
+    for place in places:
+        if (place / "opencl").is_dir():
+            return place
+    raise DeviceError(
+        f"the kernels are missing: neither {places[0]} nor {places[1]} is there; reinstall fidsplat"
+    )

@@ -1,9 +1,9 @@
 """Cooperative cancellation: SIGINT and SIGTERM set a flag, and work stops at its next step.
 
-The handler raises nothing. An exception from a handler arises between any two instructions: in a finalizer
-or in a callback of a library, which drops it, so that the work goes on, or while a library loads, which
-aborts the process. `check` raises instead, where work calls it. A second signal, half a second later or
-more, raises at once, for work that has no step for long; a third ends the process.
+The handler does not raise, as its exception could arise between any two instructions: in a finalizer or a
+callback of a library, which would discard it, or while a library loads, which would abort the process.
+`check`, called by the work, raises instead. A second signal, half a second later or more, raises immediately,
+for work without frequent steps; a third ends the process.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 
-TYPE_CHECKING = False  # this module is loaded first of all: what takes long is imported late
+TYPE_CHECKING = False  # this module is loaded first, so that slow imports come later
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Callable, Iterator, Sequence
@@ -25,27 +25,26 @@ if TYPE_CHECKING:
     T = TypeVar("T")
 
 PERIOD = 0.1
-"""seconds between two looks at the flag of something that waits"""
+"""seconds between two checks of the flag while waiting"""
 REPEAT = 0.5
-"""seconds in which a second signal is the first again: `timeout` and shells send to a process and to its
-group"""
+"""seconds in which a second signal is a duplicate: `timeout` and shells signal a process and its group"""
 
 _number: int | None = None
-"""of the signal that came"""
+"""number of the received signal"""
 _since = 0.0
-"""when it came, time.monotonic()"""
+"""time of the signal, time.monotonic()"""
 _postponed = 0
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, which stops a command as Ctrl-C does: half-written files are removed."""
+    """SIGTERM. It stops a command like Ctrl-C, so that incomplete files are removed."""
 
 
 def install() -> dict[int, Any]:
-    """Let SIGINT and SIGTERM set the flag; returns the handlers that are replaced.
+    """Let SIGINT and SIGTERM set the flag; returns the replaced handlers.
 
-    Signals that are ignored stay ignored, as those of a command that a shell starts in the background.
-    Outside the main thread nothing changes.
+    Ignored signals stay ignored, as in a background command of a shell. Outside the main thread nothing
+    changes.
     """
     if threading.current_thread() is not threading.main_thread():
         return {}
@@ -60,7 +59,7 @@ def install() -> dict[int, Any]:
 
 @contextlib.contextmanager
 def handled() -> Iterator[None]:
-    """SIGINT and SIGTERM set the flag within the block."""
+    """Let SIGINT and SIGTERM set the flag within the block."""
     global _number
     before = install()
     try:
@@ -73,15 +72,16 @@ def handled() -> Iterator[None]:
 
 
 def check() -> None:
-    """A step of work: raises KeyboardInterrupt, or Terminated, in the main thread once a signal came."""
+    """Raise KeyboardInterrupt, or Terminated, in the main thread after a signal. Work calls it at each
+    step."""
     if _number is not None and not _postponed and threading.current_thread() is threading.main_thread():
         raise _stop(_number)
 
 
 @contextlib.contextmanager
 def postponed() -> Iterator[Callable[[], KeyboardInterrupt | None]]:
-    """Within the block `check` raises nothing, so that work is finished or saved; yields what returns the
-    exception to raise once a signal came, and None before."""
+    """Disable `check` within the block, so that work is completed or saved. Yields a function that returns
+    the exception to raise after a signal, and None before."""
     global _postponed
     _postponed += 1
     try:
@@ -91,7 +91,7 @@ def postponed() -> Iterator[Callable[[], KeyboardInterrupt | None]]:
 
 
 def result_of(future: Future[T]) -> T:
-    """The result of a task in another thread; waiting for it can be interrupted."""
+    """The result of a task in another thread; signals interrupt the waiting."""
     from concurrent.futures import wait
 
     while not wait([future], PERIOD).done:
@@ -100,7 +100,7 @@ def result_of(future: Future[T]) -> T:
 
 
 def sleep(seconds: float) -> None:
-    """Sleep; `check` ends it early."""
+    """Sleep until a signal arrives or the time has passed."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0:
         check()
@@ -108,7 +108,7 @@ def sleep(seconds: float) -> None:
 
 
 def run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run a process to its end with its output captured as text; it is killed when this is interrupted."""
+    """Run a process and capture its output as text; a signal kills it."""
     import subprocess
 
     pipe = subprocess.PIPE
@@ -118,7 +118,7 @@ def run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
                 check()
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     out, err = process.communicate(timeout=PERIOD)
-                    check()  # Ctrl-C in a terminal ends the process too
+                    check()  # Ctrl-C in a terminal also ends the process
                     return subprocess.CompletedProcess(command, process.returncode, out, err)
         except BaseException:
             process.kill()
@@ -126,7 +126,7 @@ def run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def lines_of(pipe: IO[bytes]) -> Iterator[str]:
-    """The lines of a process's output as they come; waiting for them can be interrupted."""
+    """Lines of a process's output; signals interrupt the waiting."""
     import select
 
     rest = b""

@@ -1,7 +1,7 @@
-"""Readers of NumPy's .npy and .npz files that trust nothing in them.
+"""Safe readers of untrusted .npy and .npz files.
 
-`numpy.load` allocates what a header declares, may skip the checksums of a .npz file, and raises whatever
-Python's parser raises for a damaged header. These readers allocate no more than the file holds.
+`numpy.load` allocates the size that a header declares, may skip the checksums of a .npz file, and raises any
+error of Python's parser for a damaged header. These readers allocate no more than the size of the file.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ def load_npy(file: Path) -> np.ndarray:
 def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """The arrays of a .npz file that `numpy.savez` wrote, read-only, with their CRC-32 checked.
 
-    names: of the arrays to read; None: all.
+    Args:
+        names: arrays to read; None for all.
 
     Raises:
         InputError: the file is not a regular file, or cannot be read.
@@ -59,7 +60,7 @@ def load_npz(file: Path, names: Collection[str] | None = None) -> dict[str, np.n
 def _array(content: bytes) -> np.ndarray:
     length = int.from_bytes(content[8:10], "little")
     if content[:8] != _MAGIC:
-        raise ValueError("it holds no NumPy array of format version 1.0")
+        raise ValueError("it must hold a NumPy array of format version 1.0")
     try:
         header = ast.literal_eval(content[10 : 10 + length].decode("latin-1").strip())
         dtype, shape = np.lib.format.descr_to_dtype(header["descr"]), header["shape"]
@@ -68,5 +69,5 @@ def _array(content: bytes) -> np.ndarray:
         if dtype.hasobject or not dtype.itemsize or size != len(content) - 10 - length:
             raise ValueError
         return np.ndarray(shape, dtype, content, 10 + length, order=order)
-    except Exception:  # Python's parser and NumPy raise many: SyntaxError, MemoryError, RecursionError
+    except Exception:  # SyntaxError, MemoryError, RecursionError and others of Python's parser and NumPy
         raise ValueError("the header of an array is damaged, or does not fit its data") from None

@@ -1,4 +1,4 @@
-"""What a measurement depends on: the sources of the package and of its kernels, the commit, the machine."""
+"""Provenance of a measurement: hash of the sources, commit, machine, versions."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from pathlib import Path
 from typing import Any
 
 from fidsplat import __version__
-from fidsplat.util.kernel_files import kernels_folder
+from fidsplat.util.files import kernels_folder
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _REBUILDING = {"fidsplat", "numpy", "copyreg"}
-"""packages by whose functions pickle makes data again"""
+"""packages whose functions pickle calls to restore data"""
 _WITHOUT_SOURCES = {"__pycache__", "_kernels"}
-"""folders of the package whose files are not sources of its own; a wheel carries the kernels in one"""
+"""folders of the package without sources of its own; a wheel has the kernels in one of them"""
 
 
 def digest_of(content: object) -> str:
-    """16 hexadecimal digits of all that plain data hold; large arrays are not copied.
+    """SHA-256 of plain data as 16 hexadecimal digits; large arrays are not copied.
 
-    Raises PicklingError, AttributeError or TypeError, as pickle does, for content that is no data.
+    Raises PicklingError, AttributeError or TypeError for content other than data.
     """
     digest = _Digest()
     _DataPickler(digest, protocol=5).dump(content)
@@ -35,8 +35,8 @@ def digest_of(content: object) -> str:
 
 
 class _DataPickler(pickle.Pickler):
-    """Refuses functions of others and what is called like one: pickle knows them by their names, by which
-    another one may be found tomorrow."""
+    """Pickler that refuses functions and other callables: pickle stores only their names, which may refer to
+    something else later."""
 
     def persistent_id(self, obj: Any) -> None:
         known = (getattr(obj, "__module__", None) or "").partition(".")[0] in _REBUILDING
@@ -45,22 +45,22 @@ class _DataPickler(pickle.Pickler):
 
 
 class _Digest:
-    """A stream that keeps a hash of what is written to it."""
+    """A stream that hashes the written data."""
 
     def __init__(self) -> None:
         self.sha = hashlib.sha256()
 
     def write(self, data: Any) -> int:
-        content = memoryview(data)  # bytes, or a large array where it lies
+        content = memoryview(data)  # bytes, or a large array without a copy
         self.sha.update(content)
         return content.nbytes
 
 
 @cache
 def code_hash() -> str:
-    """16 hexadecimal digits of every source of the package and of the kernels, data and templates included.
+    """SHA-256 of all sources, data and templates of the package and the kernels, as 16 hexadecimal digits.
 
-    The same in a checkout and in a wheel, where the kernels lie elsewhere.
+    Equal in a checkout and in a wheel, which have different folders of kernels.
     """
     found = hashlib.sha256()
     for name, file in sorted(sources().items()):
@@ -70,7 +70,7 @@ def code_hash() -> str:
 
 
 def sources() -> dict[str, Path]:
-    """The files that `code_hash` covers, by their names relative to `fidsplat` and to `kernels`."""
+    """Files of `code_hash` by their paths relative to `fidsplat` and `kernels`."""
     found = {}
     for top, folder in (("fidsplat", _PACKAGE), ("kernels", kernels_folder())):
         for file in folder.rglob("*"):
@@ -82,12 +82,12 @@ def sources() -> dict[str, Path]:
 
 
 def run_facts(device: str | None, seed: int, versions: Mapping[str, str] | None = None) -> dict:
-    """What the numbers of a run depend on, as plain data.
+    """Provenance of a run as plain data.
 
     Args:
-        device: title and driver of what draws; None when nothing is drawn.
-        seed: of texts, views and scenes.
-        versions: of the packages that take part, by name.
+        device: title and driver of the rendering device; None without rendering.
+        seed: seed of texts, views and scenes.
+        versions: versions of other packages by name.
     """
     return {
         "device": device,
@@ -101,7 +101,7 @@ def run_facts(device: str | None, seed: int, versions: Mapping[str, str] | None 
 
 
 def commit() -> str | None:
-    """Commit of the checkout, with "+" when tracked files differ from it; None outside a checkout."""
+    """Commit of the checkout, with "+" if tracked files differ; None outside a checkout."""
     here = Path(__file__)
 
     def git(*words: str) -> str | None:
@@ -109,7 +109,7 @@ def commit() -> str | None:
         return None if done.returncode else done.stdout.strip()
 
     try:
-        # an environment may lie inside somebody else's repository
+        # a virtual environment may be inside another repository
         if git("ls-files", "--error-unmatch", here.name) is None:
             return None
         head = git("rev-parse", "--short=12", "HEAD")

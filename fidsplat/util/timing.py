@@ -1,9 +1,8 @@
-"""One way to time things: whoever is compared takes turns with the others, so that what disturbs one disturbs
-all.
+"""Interleaved timing: compared functions run alternately, so that disturbances affect all of them.
 
-    ours, theirs = Timer(draw_ours), Timer(draw_theirs)
-    take_turns([ours, theirs], rounds=20)
-    ours.median, theirs.quartiles, ratios(ours, theirs)
+ours, theirs = Timer(render_ours), Timer(render_theirs)
+time_interleaved([ours, theirs], rounds=20)
+ours.median, theirs.quartiles, ratios(ours, theirs)
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ import numpy as np
 from fidsplat.util.errors import FidsplatError
 
 WARM_UP = 2
-"""rounds that go before those that count"""
+"""rounds before the timed ones"""
 
 
 class Clock:
-    """A clock in seconds that what is measured moves on itself: a stage by the device's clock, or a part of a
-    child process."""
+    """A clock in seconds that the timed work advances itself, for stages timed by the device or a child
+    process."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -33,33 +32,32 @@ class Clock:
 
 
 class Timer:
-    """Something to be timed, and the times of its runs so far."""
+    """A function to time, and the times of its runs."""
 
     def __init__(
         self,
         work: Callable[[], Any],
         clock: Callable[[], float] = time.perf_counter,
-        drops_out: bool = False,
+        catch_errors: bool = False,
         parts: Callable[[Any], Mapping[str, float]] | None = None,
     ) -> None:
         """
         Args:
-            work: does it once and ends when it is done. It may return milliseconds by name, which are kept
-                beside the whole.
-            clock: seconds.
-            parts: gives those milliseconds from what `work` returns, as `frame.timings`; not timed itself.
-            drops_out: whether a FidsplatError of `work` ends its part and is kept in `error`; else it is
-                raised.
+            work: function that returns when the work is complete. It may return milliseconds of its parts by
+                name.
+            clock: time in seconds. parts: converts the result of `work` to milliseconds by name, such as
+            `frame.timings`; not timed. catch_errors: store a FidsplatError of `work` in `error` and stop
+            timing it, instead of raising it.
         """
-        self._work, self._clock, self._drops_out, self._parts = work, clock, drops_out, parts
+        self._work, self._clock, self._catch_errors, self._parts = work, clock, catch_errors, parts
         self.ms: list[float] = []
-        """milliseconds of each run that counts"""
+        """milliseconds of each timed run"""
         self.parts: dict[str, list[float]] = {}
-        """the same runs part by part, as `work` returned them"""
+        """milliseconds of each part of the timed runs"""
         self.error = ""
 
-    def run(self, counts: bool = True) -> float:
-        """Do it once; returns milliseconds, NaN once it has dropped out."""
+    def run(self, timed: bool = True) -> float:
+        """Run once; returns milliseconds, or NaN after an error."""
         if self.error:
             return math.nan
         try:
@@ -69,11 +67,11 @@ class Timer:
             if self._parts is not None:
                 parts = self._parts(parts)
         except FidsplatError as error:
-            if not self._drops_out:
+            if not self._catch_errors:
                 raise
             self.error = str(error)
             return math.nan
-        if counts:
+        if timed:
             self.ms.append(taken)
             for name, ms in parts.items() if isinstance(parts, Mapping) else ():
                 self.parts.setdefault(name, []).append(ms)
@@ -81,7 +79,7 @@ class Timer:
 
     @property
     def median(self) -> float:
-        """Of the runs that count; NaN without any."""
+        """Median of the timed runs; NaN without any."""
         return float(np.median(self.ms)) if self.ms else math.nan
 
     @property
@@ -95,40 +93,40 @@ class Timer:
         return {name: float(np.median(times)) for name, times in self.parts.items()}
 
 
-def frame_timer(renderer, scene, camera, drops_out: bool = False, **how) -> Timer:
-    """Times frames of a scene that is on the device; the picture stays there. A time is from the call until
-    the device is done, its parts are the stages by the device's own clock.
+def frame_timer(renderer, scene, camera, catch_errors: bool = False, **how) -> Timer:
+    """A timer of frames of a resident scene, whose image stays on the device. A time ends when the device is
+    done; its parts are the stages by the device's clock.
 
     Args:
-        renderer, scene, camera, how: as in `renderer.render(scene, camera, **how)`.
+        renderer, scene, camera, how: arguments of `renderer.render(scene, camera, **how)`.
     """
-    draw = lambda: renderer.render(scene, camera, **how).wait()  # noqa: E731
-    return Timer(draw, drops_out=drops_out, parts=lambda frame: frame.timings)
+    render = lambda: renderer.render(scene, camera, **how).wait()  # noqa: E731
+    return Timer(render, catch_errors=catch_errors, parts=lambda frame: frame.timings)
 
 
-def take_turns(
+def time_interleaved(
     timers: Sequence[Timer],
     rounds: int,
     *,
-    least: int | None = None,
+    min_rounds: int | None = None,
     seconds: float = math.inf,
     warm_up: int = WARM_UP,
     tick: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run all timers once a round, and every second round in the opposite order.
+    """Run all timers once per round, in reversed order every second round.
 
     Args:
-        rounds: how many count, at most.
-        least, seconds: once `least` rounds are done, no more are begun after so many seconds.
-        warm_up: rounds that go before and do not count.
-        tick: is called after each run that counts.
+        rounds: maximum number of timed rounds.
+        min_rounds, seconds: after `min_rounds` rounds, none is started later than `seconds`.
+        warm_up: number of rounds before the timed ones.
+        tick: called after each timed run.
     """
     for _ in range(warm_up):
         for timer in timers:
-            timer.run(counts=False)
+            timer.run(timed=False)
     end = time.monotonic() + seconds
     for number in range(rounds):
-        if number >= (rounds if least is None else least) and time.monotonic() >= end:
+        if number >= (rounds if min_rounds is None else min_rounds) and time.monotonic() >= end:
             break
         for timer in timers[:: -1 if number % 2 else 1]:
             timer.run()
@@ -136,7 +134,7 @@ def take_turns(
 
 
 def ratios(ours: Timer, base: Timer) -> list[float]:
-    """Time of `ours` over that of `base`, round by round."""
+    """Time of `ours` divided by the time of `base`, for each round."""
     return np.divide(ours.ms, base.ms).tolist()
 
 

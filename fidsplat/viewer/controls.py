@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from fidsplat.capture.quality import PRESETS
 from fidsplat.scenes import Scene
-from fidsplat.util.markdown import escaped
+from fidsplat.util.markup import escaped
 from fidsplat.viewer.session import Session
 from fidsplat.viewer.settings import LENSES, Settings
 

@@ -23,7 +23,7 @@ from fidsplat.images.files import png_bytes
 from fidsplat.scenes import Scene
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.util.errors import FidsplatError, InputError
-from fidsplat.util.markdown import escaped
+from fidsplat.util.markup import escaped
 from fidsplat.viewer.controls import NO_TARGET, Controls
 from fidsplat.viewer.gizmo import GizmoTarget, find_target, target_names
 from fidsplat.viewer.guard import guarded

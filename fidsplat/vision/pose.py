@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.util.arguments import LARGEST, real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import LARGEST, real_array
 
 # OpenCV's square has y up and z towards the viewer, ours y down and z away (docs/conventions.md)
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -13,9 +13,8 @@ import numpy as np
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats.rotations import check_similarity
-from fidsplat.util.arguments import instance, invalid
+from fidsplat.util.arguments import instance, invalid, real_array
 from fidsplat.util.errors import InputError
-from fidsplat.util.scalars import real_array
 from fidsplat.vision.visible import visible
 
 Box = tuple[float, float, float, float]

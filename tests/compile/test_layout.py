@@ -230,7 +230,7 @@ def test_a_mistake_in_a_kernel_is_told_with_its_file_and_line(renderer, toys):
 
 
 def test_line_directives_lead_to_the_lines_of_the_files():
-    from fidsplat.util.kernel_files import kernels_folder
+    from fidsplat.util.files import kernels_folder
 
     source = assemble(combination(everything("distortion")).features(), cpu_shape())
     assert source.listing.count("\n") == source.text.count("\n")

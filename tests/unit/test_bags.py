@@ -43,8 +43,8 @@ def images(path):
 
 @pytest.fixture
 def small_limit(monkeypatch):
-    monkeypatch.setattr("fidsplat.util.input_limit.FLOOR", 2**21)
-    monkeypatch.setattr("fidsplat.util.input_limit.RATIO", 1)
+    monkeypatch.setattr("fidsplat.util.limits.FLOOR", 2**21)
+    monkeypatch.setattr("fidsplat.util.limits.RATIO", 1)
 
 
 KINDS = [

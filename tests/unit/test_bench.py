@@ -209,11 +209,11 @@ def test_a_table_for_people_and_a_file_for_programs(capsys, tmp_path):
 def test_an_interrupt_keeps_what_was_measured(capsys, tmp_path, monkeypatch):
     draws = []
 
-    def stopped(self, counts=True, run=Timer.run):
-        draws.append(counts)
+    def stopped(self, timed=True, run=Timer.run):
+        draws.append(timed)
         if len(draws) == 2 * (1 + WARM_UP) + 3 + 2:  # the second frame of the second scene
             raise KeyboardInterrupt
-        return run(self, counts)
+        return run(self, timed)
 
     monkeypatch.setattr(Timer, "run", stopped)
     file = tmp_path / "figures.json"
@@ -342,7 +342,12 @@ def test_the_plot_has_a_bar_for_each_scene_and_device(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [("times.pdf", "ends so"), ("no/../\0.svg", "names no file"), (".", "ends so")]
+    ("name", "words"),
+    [
+        ("times.pdf", "ends in .svg or .png"),
+        ("no/../\0.svg", "a path must be text"),
+        (".", "ends in .svg or .png"),
+    ],
 )
 def test_a_plot_that_cannot_be_written_is_said_first(name, words, capsys):
     assert bench("--scenes", "small", "--plot", name) == 2

@@ -15,7 +15,7 @@ import fidsplat as fs
 from fidsplat.formats import load_splats, save_splats, usd
 from fidsplat.images.files import decoded, read_bits, read_image
 from fidsplat.sim import read_description
-from fidsplat.util.input_limit import FLOOR, RATIO, VARIABLE, input_limit
+from fidsplat.util.limits import FLOOR, RATIO, VARIABLE, input_limit
 
 ONE = fs.SplatCloud([[0, 0, 1.0]], [[1.0, 0, 0, 0]], [[0.1, 0.1]], [0.5], colors=[[1.0, 0, 0]])
 
@@ -165,8 +165,8 @@ def test_chunks_of_logs(tmp_path, monkeypatch, indexed, compression):
         for time in range(20):
             made.add_message(channel, time, zeros, time)
         made.finish()
-    monkeypatch.setattr("fidsplat.util.input_limit.FLOOR", 2**22)
-    monkeypatch.setattr("fidsplat.util.input_limit.RATIO", 1)
+    monkeypatch.setattr("fidsplat.util.limits.FLOOR", 2**22)
+    monkeypatch.setattr("fidsplat.util.limits.RATIO", 1)
     with pytest.raises(fs.InputError, match=r"a\.mcap must expand to at most 4.*chunk"):
         list(log_pictures(path))
 

@@ -80,7 +80,7 @@ def test_a_folder_that_is_missing_or_full_is_an_input_error(tmp_path, monkeypatc
 def test_what_is_no_ordinary_file_is_not_replaced(tmp_path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    with pytest.raises(InputError, match="not an ordinary file"), atomic_write(pipe):
+    with pytest.raises(InputError, match="must be a regular file"), atomic_write(pipe):
         pass
     assert pipe.is_fifo()
 
@@ -127,6 +127,9 @@ def put_bag(folder, pipe, name):
     from fidsplat.logs import log_pictures
 
     (folder / "bag").mkdir()
+    if name != "metadata.yaml":
+        facts = f"rosbag2_bagfile_information: {{relative_file_paths: [{name}]}}\n"
+        (folder / "bag" / "metadata.yaml").write_text(facts)
     pipe.rename(folder / "bag" / name)
     return next(log_pictures(folder / "bag"))
 
@@ -355,5 +358,5 @@ def test_a_bag_that_names_a_file_outside_of_it(tmp_path):
     (tmp_path / "other" / "other.db3").rename(tmp_path / "other.db3")
     note = tmp_path / "bag" / "metadata.yaml"
     note.write_text(note.read_text().replace("bag.db3", "../other.db3"))
-    with pytest.raises(InputError, match=r"files are missing: .*bag/other\.db3"):
+    with pytest.raises(InputError, match=r"cannot read .*bag/other\.db3"):
         next(log_pictures(tmp_path / "bag"))

@@ -71,7 +71,7 @@ def test_the_model_loads_and_has_the_benches(small):
 def test_the_scene_file_is_there_when_all_else_is(tmp_path, capsys):
     (tmp_path / "greenhouse.xml").mkdir()
     assert main(["greenhouse", "-o", str(tmp_path), "--rows", "1", "--plants", "1"]) == 2
-    assert "not an ordinary file" in capsys.readouterr().err
+    assert "must be a regular file" in capsys.readouterr().err
     assert not (tmp_path / "greenhouse.toml").exists()
 
 

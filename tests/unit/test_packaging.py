@@ -27,7 +27,7 @@ import sys, site
 others = list(sys.path)
 site.addsitedir(sys.argv[1])  # reads the .pth file of an editable install
 sys.path[:] = [p for p in sys.path if p not in others] + others  # before this environment's own fidsplat
-from fidsplat.util.kernel_files import kernels_folder
+from fidsplat.util.files import kernels_folder
 folder = kernels_folder()
 print(folder)
 for path in sorted([*folder.rglob("*.cl"), *folder.rglob("*.py")]):

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from fidsplat.util.errors import DeviceError
-from fidsplat.util.timing import Clock, Timer, quartiles, ratios, take_turns
+from fidsplat.util.timing import Clock, Timer, quartiles, ratios, time_interleaved
 
 
 def timers(order, *seconds):
@@ -23,13 +23,13 @@ def timers(order, *seconds):
 
         return once
 
-    return [Timer(work(k, iter(given)), clock, drops_out=True) for k, given in enumerate(seconds)]
+    return [Timer(work(k, iter(given)), clock, catch_errors=True) for k, given in enumerate(seconds)]
 
 
 def test_turns_alternate_and_warm_up_does_not_count():
     order, ticks = [], []
     one, other = timers(order, [9, 1, 2, 3, 4], [9, 2, 2, 2, 2])
-    take_turns([one, other], 4, warm_up=1, tick=lambda: ticks.append(1))
+    time_interleaved([one, other], 4, warm_up=1, tick=lambda: ticks.append(1))
     assert order == [0, 1, 0, 1, 1, 0, 0, 1, 1, 0]
     assert one.ms == [1000, 2000, 3000, 4000]
     assert one.parts == {"half": [500, 1000, 1500, 2000]}
@@ -39,23 +39,23 @@ def test_turns_alternate_and_warm_up_does_not_count():
     assert len(ticks) == 8
 
 
-def test_what_fails_drops_out_or_raises():
+def test_what_fails_catch_errors_or_raises():
     order = []
     one, other = timers(order, [1, 1, DeviceError("it broke"), 1], [1] * 6)
-    take_turns([one, other], 4)
+    time_interleaved([one, other], 4)
     assert (one.ms, one.error) == ([], "it broke")
     assert len(other.ms) == 4
     assert order.count(0) == 3
     assert math.isnan(one.run())
     assert math.isnan(one.median)
     (fragile,) = timers(order, [DeviceError("it broke")])
-    fragile._drops_out = False
+    fragile._catch_errors = False
     with pytest.raises(DeviceError, match="it broke"):
-        take_turns([fragile], 1)
+        time_interleaved([fragile], 1)
 
 
 @pytest.mark.parametrize(("least", "done"), [(3, 3), (None, 10), (20, 10)])
 def test_no_more_than_the_least_once_time_is_up(least, done):
     (timer,) = timers([], [0.001] * 12)
-    take_turns([timer], 10, least=least, seconds=0.0)
+    time_interleaved([timer], 10, min_rounds=least, seconds=0.0)
     assert len(timer.ms) == done

@@ -135,7 +135,7 @@ def test_a_run_that_begins_again_keeps_the_old_checkpoint_until_it_has_its_own(d
     assert sha(file) == kept
     again.run()
     assert sha(file) != kept
-    with pytest.raises(fs.InputError, match="not an ordinary file"):  # before any work
+    with pytest.raises(fs.InputError, match="must be a regular file"):  # before any work
         Trainer(dataset, renderer, checkpoint=tmp_path, **QUICK)
 
 

@@ -36,7 +36,7 @@ from fidsplat.backends.opencl.layout import BOUNDS, GROUP_KERNELS, KERNELS, MOME
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet, Output
 from fidsplat.util.errors import DeviceError
-from fidsplat.util.kernel_files import kernels_folder
+from fidsplat.util.files import kernels_folder
 
 _LISTS = {
     "ordered": ("scan", "sort", "bin"),

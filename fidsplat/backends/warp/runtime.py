@@ -13,8 +13,8 @@ from types import ModuleType
 
 from fidsplat.backends.checked_cache import check_once
 from fidsplat.util.errors import DeviceError
-from fidsplat.util.kernel_files import kernels_folder
-from fidsplat.util.stderr import without_stderr
+from fidsplat.util.files import kernels_folder
+from fidsplat.util.streams import without_stderr
 
 MISSING = "Warp is not installed; install it with: pip install 'fidsplat[warp]' (or pip install warp-lang)"
 _PACKAGE = "fidsplat_warp_kernels"

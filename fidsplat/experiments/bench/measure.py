@@ -23,7 +23,7 @@ from fidsplat.render.resident import ResidentCloud
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.streaming.residency import Residency
 from fidsplat.util.errors import FidsplatError
-from fidsplat.util.timing import Timer, take_turns
+from fidsplat.util.timing import Timer, time_interleaved
 
 
 @dataclass
@@ -142,7 +142,7 @@ class Bench:
             runs.append(SceneRun(scene, name, rates, cloud, camera))
             self.results.append(runs[-1].result)
         self._tell(scene)
-        take_turns([run.result.timer for run in runs], repeats, tick=self._tick)
+        time_interleaved([run.result.timer for run in runs], repeats, tick=self._tick)
 
 
 class SceneRun:
@@ -155,7 +155,7 @@ class SceneRun:
         self.camera, self.capture = camera, Capture(camera, quality=TIMED)
         self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
         """what was drawn, (h, w, 3)"""
-        timer = Timer(self._whole, drops_out=True, parts=lambda frame: frame.timings)
+        timer = Timer(self._whole, catch_errors=True, parts=lambda frame: frame.timings)
         self.result = Result(scene, self.renderer.device, camera.width, camera.height, timer, rates)
         try:
             self.resident = self.renderer.upload(cloud)

@@ -17,7 +17,7 @@ from fidsplat.experiments.tradeoff.scenes import Own, TradeScene, make
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
-from fidsplat.util.timing import frame_timer, quartiles, ratios, take_turns
+from fidsplat.util.timing import frame_timer, quartiles, ratios, time_interleaved
 
 _SCENES, _TRUTHS = 12, 6
 """kept at a time"""
@@ -110,7 +110,7 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
         )
         for drawn in (quality, BASE)
     )
-    take_turns([own, base], effort.most, least=effort.least, seconds=effort.seconds, warm_up=1)
+    time_interleaved([own, base], effort.most, min_rounds=effort.least, seconds=effort.seconds, warm_up=1)
     result: dict = {"repeats": len(own.ms), "stages_ms": own.part_medians, "memory_bytes": memory}
     for name, values in (("ms", own.ms), ("base_ms", base.ms), ("ratio", ratios(own, base))):
         low, result[name], high = quartiles(values)

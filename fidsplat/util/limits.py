@@ -1,0 +1,114 @@
+"""Limits: memory that input files may expand to, and limits of the process (`ulimit`) below which
+libraries and drivers crash. The standard library is all that this module imports."""
+
+from __future__ import annotations
+
+import os
+import sys
+from functools import cache
+from pathlib import Path
+
+from fidsplat.util.errors import DeviceError, InputError, bytes_words
+
+try:
+    import resource
+except ImportError:  # Windows has no such limits
+    resource = None
+
+VARIABLE = "FIDSPLAT_INPUT_LIMIT"
+"""environment variable with a number of bytes that replaces the limit"""
+FLOOR = 2**29
+"""bytes that any file may expand to; an image of one colour is a thousand times larger than its PNG"""
+RATIO = 64
+"""ratio to its size on disk that a larger file may expand to; SOG and SPZ files expand about 20 times"""
+
+
+def input_limit(size: int) -> int:
+    """Bytes that a file of a size may expand to: `FIDSPLAT_INPUT_LIMIT`, else the larger of 512 MiB and 64
+    times its size, but at most half of the machine's memory."""
+    text = os.environ.get(VARIABLE)
+    if text is None:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**33
+        return min(max(FLOOR, RATIO * size), memory // 2)
+    if not text.isdecimal() or int(text) == 0:
+        raise InputError(
+            f"{VARIABLE} must be a number of bytes above 0, got {text!r}; write for example {2**32}"
+        )
+    return int(text)
+
+
+def check_expansion(path: Path | str, need: float, what: str, size: int | None = None) -> None:
+    """Raise InputError if a file would expand beyond `input_limit`.
+
+    Args:
+        path: the file, or with a size a description of its part.
+        need: bytes of memory after expansion.
+        what: content that the file declares, for the message: "100,000,000 splats".
+        size: bytes of the file or of its compressed part; by default those on the disk, without the holes
+            of a sparse file.
+    """
+    if size is None:
+        status = Path(path).stat()
+        size = min(status.st_size, 512 * status.st_blocks)
+    if need > (limit := input_limit(size)):
+        raise InputError(
+            f"{path} must expand to at most {bytes_words(limit)}, as it has {bytes_words(size)}, got {what}, "
+            f"{bytes_words(need)}; if you trust the file, set {VARIABLE}={int(need) + 1}"
+        )
+
+
+_IMPORTS, _DRIVER, _PER_CORE = 640 * 2**20, 640 * 2**20, 2**24
+"""bytes of address space: NumPy, OpenCV and so on; a driver with its compiler; the threads of a core"""
+_FILE = 2**24
+"""largest file of a driver's compiler in bytes"""
+_OPEN_FILES = 32
+"""file descriptors of a command and a driver's compiler and linker"""
+
+
+def check_imports() -> None:
+    """Raise InputError if the limit on memory is too low for imports, as OpenBLAS would crash."""
+    needed = _IMPORTS + _cores() * _PER_CORE
+    if (space := _limit("RLIMIT_AS")) < needed:
+        raise InputError(
+            f"the limit on memory must be at least {bytes_words(needed)}, got {bytes_words(space)}; "
+            f"raise it with `ulimit -v {needed // 2**10}`"
+        )
+
+
+@cache
+def check_driver(family: str) -> None:
+    """Raise DeviceError if a limit is too low for the driver of a family, which would abort the process.
+    Checked once per family, as the loaded driver counts as used memory.
+    """
+    if (largest := _limit("RLIMIT_FSIZE")) < _FILE:
+        raise DeviceError(
+            f"the limit on file size must be at least {bytes_words(_FILE)} for compiled kernels, got "
+            f"{bytes_words(largest)}; raise it with `ulimit -f`, or use the device reference"
+        )
+    if (files := _limit("RLIMIT_NOFILE")) < _OPEN_FILES:
+        raise DeviceError(
+            f"the limit on open files must be at least {_OPEN_FILES} for compiled kernels, got {files}; "
+            f"raise it with `ulimit -n {_OPEN_FILES}`, or use the device reference"
+        )
+    if (space := _limit("RLIMIT_AS")) == float("inf"):
+        return
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    needed = _DRIVER + _cores() * _PER_CORE
+    if space - used < needed:
+        raise DeviceError(
+            f"the limit on memory must leave at least {bytes_words(needed)} for the driver of {family}, got "
+            f"{bytes_words(max(0, space - used))}; raise it with `ulimit -v {(used + needed) // 2**10}`, or "
+            "use the device reference"
+        )
+
+
+def _limit(name: str) -> float:
+    """A limit in bytes, or infinity. Only Linux limits memory."""
+    if resource is None or (name == "RLIMIT_AS" and sys.platform != "linux"):
+        return float("inf")
+    limit = resource.getrlimit(getattr(resource, name))[0]
+    return float("inf") if limit == resource.RLIM_INFINITY else limit
+
+
+def _cores() -> int:
+    return os.cpu_count() or 1

@@ -1,0 +1,37 @@
+"""Text as Markdown and HTML."""
+
+import html
+import re
+
+_ACTIVE = re.compile(r"[&<>\[\]!|\\]")
+_SPACE = re.compile(r"\s+")
+
+
+def escaped(text: object) -> str:
+    """Text as one line of Markdown, with character references for HTML, links, images and table cells.
+
+    Emphasis and code (`*`, `_`, a backtick) are not escaped, as they change only the typeface.
+    """
+    return _ACTIVE.sub(lambda found: f"&#{ord(found[0])};", _SPACE.sub(" ", str(text)))
+
+
+class Summarised:
+    """Base of classes with a short summary, which notebooks show as a table."""
+
+    def summary(self) -> dict[str, str]:
+        """Short descriptions by name."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        """The summary as an HTML table."""
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
+            f"<td style='text-align:left'>{html.escape(words)}</td></tr>"
+            for name, words in self.summary().items()
+        )
+        return f"<b>{type(self).__name__}</b><table>{rows}</table>"
+
+
+def point(values) -> str:
+    """Coordinates with four significant digits."""
+    return "(" + ", ".join(f"{float(value):.4g}" for value in values) + ")"

@@ -1,0 +1,54 @@
+"""Standard streams of the process: closed ones, and messages that libraries write to stderr."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Iterator
+
+_lock = threading.Lock()
+_users, _copy = 0, -1
+
+
+def open_missing() -> None:
+    """Replace a closed stdin, stdout or stderr by the null device. Otherwise the next opened file would take
+    its descriptor and receive the output."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            # takes the lowest free descriptor, which is the missing one
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 it stays open
+
+
+def discard_stdout() -> None:
+    """Discard further output on stdout, including Python's final flush."""
+    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor is not flushed at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextlib.contextmanager
+def without_stderr() -> Iterator[None]:
+    """Discard output of native code to file descriptor 2. Calls of several threads may nest and overlap."""
+    global _users, _copy
+    with _lock:
+        _users += 1
+        if _users == 1:
+            if sys.stderr is not None:
+                sys.stderr.flush()
+            try:
+                _copy = os.dup(2)
+            except OSError:  # stderr is closed
+                _copy = -1
+            else:
+                nothing = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nothing, 2)
+                os.close(nothing)
+    try:
+        yield
+    finally:
+        with _lock:
+            _users -= 1
+            if not _users and _copy >= 0:
+                os.dup2(_copy, 2)
+                os.close(_copy)
