@@ -45,16 +45,16 @@ class WholeScene(Traits, Protocol):
         """Coplanar groups of its splats."""
         ...
 
-    def distinct(self, places: bool) -> int:
-        """How many keys its chunks have. places: whether the device moves chunks to their places."""
+    def distinct(self, applies_poses: bool) -> int:
+        """How many keys its chunks have. applies_poses: whether the device applies `Chunk.pose`."""
         ...
 
 
 class ChunkCache(Protocol):
     """Chunks of one scene on a device: those that were used last stay, within the memory budget."""
 
-    places: bool
-    """whether it moves chunks to their places; else `Chunk.pose` must be None"""
+    applies_poses: bool
+    """whether it applies `Chunk.pose`, which must be None otherwise"""
 
     @property
     def memory_bytes(self) -> int:

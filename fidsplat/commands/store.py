@@ -109,11 +109,11 @@ class Place:
                 _parse_triple("--grid", self.grid, int), _parse_triple("--pitch", self.pitch, float)
             )
         store = Store(place_store(self.source, self.out, poses, overwrite=self.overwrite))
-        facts = {"store": str(store.path), "places": store.places, "splats": len(store)}
+        facts = {"store": str(store.path), "places": store.instances, "splats": len(store)}
         return report(
             self.json,
             facts,
-            f"{several(len(store), 'splats')} at {several(store.places, 'places')}: {store.path}",
+            f"{several(len(store), 'splats')} at {several(store.instances, 'places')}: {store.path}",
         )
 
 
@@ -174,15 +174,15 @@ def _facts(store: fs.Store) -> dict[str, Any]:
     levels = [
         {
             "level": int(level),
-            "nodes": int(np.count_nonzero(nodes["level"] == level)) * store.places,
-            "splats": int(nodes["count"][nodes["level"] == level].sum()) * store.places,
+            "nodes": int(np.count_nonzero(nodes["level"] == level)) * store.instances,
+            "splats": int(nodes["count"][nodes["level"] == level].sum()) * store.instances,
             "cell_m": float(np.median(nodes["size"][nodes["level"] == level])),
         }
         for level in np.unique(nodes["level"])
     ]
     header = store.header
     facts = {"store": str(store.path), "splats": len(store), "kind": _KINDS[store.ellipsoids]}
-    facts |= {"sh_degree": max(store.sh_degree, 0), "chunks": store.chunks, "places": store.places}
+    facts |= {"sh_degree": max(store.sh_degree, 0), "chunks": store.chunks, "places": store.instances}
     facts |= {"placed": header.store, "bytes": store.nbytes, "columns": dict(header.columns)}
     facts |= {"sources": list(header.sources), "left_out": dict(header.dropped), "levels": levels}
     return facts | {"bounds": list(store.bounds()) if len(store) else None}

@@ -1,2 +1,1 @@
-"""Scenes on disk: splats in chunks of a spatial order with bounds, levels of detail above them, and copies of
-whole stores at other places (docs/large-scenes.md)."""
+"""Stores: splats on disk in chunks with bounding boxes and levels of detail (docs/large-scenes.md)."""

@@ -29,7 +29,7 @@ CellSizes = float | tuple[tuple[float, ...], ...]
 """samples: cells of a smaller size on the image are merged; one for all, or for each level of each store"""
 
 NodeMasks = tuple[np.ndarray, ...]
-"""(places * nodes,) bool for each store: the selected nodes"""
+"""(instances * nodes,) bool for each store: the selected nodes"""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class ChunkedSplats:
 
     def all_chunks(self) -> Selection:
         """All chunks, without nodes of levels of detail."""
-        masks = (np.tile(store.nodes["level"] == 0, store.places) for store in self.stores)
+        masks = (np.tile(store.nodes["level"] == 0, store.instances) for store in self.stores)
         return Selection.of(tuple(masks))
 
     def cell_sizes(self, *qualities: Quality) -> CellSizes:
@@ -125,8 +125,8 @@ class ChunkedSplats:
 
     @cached_property
     def node_counts(self) -> tuple[np.ndarray, ...]:
-        """Number of splats of each store's nodes, (places * nodes,) int64."""
-        return tuple(np.tile(store.nodes["count"].astype(np.int64), store.places) for store in self.stores)
+        """Number of splats of each store's nodes, (instances * nodes,) int64."""
+        return tuple(np.tile(store.nodes["count"].astype(np.int64), store.instances) for store in self.stores)
 
     @cached_property
     def pinned(self) -> NodeMasks:
@@ -134,7 +134,7 @@ class ChunkedSplats:
         return tuple(_pinned(store) for store in self.stores)
 
     def boxes(self, number: int, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
-        """Corners (places * nodes, 3) [m] of boxes around a store's nodes, from the origin."""
+        """Corners (instances * nodes, 3) [m] of boxes around a store's nodes, from the origin."""
         store = self.stores[number]
         low, high = store.boxes(sigmas)
         return low + (store.origin - self.origin), high + (store.origin - self.origin)
@@ -247,4 +247,4 @@ class ChunkedSplats:
 
 def _pinned(store: Store) -> np.ndarray:
     nodes = store.nodes
-    return np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), store.places)
+    return np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), store.instances)

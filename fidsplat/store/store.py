@@ -90,15 +90,15 @@ class Store(Summarised):
         return self.header.splats
 
     def __repr__(self) -> str:
-        places = "" if self.poses is None else f", at {len(self.poses)} places"
-        return f"Store({str(self.path)!r}, {len(self):,} splats{places})"
+        instances = "" if self.poses is None else f", {len(self.poses)} instances"
+        return f"Store({str(self.path)!r}, {len(self):,} splats{instances})"
 
     def summary(self) -> dict[str, str]:
         """Its content in words."""
         rows = {"splats": f"{len(self):,}", "chunks": f"{self.chunks:,}"}
         rows["colours"] = "plain" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
         if self.poses is not None:
-            rows["places"] = f"{len(self.poses):,} of {self.header.store}"
+            rows["instances"] = f"{len(self.poses):,} of {self.header.store}"
         if len(self):
             rows["bounds"] = " to ".join(map(point, self.bounds())) + " m"
         return rows | {f"left out: {why}": f"{n:,}" for why, n in self.header.dropped.items()}
@@ -133,18 +133,18 @@ class Store(Summarised):
     @property
     def identity(self) -> str:
         """Hexadecimal digest of its content."""
-        places = "" if self.poses is None else self.poses.tobytes().hex()
-        return self.header.identity + places
+        poses = "" if self.poses is None else self.poses.tobytes().hex()
+        return self.header.identity + poses
 
     @property
-    def places(self) -> int:
+    def instances(self) -> int:
         """Number of instances: 1 for a store with its own splats."""
         return 1 if self.poses is None else len(self.poses)
 
     @property
     def chunks(self) -> int:
         """Number of chunks of all instances."""
-        return self.places * int(np.count_nonzero(self.nodes["level"] == 0))
+        return self.instances * int(np.count_nonzero(self.nodes["level"] == 0))
 
     @property
     def nbytes(self) -> int:
@@ -164,7 +164,7 @@ class Store(Summarised):
         Raises InputError for an empty store.
         """
         low, high = self.boxes(sigmas)
-        leaves = np.tile(self.nodes["level"] == 0, self.places)
+        leaves = np.tile(self.nodes["level"] == 0, self.instances)
         if not leaves.any():
             raise InputError("an empty store has no bounds")
         return low[leaves].min(axis=0) + self.origin, high[leaves].max(axis=0) + self.origin
@@ -201,7 +201,7 @@ class Store(Summarised):
     # nodes of all instances: node i of instance p has the number p * len(nodes) + i
 
     def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corners, (places * nodes, 3) float64 [m] from the origin, of boxes around the
+        """Lowest and highest corners, (instances * nodes, 3) float64 [m] from the origin, of boxes around the
         splats of each node to that many standard deviations; 0: around their centres."""
         sigmas = checked_number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         nodes, share = self.nodes, min(sigmas / layout.FAR, 1.0)
@@ -212,23 +212,23 @@ class Store(Summarised):
         if self.poses is None:
             return low, high
         center, half = (low + high) / 2, (high - low) / 2
-        turns = self.poses[:, :3, :3]
-        middles = center @ np.swapaxes(turns, 1, 2) + self._moves[:, None]
-        low, high = _rounded(middles, half @ np.swapaxes(np.abs(turns), 1, 2))
+        rotations = self.poses[:, :3, :3]
+        middles = center @ np.swapaxes(rotations, 1, 2) + self._offsets[:, None]
+        low, high = _rounded(middles, half @ np.swapaxes(np.abs(rotations), 1, 2))
         return low.reshape(-1, 3), high.reshape(-1, 3)
 
-    def placed_boxes(
-        self, low: np.ndarray, high: np.ndarray, places: np.ndarray
+    def instance_boxes(
+        self, low: np.ndarray, high: np.ndarray, instances: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Boxes (k, 3) of the other store, each at the pose of an instance (k,)."""
         assert self.poses is not None
-        turns = self.poses[places, :3, :3]
+        rotations = self.poses[instances, :3, :3]
         center, half = (low + high) / 2, (high - low) / 2
-        middles = np.einsum("kij,kj->ki", turns, center) + self._moves[places]
-        return _rounded(middles, np.einsum("kij,kj->ki", np.abs(turns), half))
+        middles = np.einsum("kij,kj->ki", rotations, center) + self._offsets[instances]
+        return _rounded(middles, np.einsum("kij,kj->ki", np.abs(rotations), half))
 
     @cached_property
-    def _moves(self) -> np.ndarray:
+    def _offsets(self) -> np.ndarray:
         """(p, 3) float64 metres: translation of the other store's means to each instance."""
         assert self.poses is not None
         inner, outer = np.array(self._own.origin), self.origin
@@ -236,9 +236,9 @@ class Store(Summarised):
 
     def first_of(self, numbers: np.ndarray) -> np.ndarray:
         """(k,) int64: index of the first splat of chunks, by number; -1 for nodes of levels of detail."""
-        place, node = np.divmod(self._checked(numbers), max(len(self.nodes), 1))
+        instance, node = np.divmod(self._checked(numbers), max(len(self.nodes), 1))
         own = self.nodes[node]
-        return np.where(own["level"] == 0, own["first"] + place * self._own.splats, -1)
+        return np.where(own["level"] == 0, own["first"] + instance * self._own.splats, -1)
 
     def counts(self, numbers: np.ndarray) -> np.ndarray:
         """(k,) number of splats of nodes, by their numbers."""
@@ -246,7 +246,7 @@ class Store(Summarised):
 
     def _checked(self, numbers: np.ndarray) -> np.ndarray:
         """Validated numbers of nodes, (k,)."""
-        given, count = real_array("numbers", numbers), self.places * len(self.nodes)
+        given, count = real_array("numbers", numbers), self.instances * len(self.nodes)
         if not ((given == np.rint(given)) & (given >= 0) & (given < count)).all():
             raise invalid("numbers", f"whole numbers of nodes, 0 to {count - 1}", numbers)
         return given.astype(np.int64)
@@ -256,20 +256,20 @@ class Store(Summarised):
 
         placed: whether to apply the pose of the instance.
         """
-        last = self.places * len(self.nodes) - 1
+        last = self.instances * len(self.nodes) - 1
         flag("placed", placed)
-        place, node = divmod(whole_number("the number of a node", number, 0, last), len(self.nodes))
+        instance, node = divmod(whole_number("the number of a node", number, 0, last), len(self.nodes))
         first = int(self.nodes["first"][node])
-        return self._rows(first, first + int(self.nodes["count"][node]), place if placed else None)
+        return self._rows(first, first + int(self.nodes["count"][node]), instance if placed else None)
 
     @cached_property
     def pose_rows(self) -> np.ndarray:
         """(p, 16) float64: poses in the layout of `Chunk.pose`; (0, 16) if it is not instanced."""
         if self.poses is None:
             return np.empty((0, 16))
-        turns = self.poses[:, :3, :3]
-        quats = np.stack([matrix_to_quaternion(turn) for turn in turns])
-        return np.concatenate([turns.reshape(-1, 9), self._moves, quats], axis=1)
+        rotations = self.poses[:, :3, :3]
+        quats = np.stack([matrix_to_quaternion(rotation) for rotation in rotations])
+        return np.concatenate([rotations.reshape(-1, 9), self._offsets, quats], axis=1)
 
     def labels(self) -> set[int]:
         """Labels of its splats. Reads the complete column."""
@@ -290,7 +290,7 @@ class Store(Summarised):
     def cloud(self) -> SplatCloud:
         """All splats in one cloud, mapped from the files where possible. Frames of the store are
         bit-identical to frames of this cloud."""
-        parts = [self._rows(0, self._own.splats, place) for place in range(self.places)]
+        parts = [self._rows(0, self._own.splats, instance) for instance in range(self.instances)]
         return PartialCloud.of(concatenated(parts), self, self.header.dropped)
 
     def verify(self, progress: Progress | None = None) -> list[str]:
@@ -316,16 +316,16 @@ class Store(Summarised):
             for name, kind in own.columns.items()
         }
 
-    def _rows(self, first: int, end: int, place: int | None) -> dict[str, np.ndarray]:
+    def _rows(self, first: int, end: int, instance: int | None) -> dict[str, np.ndarray]:
         """Splats of rows [first, end) at the pose of an instance; None: as stored."""
         made = {name: array[first:end] for name, array in self._columns.items()}
         for name in {"sh", "colors"} & set(made):
             made[name] = made[name].astype(np.float32, copy=False)
         if "labels" not in made:
             made["labels"] = np.zeros(end - first, np.int32)
-        if self.poses is None or place is None:
+        if self.poses is None or instance is None:
             return made
-        return transformed(made, self.poses[place, :3, :3], self._moves[place])
+        return transformed(made, self.poses[instance, :3, :3], self._offsets[instance])
 
 
 def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:

@@ -60,14 +60,14 @@ class SubchunkTable:
     def of(self, numbers: np.ndarray) -> Subchunks:
         """The subchunks of nodes (k,), by their numbers."""
         store = self._store
-        places, own = np.divmod(numbers, max(len(store.nodes), 1))
+        instances, own = np.divmod(numbers, max(len(store.nodes), 1))
         each = [self._boxes(node) for node in own.tolist()]
         counts = np.array([len(reach) for _, _, reach in each], np.int64)
-        nodes, place = np.repeat(numbers, counts), np.repeat(places, counts)
+        nodes, instance = np.repeat(numbers, counts), np.repeat(instances, counts)
         low, high = (np.concatenate([np.empty((0, 3)), *(one[corner] for one in each)]) for corner in (0, 1))
         reach = np.concatenate([np.empty(0), *(one[2] for one in each)])
         if store.poses is not None:
-            low, high = store.placed_boxes(low, high, place)
+            low, high = store.instance_boxes(low, high, instance)
         first = ROWS * (np.arange(len(nodes)) - np.repeat(np.cumsum(counts) - counts, counts))
         rows = np.minimum(store.counts(nodes) - first, ROWS)
         return Subchunks(

@@ -138,7 +138,7 @@ class Band:
         return occluded_nodes(self.scene, self.view, self.features, ends)
 
     def minimum_keys(self) -> tuple[np.ndarray, ...]:
-        """(places * nodes,) metres for each store: lower bounds on sort keys."""
+        """(instances * nodes,) metres for each store: lower bounds on sort keys."""
         return node_keys(self.scene, self.view, self.features)
 
     @cached_property

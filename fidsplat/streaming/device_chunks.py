@@ -29,11 +29,11 @@ class DeviceChunks:
         """Number of splats of the largest node; splats in memory are split into chunks of this size."""
         return max(int(store.nodes["count"].max(initial=1)) for store in self.scene.stores)
 
-    def of(self, selection: Selection, places: bool) -> list[Chunk]:
-        """Chunks of a selection. places: whether the device applies the poses of placed stores."""
+    def of(self, selection: Selection, applies_poses: bool) -> list[Chunk]:
+        """Chunks of a selection. applies_poses: whether the device applies poses of instances."""
         made = []
         for number, (store, nodes) in enumerate(zip(self.scene.stores, selection.nodes, strict=True)):
-            posed = places and self._can_pose(store)
+            posed = applies_poses and self._can_pose(store)
             known = self._chunks.setdefault((number, posed), {})
             for index, node in enumerate(nodes):
                 if (chunk := known.get(node)) is None:
@@ -48,10 +48,10 @@ class DeviceChunks:
             made.append(Chunk(("in memory", first), end - first, partial(self._in_memory, first, end)))
         return made
 
-    def distinct(self, places: bool) -> int:
-        """Number of different chunk keys. places: whether the device applies the poses of placed stores."""
+    def distinct(self, applies_poses: bool) -> int:
+        """Number of different chunk keys. applies_poses: whether the device applies poses of instances."""
         each = (
-            len(store.nodes) * (1 if places and self._can_pose(store) else store.places)
+            len(store.nodes) * (1 if applies_poses and self._can_pose(store) else store.instances)
             for store in self.scene.stores
         )
         return sum(each) + -(-len(self.scene.in_memory) // self.largest_chunk)
@@ -84,9 +84,9 @@ class DeviceChunks:
 
     def _chunk_of(self, number: int, node: int, posed: bool) -> Chunk:
         store = self.scene.stores[number]
-        place, own = divmod(node, len(store.nodes))
+        instance, own = divmod(node, len(store.nodes))
         key = (number, own if posed else node)
-        pose = store.pose_rows[place] if posed else None
+        pose = store.pose_rows[instance] if posed else None
         return Chunk(key, int(store.nodes["count"][own]), partial(self._arrays, key, posed), pose)
 
     def _arrays(self, key: tuple[int, int], posed: bool) -> dict[str, np.ndarray]:

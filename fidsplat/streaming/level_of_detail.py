@@ -34,22 +34,22 @@ def visible_nodes(
 def _visible_nodes(
     scene: ChunkedSplats, number: int, views: Sequence[View], features: FeatureSet, cell_sizes: np.ndarray
 ) -> np.ndarray:
-    """(places * nodes,) bool: the nodes of one store. cell_sizes: (levels + 1,) samples."""
+    """(instances * nodes,) bool: the nodes of one store. cell_sizes: (levels + 1,) samples."""
     store, boxes = scene.stores[number], partial(scene.boxes, number)
     if not len(store.nodes):
         return np.zeros(0, bool)
-    nodes, places = store.nodes, store.places
-    level = np.tile(nodes["level"], places)
-    reach = np.tile(nodes["reach"].astype(np.float64), places)
+    nodes, instances = store.nodes, store.instances
+    level = np.tile(nodes["level"], instances)
+    reach = np.tile(nodes["reach"].astype(np.float64), instances)
     visible = np.zeros(len(level), bool)
     for view in views:
         visible |= in_frustum(view, features, boxes, reach)
     pinned = scene.pinned[number]
     if not cell_sizes.any():
         return (visible | pinned) & (level == 0)
-    parents = np.tile(nodes["parent"].astype(np.int64), places)
-    parents = np.where(parents >= 0, parents + np.repeat(np.arange(places), len(nodes)) * len(nodes), -1)
-    edges = np.tile(nodes["size"].astype(np.float64), places)
+    parents = np.tile(nodes["parent"].astype(np.int64), instances)
+    parents = np.where(parents >= 0, parents + np.repeat(np.arange(instances), len(nodes)) * len(nodes), -1)
+    edges = np.tile(nodes["size"].astype(np.float64), instances)
     refined = np.zeros(len(level), bool)
     for view in views:
         refined |= projected_sizes(view, boxes, edges) > cell_sizes[level]

@@ -61,7 +61,7 @@ def contributing_tiles(
 
 
 def node_keys(scene: ChunkedSplats, view: View, features: FeatureSet) -> tuple[np.ndarray, ...]:
-    """(places * nodes,) metres for each store: lower bounds on the sort keys of nodes."""
+    """(instances * nodes,) metres for each store: lower bounds on the sort keys of nodes."""
     numbers = range(len(scene.stores))
     return tuple(minimum_keys(view, features, partial(scene.boxes, number)) for number in numbers)
 
@@ -72,7 +72,7 @@ def occluded_nodes(
     """Masks of the nodes that are occluded in a frame with these termination depths, except pinned ones."""
     made = []
     for number, (store, pinned) in enumerate(zip(scene.stores, scene.pinned, strict=True)):
-        reach = np.tile(store.nodes["reach"].astype(np.float64), store.places)
+        reach = np.tile(store.nodes["reach"].astype(np.float64), store.instances)
         made.append(occluded(view, features, partial(scene.boxes, number), reach, ends) & ~pinned)
     return tuple(made)
 

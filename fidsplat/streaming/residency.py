@@ -113,7 +113,7 @@ class Residency:
     def _uploaded(self, selection: Selection, first_id: int) -> ResidentData:
         if self._cache is None:
             return self._backend.upload(self.scene.part(selection))
-        return self._cache.gather(self.chunks.of(selection, self._cache.places), first_id)
+        return self._cache.gather(self.chunks.of(selection, self._cache.applies_poses), first_id)
 
     def _can_cull(self, view: View, features: FeatureSet) -> bool:
         """Whether occlusion culling is supported."""
@@ -161,7 +161,7 @@ class Residency:
                 if self._cache is None:
                     self.scene.prefetch(band.selection)
                 else:
-                    self._cache.bring(self.chunks.of(band.selection, self._cache.places))
+                    self._cache.bring(self.chunks.of(band.selection, self._cache.applies_poses))
 
         self._prefetch_thread = threading.Thread(target=work, name="fidsplat-prefetch", daemon=True)
         self._prefetch_thread.start()

@@ -51,7 +51,7 @@ class OpenCLChunks:
 
     def __init__(self, workspace: Workspace, whole: WholeScene, rows: int) -> None:
         self.workspace, self.whole, self._rows = workspace, whole, max(rows, 1)
-        self.places = workspace.info.float64
+        self.applies_poses = workspace.info.float64
         self.widths: dict[str, int] = {}
         """bytes of a splat in each array"""
         self._arrays: dict[str, cl.Buffer] = {}
@@ -69,7 +69,9 @@ class OpenCLChunks:
         """for transfers, beside what is drawn"""
         self._last: cl.Event | None = None
         """the last copy out of slots"""
-        program = build(workspace, kernel_text("store/gather_chunks.cl"), f"-DINSTANCED={int(self.places)}")
+        program = build(
+            workspace, kernel_text("store/gather_chunks.cl"), f"-DINSTANCED={int(self.applies_poses)}"
+        )
         self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
 
     @property
@@ -219,7 +221,7 @@ class OpenCLChunks:
         """Slots, at most."""
         share = self.workspace.memory_budget // _SHARE // self._slot_bytes
         widest = self.workspace.device.max_mem_alloc_size // (self._rows * max(self.widths.values()))
-        return max(1, self._size, min(share, widest, self.whole.distinct(self.places)))
+        return max(1, self._size, min(share, widest, self.whole.distinct(self.applies_poses)))
 
     def _grow(self, size: int) -> None:
         if self._last is not None:
