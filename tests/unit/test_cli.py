@@ -325,3 +325,20 @@ def test_detect_where_nothing_is(capsys, tmp_path):
     assert prints_json(capsys, "detect", empty)["detections"] == []
     assert main(["detect", str(empty)]) == 0
     assert "no code found" in capsys.readouterr().out
+
+
+def test_figures_of_a_cloud_move_with_its_origin():
+    """Lengths stay, places move."""
+    from fidsplat.commands.info import describe
+    from fidsplat.scenes.random_clouds import random_splats
+
+    cloud, away = random_splats(500, 4), np.array([4e5, -3e5, 100.0])
+    arrays = {name: getattr(cloud, name) for name in ("means", "quats", "scales", "opacities", "colors")}
+    near, far = describe(cloud), describe(fs.SplatCloud(**arrays, origin=cloud.origin + away))
+    assert near.keys() == far.keys()
+    for name, value in near.items():
+        moved = np.asarray(far[name])
+        if name in ("bounds", "middle_bounds", "marker_position"):
+            np.testing.assert_allclose(moved, np.asarray(value) + away, atol=1e-6, err_msg=name)
+        elif isinstance(value, float):
+            assert far[name] == pytest.approx(value, rel=1e-6), name

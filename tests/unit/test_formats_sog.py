@@ -120,3 +120,23 @@ def test_a_sog_file_that_says_nothing_or_too_much(tmp_path, monkeypatch):
     monkeypatch.setattr("fidsplat.formats.sog.MAX_META", 1)
     with pytest.raises(fs.InputError, match=r"meta\.json has 2 bytes"):
         fs.load_splats(path)
+
+
+@pytest.mark.parametrize(("spare", "fits"), [(0, True), (-1, False)])
+def test_pictures_may_have_twice_the_pixels_that_are_meant(tmp_path, monkeypatch, spare, fits):
+    """At that size exactly: two splats in pictures of 2 x 2."""
+    monkeypatch.setattr("fidsplat.formats.sog.SPARE", spare)
+    sog(tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    said = json.loads(parts.pop("meta.json"))
+    del said["shN"]  # its palette has another size
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        archive.writestr("meta.json", json.dumps(said))
+        for name, data in parts.items():
+            archive.writestr(name, data)
+    if fits:
+        assert len(fs.load_splats(tmp_path / "a.sog")) == 2
+    else:
+        with pytest.raises(fs.InputError, match="has 4 pixels for 2; it is not read"):
+            fs.load_splats(tmp_path / "a.sog")

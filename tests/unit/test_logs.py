@@ -220,3 +220,17 @@ def test_damaged_logs(tmp_path, name):
         with contextlib.suppress(fs.InputError):
             for image in (one.image for one in log_pictures(path)):
                 assert image.shape[2] == 3
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "bag"])
+def test_times_up_to_the_last_that_a_stamp_holds(tmp_path, name):
+    from fidsplat.logs import RobotLog, log_pictures
+
+    last = 2**31 - 1
+    with RobotLog(tmp_path / name) as log:
+        for time in (0.0, float(last)):
+            log.image(time, "front", RGB)
+        for late in (last + 0.5, np.nextafter(last, np.inf), 2.0**31):
+            with pytest.raises(fs.InputError, match="must be seconds from 0"):
+                log.image(late, "front", RGB)
+    assert [one.stamp for one in log_pictures(tmp_path / name)] == [0, last * 10**9]
