@@ -9,7 +9,6 @@ from dataclasses import asdict
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.interface import Measurable
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.experiments.bench.measure import SceneRun
 from fidsplat.util.timing import Clock
@@ -35,7 +34,7 @@ def pytest_addoption(parser) -> None:
 def pytest_benchmark_update_machine_info(config, machine_info) -> None:
     renderer = fs.Renderer(config.getoption("--device"))
     backend = renderer.backend
-    rates = backend.rates() if isinstance(backend, Measurable) else None
+    rates = backend.rates() if backend.traits.measures_rates else None
     machine_info["fidsplat"] = {
         "version": fs.__version__,
         "device": asdict(renderer.device),

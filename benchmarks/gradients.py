@@ -27,7 +27,7 @@ from measuring import PROGRESS, facts, keep, options, show
 from rich.progress import track
 
 import fidsplat as fs
-from fidsplat.backends.derivatives import Differentiates
+from fidsplat.backends.interface import Backend
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.scenes.random_clouds import load_scene
@@ -35,7 +35,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.timing import Timer, time_interleaved
 
 
-def errors(backend: Differentiates, scenes: int) -> list[dict[str, float | str]]:
+def errors(backend: Backend, scenes: int) -> list[dict[str, float | str]]:
     """Of each parameter the median and the largest error of all scenes."""
     reference, found, beyond = ReferenceBackend(), defaultdict(list), defaultdict(list)
     for seed in track(range(scenes), "Scenes", console=PROGRESS):
@@ -61,7 +61,7 @@ def errors(backend: Differentiates, scenes: int) -> list[dict[str, float | str]]
     ]
 
 
-def times(backend: Differentiates, scene: str, quality: str | None, repeats: int) -> dict[str, float | str]:
+def times(backend: Backend, scene: str, quality: str | None, repeats: int) -> dict[str, float | str]:
     """Medians in milliseconds of a picture and its derivatives, and of each stage."""
     cloud, camera = load_scene(scene)
     features, view = prepare(cloud, fs.Capture(camera, quality=quality))
@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--quality", help="of what is timed (default: standard)")
     given = parser.parse_args()
     renderer = fs.Renderer(given.device)
-    if not isinstance(renderer.backend, Differentiates):
+    if not renderer.backend.traits.differentiates:
         raise InputError(f"{given.device} has no derivatives; use an OpenCL or a Warp device")
     backend = renderer.backend
     if given.time:

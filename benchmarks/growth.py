@@ -23,7 +23,7 @@ from measuring import PROGRESS, keep, options, show
 from rich.progress import Progress, TextColumn
 
 import fidsplat as fs
-from fidsplat.backends.interface import Measurable, Rates
+from fidsplat.backends.interface import Rates
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.experiments.bench.measure import SceneRun, overdraw
 from fidsplat.experiments.sweep import Results, name_of, read_records
@@ -97,7 +97,7 @@ def run(series: dict[str, list[Point]], device: str, repeats: int, longest: floa
     renderer = fs.Renderer(device)
     info, backend = renderer.device, renderer.backend
     results = Results(file, run_facts(f"{info.title}, {info.version}", 0))
-    rates = backend.rates() if isinstance(backend, Measurable) else None
+    rates = backend.rates() if backend.traits.measures_rates else None
     del renderer, backend
     columns = (*Progress.get_default_columns(), TextColumn("{task.fields[now]}"))
     with Progress(*columns, console=PROGRESS) as progress:

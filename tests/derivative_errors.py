@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.gradients import on_host
+from fidsplat.backends.interface import Backend
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
@@ -84,7 +84,7 @@ def random_loss(features: FeatureSet, view: View, seed: int = 0) -> dict[str, np
 
 
 def derivatives(
-    backend: Differentiates,
+    backend: Backend,
     cloud: SplatCloud,
     capture: Capture,
     by_images: Mapping[str, np.ndarray] | None = None,
@@ -94,7 +94,7 @@ def derivatives(
     """A picture's derivatives in NumPy; those of a random loss unless `by_images` says by which images.
 
     distorted: pictures of depths have their distortion too. build: further arguments of
-    `Differentiates.differentiate`, that some backends have.
+    `Backend.differentiate`.
     """
     features, view = prepare(cloud, capture)
     if distorted and "depth" in features.names:

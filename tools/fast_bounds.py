@@ -19,7 +19,6 @@ from rich.progress import track
 
 import fidsplat as fs
 from fidsplat.backends.opencl.device import OpenCLBackend
-from fidsplat.backends.probing import Probed
 from fidsplat.selftest.arithmetic import worst
 
 AT_ONCE = 1 << 22
@@ -50,7 +49,7 @@ def main() -> None:
     options = parser.parse_args()
     renderer = fs.Renderer(options.device)
     backend = renderer.backend
-    if not isinstance(backend, Probed):
+    if not backend.traits.probed:
         parser.error(f"{renderer.device.name} runs no functions alone")
     if options.no_fma:
         if not isinstance(backend, OpenCLBackend):

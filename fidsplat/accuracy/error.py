@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fidsplat.backends.interface import GivesFloat64
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import select
@@ -140,6 +139,6 @@ def reference_image(
         InputError, DeviceError: as `Renderer.render`.
     """
     frame = renderer.render(scene, full_precision(capture.with_(outputs=output), renderer))
-    if isinstance(frame._images, GivesFloat64):  # other reads round to float32
+    if renderer.device.always_float64:  # other reads round to float32
         return frame._images.read_float64(output)
     return np.asarray(frame[output], np.float64)

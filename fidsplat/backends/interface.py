@@ -1,26 +1,31 @@
-"""What every backend offers, and what only some do: typed protocols, by which others tell what a backend can.
+"""The interface of a device: base classes with a default for what only some devices offer.
 
-Nobody outside a backend asks for its name: a capability is asked for with `isinstance(backend, Adopts)`.
+`Backend.traits` says what a device offers. Nobody outside a backend asks for its name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.coplanar_groups import PlaneTable
+from fidsplat.backends.probing import Probe
+from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
-from fidsplat.effects import FeatureSet
-from fidsplat.effects.select import Traits
+from fidsplat.cameras import Camera
+from fidsplat.effects import OUTPUTS, FeatureSet
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.errors import DeviceError, InputError
 
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """One device that a backend sees."""
+    """Description of a device."""
 
     name: str
     """What to pass as `device=` to get this one."""
@@ -37,236 +42,476 @@ class DeviceInfo:
     reason: str
     """Why it cannot be used; empty if it can. For a usable device, a remark (may be empty)."""
     always_float64: bool = False
-    """whether all is computed in float64: slow, and what other devices are compared with"""
+    """whether all is computed in float64: slow, and the reference for other devices"""
+
+
+@dataclass(frozen=True)
+class DeviceTraits:
+    """Optional capabilities of a device."""
+
+    adopts_arrays: bool = False
+    """`Backend.adopt`"""
+    renders_pixel_subsets: bool = False
+    """`Pipeline.render_every`"""
+    caches_chunks: bool = False
+    """`Backend.chunk_cache`"""
+    termination_depths: bool = False
+    """`Backend.termination_depths` and `copy_tiles`, and kernels for the effect `termination_depths`"""
+    differentiates: bool = False
+    """`Backend.differentiate`"""
+    trains: bool = False
+    """`Backend.training`"""
+    measures_rates: bool = False
+    """`Backend.rates`, `memory_bytes` and `release_scratch`, and kernels for the effect `overdraw`"""
+    probed: bool = False
+    """`Backend.probe`, `shapes` and `pieces`, for tests"""
 
 
 @dataclass(frozen=True)
 class Rates:
-    """What a device can do at best, measured: per second."""
+    """Measured peak rates of a device, per second."""
 
     copy_bytes: float
     """bytes read and bytes written by a copy, together"""
     fma: float
     """float32 multiply-adds"""
     exp: float
-    """float32 exponentials, as the blend stage calls them"""
+    """float32 exponentials, as in the blend stage"""
     division: float
-    """float32 divisions, as the blend stage writes them"""
+    """float32 divisions, as in the blend stage"""
 
 
-class ResidentData(Traits, Protocol):
-    """A cloud on a device."""
+class ResidentData(ABC):
+    """A cloud on a device, with the `CloudTraits`."""
 
-    @property
-    def count(self) -> int:
-        """Splats."""
-        ...
-
-    @property
-    def origin(self) -> np.ndarray:
-        """(3,) float64 metres: the world's position of the means' zero."""
-        ...
-
-    @property
-    def memory_bytes(self) -> int:
-        """Device memory that it takes; 0 where the device reads the host's own arrays."""
-        ...
-
-
-@runtime_checkable
-class HasColorRange(Protocol):
-    """A cloud whose colours are known, as the output `error` requires."""
-
-    @property
-    def count(self) -> int:
-        """Splats."""
-        ...
+    count: int
+    """splats"""
+    origin: np.ndarray
+    """(3,) float64 metres: world position of the means' zero"""
+    memory_bytes: int
+    """device memory that it takes; 0 where the device reads the host's own arrays"""
+    sh_degree: int
+    has_coplanar_groups: bool
+    footprint: str
+    ellipsoids: str
 
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel of every splat, from any direction."""
-        ...
+        raise InputError(
+            "the output 'error' must be of splats whose colours are known, got a cloud without them; render "
+            "a SplatCloud, or leave the output out"
+        )
 
 
-class Images(Protocol):
-    """Finished output images of one picture, on the device until asked for."""
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Consecutive splats of a scene."""
+
+    key: Hashable
+    """the same for the same splats, wherever they are placed"""
+    count: int
+    load: Callable[[], Mapping[str, np.ndarray]]
+    """their arrays by the names of a cloud's, float32 or int32; `coplanar_groups` by the index of a
+    `PlaneTable`"""
+    pose: np.ndarray | None = None
+    """(16,) float64: placement, the rotation by rows, the position of the means' zero [m], and the
+    quaternion; None: not moved"""
+    first: int = 0
+    """row of those arrays at which its `count` splats start"""
+
+
+class ChunkedScene(ABC):
+    """A scene divided into chunks, with the `CloudTraits` of all of it."""
+
+    origin: np.ndarray
+    """(3,) float64 metres: world position of the means' zero"""
+    sh_degree: int
+    has_coplanar_groups: bool
+    footprint: str
+    ellipsoids: str
+    group_table: PlaneTable | None
+    """coplanar groups of its splats"""
+
+    @abstractmethod
+    def distinct(self, applies_poses: bool) -> int:
+        """Number of keys of its chunks. applies_poses: whether the device applies `Chunk.pose`."""
+
+
+class ChunkCache(ABC):
+    """Device cache of a scene's chunks, bounded by the memory budget; the least recently used are evicted."""
+
+    applies_poses: bool
+    """whether the device applies `Chunk.pose`; else it must be None"""
+    memory_bytes: int
+    """device memory that it takes"""
+
+    @abstractmethod
+    def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> ResidentData:
+        """Concatenate chunks on the device, loading those that are not cached. first_id: `splat_id` of the
+        first splat."""
+
+    @abstractmethod
+    def bring(self, chunks: Sequence[Chunk]) -> None:
+        """Prefetch chunks of the next frame while one is rendered, as far as capacity allows. Called from
+        another thread."""
+
+
+class Images:
+    """Output images of one view, on the device until they are read."""
+
+    timings: Mapping[str, float]
+    """milliseconds on the device by stage, in their order"""
+    stats: Mapping[str, int]
+    """splats, visible, pairs"""
+    shares_arrays: bool = False
+    """whether `device_array` is available"""
 
     def read(self, name: str) -> np.ndarray:
-        """The image as a NumPy array of its own, in the type of `OUTPUTS[name]`."""
-        ...
-
-    @property
-    def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage, in the order in which they ran."""
-        ...
-
-    @property
-    def stats(self) -> Mapping[str, int]:
-        """splats, visible, pairs."""
-        ...
-
-
-@runtime_checkable
-class Waits(Protocol):
-    """Images that may still be on their way."""
-
-    def wait(self) -> None:
-        """Until the device has drawn them."""
-        ...
-
-
-class BatchImages(Protocol):
-    """Finished output images of many views."""
-
-    @property
-    def views(self) -> int:
-        """How many, those that were masked out among them."""
-        ...
-
-    def read(self, name: str) -> np.ndarray:
-        """The images as a NumPy array of its own, (views, h, w) or (views, h, w, channels), in the type of
-        `OUTPUTS[name]`; where a view was masked out 0, or -1 in `label` and `splat_id`."""
-        ...
-
-    def read_one(self, name: str, number: int) -> np.ndarray:
-        """The image of one view, as a NumPy array of its own."""
-        ...
-
-    @property
-    def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage, of all views together."""
-        ...
-
-    @property
-    def stats(self) -> Mapping[str, int]:
-        """splats in the cloud; visible and pairs of all views together."""
-        ...
-
-
-@runtime_checkable
-class GivesArrays(Protocol):
-    """Images that others on the device can use where they were drawn."""
-
-    def device_array(self, name: str) -> Any:
-        """The image as an array of the device, (h, w) or (h, w, channels), of a batch with the views before
-        these; no copy."""
-        ...
-
-
-@runtime_checkable
-class GivesFloat64(Protocol):
-    """Images that were computed in float64 and still are."""
+        """Copy an image to the host, in the type of `OUTPUTS[name]`."""
+        raise NotImplementedError
 
     def read_float64(self, name: str) -> np.ndarray:
-        """The image as a NumPy array in float64."""
-        ...
+        """Copy an image to the host in float64, not rounded where it was computed so."""
+        return self.read(name).astype(np.float64)
 
-
-@runtime_checkable
-class GivesUint8(Protocol):
-    """Images whose 8-bit values the device makes, so that a quarter of the bytes is copied."""
-
-    def read_uint8(self, name: str) -> np.ndarray:
-        """An image of floats in [0, 1] as `to_uint8` (fidsplat/images/files.py) makes it of what `read`
-        gives, bit for bit: a NumPy array of its own, (h, w) or (h, w, channels) uint8."""
-        ...
-
-
-@runtime_checkable
-class ReadsRows(Protocol):
-    """Images of which some rows can be read alone."""
+    def read_uint8(self, name: str) -> np.ndarray | None:
+        """Copy an image of floats in [0, 1] to the host in 8 bits, converted by the device with the bits of
+        `to_uint8` (fidsplat/images/files.py); None where the device does not convert."""
+        return None
 
     def empty(self, name: str) -> np.ndarray:
-        """An array for the whole image."""
-        ...
+        """A host array for an image."""
+        return np.empty_like(self.read(name))
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
-        """Copies rows of pixels [first, end) of an image, as `read` gives them, to those of such an array."""
-        ...
+        """Copy pixel rows [first, end) to the same rows of an array of the image's shape."""
+        if first < end:
+            into[first:end] = self.read(name)[first:end]
+
+    def device_array(self, name: str) -> Any:
+        """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
+        raise InputError(
+            f"device_array must be of a device that shares its arrays, got {name} of one that does not; "
+            "render with device='warp:cuda' or 'warp:cpu', or take frame[name], which is copied to the host"
+        )
+
+    def wait(self) -> None:
+        """Wait until the device has rendered them."""
 
 
-@runtime_checkable
-class DrawsEvery(Protocol):
-    """A pipeline that draws pixels one by one: it can leave some out, and say how far it is."""
+class BatchImages(Images):
+    """Output images of several views, (views, h, w) or (views, h, w, channels); timings and stats are sums
+    over the views, but `splats`. Views that are masked out hold `Output.blank`."""
 
-    def render_every(
-        self, cloud: Any, view: Any, step: int, tell: Callable[[float], object] | None = None
-    ) -> Images:
-        """Every step-th pixel in both directions, beginning with the first: images of (ceil(h / step),
-        ceil(w / step)) with the bits that `render` gives those pixels. tell: called with the share that is
-        done, 0 to 1."""
-        ...
+    views: int
+    """masked ones included"""
 
-
-@runtime_checkable
-class DrawsBatches(Protocol):
-    """A pipeline that draws many views together."""
-
-    def render_batch(self, resident: Any, batch: ViewBatch) -> BatchImages:
-        """Draw many views of an uploaded cloud, each with the bits of itself alone."""
-        ...
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        """Copy the image of one view to the host."""
+        raise NotImplementedError
 
 
-class Pipeline(Protocol):
+class SeparateImages(BatchImages):
+    """Images of views that were rendered one after another."""
+
+    def __init__(self, images: Mapping[int, Images], batch: ViewBatch, splats: int) -> None:
+        """images: of the views that were rendered, by their number. splats: in the cloud."""
+        self._images, self.views, self._size, self._splats = images, batch.total, batch.size, splats
+
+    def read(self, name: str) -> np.ndarray:
+        made = self._background(name, self.views)
+        for number, images in self._images.items():
+            made[number] = images.read(name)
+        return made
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        return self._images[number].read(name) if number in self._images else self._background(name)
+
+    def _background(self, name: str, *views: int) -> np.ndarray:
+        output = OUTPUTS[name]
+        shape = (*views, *self._size) if output.channels == 1 else (*views, *self._size, output.channels)
+        return np.full(shape, output.blank, output.dtype)
+
+    def wait(self) -> None:
+        for images in self._images.values():
+            images.wait()
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        return summed(images.timings for images in self._images.values())
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        none = {"splats": 0, "visible": 0, "pairs": 0}
+        return summed([none, *(images.stats for images in self._images.values())]) | {"splats": self._splats}
+
+
+def summed(counts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Sums of mappings from names to numbers."""
+    sums: dict[str, Any] = {}
+    for each in counts:
+        for name, value in each.items():
+            sums[name] = sums.get(name, 0) + value
+    return sums
+
+
+class Pipeline(ABC):
     """The stages compiled for one FeatureSet."""
 
+    @abstractmethod
     def render(self, resident: Any, view: View) -> Images:
-        """Draw one picture of an uploaded cloud."""
-        ...
+        """Render one view of an uploaded cloud."""
+
+    def render_batch(self, resident: Any, batch: ViewBatch) -> BatchImages:
+        """Render several views of an uploaded cloud, each bit-identical to `render`."""
+        images = {int(k): self.render(resident, batch.one(n)) for n, k in enumerate(batch.slots)}
+        return SeparateImages(images, batch, resident.count)
+
+    def render_every(
+        self, resident: Any, view: View, step: int, tell: Callable[[float], object] | None = None
+    ) -> Images:
+        """Render every step-th pixel in both directions, starting with the first: images of
+        (ceil(h / step), ceil(w / step)), bit-identical to those pixels of `render`. tell: called with the
+        completed share, 0 to 1."""
+        raise NotImplementedError
+
+    def fits(self, resident: Any, view: View) -> bool:
+        """Whether the frame fits the memory budget without rendering the cloud in chunks."""
+        return True
 
     def trace(self, resident: Any, view: View) -> dict[str, np.ndarray]:
-        """Draw one picture and return what passes between the stages, for tests."""
-        ...
+        """Render one view and return the data between the stages, for tests."""
+        raise NotImplementedError
 
 
-class Backend(Protocol):
+class GradientPipeline(ABC):
+    """The stages and their derivatives, compiled for one FeatureSet."""
+
+    @abstractmethod
+    def forward(self, resident: Any, view: View, waits: bool = True) -> Any:
+        """Render one view of an uploaded cloud, bit-identical to `Pipeline.render`, and retain what
+        `backward` needs until the device renders another frame.
+
+        waits: until it is known that the buffers were large enough. If they were not, `backward` may raise
+        TooLittleRoom, and nothing of the frame counts.
+
+        Raises:
+            DeviceError: the device runs out of memory or fails; or the frame needs bands or chunks, which
+                have no gradient.
+        """
+
+    @abstractmethod
+    def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, Any]:
+        """Gradients of a loss with respect to splats, background and pose, from those by output images.
+
+        Steps (the alpha cut-off, the transmittance stop, the near plane, the order of splats) have no
+        derivative: they are constants of the frame.
+
+        Args:
+            images: the result of the last `forward` on this device.
+            gradients: by the names of outputs (rgb, alpha, depth, normal, distortion), float32 arrays of
+                their shape, of the device or NumPy's; missing ones are 0.
+
+        Returns:
+            Device arrays in the cloud's shapes and units: `means` (n, 3), `quats` (n, 4), `scales` (n, 2),
+            `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3), with respect to the stored values, also of
+            quaternions that are not normalised; `screen` (n,), the norm of the gradient by the projected
+            centre in units of half images (the densification statistic of 2DGS trainers, their dL_dmean2D);
+            `background` (3,); `pose` (6,): rotation vector [1 / rad] and translation [1 / m] of a motion
+            after world_to_camera, in the camera's axes. Splats that are not rendered have zeros. The arrays
+            are bit-identical on every run and valid until the next call.
+
+        Raises:
+            TooLittleRoom: the buffers of a frame that was not waited for were too small; the next has more.
+            InputError: another frame has been rendered since, or a gradient is of no output or has a wrong
+                shape.
+            DeviceError: the device runs out of memory or fails.
+        """
+
+    def take_back(self, images: Any, gradients: Mapping[str, Any]) -> Any:
+        """`backward` up to the sums over tiles, whose result `TrainingKernels.step` accepts; its method
+        `gradients` completes it. Only on devices that train."""
+        raise NotImplementedError
+
+
+class TrainingKernels(ABC):
+    """The work of a training step around the frame (`fidsplat.train`), on device arrays.
+
+    Its state is n splats before their activations, float32: `means` (n, 3), `log_scales` (n, 2), `quats`
+    (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's running means of each as `first_NAME` and `second_NAME`;
+    `gradients` (n,) and `seen` (n,), the sums by which densification chooses splats.
+    """
+
+    late: int
+    """number of later frames after which a loss may still be read"""
+
+    @abstractmethod
+    def take_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
+        """Set the ground truth: images (h, w, 3) uint8 with their masks (h, w) bool."""
+
+    @abstractmethod
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Set these arrays; missing ones are unchanged."""
+
+    @abstractmethod
+    def store(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Copy the arrays of these names to the host, all by default."""
+
+    @abstractmethod
+    def pick(self, rows: np.ndarray, kept: int) -> None:
+        """Replace the splats by the rows (m,) uint32 of them; from row `kept` on without optimiser state."""
+
+    @abstractmethod
+    def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
+        """Overwrite the last rows of these arrays, from row `first` on."""
+
+    @abstractmethod
+    def clear(self, names: Sequence[str]) -> None:
+        """Fill these arrays with zeros."""
+
+    @abstractmethod
+    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
+        """The splats as a cloud to render, with SH of this degree; it changes as they do."""
+
+    @abstractmethod
+    def loss(
+        self, images: Any, view: int, dssim_weight: float
+    ) -> tuple[Callable[[], tuple[float, float]], Any]:
+        """Compare a frame with the ground truth of a view, by its number. Returns what waits for the loss and
+        the mean squared difference, to be called before `late` more frames, and the gradient of the loss
+        (h, w, 3) as a device array that is valid until the next call."""
+
+    @abstractmethod
+    def surface(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
+        """Gradients of `fidsplat.train.losses.normal_loss` by `depth` and `normal`, times the weight, as
+        device arrays that are valid until the next call."""
+
+    @abstractmethod
+    def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
+        """Add screen gradients and visibility to their sums. taken: from `GradientPipeline.take_back`."""
+
+    @abstractmethod
+    def step(
+        self,
+        taken: Any,
+        sizes: Mapping[str, float],
+        numbers: Mapping[str, float],
+        camera: Camera | None,
+        origin: np.ndarray,
+    ) -> None:
+        """Apply a step of Adam.
+
+        Args:
+            taken: from `GradientPipeline.take_back`.
+            sizes: step sizes of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest`.
+            numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
+                `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
+                not depend are left unchanged.
+            camera: unless None, `count` is applied first.
+        """
+
+    @abstractmethod
+    def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
+        """Add noise to the means within their disks, `size` times their variance, less where the opacity is
+        above `clear`. words: the seed's low and high word, the iteration, the purpose."""
+
+
+class Backend(ABC):
     """An open device."""
 
     info: DeviceInfo
+    traits: DeviceTraits = DeviceTraits()
+    shape: Any = None
+    """build constants of its kernels: sizes of tiles, methods of sorting"""
+    pair_budget: int = 2**30 - 1
+    """maximum number of splat-tile pairs that are listed at once; tests lower it"""
+    memory_bytes: int = 0
+    """device memory of scratch buffers; clouds and finished images are not included"""
 
-    def limit_memory(self, budget: int) -> None:
-        """Let a picture and its cloud take at most `budget` bytes of the device."""
-        ...
+    def lacks(self, requirement: str, remedy: str) -> str:
+        """Error message of an operation that the device does not offer."""
+        return f"device must {requirement}, got {self.info.name}; {remedy}"
 
+    @abstractmethod
     def upload(self, cloud: SplatCloud) -> ResidentData:
-        """The cloud on the device."""
-        ...
+        """Copy a cloud to the device."""
 
-    def unsupported(self, features: FeatureSet) -> str:
-        """What of these features the device cannot draw, as the message of the error that drawing them
-        raises; empty if it can draw all."""
-        ...
-
-    def pipeline(self, features: FeatureSet) -> Pipeline:
-        """The pipeline for these features, compiled on first use.
+    @abstractmethod
+    def pipeline(self, features: FeatureSet, shape: Any = None) -> Pipeline:
+        """The pipeline for these features, compiled on first use. shape: one of `shapes` instead of the
+        device's own.
 
         Raises:
-            DeviceError: what is `unsupported`; or the compiler refuses.
+            DeviceError: what is `unsupported`; or the compiler fails.
         """
-        ...
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """Error message naming the features that the device cannot render; empty if it renders all."""
+        return ""
 
-@runtime_checkable
-class Adopts(Protocol):
-    """A backend that draws splats from arrays that are on the device already."""
+    def limit_memory(self, budget: int) -> None:
+        """Limit the device memory of a frame and its cloud to `budget` bytes."""
+        raise InputError(self.lacks("have a memory budget", f"leave out memory_budget={budget}"))
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> ResidentData:
-        """Arrays (`means`, `quats`, ...) used where they lie. Raises InputError for one that cannot be."""
-        ...
+        """A cloud of arrays (`means`, `quats`, ...) that are on the device, without a copy. Raises InputError
+        for arrays that cannot be used."""
+        raise InputError(self.lacks("adopt arrays", "use a Warp device, or a SplatCloud"))
 
+    def chunk_cache(self, scene: ChunkedScene, rows: int) -> ChunkCache:
+        """A cache of a scene's chunks, each of at most `rows` splats."""
+        raise DeviceError(self.lacks("cache chunks of a scene", "upload the scene"))
 
-@runtime_checkable
-class Measurable(Protocol):
-    """A backend that can be held against its hardware. It also has kernels for the effect `overdraw`."""
+    def termination_depths(self, images: Any) -> TerminationDepths:
+        """Termination depth per tile of a frame with the effect `termination_depths`; waits for the frame."""
+        raise DeviceError(self.lacks("report termination depths", "render without occlusion culling"))
 
-    @property
-    def memory_bytes(self) -> int:
-        """Device memory that scratch buffers hold; clouds and finished images are not among them."""
-        ...
+    def copy_tiles(self, images: Any, other: Any, tiles: np.ndarray) -> None:
+        """Copy tiles (rows, columns) bool of another frame of the same view into a frame, and add its counts.
+        Pixels must not have samples in more than one tile."""
+        raise DeviceError(self.lacks("copy tiles", "render without occlusion culling"))
+
+    def differentiate(self, features: FeatureSet, shape: Any = None) -> GradientPipeline:
+        """The pipeline for these features with its derivatives, compiled on first use.
+
+        Raises:
+            InputError: an effect has no gradient; the message names it and a remedy.
+            DeviceError: the compiler fails.
+        """
+        raise DeviceError(self.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
+
+    def compile_ahead(self, features: FeatureSet) -> None:  # noqa: B027 (optional)
+        """Start to compile `differentiate` of these features in the background, where the device can.
+        `differentiate` waits for it and raises its errors."""
+
+    def training(self) -> TrainingKernels:
+        """Compiled training kernels, without splats. Raises DeviceError where the compiler fails."""
+        raise DeviceError(self.lacks("have kernels for training", "train in NumPy"))
 
     def release_scratch(self) -> None:
-        """Let go of them, so that the next picture shows what it needs."""
-        ...
+        """Release the scratch buffers, so that the next frame allocates only what it needs."""
+        raise DeviceError(self.lacks("measure its memory", "use an OpenCL device"))
 
     def rates(self) -> Rates:
-        """What the device can do at best; measured again at each call."""
-        ...
+        """Peak rates of the device, measured at each call."""
+        raise DeviceError(self.lacks("measure its rates", "use an OpenCL device"))
+
+    def probe(self) -> Probe:
+        """Access to the device for tests."""
+        raise DeviceError(self.lacks("have a probe", "use an OpenCL or Warp device"))
+
+    def shapes(self, kind: str) -> dict[str, Any]:
+        """Other build constants, by name, for tests.
+
+        kind: `tiles`, other tile sizes, bit-identical; `schedule`, the schedule of a GPU (on a GPU: other
+        tiles), equal but for rounding; `listing`, the tile-binning strategies under the schedule of a GPU
+        where the device has several; `sorting`, all methods of binning and sorting; `arithmetic`, ways of
+        compiling the functions of `Probe.arithmetic`: fused or not, in vectors or one by one; `k_buffer`,
+        smaller k-buffers, bit-identical; `tape`, fewer fragments stored for the backward pass, with
+        bit-identical gradients.
+        """
+        return {}
+
+    def pieces(self, shape: Any) -> int:
+        """Number of pieces into which sorts divide their input."""
+        return 1

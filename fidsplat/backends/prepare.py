@@ -13,12 +13,12 @@ from fidsplat.backends.view import FAR_EYE, SubFrame, View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import Views
 from fidsplat.effects import FeatureSet, select
-from fidsplat.effects.select import Traits
+from fidsplat.effects.select import CloudTraits
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
 
 
-class Origined(Traits, Protocol):
+class Origined(CloudTraits, Protocol):
     """What decides the kernels, and where the zero of its means is."""
 
     @property

@@ -10,7 +10,6 @@ tiles that it can touch. This holds for every output and order.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -39,19 +38,3 @@ class TerminationDepths:
         depths = bits.view(np.float32).copy()
         depths[(keys == 0xFFFFFFFF) | np.isnan(depths)] = np.inf
         return TerminationDepths(depths, tile)
-
-
-@runtime_checkable
-class GivesTileEnds(Protocol):
-    """A backend whose pipelines support the effect `termination_depths`."""
-
-    def tile_ends_of(self, images: object) -> TerminationDepths:
-        """Termination depths of a frame; waits until it is rendered."""
-        ...
-
-    def take_tiles(self, images: object, other: object, tiles: np.ndarray) -> None:
-        """Copy selected tiles (rows, columns) bool of another frame of the same view, and its counts.
-
-        All samples of a pixel must be in one tile.
-        """
-        ...

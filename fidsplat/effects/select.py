@@ -50,7 +50,7 @@ class FeatureSet:
         return (RGB, *(effect.output for effect in effects if effect.output))
 
 
-class Traits(Protocol):
+class CloudTraits(Protocol):
     """Properties of a cloud that select kernels."""
 
     @property
@@ -74,7 +74,7 @@ class Traits(Protocol):
         ...
 
 
-def select(cloud: Traits, capture: Capture) -> FeatureSet:
+def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     """Select the features that a capture of a cloud requires. Values without effect select nothing. A capture
     without a camera is that of a pinhole.
 
@@ -135,7 +135,7 @@ def with_termination_depths(features: FeatureSet) -> FeatureSet:
     return replace(features, slots=(*features.slots, "termination_depths"))
 
 
-def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
+def _composing(cloud: CloudTraits, order: str, one_depth_each: bool) -> str:
     """Select the compositing effect: by centre depth, or by fragment depth with or without coplanar groups.
 
     If every fragment has the float32 depth of its splat's centre, both orders are equal and the k-buffer is
@@ -146,7 +146,7 @@ def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
     return "compose_pixel" if order == "pixel" and not one_depth_each else "compose_ordered"
 
 
-def _ellipsoid(cloud: Traits, quality: Quality, lens: Lens | None) -> str:
+def _ellipsoid(cloud: CloudTraits, quality: Quality, lens: Lens | None) -> str:
     """Projection of 3D Gaussians; empty if there are none."""
     if cloud.ellipsoids == "none":
         return ""

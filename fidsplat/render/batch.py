@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import BatchImages, GivesArrays, Images, Waits
+from fidsplat.backends.interface import BatchImages, Images
 from fidsplat.capture.views import Views
-from fidsplat.effects import OUTPUTS
 from fidsplat.render.frame import Frame, Ids, check_process, numbered, refuse_numbered
 from fidsplat.util.errors import InputError, MissingOutputError
 
@@ -58,11 +57,6 @@ class FrameBatch(Mapping):
         self._check(name)
         check_process(self._process, "batch")
         refuse_numbered(name, self._ids)
-        if not isinstance(self._images, GivesArrays):
-            raise InputError(
-                f"this device keeps {name} of a batch in no array that others can use; take batch[{name!r}], "
-                "which is copied to the host"
-            )
         return self._images.device_array(name)
 
     def frame(self, number: int) -> Frame:
@@ -81,8 +75,7 @@ class FrameBatch(Mapping):
 
     def wait(self) -> FrameBatch:
         """This batch, once the device has drawn it; nothing is copied."""
-        if isinstance(self._images, Waits):
-            self._images.wait()
+        self._images.wait()
         return self
 
     def _check(self, name: str) -> None:
@@ -113,42 +106,7 @@ class FrameBatch(Mapping):
         return self._images.stats
 
 
-class ViewByView:
-    """The images of a batch that was drawn one view after another."""
-
-    def __init__(self, images: Mapping[int, Images], views: int, size: tuple[int, int], splats: int) -> None:
-        """images: of the views that were drawn, by their number. splats: in the cloud."""
-        self._images, self.views, self._size, self._splats = images, views, size, splats
-
-    def read(self, name: str) -> np.ndarray:
-        """(views, h, w) or (views, h, w, channels)."""
-        output = OUTPUTS[name]
-        channels = () if output.channels == 1 else (output.channels,)
-        made = np.full((self.views, *self._size, *channels), output.blank, output.dtype)
-        for number, images in self._images.items():
-            made[number] = images.read(name)
-        return made
-
-    def read_one(self, name: str, number: int) -> np.ndarray:
-        """(h, w) or (h, w, channels)."""
-        if number in self._images:
-            return self._images[number].read(name)
-        output = OUTPUTS[name]
-        channels = () if output.channels == 1 else (output.channels,)
-        return np.full((*self._size, *channels), output.blank, output.dtype)
-
-    @property
-    def timings(self) -> Mapping[str, float]:
-        return _added(images.timings for images in self._images.values())
-
-    @property
-    def stats(self) -> Mapping[str, int]:
-        none = {"splats": 0, "visible": 0, "pairs": 0}
-        counts = [images.stats for images in self._images.values()]
-        return _added([none, *counts]) | {"splats": self._splats}
-
-
-class _KeptBatch:
+class _KeptBatch(BatchImages):
     """Images of a batch that are no longer on a device."""
 
     def __init__(
@@ -164,7 +122,7 @@ class _KeptBatch:
         return self._arrays[name][number].copy()
 
 
-class _OneOf:
+class _OneOf(Images):
     """The images of one view of a batch."""
 
     timings: Mapping[str, float] = {}
@@ -181,12 +139,3 @@ def _kept_batch(
     arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], views: Views
 ) -> FrameBatch:
     return FrameBatch(_KeptBatch(arrays, timings, stats), views)
-
-
-def _added(counts) -> dict[str, Any]:
-    """The sums of mappings from names to numbers."""
-    sums: dict[str, Any] = {}
-    for each in counts:
-        for name, value in each.items():
-            sums[name] = sums.get(name, 0) + value
-    return sums

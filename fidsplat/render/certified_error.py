@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import Backend, GivesFloat64, HasColorRange, Images
+from fidsplat.backends.interface import Backend, Images, ResidentData
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
@@ -125,7 +125,7 @@ class ErrorImage:
 
     def read(self) -> np.ndarray:
         """(h, w) float32."""
-        measured = np.abs(_float64(self.rgb) - _float64(self.ideal)).max(axis=2)
+        measured = np.abs(self.rgb.read_float64("rgb") - self.ideal.read_float64("rgb")).max(axis=2)
         off = np.full(measured.shape, self.plan.off)
         if "rounding" in self.plan.features.outputs:
             off += _SLACK * self.ideal.read("rounding")
@@ -137,12 +137,6 @@ class ErrorImage:
         return {"error": sum(self.ideal.timings.values())}
 
 
-def _float64(images: Images) -> np.ndarray:
-    if isinstance(images, GivesFloat64):
-        return images.read_float64("rgb")
-    return images.read("rgb").astype(np.float64)
-
-
 def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
     """The ideal of a capture of an uploaded cloud.
 
@@ -151,7 +145,7 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
             it and the output.
     """
     _refuse_unbounded(capture)
-    if not isinstance(data, HasColorRange):
+    if not isinstance(data, ResidentData):
         raise InputError(
             "the output 'error' must be of splats in memory, got a store; render store.cloud() where it fits "
             "into memory, or leave out the output 'error'"

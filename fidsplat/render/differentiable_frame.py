@@ -6,9 +6,8 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
-from fidsplat.backends.derivatives import DifferentiablePipeline
 from fidsplat.backends.gradients import DifferentiableImages, on_host
-from fidsplat.backends.interface import Images
+from fidsplat.backends.interface import GradientPipeline, Images
 from fidsplat.capture.capture import Capture
 from fidsplat.render.frame import Frame
 from fidsplat.util import interrupts
@@ -21,7 +20,7 @@ class DifferentiableFrame(Frame):
         self,
         images: Images,
         capture: Capture,
-        pipeline: DifferentiablePipeline,
+        pipeline: GradientPipeline,
         lock: threading.Lock,
         distortion: bool = False,
     ) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from fidsplat.backends.interface import GivesArrays, GivesUint8, Images, ReadsRows, Waits
+from fidsplat.backends.interface import Images
 from fidsplat.capture.capture import Capture
 from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, MissingOutputError
@@ -82,11 +82,6 @@ class Frame(Mapping):
             raise InputError(
                 "the output 'error' must be read on the host, got device_array; take frame['error']"
             )
-        if not isinstance(self._images, GivesArrays):
-            raise InputError(
-                f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
-                "'warp:cpu', or take frame[name], which is copied to the host"
-            )
         return self._images.device_array(name)
 
     def to_uint8(self) -> np.ndarray:
@@ -98,9 +93,11 @@ class Frame(Mapping):
             InputError: `rgb` was not asked for.
         """
         self._check("rgb")
-        if "rgb" not in self._arrays and isinstance(self._images, GivesUint8):
+        if "rgb" not in self._arrays:
             check_process(self._process, "frame")
-            return self._images.read_uint8("rgb")
+            converted = self._images.read_uint8("rgb")
+            if converted is not None:
+                return converted
         from fidsplat.images.files import to_uint8  # late: it brings OpenCV
 
         return to_uint8(self["rgb"])
@@ -148,7 +145,7 @@ class Frame(Mapping):
     def _stays(self, name: str) -> bool:
         """Whether the device has an array of this image to give."""
         made = name == "error" or (name == "splat_id" and self._ids is not None)
-        return isinstance(self._images, GivesArrays) and not made
+        return self._images.shares_arrays and not made
 
     def _only(self) -> str:
         """The name of the one output."""
@@ -194,8 +191,7 @@ class Frame(Mapping):
         Raises:
             DeviceError: the device has failed while it was drawing.
         """
-        if isinstance(self._images, Waits):
-            self._images.wait()
+        self._images.wait()
         return self
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray | None = None) -> np.ndarray:
@@ -206,17 +202,14 @@ class Frame(Mapping):
             InputError: rows that the picture does not have, or an array of another shape or type.
         """
         self._check(name)
-        by_rows = self._images if isinstance(self._images, ReadsRows) and name != "error" else None
+        images = self._images if name != "error" else _KeptImages({name: self[name]}, {}, {})
         if into is None:
-            into = by_rows.empty(name) if by_rows is not None else np.empty_like(self[name])
-        elif not isinstance(into, np.ndarray) or not (by_rows is not None or into.shape == self[name].shape):
+            into = images.empty(name)
+        elif not isinstance(into, np.ndarray):
             raise invalid("into", "an array of the shape of the output", into)
         whole_number("the end of the rows", end, 0, len(into))
         whole_number("the first row", first, 0, end)
-        if by_rows is None:
-            into[first:end] = self[name][first:end]
-            return into
-        by_rows.read_rows(name, first, end, into)
+        images.read_rows(name, first, end, into)
         if name == "splat_id":
             into[first:end] = numbered(name, into[first:end], self._ids)
         return into
@@ -240,7 +233,7 @@ class Frame(Mapping):
 
 
 @dataclass(frozen=True)
-class _KeptImages:
+class _KeptImages(Images):
     """Images that are no longer on a device."""
 
     arrays: dict[str, np.ndarray]

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.interface import Images
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture, output_names
 from fidsplat.capture.quality import Quality
@@ -223,7 +224,7 @@ class _Line:
 
 
 @dataclass(frozen=True)
-class _Banded:
+class _Banded(Images):
     """Images of bands as those of one picture."""
 
     frames: list[Frame]

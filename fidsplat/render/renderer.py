@@ -10,15 +10,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from fidsplat.backends.derivatives import Differentiates
-from fidsplat.backends.interface import (
-    Adopts,
-    DeviceInfo,
-    DrawsBatches,
-    DrawsEvery,
-    Images,
-    Pipeline,
-)
+from fidsplat.backends.interface import DeviceInfo, Images, Pipeline
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import FIRST, open_backend
 from fidsplat.backends.view import NO_CAMERA, View
@@ -28,7 +20,7 @@ from fidsplat.capture.environment import background_of
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.views import Views, views_of
 from fidsplat.effects.differentiable import check_gradients, with_distortion
-from fidsplat.render.batch import FrameBatch, ViewByView
+from fidsplat.render.batch import FrameBatch
 from fidsplat.render.certified_error import ErrorImage, ideal_of
 from fidsplat.render.differentiable_frame import DifferentiableFrame
 from fidsplat.render.frame import Frame, check_process, stacked
@@ -41,7 +33,7 @@ from fidsplat.streaming.bands import BandData
 from fidsplat.streaming.residency import Residency
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import whole_number
-from fidsplat.util.errors import DeviceError, InputError, unknown
+from fidsplat.util.errors import InputError, unknown
 
 _PLAIN = Capture()
 
@@ -129,10 +121,6 @@ class Renderer:
         Raises:
             InputError: the backend takes no arrays, or one has the wrong shape, type or device.
         """
-        if not isinstance(self.backend, Adopts):
-            raise InputError(
-                f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud"
-            )
         check_process(self._process, "Renderer")
         if (colors is None) == (sh is None):
             raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
@@ -197,10 +185,6 @@ class Renderer:
             DeviceError: the device has no gradients, fails, or lacks the memory to render in one piece.
         """
         asked = _asked(scene, capture, outputs=outputs, quality=quality, **parts)
-        if not isinstance(self.backend, Differentiates):
-            raise DeviceError(
-                f"device must have gradients, got {self.device.name}; use 'opencl', 'warp' or 'reference'"
-            )
         resident = self._resident(scene)
         if isinstance(resident.data, Residency):
             raise InputError(
@@ -239,10 +223,9 @@ class Renderer:
         asked = _asked(scene, capture, outputs=outputs, quality=quality)
 
         def draw(pipeline: Pipeline, data: Any, view: View) -> Images:
-            if not isinstance(pipeline, DrawsEvery):
+            if not self.backend.traits.renders_pixel_subsets:
                 raise InputError(
-                    f"{self.device.name} draws whole pictures only; device='reference' draws some of their "
-                    "pixels"
+                    self.backend.lacks("render subsets of pixels", "use device='reference', or render")
                 )
             return pipeline.render_every(data, view, step, tell)
 
@@ -377,12 +360,7 @@ class Renderer:
         with self._lock:
             drawn = (batch.one(number) for number in range(len(batch.slots)))
             data, ids = resident.seen(drawn, features, (capture.quality for capture in views.captures))
-            pipeline = self.backend.pipeline(features)
-            if isinstance(pipeline, DrawsBatches):
-                images = pipeline.render_batch(data, batch)
-            else:
-                each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
-                images = ViewByView(each, batch.total, batch.size, len(resident))
+            images = self.backend.pipeline(features).render_batch(data, batch)
         return FrameBatch(images, views, ids)
 
     def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:

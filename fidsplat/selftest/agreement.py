@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.prepare import prepare
-from fidsplat.backends.probing import Reshapes
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
@@ -157,7 +156,7 @@ def trace(renderer: Renderer, spec: FrameSpec, shape=None) -> dict[str, np.ndarr
     """Buffers between the stages of a device, and the outputs; `shape` replaces its build constants."""
     features, view = spec.prepared()
     backend = renderer.backend
-    if shape is not None and isinstance(backend, Reshapes):
+    if shape is not None and backend.traits.probed:
         pipeline = backend.pipeline(features, shape)
     else:
         pipeline = backend.pipeline(features)

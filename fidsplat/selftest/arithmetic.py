@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.prepare import prepare
-from fidsplat.backends.probing import Probed, Reshapes
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.render.renderer import Renderer
@@ -65,7 +64,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
         DeviceError: the device cannot compile or run the kernels.
     """
     backend = renderer.backend
-    if not isinstance(backend, Probed):
+    if not backend.traits.probed:
         return None
     generator = np.random.default_rng(seed)
     exponents = generator.uniform(-14, 0, _COUNT).astype(np.float32).astype(float)
@@ -107,7 +106,7 @@ def worst(got: np.ndarray, truth: np.ndarray) -> float:
 )
 def f1(renderer: Renderer) -> Found:
     # products are rounded before subtraction, and FMA fuses if the device declares it
-    if not isinstance(renderer.backend, Probed):
+    if not renderer.backend.traits.probed:
         return
     probe = renderer.backend.probe()
     generator = np.random.default_rng(61)
@@ -135,7 +134,7 @@ def f2(renderer: Renderer) -> Found:
 @case("F3", "NaN and infinity are detected", "quiet, negative and signalling NaN; the build options")
 def f3(renderer: Renderer) -> Found:
     # neither a build option nor the compiler assumes that there is no NaN
-    if not isinstance(renderer.backend, Probed):
+    if not renderer.backend.traits.probed:
         return
     probe = renderer.backend.probe()
     unsafe = [option for option in probe.options() if any(word in option for word in UNSAFE)]
@@ -176,7 +175,7 @@ def f4(renderer: Renderer) -> Found:
 def f5(renderer: Renderer) -> Found:
     # the schedule with barriers against the one without; on a GPU, against other sizes of its groups
     backend = renderer.backend
-    if not isinstance(backend, Reshapes):
+    if not backend.traits.probed:
         return
     # lists of up to several batches of staged splats (128), and pixels that terminate early
     crowded = random_splats(260, 65, depth=(0.8, 1.5), scale=(0.02, 0.25), across=0.25)
@@ -208,7 +207,7 @@ def in_a_row(depths) -> SplatCloud:
 def f6(renderer: Renderer) -> Found:
     # depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort
     backend = renderer.backend
-    if not isinstance(backend, Reshapes):
+    if not backend.traits.probed:
         return
     generator = np.random.default_rng(67)
     features, view = prepare(in_a_row([1.0]), Capture(VIEW))

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from fidsplat.backends.probing import Reshapes
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes.random_clouds import log_uniform, random_splats
 from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, FrameSpec, differing, render, trace
@@ -97,7 +96,7 @@ def a4(renderer: Renderer) -> Found:
         yield _spec(_tilted(ratio), focal=80.0)
     clouds = [_tilted(0.2), _crossing(60), random_splats(120, seed=4), _specks()]
     spec = _spec(SplatCloud.concatenate(clouds), width=93, height=77)
-    if not isinstance(renderer.backend, Reshapes):
+    if not renderer.backend.traits.probed:
         return
     base = trace(renderer, spec)
     for name, shape in renderer.backend.shapes("tiles").items():

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fidsplat.backends.prepare import view_of
-from fidsplat.backends.probing import Reshapes
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
 from fidsplat.render.renderer import Renderer
@@ -306,7 +305,7 @@ def c3(renderer: Renderer) -> Found:
     copies = {name: first[name].copy() for name in first}
     changed = max(differing(copies, render(renderer, spec), ALL_OUTPUTS) for _ in range(3))
     yield Finding("pixels that change when rendered again", changed, 0)
-    if isinstance(renderer.backend, Reshapes):
+    if renderer.backend.traits.probed:
         tiles = next(iter(renderer.backend.shapes("tiles").values()))
         changed = differing(copies, trace(renderer, spec, tiles), ALL_OUTPUTS)
         yield Finding("pixels that change with another tile size", changed, 0)

@@ -7,14 +7,14 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from fidsplat.backends.chunk_cache import Chunk
 from fidsplat.backends.coplanar_groups import PlaneTable
+from fidsplat.backends.interface import Chunk, ChunkedScene
 from fidsplat.store.chunked_splats import ChunkedSplats, Selection
 from fidsplat.store.partial_cloud import PartialCloud
 from fidsplat.store.store import Store
 
 
-class DeviceChunks:
+class DeviceChunks(ChunkedScene):
     """Chunks of a scene for a device, with the traits of the complete scene."""
 
     def __init__(self, scene: ChunkedSplats) -> None:

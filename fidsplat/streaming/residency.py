@@ -9,10 +9,9 @@ from functools import partial
 
 import numpy as np
 
-from fidsplat.backends.chunk_cache import KeepsChunks, KnowsRoom
 from fidsplat.backends.interface import Backend, Images, Pipeline, ResidentData
 from fidsplat.backends.prepare import prepare
-from fidsplat.backends.termination_depth import GivesTileEnds, TerminationDepths
+from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
@@ -34,7 +33,7 @@ class Residency:
         self.scene, self._backend, self.chunks = scene, backend, DeviceChunks(scene)
         self._cache = (
             backend.chunk_cache(self.chunks, self.chunks.largest_chunk)
-            if isinstance(backend, KeepsChunks)
+            if backend.traits.caches_chunks
             else None
         )
         self._current: tuple[Selection, int, ResidentData] | None = None
@@ -66,7 +65,7 @@ class Residency:
 
         def fits(band: Band, first_id: int = 0) -> bool:
             data = self._data(band.selection, first_id)
-            return not isinstance(pipeline, KnowsRoom) or pipeline.fits(data, band.view)
+            return pipeline.fits(data, band.view)
 
         def ids_of(bands: Sequence[Band]) -> Callable[[], np.ndarray]:
             self.nodes += sum(len(band.selection) for band in bands)
@@ -76,14 +75,14 @@ class Residency:
         backend = self._backend
         if not self._occlusion.is_worthwhile(full):
             self._occlusion.skip_view()
-        elif self._can_cull(view, features) and isinstance(backend, GivesTileEnds):
+        elif self._can_cull(view, features):
             culling_pipeline = backend.pipeline(with_termination_depths(features))
 
             def render_band(band: Band, first_id: int) -> tuple[Images, TerminationDepths]:
                 images = culling_pipeline.render(self._data(band.selection, first_id), band.view)
-                return images, backend.tile_ends_of(images)
+                return images, backend.termination_depths(images)
 
-            rendered = self._occlusion.render(full, fits, render_band, backend.take_tiles)
+            rendered = self._occlusion.render(full, fits, render_band, backend.copy_tiles)
             if rendered is not None:
                 bands, images = rendered
                 yield BandData(full.rows, full.view, None, ids_of(bands), images)
@@ -117,8 +116,10 @@ class Residency:
 
     def _can_cull(self, view: View, features: FeatureSet) -> bool:
         """Whether occlusion culling is supported."""
-        has_depths = isinstance(self._backend, GivesTileEnds) and isinstance(self._backend, KeepsChunks)
-        return has_depths and occlusion_test.is_supported(view, features)
+        traits = self._backend.traits
+        return (
+            traits.termination_depths and traits.caches_chunks and occlusion_test.is_supported(view, features)
+        )
 
     def prefetched(self, captures: Iterator[Capture]) -> Iterator[Capture]:
         """The captures, each yielded while the chunks of the next are prefetched."""

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.derivatives import TakenBack, TrainingKernels
-from fidsplat.backends.interface import Images, ResidentData
+from fidsplat.backends.interface import Images, ResidentData, TrainingKernels
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.densify import Densification, limited_logits
@@ -88,17 +87,17 @@ class DeviceWork:
         """Derivatives of the loss of normals by depths and normals, times its weight."""
         return self._kernels.surface(images, view, self._cameras[view], weight)
 
-    def take_back(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> TakenBack:
+    def take_back(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> Any:
         """What `count` and `step` take of a picture, from the derivatives by it."""
         return pipeline.take_back(images, slopes)
 
-    def count(self, taken: TakenBack, camera: Camera, origin: np.ndarray) -> None:
+    def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""
         self._kernels.count(taken, camera, origin)
 
     def step(
         self,
-        taken: TakenBack,
+        taken: Any,
         rate: Mapping[str, float],
         step: int,
         camera: Camera | None,

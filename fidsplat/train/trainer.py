@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.derivatives import CompilesAhead, Differentiates, Trains
 from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture.capture import Capture
@@ -105,11 +104,8 @@ class Trainer:
         self.renderer = Renderer() if renderer is None else renderer
         self.checkpoint = None if checkpoint is None else _writable(checkpoint)
         backend = self.renderer.backend
-        if not isinstance(backend, Differentiates):
-            raise DeviceError(
-                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp' "
-                "or 'reference'"
-            )
+        if not backend.traits.differentiates:
+            raise DeviceError(backend.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
         self._differentiate = backend.differentiate
         self._quality = Quality.of(self.settings.quality)
         if self.renderer.device.kind == "cpu" and "arithmetic" not in self.settings.quality:
@@ -118,7 +114,7 @@ class Trainer:
         self._solid = [replace(each, outputs=_SOLID) for each in self._captures]
         self._work = (
             DeviceWork(backend.training(), dataset.views, self.settings)
-            if isinstance(backend, Trains)
+            if backend.traits.trains
             else HostWork(backend, dataset.views, self.settings)
         )
         self._made = self._begin(start, restart)
@@ -278,7 +274,7 @@ class Trainer:
     def _compared(self, iteration: int, number: int, waits: bool) -> tuple[Callable[[], Loss], Any]:
         """Draws a view: what waits for its loss, and the picture taken back, from which splats learn.
 
-        waits: as `DifferentiablePipeline.forward`.
+        waits: as `GradientPipeline.forward`.
         """
         resident = self._work.resident(self.settings.degree_at(iteration), self.dataset.origin)
         by_normals, by_distortions = self.settings.surface_weights_at(iteration)
@@ -289,8 +285,8 @@ class Trainer:
         if features != self._features:
             self._features = features
             later = next_features(self.settings, iteration, plain, solid)
-            if later is not None and isinstance(backend := self.renderer.backend, CompilesAhead):
-                backend.compile_ahead(later)
+            if later is not None:
+                self.renderer.backend.compile_ahead(later)
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, seen, waits)
         value, slope = self._work.loss(images, number)

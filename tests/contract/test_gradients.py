@@ -17,7 +17,6 @@ from derivative_errors import (
 )
 
 import fidsplat as fs
-from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.gradients import TooLittleRoom, on_host
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
@@ -56,7 +55,7 @@ CASES = {
 
 @pytest.fixture
 def backend(renderer):
-    assert isinstance(renderer.backend, Differentiates)
+    assert renderer.backend.traits.differentiates
     return renderer.backend
 
 

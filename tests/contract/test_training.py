@@ -1,12 +1,13 @@
 """The kernels of training: they do as NumPy does, and their losses of depths what these are for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from derivative_errors import COSINE, NORM, derivatives, differences, random_picture
 from training_scene import QUICK, scene
 
 import fidsplat as fs
-from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.effects.differentiable import with_distortion
@@ -33,7 +34,8 @@ def test_kernels_and_numpy_train_alike(renderer, dataset, monkeypatch, losses):
     settings = {**QUICK, "densify_from": 99, **losses}
     for name in ("kernels", "numpy"):
         if name == "numpy":
-            monkeypatch.setattr("fidsplat.train.trainer.Trains", type("Nobody", (), {}))
+            traits = replace(renderer.backend.traits, trains=False)
+            monkeypatch.setattr(renderer.backend, "traits", traits)
         trainer = Trainer(dataset, renderer, iterations=10, sh_degree=0, **settings)
         trainer.run()
         steps[name] = trainer.history["losses"]
@@ -97,7 +99,7 @@ def test_the_loss_of_normals_does_what_it_is_for(renderer, dataset):
 def test_the_loss_of_distortions_does_what_it_is_for(renderer, dataset):
     """With it fragments are closer together than they were, and than without it. One disk of the scene lies
     nearly along its plane to the first camera, and reaches up to it."""
-    assert isinstance(renderer.backend, Differentiates)
+    assert renderer.backend.traits.differentiates
     after = {}
     for weight in (0.0, 10.0):
         losses = {"distortion_weight": weight, "distortion_from": 0, "densify_from": 99, "sh_degree": 0}

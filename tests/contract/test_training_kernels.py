@@ -10,7 +10,6 @@ from derivative_errors import COSINE, NORM, derivatives, differences, random_los
 from training_scene import scene
 
 import fidsplat as fs
-from fidsplat.backends.derivatives import Trains
 from fidsplat.backends.gradients import on_host
 from fidsplat.backends.opencl import training
 from fidsplat.backends.prepare import prepare
@@ -42,7 +41,7 @@ def views():
 @pytest.fixture
 def works(renderer, views):
     """What makes the kernels' work and its twin, with the same splats."""
-    assert isinstance(renderer.backend, Trains)
+    assert renderer.backend.traits.trains
 
     def make(lanes=0, **changes):
         settings = TrainSettings(iterations=5, **changes)

@@ -7,7 +7,6 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
-from fidsplat.backends.interface import GivesUint8
 from fidsplat.backends.opencl.shapes import gpu_shape
 from fidsplat.images.files import to_uint8
 from fidsplat.util.errors import MissingOutputError
@@ -44,7 +43,7 @@ def put(frame, values):
 @pytest.mark.parametrize("size", [(37, 23), (64, 32)], ids=str)
 def test_a_picture_has_the_bits_of_the_host(renderer, size):
     frame = drawn(renderer, *size)
-    assert isinstance(frame._images, GivesUint8)
+    assert frame._images.read_uint8("rgb") is not None
     on_device = frame.to_uint8()
     assert (on_device.shape, on_device.dtype) == ((*size[::-1], 3), np.uint8)
     assert np.array_equal(on_device, to_uint8(frame["rgb"]))

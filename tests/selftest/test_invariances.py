@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.probing import Reshapes
 from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.selftest.agreement import ALL_OUTPUTS, CULLED, FrameSpec, differing, render, trace
 from fidsplat.selftest.clouds import camera, rotation, splats, subset_of
@@ -36,7 +35,7 @@ def test_run_to_run(renderer, picture):
 
 
 def test_tile_sizes(renderer, picture):
-    if not isinstance(renderer.backend, Reshapes):
+    if not renderer.backend.traits.probed:
         pytest.skip("draws without tiles")
     own = render(renderer, picture)
     for shape in renderer.backend.shapes("tiles").values():
@@ -45,7 +44,7 @@ def test_tile_sizes(renderer, picture):
 
 def test_one_tile_for_the_whole_picture(renderer):
     """numerics A4 and A5: what a tile lacks, a picture of one tile has."""
-    if not isinstance(renderer.backend, Reshapes):
+    if not renderer.backend.traits.probed:
         pytest.skip("draws without tiles")
     own = renderer.backend.shape
     width, height = (own.lanes, 32) if own.schedule == "lanes" else (32, 32)

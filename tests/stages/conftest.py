@@ -2,11 +2,9 @@
 
 import pytest
 
-from fidsplat.backends.probing import Reshapes
-
 
 @pytest.fixture(scope="module")
 def backend(renderer):
-    if not isinstance(renderer.backend, Reshapes):
+    if not renderer.backend.traits.probed:
         pytest.skip("draws in one piece")
     return renderer.backend

@@ -118,9 +118,11 @@ def test_what_is_hidden_is_not_read(town, asked):
 
 def test_the_same_view_is_drawn_once(town, asked, monkeypatch):
     renderer, times = fs.Renderer("opencl"), []
-    ask = type(renderer.backend).tile_ends_of
+    ask = type(renderer.backend).termination_depths
     monkeypatch.setattr(
-        type(renderer.backend), "tile_ends_of", lambda self, images: times.append(1) or ask(self, images)
+        type(renderer.backend),
+        "termination_depths",
+        lambda self, images: times.append(1) or ask(self, images),
     )
     resident = renderer.upload(town)
     renderer.render(resident, view())
@@ -137,7 +139,7 @@ def test_what_is_missing_is_drawn_in_its_tiles_alone(town, asked, monkeypatch, w
     monkeypatch.setattr(occlusion_culling, "_PATCH_RATIO", 1)
     renderer, taken, path = fs.Renderer("opencl"), [], [view(), view(0.02, 0.1), view(0.03, 0.5)]
     backend = type(renderer.backend)
-    take, outputs = backend.take_tiles, ALL_OUTPUTS if way != "groups" else ("rgb", "splat_id")
+    take, outputs = backend.copy_tiles, ALL_OUTPUTS if way != "groups" else ("rgb", "splat_id")
 
     def noted(self, images, other, tiles):
         own, others = (dict(each.stats) for each in (images, other))
@@ -145,7 +147,7 @@ def test_what_is_missing_is_drawn_in_its_tiles_alone(town, asked, monkeypatch, w
         assert images.stats == {name: own[name] + others[name] for name in own}
         taken.append(tiles.mean())
 
-    monkeypatch.setattr(backend, "take_tiles", noted)
+    monkeypatch.setattr(backend, "copy_tiles", noted)
     if way == "groups":
         renderer.backend.shape = renderer.backend.shapes("schedule")["groups"]
     quality = {**WAYS, "odd samples": "samples=3", "groups": "", "bands": ""}[way] or None
@@ -290,7 +292,7 @@ def test_a_tile_ends_where_all_of_its_pixels_are_finished(order, schedule):
     capture = fs.Capture(camera, outputs=("alpha", "depth"), quality=f"lowpass=none,order={order}")
     features, shot = prepare(cloud, capture)
     images = backend.pipeline(with_termination_depths(features)).render(backend.upload(cloud), shot)
-    found = backend.tile_ends_of(images)
+    found = backend.termination_depths(images)
     height, width = found.tile
     rows, columns = found.depths.shape
     tiles = [(row, column) for row in range(rows) for column in range(columns)]

@@ -1,4 +1,4 @@
-"""A backend from outside the tree: one line in the registry, and everything that people use draws with it."""
+"""A backend from outside the tree: one line in the registry makes it usable everywhere."""
 
 import numpy as np
 import pytest
@@ -6,17 +6,17 @@ import pytest
 import fidsplat as fs
 from fidsplat.accuracy.error import supports_float64
 from fidsplat.backends import registry
+from fidsplat.backends.interface import DeviceTraits
 
 CAMERA = fs.Camera.pinhole(6, 4, 6.0, 6.0, 3.0, 2.0)
 CLOUD = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.9], colors=[[1.0, 0.5, 0.25]])
-TOY = '''
-"""Draws the background, and nothing else."""
+TOY = """
 import numpy as np
-from fidsplat.backends.interface import DeviceInfo
+from fidsplat.backends import interface
 from fidsplat.effects import OUTPUTS
 from fidsplat.util.errors import DeviceError
 
-INFO = DeviceInfo("toy", "Toy", "Toys", "1", "other", 1, 1, 1, False, True, "")
+INFO = interface.DeviceInfo("toy", "Toy", "Toys", "1", "other", 1, 1, 1, False, True, "")
 
 
 def devices():
@@ -27,7 +27,7 @@ def open_device(selector):
     return Backend()
 
 
-class Cloud:
+class Cloud(interface.ResidentData):
     memory_bytes = 0
 
     def __init__(self, cloud):
@@ -36,11 +36,8 @@ class Cloud:
         self.ellipsoids = cloud.ellipsoids
 
 
-class Backend:
+class Backend(interface.Backend):
     info = INFO
-
-    def limit_memory(self, budget):
-        pass
 
     def upload(self, cloud):
         return Cloud(cloud)
@@ -49,24 +46,18 @@ class Backend:
         lacking = {*features.outputs, *features.posts, *features.slots[8:]} - {"alpha"}
         return f"toy has no {', '.join(sorted(lacking))}" if lacking else ""
 
-    def pipeline(self, features):
+    def pipeline(self, features, shape=None):
         if why := self.unsupported(features):
             raise DeviceError(why)
-        return Pipeline(features)
+        return Pipeline()
 
 
-class Pipeline:
-    def __init__(self, features):
-        self.features = features
-
+class Pipeline(interface.Pipeline):
     def render(self, resident, view):
         return Images(view, resident.count)
 
-    def trace(self, resident, view):
-        return {name: self.render(resident, view).read(name) for name in ("rgb", *self.features.outputs)}
 
-
-class Images:
+class Images(interface.Images):
     def __init__(self, view, count):
         self.view, self.timings, self.stats = view, {"toy": 0.0}, {"splats": count, "visible": 0, "pairs": 0}
 
@@ -75,7 +66,7 @@ class Images:
         if name == "rgb":
             return np.full((*shape, 3), self.view.background, OUTPUTS[name].dtype)
         return np.zeros(shape, OUTPUTS[name].dtype)
-'''
+"""
 
 
 @pytest.fixture
@@ -98,11 +89,27 @@ def test_it_is_listed_and_draws(toy):
     assert [one["rgb"].shape for one in toy.render_views(CLOUD, [CAMERA, capture])] == [(4, 6, 3)] * 2
 
 
-def test_what_it_lacks_is_an_error_that_says_so(toy):
+def test_a_missing_effect_is_an_error_that_names_both(toy):
     with pytest.raises(fs.DeviceError, match="toy has no depth"):
         toy.render(CLOUD, CAMERA, "depth")
-    with pytest.raises(fs.InputError, match="toy takes no arrays of a device"):
+    with pytest.raises(fs.InputError, match="device must adopt arrays, got toy"):
         toy.adopt(means=1, quats=1, scales=1, opacities=1, colors=1)
-    with pytest.raises(fs.InputError, match="keeps rgb in no array"):
+    with pytest.raises(fs.InputError, match="device must render subsets of pixels, got toy"):
+        toy.render_every(2, CLOUD, CAMERA)
+    with pytest.raises(fs.DeviceError, match="device must have gradients, got toy"):
+        toy.backend.differentiate(None)
+    with pytest.raises(fs.InputError, match="device that shares its arrays, got rgb"):
         toy.render(CLOUD, CAMERA).device_array("rgb")
+    with pytest.raises(fs.InputError, match="device must have a memory budget, got toy"):
+        fs.Renderer("toy", memory_budget=1)
+    assert toy.backend.traits == DeviceTraits()
     assert not supports_float64(toy, fs.Capture(CAMERA))
+
+
+def test_defaults_of_the_interface(toy):
+    frame = toy.render(CLOUD, CAMERA)
+    assert (frame.to_uint8() == 0).all()
+    assert frame.wait().read_rows("rgb", 1, 2).shape == (4, 6, 3)
+    batch = toy.render_batch(CLOUD, CAMERA, poses=[[0, 0, 0, 0, 0, 0, 1]] * 2, mask=[True, False])
+    assert (batch["rgb"].shape, batch.stats["splats"]) == ((2, 4, 6, 3), 1)
+    toy.backend.compile_ahead(None)

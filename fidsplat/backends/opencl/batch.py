@@ -10,6 +10,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.interface import BatchImages, summed
 from fidsplat.backends.opencl.images import Rendered
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects.catalogue import Output
@@ -59,8 +60,10 @@ class OutputBuffers:
         return self.size if channels == 1 else (*self.size, channels)
 
 
-class OpenCLBatch:
+class OpenCLBatch(BatchImages):
     """Finished images of many views on the device."""
+
+    shares_arrays = True
 
     def __init__(
         self, workspace: Workspace, buffers: OutputBuffers, rendered: list[Rendered], splats: int
@@ -105,20 +108,12 @@ class OpenCLBatch:
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds by stage, of all views together."""
-        return _added([one.timings() for one in self._rendered])
+        return summed([one.timings() for one in self._rendered])
 
     @property
     def stats(self) -> Mapping[str, int]:
         return (
             {"visible": 0, "pairs": 0}
-            | _added([one.stats() for one in self._rendered])
+            | summed([one.stats() for one in self._rendered])
             | {"splats": self._splats}
         )
-
-
-def _added(counts: list[dict[str, Any]]) -> dict[str, Any]:
-    sums: dict[str, Any] = {}
-    for each in counts:
-        for name, value in each.items():
-            sums[name] = sums.get(name, 0) + value
-    return sums

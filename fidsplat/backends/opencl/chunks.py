@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.chunk_cache import Chunk, WholeScene
+from fidsplat.backends.interface import Chunk, ChunkCache, ChunkedScene, ResidentData
 from fidsplat.backends.opencl.assemble import kernel_text
 from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.workspace import Workspace
@@ -46,10 +46,10 @@ class Copies:
     """of slots, before it was made"""
 
 
-class OpenCLChunks:
+class OpenCLChunks(ChunkCache):
     """As `ChunkCache`."""
 
-    def __init__(self, workspace: Workspace, whole: WholeScene, rows: int) -> None:
+    def __init__(self, workspace: Workspace, whole: ChunkedScene, rows: int) -> None:
         self.workspace, self.whole, self._rows = workspace, whole, max(rows, 1)
         self.applies_poses = workspace.info.float64
         self.widths: dict[str, int] = {}
@@ -247,7 +247,7 @@ def _roomy(count: int) -> int:
     return -(-count // step) * step
 
 
-class GatheredChunks:
+class GatheredChunks(ResidentData):
     """What a picture is drawn of, as `Resident`: copied out of slots when a picture first asks for an array,
     or, where that would take more than its part of the memory budget, some splats at a time for every
     picture (`streamed`)."""

@@ -10,8 +10,7 @@ import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import check_once
-from fidsplat.backends.chunk_cache import WholeScene
-from fidsplat.backends.interface import DeviceInfo, Rates
+from fidsplat.backends.interface import Backend, ChunkedScene, DeviceInfo, DeviceTraits, Rates
 from fidsplat.backends.opencl.ahead import Ahead
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.chunks import OpenCLChunks
@@ -79,8 +78,17 @@ def open_device(selector: str = "") -> OpenCLBackend:
     )
 
 
-class OpenCLBackend(Workspace):
+class OpenCLBackend(Workspace, Backend):
     """An open OpenCL device, and what is compiled for it."""
+
+    traits = DeviceTraits(
+        caches_chunks=True,
+        termination_depths=True,
+        differentiates=True,
+        trains=True,
+        measures_rates=True,
+        probed=True,
+    )
 
     def __init__(self, device: cl.Device) -> None:
         if is_pocl(device):
@@ -101,16 +109,16 @@ class OpenCLBackend(Workspace):
         """The cloud in device buffers."""
         return Resident(self, cloud)
 
-    def chunk_cache(self, whole: WholeScene, rows: int) -> OpenCLChunks:
-        """As `KeepsChunks`."""
-        return OpenCLChunks(self, whole, rows)
+    def chunk_cache(self, scene: ChunkedScene, rows: int) -> OpenCLChunks:
+        """A cache of a scene's chunks, each of at most `rows` splats."""
+        return OpenCLChunks(self, scene, rows)
 
-    def tile_ends_of(self, images: OpenCLImages) -> TerminationDepths:
-        """As `GivesTileEnds`."""
+    def termination_depths(self, images: OpenCLImages) -> TerminationDepths:
+        """Termination depth per tile of a frame with the effect `termination_depths`."""
         return images.tile_ends()
 
-    def take_tiles(self, images: OpenCLImages, other: OpenCLImages, tiles: np.ndarray) -> None:
-        """As `GivesTileEnds`."""
+    def copy_tiles(self, images: OpenCLImages, other: OpenCLImages, tiles: np.ndarray) -> None:
+        """Copy tiles of another frame of the same view into a frame."""
         images.take_tiles(other, tiles)
 
     def unsupported(self, features: FeatureSet) -> str:
@@ -147,7 +155,7 @@ class OpenCLBackend(Workspace):
         return self._pipelines[key]
 
     def differentiate(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLGradients:
-        """As `Differentiates`; `shape` replaces the device's own build constants (tests)."""
+        """The pipeline with derivatives; `shape` replaces the device's own build constants (tests)."""
         check_differentiable(features)
         self._ahead.wait(features)
         pipeline = self.pipeline(features, shape)
@@ -156,12 +164,12 @@ class OpenCLBackend(Workspace):
         return self._gradients[pipeline]
 
     def compile_ahead(self, features: FeatureSet) -> None:
-        """As `CompilesAhead`."""
+        """Start to compile `differentiate` in the background."""
         if self._own[1].get(features) not in self._gradients:
             self._ahead.begin(features, lambda: self.differentiate(features).prepare_step())
 
     def training(self) -> OpenCLTraining:
-        """As `Trains`."""
+        """Compiled training kernels, without splats."""
         return OpenCLTraining(self)
 
     def _key(self, features: FeatureSet, shape: DeviceShape | None) -> tuple[FeatureSet, DeviceShape]:
@@ -191,7 +199,7 @@ class OpenCLBackend(Workspace):
         return OpenCLProbe(self)
 
     def shapes(self, kind: str) -> dict[str, DeviceShape]:
-        """As `Reshapes` (fidsplat/backends/probing.py)."""
+        """Other build constants, by name, for tests."""
         return other_shapes(self.shape, kind)
 
     def pieces(self, shape: DeviceShape) -> int:

@@ -19,6 +19,7 @@ from fidsplat.backends.gradients import (
     check_shape,
     gradient_shape,
 )
+from fidsplat.backends.interface import GradientPipeline
 from fidsplat.backends.opencl.assemble import (
     assemble_gradients,
     assemble_step,
@@ -70,13 +71,13 @@ def _failing(picture: DeviceFrame) -> Iterator[None]:
 
 
 class TakenBack:
-    """As `fidsplat.backends.derivatives.TakenBack`."""
+    """A frame whose gradients are summed per tile, until the device renders another one."""
 
     def __init__(self, of: OpenCLGradients, images: OpenCLDifferentiable, picture: DeviceFrame) -> None:
         self._of, self._images, self._picture = of, images, picture
 
     def gradients(self) -> dict[str, Any]:
-        """As `DifferentiablePipeline.backward`."""
+        """The result of `GradientPipeline.backward`."""
         with self._last():
             return self._of.sum_up(self._picture)
 
@@ -95,7 +96,7 @@ class TakenBack:
         return _failing(self._picture)
 
 
-class OpenCLGradients:
+class OpenCLGradients(GradientPipeline):
     """Compiled stages and their derivatives."""
 
     def __init__(self, pipeline: OpenCLPipeline) -> None:
@@ -114,7 +115,7 @@ class OpenCLGradients:
         """number of splats, and what was launched for so many"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
-        """As `DifferentiablePipeline`: GPUs need not wait where pictures were taken back before."""
+        """Render one view; GPUs need not wait where frames were differentiated before."""
         pipeline, again = self._pipeline, self._again
         with pipeline.workspace.rendering():
             if waits or not self._pairs:
@@ -125,12 +126,12 @@ class OpenCLGradients:
             return OpenCLDifferentiable(frame, pipeline.images_of(frame))
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        """As `DifferentiablePipeline`: pyopencl arrays."""
+        """Gradients as pyopencl arrays."""
         with images.picture.workspace.lock:
             return self.take_back(images, gradients).gradients()
 
     def take_back(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TakenBack:
-        """As `TrainedPipeline`."""
+        """`backward` up to the sums over tiles."""
         check_gradients(self._pipeline.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)

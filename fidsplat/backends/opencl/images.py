@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.interface import Images
 from fidsplat.backends.opencl.counts import Counts
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.recorded_frame import RecordedFrame
@@ -113,7 +114,7 @@ class Replay:
         return {} if resident is None else self._pipeline.profile(resident, self._view, self._recorded)
 
 
-class OpenCLImages:
+class OpenCLImages(Images):
     """The output images of one picture. Their buffers go back to the pool when nobody holds them any more."""
 
     def __init__(
@@ -148,7 +149,7 @@ class OpenCLImages:
         return image
 
     def empty(self, name: str) -> np.ndarray:
-        """As `ReadsRows`."""
+        """A host array for an image, in memory that copies fast."""
         return self._workspace.host_memory.empty(self._shape(name), self._outputs[name].dtype)
 
     def _shape(self, name: str) -> tuple[int, ...]:
@@ -156,7 +157,7 @@ class OpenCLImages:
         return self._size if channels == 1 else (*self._size, channels)
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
-        """As `ReadsRows`. Raises DeviceError as `read`."""
+        """Copy pixel rows [first, end) alone. Raises DeviceError as `read`."""
         if first == end:
             return
         with self._workspace.failing(f"rendering {name}"):
@@ -166,14 +167,14 @@ class OpenCLImages:
             cl.enqueue_copy(queue, into[first:end], image, src_offset=above, wait_for=rendered.done())
 
     def read_uint8(self, name: str) -> np.ndarray:
-        """As `GivesUint8`. Raises DeviceError as `read`."""
+        """Copy an image in 8 bits. Raises DeviceError as `read`."""
         with self._workspace.failing(f"rendering {name}"):
             rendered = self.settle()
             image = rendered.buffer(f"{name}_out")
             return read_uint8(self._workspace, image, self._shape(name), rendered.done())
 
     def tile_ends(self) -> TerminationDepths:
-        """As `GivesTileEnds`, of pictures whose features have the effect. Raises DeviceError as `read`."""
+        """Termination depths of a frame with that effect. Raises DeviceError as `read`."""
         with self._workspace.failing("rendering"):
             rendered, (grid, tile) = self.settle(), self._tiles
             keys = np.empty(grid, np.uint32)
@@ -182,7 +183,7 @@ class OpenCLImages:
         return TerminationDepths.of_keys(keys, tile)
 
     def take_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
-        """As `GivesTileEnds`. Raises DeviceError as `read`."""
+        """Copy tiles of another frame of the same view. Raises DeviceError as `read`."""
         with self._workspace.failing("rendering"):
             own, others = self.settle(), other.settle()
             queue, copied = self._workspace.read_queue, None

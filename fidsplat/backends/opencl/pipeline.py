@@ -11,6 +11,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers
@@ -48,7 +49,7 @@ class CachedFrame:
     recorded: RecordedFrame | None = None
 
 
-class OpenCLPipeline:
+class OpenCLPipeline(Pipeline):
     """Compiled stages."""
 
     def __init__(

@@ -16,6 +16,7 @@ from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import build_options, check_kernels
 from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.probing import Probe
 from fidsplat.util.errors import DeviceError
 
 
@@ -96,7 +97,7 @@ kernel void probe(global const float *x, global int *unequal, global int *named,
 """
 
 
-class OpenCLProbe:
+class OpenCLProbe(Probe):
     """Small kernels under the build options and the pragmas of the stages, single stages on made-up input,
     and buffers that are filled with rubbish first: `Probe` of fidsplat/backends/probing.py."""
 

@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.coplanar_groups import PlaneTable
+from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.opencl.buffers import DeviceBuffer
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.splats.cloud import SplatCloud
@@ -22,7 +23,7 @@ _VECTOR = 16
 """bytes of the vectors that kernels read of arrays"""
 
 
-class Resident:
+class Resident(ResidentData):
     """A SplatCloud on the device.
 
     A CPU reads the cloud's own arrays, without a copy. On other devices they are copied, labels and colours
@@ -102,7 +103,7 @@ class Resident:
         return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
 
     def color_range(self) -> tuple[float, float]:
-        """As `HasColorRange`."""
+        """Lower and upper bound of every channel, from any direction."""
         return color_range(self._arrays.get("colors"), self._arrays.get("sh"))
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:

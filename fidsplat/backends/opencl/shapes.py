@@ -67,7 +67,7 @@ def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
 
 
 def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
-    """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/probing.py."""
+    """Other build constants, by name, for tests: `Backend.shapes`."""
     if kind == "schedule":
         return {"groups": _groups(own, 16 if own.schedule == "lanes" else 8)}
     if kind == "k_buffer":

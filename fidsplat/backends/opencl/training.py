@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
+from fidsplat.backends.interface import ResidentData, TrainingKernels
 from fidsplat.backends.opencl.assemble import assemble_training
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.loss_sums import LATE, LossSums
@@ -51,7 +52,7 @@ Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
 """kernel, size, work-group, and values of the arguments"""
 
 
-class ResidentArrays:
+class ResidentArrays(ResidentData):
     """Splats in arrays of the device, as pictures read them: disks without labels and planes."""
 
     has_coplanar_groups, footprint, ellipsoids, group_table = False, "gaussian", "none", None
@@ -83,8 +84,8 @@ class ResidentArrays:
         return whole.get_sub_region(first * row, (end - first) * row)
 
 
-class OpenCLTraining:
-    """As `TrainingKernels`."""
+class OpenCLTraining(TrainingKernels):
+    """Training kernels of an OpenCL device."""
 
     late = LATE // 2 - 1  # a picture may be compared twice
 

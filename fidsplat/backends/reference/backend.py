@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.interface import DeviceInfo
+from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits, Images, Pipeline, ResidentData
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.culling import may_see
 from fidsplat.backends.reference.gradients import ReferenceGradients
@@ -22,7 +22,7 @@ from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import color_range
 from fidsplat.util import interrupts
-from fidsplat.util.errors import InputError, UnknownDeviceError
+from fidsplat.util.errors import UnknownDeviceError
 
 _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once: half a megabyte each, which caches hold
 _TILE = 16  # samples along a side of those for which splats are chosen together
@@ -62,40 +62,30 @@ def open_device(selector: str = "") -> ReferenceBackend:
     return ReferenceBackend()
 
 
-class ReferenceBackend:
+class ReferenceBackend(Backend):
     """NumPy in float64."""
+
+    traits = DeviceTraits(renders_pixel_subsets=True, differentiates=True)
 
     def __init__(self) -> None:
         self.info = devices()[0]
-
-    def limit_memory(self, budget: int) -> None:
-        """Not offered.
-
-        Raises:
-            InputError: always.
-        """
-        raise InputError(f"memory_budget is {budget}, but the reference has none: it takes pixels in blocks")
 
     def upload(self, cloud: SplatCloud) -> ReferenceCloud:
         """The cloud itself."""
         return ReferenceCloud(cloud)
 
-    def unsupported(self, features: FeatureSet) -> str:
-        """Nothing."""
-        return ""
-
-    def pipeline(self, features: FeatureSet) -> ReferencePipeline:
-        """Nothing to compile."""
+    def pipeline(self, features: FeatureSet, shape: None = None) -> ReferencePipeline:
+        """The pipeline for these features; nothing is compiled."""
         return ReferencePipeline(features)
 
-    def differentiate(self, features: FeatureSet) -> ReferenceGradients:
-        """As `Differentiates`."""
+    def differentiate(self, features: FeatureSet, shape: None = None) -> ReferenceGradients:
+        """The pipeline with derivatives."""
         check_differentiable(features)
         return ReferenceGradients(self.pipeline(features), features)
 
 
-class ReferenceCloud:
-    """A cloud with what the renderer asks of a resident one."""
+class ReferenceCloud(ResidentData):
+    """A cloud in host memory."""
 
     def __init__(self, cloud: SplatCloud) -> None:
         self.cloud = cloud
@@ -107,13 +97,13 @@ class ReferenceCloud:
         self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
 
     def color_range(self) -> tuple[float, float]:
-        """As `HasColorRange`."""
+        """Lower and upper bound of every channel, from any direction."""
         return color_range(self.cloud.plain_colors, self.cloud.sh)
 
 
 @dataclass
-class ReferenceImages:
-    """Finished output images in memory."""
+class ReferenceImages(Images):
+    """Output images in host memory."""
 
     images: dict[str, np.ndarray]
     timings: Mapping[str, float]
@@ -128,7 +118,7 @@ class ReferenceImages:
         return self.images[name]
 
 
-class ReferencePipeline:
+class ReferencePipeline(Pipeline):
     """Draws whole pictures (`render`) or chosen pixels (`pixels`)."""
 
     def __init__(self, features: FeatureSet) -> None:
@@ -145,7 +135,7 @@ class ReferencePipeline:
         step: int,
         tell: Callable[[float], object] | None = None,
     ) -> ReferenceImages:
-        """As `DrawsEvery`."""
+        """Render every step-th pixel in both directions."""
         rows, columns = np.mgrid[
             0 : view.height // view.samples : step, 0 : view.width // view.samples : step
         ]

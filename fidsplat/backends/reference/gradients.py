@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
-from fidsplat.backends.interface import Images, Pipeline
+from fidsplat.backends.interface import GradientPipeline, Images, Pipeline
 from fidsplat.backends.reference.gradients_blend import Blend, Decisions, Samples, decide
 from fidsplat.backends.reference.gradients_scene import Parameters, Placed, place, place_backward
 from fidsplat.backends.reference.setup import Setup
@@ -20,7 +20,7 @@ from fidsplat.util.errors import InputError
 _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once
 
 
-class ReferenceGradients:
+class ReferenceGradients(GradientPipeline):
     """Pictures of the reference, and their derivatives."""
 
     def __init__(self, pipeline: Pipeline, features: FeatureSet) -> None:
@@ -28,13 +28,13 @@ class ReferenceGradients:
         self._drawn: tuple[Images, FrozenPicture] | None = None
 
     def forward(self, resident: Any, view: View, waits: bool = True) -> Images:
-        """As `DifferentiablePipeline`; there is always room."""
+        """Render one view."""
         images = self._pipeline.render(resident, view)
         self._drawn = images, FrozenPicture(resident.cloud, view, self._features)
         return images
 
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """As `DifferentiablePipeline`; float64."""
+        """Gradients in float64."""
         check_gradients(self._features, gradients)
         if self._drawn is None or self._drawn[0] is not images:
             raise InputError(NOT_THE_LAST)

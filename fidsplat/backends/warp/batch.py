@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.interface import BatchImages, summed
 from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.picture import Into
 from fidsplat.backends.warp.runtime import load
@@ -39,8 +40,10 @@ def parts(
     return pairwise([views * k // count for k in range(count + 1)])
 
 
-class WarpBatch:
+class WarpBatch(BatchImages):
     """The output images of many views, on the device until asked for."""
+
+    shares_arrays = True
 
     def __init__(
         self, workspace: Workspace, outputs: tuple[Output, ...], batch: ViewBatch, splats: int
@@ -108,18 +111,10 @@ class WarpBatch:
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds by stage, of all views together."""
-        return _added(images.timings for images in self._pictures)
+        return summed(images.timings for images in self._pictures)
 
     @property
     def stats(self) -> Mapping[str, int]:
         """Of all views together, but for the splats of the cloud."""
         none = {"splats": 0, "visible": 0, "pairs": 0}
-        return _added([none, *(images.stats for images in self._pictures)]) | {"splats": self._splats}
-
-
-def _added(counts: Any) -> dict[str, Any]:
-    sums: dict[str, Any] = {}
-    for each in counts:
-        for name, value in each.items():
-            sums[name] = sums.get(name, 0) + value
-    return sums
+        return summed([none, *(images.stats for images in self._pictures)]) | {"splats": self._splats}

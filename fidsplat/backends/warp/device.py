@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import DeviceInfo
+from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.gradients import WarpGradients
 from fidsplat.backends.warp.launch import Commands
@@ -54,8 +54,10 @@ def open_device(selector: str = "") -> WarpBackend:
     return WarpBackend(min(matching, key=lambda device: not device.is_cuda))
 
 
-class WarpBackend(Workspace):
-    """An open Warp device with what its pictures share, and compiled pipelines."""
+class WarpBackend(Workspace, Backend):
+    """An open Warp device and its compiled pipelines."""
+
+    traits = DeviceTraits(adopts_arrays=True, differentiates=True, probed=True)
 
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
@@ -80,7 +82,7 @@ class WarpBackend(Workspace):
         return Resident.of(cloud, self.pool)
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
-        """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
+        """A cloud of arrays that are on the device, without a copy."""
         return Resident.around(arrays, origin, self.pool)
 
     def unsupported(self, features: FeatureSet) -> str:
@@ -100,7 +102,7 @@ class WarpBackend(Workspace):
         return self._pipelines[key]
 
     def differentiate(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpGradients:
-        """As `Differentiates`; `shape` replaces the device's own tiles (tests)."""
+        """The pipeline with derivatives; `shape` replaces the device's own tiles (tests)."""
         check_differentiable(features)
         key = (features, shape or self.shape)
         if key not in self._gradients:
@@ -112,12 +114,8 @@ class WarpBackend(Workspace):
         return WarpProbe(self)
 
     def shapes(self, kind: str) -> dict[str, WarpShape]:
-        """As `Reshapes` (fidsplat/backends/probing.py)."""
+        """Other build constants, by name, for tests."""
         return other_shapes(self.shape, kind)
-
-    def pieces(self, shape: WarpShape) -> int:
-        """Warp's sorts take everything at once."""
-        return 1
 
 
 def _describe(device: Any) -> DeviceInfo:

@@ -15,6 +15,7 @@ from fidsplat.backends.gradients import (
     check_shape,
     gradient_shape,
 )
+from fidsplat.backends.interface import GradientPipeline
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.launch import Launcher
@@ -45,14 +46,14 @@ class WarpDifferentiable(DifferentiableImages):
         self.images.wait()
 
 
-class WarpGradients:
+class WarpGradients(GradientPipeline):
     """Compiled stages and their derivatives."""
 
     def __init__(self, pipeline: WarpPipeline) -> None:
         self._pipeline, self._kernels = pipeline, GradientKernels(pipeline.program)
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> WarpDifferentiable:
-        """As `DifferentiablePipeline`; it always waits."""
+        """Render one view; always waits."""
         picture, images = self._pipeline.drawn(resident, view)
         if picture.bands > 1:
             raise DeviceError(
@@ -62,7 +63,7 @@ class WarpGradients:
         return WarpDifferentiable(picture, images)
 
     def backward(self, images: WarpDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        """As `DifferentiablePipeline`: wp.arrays."""
+        """Gradients as wp.arrays."""
         picture = images.picture
         check_gradients(picture.program.features, gradients)
         if not images.last:
@@ -88,7 +89,7 @@ class _Backward:
         }
 
     def results(self) -> dict[str, Any]:
-        """All stages; `DifferentiablePipeline.backward`'s arrays."""
+        """All stages; the arrays of `GradientPipeline.backward`."""
         found = self._room_for_results()
         self._launcher.stage("blend backward")
         self._blend()

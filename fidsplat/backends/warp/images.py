@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.interface import Images
 from fidsplat.backends.warp.launch import Launcher
 from fidsplat.backends.warp.picture import Into
 from fidsplat.backends.warp.runtime import kernels, load, quiet
@@ -16,8 +17,10 @@ from fidsplat.effects import Output
 _CONVERTING = threading.Lock()
 
 
-class WarpImages:
+class WarpImages(Images):
     """The output images of one picture, on the device until asked for."""
+
+    shares_arrays = True
 
     def __init__(
         self,
@@ -65,7 +68,7 @@ class WarpImages:
         return np.array(self.device_array(name).numpy())
 
     def read_uint8(self, name: str) -> np.ndarray:
-        """As `GivesUint8`."""
+        """Copy an image in 8 bits, converted on the device."""
         drawn = self.device_array(name)
         made = load().empty(drawn.size, dtype=load().uint8, device=drawn.device)
         given = [drawn.flatten(), made]

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.ahead import Drawing
 from fidsplat.backends.warp.batch import WarpBatch, parts
@@ -18,7 +19,7 @@ from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.workspace import Workspace
 
 
-class WarpPipeline:
+class WarpPipeline(Pipeline):
     """Draws pictures that call for these features."""
 
     def __init__(self, program: Program, workspace: Workspace, commands: Commands) -> None:

@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.probing import Probe
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.util.errors import DeviceError
 
 
-class WarpProbe:
-    """`Probe` of fidsplat/backends/probing.py, for the device of a workspace."""
+class WarpProbe(Probe):
+    """Access to a Warp device for tests."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace

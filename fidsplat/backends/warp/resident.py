@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.coplanar_groups import PlaneTable
+from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, nbytes
 from fidsplat.splats.cloud import SplatCloud
@@ -15,7 +16,7 @@ from fidsplat.splats.harmonics import MAX_DEGREE, color_range
 from fidsplat.util.errors import DeviceError, InputError, bytes_words
 
 
-class Resident:
+class Resident(ResidentData):
     """Splats on the device."""
 
     def __init__(
@@ -39,7 +40,7 @@ class Resident:
         """whether somebody else may change the arrays"""
 
     def color_range(self) -> tuple[float, float]:
-        """As `HasColorRange`, of what the arrays hold now."""
+        """Lower and upper bound of every channel, from any direction, of the current values."""
         colors = self.arrays["colors"].numpy()[: self.count * max(self.sh_degree + 1, 1) ** 2]
         if self.sh_degree > 0:
             return color_range(None, colors.reshape(self.count, -1, 3))

@@ -25,7 +25,7 @@ def shape_for(device: Any) -> WarpShape:
 
 
 def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
-    """As `Reshapes.shapes` (fidsplat/backends/probing.py)."""
+    """Other build constants, by name, for tests: `Backend.shapes`."""
     if kind == "schedule":
         return {"groups": WarpShape("group", 8, 8)}
     if kind == "listing":

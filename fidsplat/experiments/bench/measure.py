@@ -10,7 +10,7 @@ from datetime import date
 
 import numpy as np
 
-from fidsplat.backends.interface import DeviceInfo, Measurable, Rates
+from fidsplat.backends.interface import DeviceInfo, Rates
 from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
@@ -130,7 +130,7 @@ class Bench:
         for name in dict.fromkeys(devices):
             tell(f"rates of {name}")
             backend = Renderer(name).backend
-            self.devices[name] = backend.rates() if isinstance(backend, Measurable) else None
+            self.devices[name] = backend.rates() if backend.traits.measures_rates else None
 
     def run(self, scene: str, repeats: int) -> None:
         """Draw a scene `repeats` times on each device. What a device cannot draw stands in its result."""
@@ -182,7 +182,7 @@ class SceneRun:
     def _count(self, cloud: SplatCloud) -> None:
         result, backend = self.result, self.renderer.backend
         result.mean_rgb = float(self.picture.mean(dtype=np.float64))
-        if not isinstance(backend, Measurable) or result.rates is None:
+        if not backend.traits.measures_rates or result.rates is None:
             return
         pixels = result.width * result.height
         result.memory_bytes = backend.memory_bytes + self.resident.memory_bytes + 12 * pixels

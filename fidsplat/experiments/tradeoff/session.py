@@ -9,7 +9,6 @@ from functools import lru_cache
 import numpy as np
 
 from fidsplat.accuracy.error import full_precision, reference_image, reference_renderer
-from fidsplat.backends.interface import Measurable
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import MarkerQuality, Quality
 from fidsplat.experiments.tradeoff.points import BASE
@@ -122,7 +121,7 @@ def memory_of(session: Session, view: str, quality: Quality) -> int | None:
     """Bytes on the device of a picture at a setting: scratch, cloud and picture; None where the backend
     cannot tell."""
     backend, scene = session.renderer.backend, session.scene(view, quality.marker)
-    if not isinstance(backend, Measurable):
+    if not backend.traits.measures_rates:
         return None
     backend.release_scratch()
     # a cloud keeps every form of its colours that was ever asked for; this one has been asked for nothing yet
