@@ -203,7 +203,8 @@ def _rigid(where: str, matrix: np.ndarray) -> np.ndarray:
     """The rigid matrix nearest to one that was rounded."""
     u, sizes, v = np.linalg.svd(matrix[:3, :3])
     if np.abs(sizes - 1).max() > ROUNDED or np.linalg.det(u @ v) < 0:
-        raise InputError(f"{where}: the matrix is no rotation; its scales are {sizes.round(6).tolist()}")
+        scales = ", ".join(f"{size:.7g}" for size in sizes)
+        raise InputError(f"{where}: the matrix must be a rotation, whose scales are 1, got {scales}")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 0:
         raise InputError(f"{where}: the matrix must have the last row (0, 0, 0, 1)")
     return rigid_matrix(matrix[:3, 3], matrix_to_quaternion(u @ v))

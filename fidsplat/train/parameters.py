@@ -65,7 +65,8 @@ class Splats:
     @property
     def scales(self) -> np.ndarray:
         """(n, 2) float32, metres."""
-        return np.exp(self.values["log_scales"])
+        with np.errstate(over="ignore"):  # the cloud leaves out splats whose scales overflow
+            return np.exp(self.values["log_scales"])
 
     def select(self, rows: np.ndarray) -> Splats:
         """Some of the splats, by index or mask, with their moments and statistics."""
@@ -178,7 +179,8 @@ def splats_from_cloud(cloud: SplatCloud, settings: TrainSettings, origin: np.nda
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
     """1 / (1 + exp(-x)), in the dtype of x."""
-    return 1 / (1 + np.exp(-x))
+    with np.errstate(over="ignore"):  # 0 is right
+        return 1 / (1 + np.exp(-x))
 
 
 def logit(opacity: float) -> float:

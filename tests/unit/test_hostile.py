@@ -103,7 +103,6 @@ scale = 1.0
 [[markers]]
 spec = "aruco:4x4_50:7"
 size = 0.1
-label = 3
 [[markers]]
 spec = "svg-9:good.svg"
 size = 0.1
@@ -317,7 +316,7 @@ def use_path(file):
 
 
 def use_results(file):
-    from fidsplat.experiments.targets import targets
+    from paper_targets import targets
 
     from fidsplat.experiments.results import load
 
