@@ -93,7 +93,7 @@ def _pictures_of(folder: Path) -> Path:
     poses = np.stack([np.linalg.inv(view.camera.world_to_camera) for view in VIEWS])
     names = [f"{number}.png" for number in range(len(VIEWS))]
     for view, name in zip(VIEWS, names, strict=True):
-        image_files.write_png(folder / name, view.picture)
+        image_files.write_png(folder / name, view.image)
     fs.save_trajectory(
         fs.Trajectory(range(len(VIEWS)), poses), folder / "transforms.json", VIEWS[0].camera, names
     )
@@ -183,7 +183,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         fs.place_store, {"store": _store(folder), "out": folder / "placed.fss", "poses": [np.eye(4)], "overwrite": True}, None
     ),
     "TrainingView": lambda _: (
-        TrainingView, {"name": "a", "camera": VIEWS[0].camera, "picture": VIEWS[0].picture, "mask": np.ones((18, 24), bool)}, None
+        TrainingView, {"name": "a", "camera": VIEWS[0].camera, "image": VIEWS[0].image, "mask": np.ones((8, 12), bool)}, None
     ),
     "Dataset": lambda _: (
         Dataset,
