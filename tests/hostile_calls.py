@@ -259,9 +259,9 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "RobotLog.camera_info": _log("camera_info", time=0.0, name="eye", camera=CAMERA),
     "RobotLog.transform": _log("transform", time=0.0, frame="eye", pose=np.eye(4), parent=None),
     "RobotLog.odometry": _log(
-        "odometry", time=0.0, pose=np.eye(4), velocity=(0, 0, 0), turning=(0, 0, 0), frame="base", topic="/odom", covariance=np.eye(6)
+        "odometry", time=0.0, pose=np.eye(4), velocity=(0, 0, 0), angular_velocity=(0, 0, 0), frame="base", topic="/odom", covariance=np.eye(6)
     ),
-    "RobotLog.imu": _log("imu", time=0.0, turning=(0, 0, 0), acceleration=(0, 0, 0), frame="imu", topic="/imu"),
+    "RobotLog.imu": _log("imu", time=0.0, angular_velocity=(0, 0, 0), acceleration=(0, 0, 0), frame="imu", topic="/imu"),
     "RobotLog.detections": _log("detections", time=0.0, camera="eye", found=[]),
     "SplatCloud": lambda _: (
         fs.SplatCloud,

@@ -129,11 +129,11 @@ class Detect:
     def _log_images(
         self, path: str, scene: "Scene | None"
     ) -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
-        from fidsplat.logs import log_pictures, log_poses
+        from fidsplat.logs import log_images, log_poses
         from fidsplat.render.flight import seen_from
 
         poses = {} if scene is None else log_poses(path)
-        for one in log_pictures(path, self.topic):
+        for one in log_images(path, self.topic):
             then = scene
             if scene is not None:
                 pose = poses.get((one.frame, one.stamp))

@@ -142,14 +142,14 @@ class Fly(RenderInput):
                 renderer = Renderer(device, budget)
             yield renderer.device.title, lambda folder: folder.draw(renderer)
             return
-        from fidsplat.remote.flights import FlightWork, draw
+        from fidsplat.remote.flights import FlightWork, render_flight
         from fidsplat.remote.ray_engine import ray_engine
 
         with ExitStack() as stack:
             with console(self.json).status("starting workers"):
                 work = FlightWork(flight, device, budget)
                 engine = stack.enter_context(ray_engine(self.ray, work, self.workers))
-            yield engine.title, lambda folder: draw(folder, engine, engine.workers)
+            yield engine.title, lambda folder: render_flight(folder, engine, engine.workers)
 
     def _report(self, folder: FlightFolder, sheet: Path, rendered: int, seconds: float) -> int:
         frames = len(folder.flight)

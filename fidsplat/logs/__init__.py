@@ -1,7 +1,7 @@
-"""Logs that robotics tools open: MCAP files and rosbag2 folders. Needs `pip install 'fidsplat[logs]'`."""
+"""ROS 2 logs: MCAP files and rosbag2 folders. Needs `pip install 'fidsplat[logs]'`."""
 
-from fidsplat.logs.files import check_log
-from fidsplat.logs.log import RobotLog
-from fidsplat.logs.reader import LogPicture, log_pictures, log_poses
+from fidsplat.logs.reader import LogImage, log_images, log_poses
+from fidsplat.logs.robot_log import RobotLog
+from fidsplat.logs.writers import check_log
 
-__all__ = ["LogPicture", "RobotLog", "check_log", "log_pictures", "log_poses"]
+__all__ = ["LogImage", "RobotLog", "check_log", "log_images", "log_poses"]

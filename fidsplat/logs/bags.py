@@ -1,4 +1,4 @@
-"""rosbag2 folders: metadata, and messages of MCAP and SQLite files, compressed by zstd or not."""
+"""Reader of rosbag2 folders and MCAP files: metadata and messages, with zstd compression."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ try:
     from mcap.reader import make_reader
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
-    from ruamel.yaml import YAML  # of rosbags, whose reader neither limits expansion nor quotes names
+    from ruamel.yaml import YAML  # rosbags' own reader neither limits expansion nor quotes names
 except ImportError as error:
     raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
 
 MOST_METADATA = 2**20
-"""Bytes of metadata.yaml, which are parsed in Python."""
+"""largest metadata.yaml in bytes, as a Python parser reads it"""
 _STEP = 2**20
 
 Message = tuple[str, str, int, bytes]
-"""Topic, type, time in nanoseconds, CDR."""
+"""topic, type, time in nanoseconds, CDR"""
 
 
 def bag_metadata(folder: Path) -> dict[str, Any]:
-    """Information of a bag's metadata.yaml. Raises InputError for a missing or unsuitable one, and errors of
-    the YAML package."""
+    """Metadata of a bag. Raises InputError for a missing or unsuitable metadata.yaml, and errors of the YAML
+    package."""
     path = folder / "metadata.yaml"
     text = read_input(path, most=MOST_METADATA).decode("utf-8")
-    if "<<" in text:  # tables merged into one another take exponential time
+    if "<<" in text:  # nested merges take exponential time
         raise InputError(f"{path} must not merge YAML tables, got '<<'; write the tables out")
     return YAML(typ="safe", pure=True).load(text)["rosbag2_bagfile_information"]
 
@@ -59,7 +59,7 @@ def log_messages(path: Path) -> Iterator[Message]:
         raise InputError(
             f"the compression of {path} must be zstd by file or by message, got {compressed} {form}"
         )
-    names = [PurePath(name).name for name in metadata["relative_file_paths"]]  # nothing outside of the folder
+    names = [PurePath(name).name for name in metadata["relative_file_paths"]]  # never outside the folder
     for file in (regular_file(path / name) for name in names):
         with tempfile.TemporaryDirectory() as folder:
             if compressed == "file":
@@ -100,10 +100,10 @@ def _sqlite_messages(path: Path) -> Iterator[Message]:
     name = quote(os.fsencode(path.absolute()))
     connection = sqlite3.connect(f"file://{name}?immutable=1&mode=ro", uri=True)
     try:
-        # the definition of a table may compute values that no file holds
+        # the definition of a table may compute values
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(input_limit(path.stat().st_size), 10**9))
         connection.execute("PRAGMA trusted_schema = OFF")
-        # a view in a table's place may compute for ever
+        # a view instead of a table may compute endlessly
         kinds = connection.execute("SELECT type FROM sqlite_master WHERE name IN ('messages', 'topics')")
         if sorted(kind for (kind,) in kinds) != ["table", "table"]:
             raise InputError(f"{path} must have the tables messages and topics; give a rosbag2 database")
@@ -130,12 +130,12 @@ def _mcap_messages(path: Path) -> Iterator[Message]:
 
 
 def _check_chunks(file: Path, stream: BinaryIO) -> None:
-    """Check what the chunks of an MCAP file expand to: one by one, or without an index, which says in which
-    order to read them, all together. Raises InputError above the limit."""
+    """Raise InputError if a chunk of an MCAP file expands beyond the limit, or all chunks together if the
+    file has no index and must be read completely."""
     summary, need = make_reader(stream).get_summary(), 0
     if summary is not None and summary.chunk_indexes:
         for index in summary.chunk_indexes:
-            stream.seek(index.chunk_start_offset + 9)  # behind its opcode and length
+            stream.seek(index.chunk_start_offset + 9)  # after its opcode and length
             chunk = Chunk.read(ReadDataStream(stream))
             check_expansion(file, _expanded(chunk), "a chunk", len(chunk.data))
     else:
@@ -148,15 +148,15 @@ def _check_chunks(file: Path, stream: BinaryIO) -> None:
 
 
 def _expanded(chunk: Chunk) -> int:
-    """Bytes that a chunk expands to, by itself or by its compressed data, whichever says more."""
-    said = 0
+    """Expanded bytes of a chunk: the larger of its declared size and the size in its compressed data."""
+    size = 0
     if chunk.compression == "zstd":
-        said = zstandard.frame_content_size(chunk.data)
+        size = zstandard.frame_content_size(chunk.data)
     elif chunk.compression == "lz4":
-        said = lz4.frame.get_frame_info(chunk.data)["content_size"]
-        if not said:
+        size = lz4.frame.get_frame_info(chunk.data)["content_size"]
+        if not size:
             most = min(chunk.uncompressed_size, input_limit(len(chunk.data))) + 1
-            said = len(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
-            if said == most:
+            size = len(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
+            if size == most:
                 raise InputError(f"a chunk must expand to the {most - 1:,} bytes that it declares, got more")
-    return max(chunk.uncompressed_size, said)
+    return max(chunk.uncompressed_size, size)

@@ -1,4 +1,4 @@
-"""The paper's experiments, point by point by workers."""
+"""The paper's experiments, measured point by point by workers."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from fidsplat.util.errors import FidsplatError, InputError
 
 @dataclass(frozen=True)
 class ExperimentWork:
-    """What a worker needs to measure points of experiments; called there, it opens the device.
+    """Data that a worker needs to measure points of experiments; a call opens the device.
 
-    Raises InputError for options that name files of this machine, or what is no picture but a time.
+    Raises InputError for settings that name files of this machine, and for measurements of time.
     """
 
     names: tuple[str, ...]
@@ -32,7 +32,9 @@ class ExperimentWork:
         options = self.options
         options.check()
         if counts.NAME in self.names:
-            raise InputError("counts measures times of one quiet machine; run it without --ray")
+            raise InputError(
+                "--ray must not be used for counts, which times one idle machine; run it without --ray"
+            )
         local = [options.trained]
         if isinstance(options, ViewSettings):
             local += [options.lpips, options.blender_folder if options.blender_folder.exists() else None]
@@ -40,15 +42,15 @@ class ExperimentWork:
             if path is not None:
                 raise InputError(
                     f"{path} is on the disk of this machine, which workers do not share; run it without "
-                    "--ray, in shares by --shard say"
+                    "--ray, for example by --shard"
                 )
 
-    def __call__(self) -> ExperimentDoer:
-        return ExperimentDoer(self)
+    def __call__(self) -> ExperimentWorker:
+        return ExperimentWorker(self)
 
 
-class ExperimentDoer:
-    """Measures points of experiments by their numbers."""
+class ExperimentWorker:
+    """Measures points of experiments by their indices."""
 
     def __init__(self, work: ExperimentWork) -> None:
         self._open = ExitStack()
@@ -58,7 +60,7 @@ class ExperimentDoer:
         self.title = "" if options.methods == (IDEAL,) else device_words(Renderer(options.device))
 
     def __call__(self, item: tuple[str, int]) -> dict:
-        """The result of an experiment's point, counted from 0."""
+        """The result of a point, by the experiment's name and the point's index."""
         name, number = item
         sweep = self._sweeps[name]
         return sweep.begin(sweep.points[number])()
@@ -67,10 +69,14 @@ class ExperimentDoer:
 def measure(
     points: Mapping[str, list[Key]], results: Mapping[str, Results], engine: Engine, workers: int
 ) -> Iterator[tuple[str, Record]]:
-    """Let workers measure what is left of experiments, whose points and results are given by name; yields the
-    name of each and a record of it once that is in its file. Raises FidsplatError as `drain` does."""
-    for kept in results.values():
-        kept.run["machine"] = f"a Ray cluster, {workers} workers"
+    """Measure the missing points of experiments on workers; yields the experiment's name and each record once
+    it is in its file. Raises FidsplatError like `drain`.
+
+    Args:
+        points, results: points and result files by the name of the experiment.
+    """
+    for result in results.values():
+        result.run["machine"] = f"a Ray cluster, {workers} workers"
     left = [(name, points[name].index(key)) for name in points for key in results[name].left(points[name])]
     for (name, number), result in drain(engine, left, workers):
         try:

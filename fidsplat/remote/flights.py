@@ -1,4 +1,4 @@
-"""Flights that are drawn by workers: pictures come back as the bytes of their files, as no disk is shared."""
+"""Rendering of flights by workers, which return images as bytes of their files, as no disk is shared."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import atomic_write
 
 Files = dict[tuple[str, str], bytes]
-"""content of a picture's files by output and suffix"""
+"""bytes of an image's files by output and suffix"""
 
 
 @dataclass(frozen=True, eq=False)
 class FlightWork:
-    """What a worker needs to draw pictures of a flight; called there, it opens the device. Stores are not
-    sent: a worker reads them where they are here."""
+    """Data that a worker needs to render a flight; a call opens the device. Stores are not sent: workers read
+    them at the same path."""
 
     flight: Flight
     device: str
     memory_budget: int | None = None
 
-    def __call__(self) -> FlightDrawer:
-        return FlightDrawer(self)
+    def __call__(self) -> FlightRenderer:
+        return FlightRenderer(self)
 
     def __reduce__(self):
         stores = {str(store.path.resolve()): store.identity for store in self.flight.scene.stores}
@@ -41,7 +41,7 @@ class FlightWork:
 
 @dataclass(frozen=True)
 class PackedWork:
-    """Work as it is sent. It is unpacked where it is called, so that what is missing there can be said."""
+    """Pickled work, unpacked by the worker, so that a missing store is reported."""
 
     flight: bytes
     stores: dict[str, str]
@@ -49,26 +49,26 @@ class PackedWork:
     device: str
     memory_budget: int | None
 
-    def __call__(self) -> FlightDrawer:
-        """Raises InputError where a store is not at its path, or another one is."""
+    def __call__(self) -> FlightRenderer:
+        """Raises InputError if a store is missing on the worker, or differs."""
         for path, identity in self.stores.items():
             try:
                 same = Store(path).identity == identity
             except InputError as error:
                 raise InputError(
-                    f"workers read stores from a disk that they share, and on {socket.gethostname()} "
-                    f"{error}; put it there, or draw without --ray"
+                    f"workers must share the disk of stores, and on {socket.gethostname()} {error}; copy the "
+                    "store there, or render without --ray"
                 ) from None
             if not same:
                 raise InputError(
-                    f"on {socket.gethostname()} {path} is another store than here; put the same there, or "
-                    "draw without --ray"
+                    f"{path} on {socket.gethostname()} must be the same store as here; copy it there, or "
+                    "render without --ray"
                 )
         return FlightWork(pickle.loads(self.flight), self.device, self.memory_budget)()
 
 
-class FlightDrawer:
-    """Draws pictures of a flight, whose splats stay on the device."""
+class FlightRenderer:
+    """Renderer of frames of a flight, whose splats stay on the device."""
 
     def __init__(self, work: FlightWork) -> None:
         self._flight = work.flight
@@ -77,7 +77,7 @@ class FlightDrawer:
         self.title = self._renderer.device.title
 
     def __call__(self, k: int) -> Files:
-        """The files of picture k."""
+        """The files of frame k."""
         flight = self._flight
         frame = self._renderer.render(self._resident, flight.captures[k])
         found: Files = {}
@@ -94,9 +94,9 @@ class FlightDrawer:
         return found
 
 
-def draw(folder: FlightFolder, engine: Engine, workers: int) -> Iterator[int]:
-    """Let workers draw what is left of a flight; yields the number of each picture once its files are whole
-    here. Raises FidsplatError as `drain` does."""
+def render_flight(folder: FlightFolder, engine: Engine, workers: int) -> Iterator[int]:
+    """Render the missing frames of a flight on workers; yields the number of each frame once its files are
+    complete here. Raises FidsplatError like `drain`."""
     for k, files in drain(engine, folder.left(), workers):
         for (name, suffix), content in _checked(files, k, folder.flight.capture.outputs).items():
             with atomic_write(folder.file(k, name, suffix)) as stream:
@@ -105,10 +105,10 @@ def draw(folder: FlightFolder, engine: Engine, workers: int) -> Iterator[int]:
 
 
 def _checked(files: Any, k: int, outputs: Sequence[str]) -> Files:
-    """What a worker sent of picture k. Raises FidsplatError for anything but the files of its outputs."""
-    wanted = {(name, suffix) for name in outputs for suffix in suffixes_of(name)}
-    whole = isinstance(files, dict) and files.keys() == wanted
-    if not whole or not all(isinstance(content, bytes) and content for content in files.values()):
+    """The files of frame k from a worker. Raises FidsplatError for anything else."""
+    expected = {(name, suffix) for name in outputs for suffix in suffixes_of(name)}
+    complete = isinstance(files, dict) and files.keys() == expected
+    if not complete or not all(isinstance(content, bytes) and content for content in files.values()):
         raise FidsplatError(
             f"the reply of a worker must be the files of the outputs of image {k}, got something else; "
             "install the same fidsplat there"

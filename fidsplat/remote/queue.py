@@ -1,4 +1,4 @@
-"""A queue of work for processes that may die: every item is done, none twice."""
+"""Work queue for processes that may die: every item is done exactly once."""
 
 from __future__ import annotations
 
@@ -9,43 +9,43 @@ from typing import Any, Protocol, TypeVar
 from fidsplat.util.errors import FidsplatError
 
 ATTEMPTS = 3
-"""workers that an item may lose before it is the item that is at fault"""
+"""number of lost workers after which an item counts as the cause"""
 
 Item = TypeVar("Item", bound=Hashable)
 
 
 class WorkerLost(Exception):
-    """The process that had an item is gone; its text says what is known of it."""
+    """The process of an item died; the text states what is known."""
 
 
 class Engine(Protocol):
-    """Starts workers and hands them items."""
+    """Starts workers and submits items to them."""
 
     def start(self) -> Any:
-        """A worker, which may still be on its way."""
+        """Start a worker; it may still be starting."""
         ...
 
     def submit(self, worker: Any, item: Any) -> Hashable:
-        """Give a worker an item; returns a ticket."""
+        """Submit an item to a worker; returns a ticket."""
         ...
 
     def wait(self, tickets: Sequence[Any]) -> Any:
-        """The first of them whose item is done, or whose worker is gone."""
+        """The first ticket whose item is done or whose worker died."""
         ...
 
     def result(self, ticket: Any) -> Any:
-        """What was made of a ticket's item.
+        """The result of a ticket's item.
 
         Raises:
             WorkerLost: its worker died.
-            FidsplatError: the item cannot be done, by no worker.
+            FidsplatError: no worker can do the item.
         """
         ...
 
 
 def drain(engine: Engine, items: Iterable[Item], workers: int) -> Iterator[tuple[Item, Any]]:
-    """Every item with what was made of it, in the order in which they are done. A worker has one item at a
-    time; where it dies another takes its place and its item.
+    """Yield every item with its result, in the order of completion. A worker has one item at a time; if it
+    dies, a new worker gets the item.
 
     Raises:
         FidsplatError: an item cannot be done, or has lost `ATTEMPTS` workers.
@@ -66,8 +66,7 @@ def drain(engine: Engine, items: Iterable[Item], workers: int) -> Iterator[tuple
             lost[item] += 1
             if lost[item] == ATTEMPTS:
                 raise FidsplatError(
-                    f"{item} has lost {ATTEMPTS} workers, the last of which: {error}; what was done before "
-                    "stays"
+                    f"{item} has lost {ATTEMPTS} workers, the last one: {error}; completed results are kept"
                 ) from error
             waiting.appendleft(item)
             continue

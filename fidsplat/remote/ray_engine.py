@@ -1,4 +1,4 @@
-"""Workers by Ray: actors on the machines of a cluster, each of which keeps what its items share."""
+"""Ray workers: actors on the machines of a cluster, each with the state that its items share."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.provenance import code_hash
 
 Make = Callable[[], Callable[[Any], Any]]
-"""plain data that a worker calls once; what it returns does an item"""
+"""picklable object that a worker calls once; the result is a function that does an item"""
 
 
 class Worker:
-    """What runs in a process of the cluster."""
+    """Worker in a process of the cluster."""
 
     def __init__(self) -> None:
         self._do: Callable[[Any], Any] | None = None
 
-    def title(self, make: Make, asked_by: tuple[str, str]) -> str:
-        """What draws here: `title` of what was made."""
-        return self._made(make, asked_by).title
+    def title(self, make: Make, caller: tuple[str, str]) -> str:
+        """Title of the device of this worker."""
+        return self._open(make, caller).title
 
-    def do(self, make: Make, asked_by: tuple[str, str], item: Any) -> tuple[str, str, Any]:
-        """This host, what draws here, and what was made of an item."""
-        made = self._made(make, asked_by)
-        return socket.gethostname(), made.title, made(item)
+    def do(self, make: Make, caller: tuple[str, str], item: Any) -> tuple[str, str, Any]:
+        """Host name, title of the device, and result of an item."""
+        work = self._open(make, caller)
+        return socket.gethostname(), work.title, work(item)
 
-    def _made(self, make: Make, asked_by: tuple[str, str]) -> Any:
+    def _open(self, make: Make, caller: tuple[str, str]) -> Any:
         if self._do is None:
-            if (here := identity()) != asked_by:
+            if (here := identity()) != caller:
                 raise InputError(
-                    f"the worker on {socket.gethostname()} has fidsplat {here[0]}, code {here[1]}, and this "
-                    f"is {asked_by[0]}, code {asked_by[1]}; install the same there"
+                    f"the worker on {socket.gethostname()} must have fidsplat {caller[0]}, code {caller[1]}, "
+                    f"got {here[0]}, code {here[1]}; install the same there"
                 )
             self._do = make()
         return self._do
 
 
 def identity() -> tuple[str, str]:
-    """Version and code of fidsplat here: workers must have the same, or their pictures would be others."""
+    """Version and code hash of fidsplat; workers must have the same, so that their images agree."""
     return __version__, code_hash()
 
 
 class RayEngine:
-    """As `Engine`.
+    """`Engine` of a Ray cluster.
 
     Args:
-        make: of what workers do; its result has a `title`, which must be the same everywhere.
-        workers: how many; None: one for each GPU of the cluster, else one for each machine.
+        make: called by each worker; the result has a `title`, which must be equal on all workers.
+        workers: number of workers; None for one per GPU of the cluster, else one per machine.
     """
 
     def __init__(self, make: Make, workers: int | None) -> None:
@@ -63,50 +63,50 @@ class RayEngine:
         gpus, cores = int(there.get("GPU", 0)), int(there.get("CPU", 0))
         machines = sum(node["Alive"] for node in ray.nodes())
         self.workers = workers or gpus or machines
-        # of what there are fewer of than workers several share one; what finds no place would wait for ever
+        # workers share cores and GPUs that are fewer, as an actor without its resources would wait forever
         self._actor = ray.remote(Worker).options(
             num_cpus=_share(cores, self.workers),
             num_gpus=_share(gpus, self.workers),
             max_restarts=0,
             scheduling_strategy="SPREAD",
         )
-        self._make, self._asked_by = ray.put(make), identity()
+        self._make, self._caller = ray.put(make), identity()
         self._actors: list[Any] = []
         self._spare: list[Any] = []
         first = self.start()
-        self.title: str = self._get(first.title.remote(self._make, self._asked_by))
-        """what draws"""
+        self.title: str = self._get(first.title.remote(self._make, self._caller))
+        """title of the device"""
         self._spare.append(first)
 
     def start(self) -> Any:
-        """A worker, which may still be on its way."""
+        """Start a worker; it may still be starting."""
         if self._spare:
             return self._spare.pop()
         self._actors.append(self._actor.remote())
         return self._actors[-1]
 
     def submit(self, worker: Any, item: Any) -> Any:
-        """Give a worker an item; returns a ticket."""
-        return worker.do.remote(self._make, self._asked_by, item)
+        """Submit an item to a worker; returns a ticket."""
+        return worker.do.remote(self._make, self._caller, item)
 
     def wait(self, tickets: Sequence[Any]) -> Any:
-        """The first of them that is done."""
+        """The first ticket that is done."""
         while not (done := _ray().wait(list(tickets), num_returns=1, timeout=interrupts.PERIOD)[0]):
             interrupts.check()
         return done[0]
 
     def result(self, ticket: Any) -> Any:
-        """What was made of a ticket's item. Raises WorkerLost, FidsplatError."""
+        """The result of a ticket's item. Raises WorkerLost or FidsplatError."""
         host, title, result = self._get(ticket)
         if title != self.title:
             raise InputError(
-                f"the worker on {host} draws with {title}, another with {self.title}, whose pictures differ "
-                "in their last bits; name one kind with --device"
+                f"all workers must render with {self.title}, as images of other devices differ in their last "
+                f"bits, got {title} on {host}; select one device with --device"
             )
         return result
 
     def close(self) -> None:
-        """Let the workers go."""
+        """Stop the workers."""
         for actor in self._actors:
             _ray().kill(actor)
 
@@ -121,23 +121,23 @@ class RayEngine:
             if isinstance(cause, FidsplatError):
                 raise cause from None
             raise FidsplatError(f"a worker failed with {type(cause).__name__}: {cause}") from error
-        except RayError as error:  # killed, for its memory too, or its machine is gone with what it had made
+        except RayError as error:  # killed, out of memory, or its machine is gone
             raise WorkerLost(" ".join(str(error).split())[:500]) from error
 
 
 def _share(count: int, workers: int) -> float:
-    """What of a core or a GPU a worker gets, so that all find a place."""
+    """Share of a core or GPU per worker, so that all workers can run."""
     return 1 / -(-workers // count) if count else 0
 
 
 @contextmanager
 def ray_engine(address: str, make: Make, workers: int | None = None) -> Iterator[RayEngine]:
-    """Workers of the cluster at an address: `local` starts one on this machine, `auto` is the one that runs
-    here, `ray://HOST:10001` or `HOST:6379` another.
+    """The workers of a cluster. `local` starts a cluster on this machine, `auto` uses the one that runs here,
+    `ray://HOST:10001` or `HOST:6379` another.
 
     Raises:
-        InputError: there is no such cluster, the extra `ray` is missing, workers have another fidsplat.
-        FidsplatError: workers die before they begin.
+        InputError: no such cluster, the extra `ray` is missing, or workers have another fidsplat.
+        FidsplatError: workers die while they start.
     """
     ray = _ray()
     own = not ray.is_initialized()
@@ -152,13 +152,14 @@ def ray_engine(address: str, make: Make, workers: int | None = None) -> Iterator
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             why = " ".join(str(error).split())[:300]
             raise InputError(
-                f"no Ray cluster at {address}: {why}; give --ray local, or ray://HOST:10001"
+                f"--ray must be the address of a Ray cluster, got {address}: {why}; for example local, or "
+                "ray://HOST:10001"
             ) from None
     try:
         try:
             engine = RayEngine(make, workers)
         except WorkerLost as error:
-            raise FidsplatError(f"a worker died before it began: {error}") from error
+            raise FidsplatError(f"a worker died while it started: {error}") from error
         try:
             yield engine
         finally:

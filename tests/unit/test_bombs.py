@@ -147,7 +147,7 @@ def test_images_that_small_files_declare(tmp_path, kind, data):
 @pytest.mark.parametrize("compression", ["lz4", "zstd"])
 def test_chunks_of_logs(tmp_path, monkeypatch, indexed, compression):
     writer = pytest.importorskip("mcap.writer", reason="pip install 'fidsplat[logs]'")
-    from fidsplat.logs import log_pictures
+    from fidsplat.logs import log_images
 
     kind = writer.CompressionType[compression.upper()]
     path, zeros = tmp_path / "a.mcap", bytes(2**20)
@@ -168,7 +168,7 @@ def test_chunks_of_logs(tmp_path, monkeypatch, indexed, compression):
     monkeypatch.setattr("fidsplat.util.limits.FLOOR", 2**22)
     monkeypatch.setattr("fidsplat.util.limits.RATIO", 1)
     with pytest.raises(fs.InputError, match=r"a\.mcap must expand to at most 4.*chunk"):
-        list(log_pictures(path))
+        list(log_images(path))
 
 
 def test_the_limit_follows_the_size_of_a_file_and_is_raised_by_the_environment(tmp_path, monkeypatch):

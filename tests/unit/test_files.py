@@ -124,14 +124,14 @@ def put_transforms(folder, pipe, **facts):
 
 
 def put_bag(folder, pipe, name):
-    from fidsplat.logs import log_pictures
+    from fidsplat.logs import log_images
 
     (folder / "bag").mkdir()
     if name != "metadata.yaml":
         facts = f"rosbag2_bagfile_information: {{relative_file_paths: [{name}]}}\n"
         (folder / "bag" / "metadata.yaml").write_text(facts)
     pipe.rename(folder / "bag" / name)
-    return next(log_pictures(folder / "bag"))
+    return next(log_images(folder / "bag"))
 
 
 def put_colmap(folder, pipe, name):
@@ -154,9 +154,9 @@ def put_store(folder, pipe, name):
 
 
 def in_logs(folder, pipe):
-    from fidsplat.logs import log_pictures
+    from fidsplat.logs import log_images
 
-    return next(log_pictures(pipe))
+    return next(log_images(pipe))
 
 
 def renamed(suffix, read):
@@ -265,11 +265,11 @@ def write_avi(file):
 
 
 def test_a_bag_with_a_name_that_is_not_utf8(tmp_path):
-    from fidsplat.logs import RobotLog, log_pictures
+    from fidsplat.logs import RobotLog, log_images
 
     with RobotLog(tmp_path / ODD) as log:
         log.image(0.5, "front", np.zeros((4, 5, 3)))
-    assert [one.image.shape for one in log_pictures(tmp_path / ODD)] == [(4, 5, 3)]
+    assert [one.image.shape for one in log_images(tmp_path / ODD)] == [(4, 5, 3)]
 
 
 def test_pages_and_charts_of_names_that_are_not_utf8(tmp_path):
@@ -328,7 +328,7 @@ def test_a_pose_beyond_all_numbers_is_an_input_error(tmp_path, value):
     matrix = [[1, 0, 0, 7], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     text = json.dumps({"frames": [{"file_path": "a.png", "transform_matrix": matrix}]})
     (tmp_path / "transforms.json").write_text(text.replace("7", value))
-    with pytest.raises(InputError, match=r"frame 0 needs .* 4 x 4 finite numbers"):
+    with pytest.raises(InputError, match=r"frame 0 must have .* 4 x 4 finite numbers"):
         load_dataset(tmp_path)
 
 
@@ -350,7 +350,7 @@ def test_an_array_of_usd_that_is_damaged_is_an_input_error(tmp_path):
 
 def test_a_bag_that_names_a_file_outside_of_it(tmp_path):
     """The file of that name within the bag is meant, or none."""
-    from fidsplat.logs import RobotLog, log_pictures
+    from fidsplat.logs import RobotLog, log_images
 
     for name in ("bag", "other"):
         with RobotLog(tmp_path / name) as log:
@@ -359,4 +359,4 @@ def test_a_bag_that_names_a_file_outside_of_it(tmp_path):
     note = tmp_path / "bag" / "metadata.yaml"
     note.write_text(note.read_text().replace("bag.db3", "../other.db3"))
     with pytest.raises(InputError, match=r"cannot read .*bag/other\.db3"):
-        next(log_pictures(tmp_path / "bag"))
+        next(log_images(tmp_path / "bag"))

@@ -182,7 +182,7 @@ def test_a_flight_that_was_stopped_after_its_log_goes_on(here, capsys, monkeypat
     assert _bytes_of(here / name) == first
     capsys.readouterr()
     assert fly("--times", "0,0.5", "--log", name, "-o", "other") == 2
-    assert f"{name} is there already" in capsys.readouterr().err
+    assert f"{name} already exists" in capsys.readouterr().err
     assert not (here / "other").exists()
     assert _bytes_of(here / name) == first
 
@@ -256,7 +256,7 @@ def test_a_log_and_the_truth_beside_the_pictures(here):
     logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
     words = ("--rate", "2", "--outputs", "rgb,label", "--log", "run.mcap", "--coco", "truth.json")
     assert fly(*words) == 0
-    pictures = list(logs.log_pictures("run.mcap"))
+    pictures = list(logs.log_images("run.mcap"))
     assert [one.name for one in pictures] == [f"/camera/image_raw {t:.3f} s" for t in (0, 0.5, 1)]
     np.testing.assert_array_equal(pictures[1].image, read_image("out/rgb/000001.png"))
     truth = json.loads((here / "truth.json").read_text())
@@ -306,7 +306,7 @@ def test_a_video_has_every_picture(here):
         (["--memory-budget", "lots"], "--memory-budget must be a number of bytes above 0, got 'lots'"),
         (["--trajectory", "none.tum"], "cannot read none.tum"),
         (["--times", "0,1", "--rate", "-1"], "the rate is -1.0; give a number"),
-        (["--log", "poses.tum"], "poses.tum is there already"),
+        (["--log", "poses.tum"], "poses.tum already exists"),
         (["--coco", "."], "got the folder ."),
     ],
 )

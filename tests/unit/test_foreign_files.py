@@ -123,8 +123,8 @@ PIXELS = RANDOM.integers(0, 256, (5, 7, 4), np.uint8)
 def test_encodings_of_pictures_in_a_bag_of_rosbags(tmp_path, encoding, order):
     """Rows longer than their pixels, too."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="pip install 'fidsplat[logs]'")
-    from fidsplat.logs import log_pictures
-    from fidsplat.logs.files import typestore
+    from fidsplat.logs import log_images
+    from fidsplat.logs.writers import typestore
 
     store = typestore()
     header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](3, 7), "eye")
@@ -133,7 +133,7 @@ def test_encodings_of_pictures_in_a_bag_of_rosbags(tmp_path, encoding, order):
     with rosbag2.Writer(tmp_path / "bag", version=9) as bag:
         connection = bag.add_connection("/eye", message.__msgtype__, typestore=store)
         bag.write(connection, 10, store.serialize_cdr(message, message.__msgtype__))
-    (found,) = log_pictures(tmp_path / "bag")
+    (found,) = log_images(tmp_path / "bag")
     wanted = PIXELS[..., [0, 0, 0]] if encoding == "mono8" else PIXELS[..., :3]
     np.testing.assert_array_equal(found.image, wanted)
     assert (found.frame, found.stamp) == ("eye", 3_000_000_007)
@@ -143,12 +143,12 @@ def test_encodings_of_pictures_in_a_bag_of_rosbags(tmp_path, encoding, order):
 def test_stamps_are_the_nearest_nanosecond(tmp_path, time):
     """As floats times 1e9 these are just below it; a nanosecond less would be another time."""
     pytest.importorskip("rosbags.rosbag2", reason="pip install 'fidsplat[logs]'")
-    from fidsplat.logs import RobotLog, log_pictures, log_poses
+    from fidsplat.logs import RobotLog, log_images, log_poses
 
     with RobotLog(tmp_path / "a.mcap") as log:
         log.image(time, "eye", np.zeros((2, 2, 3)))
         log.transform(time, "eye", np.eye(4))
-    (found,) = log_pictures(tmp_path / "a.mcap")
+    (found,) = log_images(tmp_path / "a.mcap")
     milliseconds = round(time * 1000)
     assert found.stamp == milliseconds * 10**6
     assert list(log_poses(tmp_path / "a.mcap")) == [("eye", milliseconds * 10**6)]

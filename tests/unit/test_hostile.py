@@ -285,9 +285,9 @@ def use_picture(file):
 
 
 def use_log(path):
-    from fidsplat.logs import log_pictures, log_poses
+    from fidsplat.logs import log_images, log_poses
 
-    for _ in log_pictures(path):
+    for _ in log_images(path):
         pass
     log_poses(path)
 

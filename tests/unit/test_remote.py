@@ -8,7 +8,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.remote.flights import FlightWork, draw
+from fidsplat.remote.flights import FlightWork, render_flight
 from fidsplat.remote.queue import ATTEMPTS, WorkerLost, drain
 from fidsplat.remote.ray_engine import _share
 from fidsplat.render.flight import Flight, FlightFolder
@@ -65,7 +65,7 @@ def test_there_are_no_more_workers_than_items():
 def test_an_item_that_kills_its_workers_is_named():
     dies = [(worker, 1) for worker in range(1, 9)]
     engine = Here(dies=dies)
-    with pytest.raises(fs.FidsplatError, match=f"7 has lost {ATTEMPTS} workers, the last of which: killed"):
+    with pytest.raises(fs.FidsplatError, match=f"7 has lost {ATTEMPTS} workers, the last one: killed"):
         list(drain(engine, [7], workers=1))
     assert engine.started == ATTEMPTS
 
@@ -98,12 +98,12 @@ def test_pictures_come_back_as_the_files_that_one_process_writes(tmp_path):
     assert work.title == renderer.device.title
     folder = FlightFolder(tmp_path / "many", flown, work.title)
     folder.file(3, "rgb", ".png").write_bytes(alone.file(3, "rgb", ".png").read_bytes())
-    drawn = list(draw(folder, Here(work, dies=[(1, 2), (3, 1)]), 2))
+    drawn = list(render_flight(folder, Here(work, dies=[(1, 2), (3, 1)]), 2))
     assert sorted(drawn) == [0, 1, 2, 3, 4]  # of picture 3 the depth was missing
     files = {file.relative_to(alone.folder): file.read_bytes() for file in alone.folder.glob("*/*")}
     assert len(files) == 5 * 4  # rgb, and of depth an array and two pictures
     assert {file.relative_to(folder.folder): file.read_bytes() for file in folder.folder.glob("*/*")} == files
-    assert list(draw(folder, Here(work), 2)) == []
+    assert list(render_flight(folder, Here(work), 2)) == []
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_replies_that_are_no_files_of_the_image(tmp_path, reply):
     folder = FlightFolder(tmp_path / "flight", flight(), "a device")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(fs.FidsplatError, match="reply of a worker must be the files of the outputs of image"):
-        list(draw(folder, Here(lambda _: reply), 2))
+        list(render_flight(folder, Here(lambda _: reply), 2))
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -149,11 +149,11 @@ def test_workers_read_stores_where_they_are_here(tmp_path):
     ours, here = pickle.loads(sent)()(2), FlightWork(flown, "reference")()(2)
     assert ours == here
     store.path.rename(tmp_path / "b.fss")
-    with pytest.raises(fs.InputError, match=r"a disk that they share, and on .*a\.fss is not a store"):
+    with pytest.raises(fs.InputError, match=r"must share the disk of stores, and on .*a\.fss is not a store"):
         pickle.loads(sent)()
     fs.save_ply(fs.marker("aruco:4x4_50:3", size=0.4, mixture="fitted").cloud, tmp_path / "a.ply")
     fs.build_store([tmp_path / "a.ply"], tmp_path / "a.fss")
-    with pytest.raises(fs.InputError, match=r"a\.fss is another store than here"):
+    with pytest.raises(fs.InputError, match=r"a\.fss on .* must be the same store as here"):
         pickle.loads(sent)()
 
 
@@ -161,7 +161,7 @@ def test_words_that_cannot_be_used(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words in (("--workers", "2"), ("--ray", "local", "--workers", "0")):
         assert main(["fly", "none.toml", *words]) == 2
-        assert "give at least 1, and --ray ADDRESS" in capsys.readouterr().err
+        assert "must be at least 1, with --ray ADDRESS" in capsys.readouterr().err
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     from fidsplat.remote.ray_engine import ray_engine
 

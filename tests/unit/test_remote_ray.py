@@ -7,7 +7,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments.sweep import read_records
 from fidsplat.remote import ray_engine as module
-from fidsplat.remote.flights import FlightWork, draw
+from fidsplat.remote.flights import FlightWork, render_flight
 from fidsplat.remote.queue import WorkerLost
 from fidsplat.remote.ray_engine import ray_engine
 from fidsplat.render.flight import Flight, FlightFolder
@@ -39,7 +39,7 @@ def test_a_worker_that_is_killed_costs_no_picture_and_none_is_drawn_twice(tmp_pa
     with ray_engine("local", FlightWork(flown, "reference"), workers=3) as engine:  # of two cores
         folder = FlightFolder(tmp_path / "many", flown, engine.title)
         drawn = []
-        for k in draw(folder, engine, engine.workers):
+        for k in render_flight(folder, engine, engine.workers):
             drawn.append(k)
             if len(drawn) == 3:
                 ray.kill(engine._actors[0])

@@ -1,4 +1,4 @@
-"""RobotLog: pictures, poses and detections as ROS 2 messages."""
+"""RobotLog: images, poses and detections as ROS 2 messages."""
 
 from __future__ import annotations
 
@@ -12,28 +12,27 @@ import numpy as np
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
 from fidsplat.effects import IMAGES
 from fidsplat.images.files import encoded, pixels_of, to_uint8
-from fidsplat.logs.files import log_file, typestore
+from fidsplat.logs.writers import log_file, typestore
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.util.arguments import instance, invalid, items, number, real_array, text
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.vision.detect import Detection
 
 PIXEL = 0.5
-"""what ROS and OpenCV count less than we do: the centre of their first pixel is at 0"""
+"""offset to the pixel coordinates of ROS and OpenCV, whose first pixel centre is at 0"""
 
 
 class RobotLog:
-    """A log that is written message by message, NAME.mcap or a rosbag2 folder (SQLite), for `with`.
+    """A log that is written message by message, NAME.mcap or a rosbag2 folder (SQLite); a context manager.
 
-    Times are seconds, of each topic not decreasing. What is written appears under its name when the block
-    ends; if it ends with an error, nothing does.
+    Times are in seconds and must not decrease within a topic. The log appears when the block ends without an
+    error.
 
     Args:
-        path: NAME.mcap, or a folder to be made.
-        world: name of the frame in which poses are.
-        overwrite: whether a log of that name is replaced.
-        source: text that identifies what the log is made from, kept in its metadata, by which `check_log`
-            finds that it is complete.
+        path: NAME.mcap, or a new folder.
+        world: name of the reference frame of poses.
+        overwrite: whether an existing log is replaced.
+        source: identifies the source of the log in its metadata, so that `check_log` recognises it.
 
     Raises:
         InputError: the log exists, cannot be written, or the packages are missing (extra `logs`).
@@ -67,10 +66,10 @@ class RobotLog:
         """An output image as `/CAMERA/image_raw`, or `/CAMERA/OUTPUT/image_raw` for all but rgb: rgb8, 32FC1,
         32FC3 or 32SC1.
 
-        compress: "jpeg" or "png" for `/CAMERA/image_raw/compressed` instead, of rgb alone.
+        compress: "jpeg" or "png" writes rgb as `/CAMERA/image_raw/compressed` instead.
 
         Raises:
-            InputError: a time before the last, a compression that nobody knows.
+            InputError: a time before the last, an unknown compression.
         """
         text("output", output)
         pixels = pixels_of(image)
@@ -80,7 +79,7 @@ class RobotLog:
         if compress is not None:
             if not isinstance(compress, str) or compress not in ("jpeg", "png") or output != "rgb":
                 raise InputError(
-                    f"compress is {compress!r} for {output}; rgb alone is compressed, as 'jpeg' or 'png'"
+                    f"compress must be 'jpeg' or 'png', for rgb only, got {compress!r} for {output}"
                 )
             data = np.frombuffer(encoded(pixels, compress), np.uint8)
             message = self._of("sensor_msgs/msg/CompressedImage")(self._header(time, camera), compress, data)
@@ -106,7 +105,7 @@ class RobotLog:
         equidistant.
 
         Raises:
-            InputError: a lens that ROS does not know.
+            InputError: a lens without a ROS model.
         """
         model, factors = _distortion(instance("camera", camera, Camera))
         k = camera.matrix - [[0, 0, PIXEL], [0, 0, PIXEL], [0, 0, 0]]
@@ -118,8 +117,8 @@ class RobotLog:
         self._write(f"/{name}/camera_info", time, message)
 
     def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
-        """Where a frame is, parent from frame (4, 4), as `/tf`; the parent is the world by default. A
-        camera's frame has OpenCV's axes, as ROS's optical frames have."""
+        """Pose of a frame in its parent (4, 4), by default the world, as `/tf`. A camera's frame has OpenCV's
+        axes, like ROS's optical frames."""
         position, turn = self._pose_parts(f"the pose of {text('the name of a frame', frame)}", pose)
         made = self._of("geometry_msgs/msg/Transform")(self._of("geometry_msgs/msg/Vector3")(*position), turn)
         stamped = self._of("geometry_msgs/msg/TransformStamped")(
@@ -128,11 +127,11 @@ class RobotLog:
         self._write("/tf", time, self._of("tf2_msgs/msg/TFMessage")([stamped]))
 
     def odometry(
-        self, time: float, pose: Any, velocity: Any = (0, 0, 0), turning: Any = (0, 0, 0),
+        self, time: float, pose: Any, velocity: Any = (0, 0, 0), angular_velocity: Any = (0, 0, 0),
         frame: str = "base_link", topic: str = "/odom", covariance: Any = None,
     ) -> None:  # fmt: skip
-        """World from body (4, 4), with velocities (3,) in metres and radians a second in the body's axes, and
-        the pose's covariance (6, 6)."""
+        """Pose of the body in the world (4, 4), velocities (3,) in m/s and rad/s in the body's axes, and the
+        covariance of the pose (6, 6)."""
         position, turn = self._pose_parts("the pose of odometry", pose)
         spread = np.zeros((6, 6)) if covariance is None else real_array("covariance", covariance)
         if spread.shape != (6, 6):
@@ -141,7 +140,7 @@ class RobotLog:
         vector, point = self._of("geometry_msgs/msg/Vector3"), self._of("geometry_msgs/msg/Point")
         body = self._of("geometry_msgs/msg/Pose")(point(*position), turn)
         twist = self._of("geometry_msgs/msg/Twist")(
-            vector(*_three("velocity", velocity)), vector(*_three("turning", turning))
+            vector(*_three("velocity", velocity)), vector(*_three("angular_velocity", angular_velocity))
         )
         message = self._of("nav_msgs/msg/Odometry")(
             self._header(time, self.world),
@@ -152,22 +151,28 @@ class RobotLog:
         self._write(topic, time, message)
 
     def imu(
-        self, time: float, turning: Any, acceleration: Any = None, frame: str = "imu", topic: str = "/imu"
+        self,
+        time: float,
+        angular_velocity: Any,
+        acceleration: Any = None,
+        frame: str = "imu",
+        topic: str = "/imu",
     ) -> None:
-        """Angular velocity (3,) radians and acceleration (3,) metres a second (squared), None where it was
-        not measured; without orientation."""
+        """Angular velocity (3,) in rad/s and acceleration (3,) in m/s^2, None if not measured; without
+        orientation."""
         vector, none = self._of("geometry_msgs/msg/Vector3"), np.zeros(9)
-        unknown = np.array([-1.0, *np.zeros(8)])  # what ROS takes as: no such reading
+        unknown = np.array([-1.0, *np.zeros(8)])  # ROS's value for a missing reading
         message = self._of("sensor_msgs/msg/Imu")(
             self._header(time, frame), self._of("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0),
-            unknown, vector(*_three("turning", turning)), none,
+            unknown, vector(*_three("angular_velocity", angular_velocity)), none,
             vector(*_three("acceleration", (0, 0, 0) if acceleration is None else acceleration)),
             unknown if acceleration is None else none,
         )  # fmt: skip
         self._write(topic, time, message)
 
     def detections(self, time: float, camera: str, found: Iterable[Detection]) -> None:
-        """Tags of a picture as `/CAMERA/detections` (apriltag_msgs); a QR code's family is its payload."""
+        """Detections in an image as `/CAMERA/detections` (apriltag_msgs); the family of a QR code is its
+        payload."""
         point, tag = (self._of(f"apriltag_msgs/msg/{name}") for name in ("Point", "AprilTagDetection"))
         tags = []
         for code in items("found", found, Detection, "a list of Detection"):
@@ -195,8 +200,8 @@ class RobotLog:
         text("topic", topic)
         if time < self._last.get(topic, -math.inf):
             raise InputError(
-                f"{topic} jumps back in time, from {self._last[topic]:g} s to {time:g} s; a simulator that "
-                "was reset needs a log of its own"
+                f"the time of {topic} must be at least {self._last[topic]:g} s, got {time:g} s; a simulator "
+                "that was reset needs a new log"
             )
         self._last[topic] = time
         kind = message.__msgtype__
@@ -222,7 +227,7 @@ def _nanoseconds(time: float) -> int:
 def _three(name: str, value: Any) -> list[float]:
     numbers = real_array(name, value, "three numbers")
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise InputError(f"{name} must be three finite numbers, not {value!r}")
+        raise invalid(name, "three finite numbers", value)
     return numbers.tolist()
 
 

@@ -1,4 +1,4 @@
-"""Where messages go: an MCAP file, or a rosbag2 folder, whole or not at all."""
+"""Writers of MCAP files and rosbag2 folders. An incomplete log is never left behind."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ _APRILTAG = {
     ),
     "AprilTagDetectionArray": "std_msgs/Header header\napriltag_msgs/AprilTagDetection[] detections",
 }
-"""messages of https://github.com/christianrauch/apriltag_msgs"""
+"""message definitions of https://github.com/christianrauch/apriltag_msgs"""
 
 
 def typestore() -> Any:
-    """The messages of ROS 2 Jazzy, and those of apriltag_msgs."""
+    """Message types of ROS 2 Jazzy and apriltag_msgs."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _APRILTAG.items():
         store.register(get_types_from_msg(text, f"apriltag_msgs/msg/{name}"))
@@ -44,14 +44,14 @@ def typestore() -> Any:
 
 
 class LogFile(Protocol):
-    """Takes messages; on disk once it is closed."""
+    """Writer of messages; the log appears when it is closed."""
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
-        """A message, as CDR. kind: its type. time: nanoseconds."""
+        """Write a message of a type (kind) as CDR, at a time in nanoseconds."""
         ...
 
     def close(self, keep: bool) -> None:
-        """Put it in its place, or throw it away."""
+        """Complete the log, or discard it."""
         ...
 
 
@@ -60,10 +60,10 @@ _METADATA = "fidsplat.source"
 
 
 def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool, source: str) -> LogFile:
-    """NAME.mcap for a file, any other name for a rosbag2 folder. source: as `RobotLog`.
+    """A writer of an MCAP file for NAME.mcap, else of a rosbag2 folder. source: see `RobotLog`.
 
     Raises:
-        InputError: it is there and is not to be overwritten, or cannot be written.
+        InputError: the log exists and may not be overwritten, or cannot be written.
     """
     target = _target(path, overwrite)
     try:
@@ -73,8 +73,7 @@ def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool, source: 
 
 
 def check_log(path: str | os.PathLike[str], overwrite: bool, source: str) -> bool:
-    """Check before long work that a log can be written; returns whether it is there already, complete and of
-    the same source. Raises InputError when it cannot be written."""
+    """Whether a complete log of the same source exists. Raises InputError if the log cannot be written."""
     if not overwrite and source and _source_of(path_of(path)) == source:
         return True
     writable_folder(_target(path, overwrite).parent)
@@ -82,7 +81,7 @@ def check_log(path: str | os.PathLike[str], overwrite: bool, source: str) -> boo
 
 
 def _source_of(path: Path) -> str | None:
-    """The source of a log that was written with one; None for anything else."""
+    """The source in the metadata of a log; None for anything else."""
     try:
         if path.is_dir():
             return bag_metadata(path)["custom_data"][_METADATA]
@@ -90,7 +89,7 @@ def _source_of(path: Path) -> str | None:
             with path.open("rb") as stream:
                 found = make_reader(stream).iter_metadata()
                 return next((one.metadata["source"] for one in found if one.name == _METADATA), None)
-    except Exception:  # of two packages with errors of their own: no log
+    except Exception:  # the errors of two packages: not a readable log
         pass
     return None
 
@@ -98,16 +97,16 @@ def _source_of(path: Path) -> str | None:
 def _target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     target = path_of(path)
     if target.exists() and not overwrite:
-        raise InputError(f"{target} is there already; give another name, or overwrite it (--overwrite)")
+        raise InputError(f"{target} already exists; give another name, or --overwrite")
     if target.exists() and target.is_dir() != (target.suffix != ".mcap"):
-        raise InputError(f"{target} is no log; give another name")
+        raise InputError(f"{target} exists and must be a log to be overwritten; give another name")
     if target.is_dir() and not (target / "metadata.yaml").exists():
-        raise InputError(f"{target} is a folder without metadata.yaml, no bag; give another name")
+        raise InputError(f"{target} must have metadata.yaml to be overwritten as a bag; give another name")
     return target
 
 
 class _Dropped(Exception):
-    """A log is thrown away."""
+    """Discards a log."""
 
 
 class _McapFile:
@@ -143,7 +142,7 @@ class _Bag:
     def __init__(self, target: Path, store: Any, source: str) -> None:
         self._target, self._store = target, store
         self._folder = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent))
-        # rosbags takes "?", "#" and "%" in a path for those of a URI
+        # rosbags interprets "?", "#" and "%" in a path as parts of a URI
         self._link = tempfile.TemporaryDirectory()
         link = Path(self._link.name, "link")
         link.symlink_to(self._folder.absolute())
@@ -156,7 +155,7 @@ class _Bag:
         self._connections: dict[str, Any] = {}
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
-        with _sqlite_says():
+        with _sqlite_errors():
             if topic not in self._connections:
                 self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
             self._writer.write(self._connections[topic], time, data)
@@ -164,13 +163,13 @@ class _Bag:
     def close(self, keep: bool) -> None:
         try:
             if keep:
-                with _sqlite_says():
+                with _sqlite_errors():
                     self._writer.close()
                 if self._target.exists():
                     self._target.rename(self._folder / "before")
                 self._made.rename(self._target)
             else:
-                with suppress(Exception):  # what went wrong is known already
+                with suppress(Exception):  # the first error is reported
                     self._writer.close()
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -178,8 +177,8 @@ class _Bag:
 
 
 @contextmanager
-def _sqlite_says() -> Iterator[None]:
-    """What SQLite cannot write as OSError; its errors are those of the package by which rosbags has it."""
+def _sqlite_errors() -> Iterator[None]:
+    """Convert errors of the SQLite package of rosbags to OSError."""
     try:
         yield
     except OSError:
