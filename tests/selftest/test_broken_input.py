@@ -1,5 +1,5 @@
 """Broken values: left out and counted when a cloud is made, culled when they reach a kernel all the same, and
-never a trace in the picture.
+never a trace in the spec.
 """
 
 import warnings
@@ -45,7 +45,7 @@ def test_each_broken_value_is_counted_under_its_reason(name):
 
 
 def test_all_broken_values_at_once(renderer):
-    """One copy of the victim for each broken value, among good splats: the picture of the good ones."""
+    """One copy of the victim for each broken value, among valid splats: the image of the valid ones."""
     cloud = crowd()
     bad = [arrays for _, arrays in broken_fields(cloud)]
     arrays = {name: getattr(cloud, name) for name in BROKEN}
@@ -91,14 +91,14 @@ UNCHECKED = {
 def test_kernels_cull_what_no_cloud_should_hold(renderer, name):
     """numerics E1: comparisons are written so that a NaN fails them. The checks are gone round on purpose."""
     cloud = crowd()
-    wanted = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS)
+    expected = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS)
     for value in UNCHECKED[name]:
         for k in range(max(getattr(cloud, name)[VICTIM].size, 1)):
             array = getattr(cloud, name).copy()
             array[(VICTIM, k) if array.ndim > 1 else VICTIM] = value
             frame = renderer.render(cloud._replaced(**{name: array}), VIEW, ALL_OUTPUTS)
-            assert same_bits(frame, wanted), f"{name}[{k}] = {value}"
-            assert frame.stats["visible"] == wanted.stats["visible"]
+            assert same_bits(frame, expected), f"{name}[{k}] = {value}"
+            assert frame.stats["visible"] == expected.stats["visible"]
 
 
 def test_kernels_cull_a_zero_quaternion(renderer):
@@ -121,13 +121,13 @@ def test_minus_zero_is_zero(renderer):
 def test_splats_that_cannot_be_seen_leave_no_trace(renderer):
     """Opacity 0, -0, denormal, and below the cut-off: good splats that are not drawn."""
     cloud = crowd()
-    wanted = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS, CATALOGUED)
+    expected = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS, CATALOGUED)
     for opacity in (0.0, -0.0, 1e-45, 1e-30, 0.0039):
         kept = corrupted(cloud, {"opacities": opacity})
         frame = renderer.render(kept, VIEW, ALL_OUTPUTS, CATALOGUED)
         assert len(kept) == len(cloud)
-        assert same_bits(frame, wanted)
-        assert frame.stats["visible"] == wanted.stats["visible"]
+        assert same_bits(frame, expected)
+        assert frame.stats["visible"] == expected.stats["visible"]
 
 
 def write_rows(path, rows):
@@ -139,7 +139,7 @@ def write_rows(path, rows):
 
 
 def test_all_zero_rows_of_a_file_are_left_out_and_counted(tmp_path, renderer):
-    """A row of zeros reads as a scale of e^0 = 1 m and an opacity of 1/2: it would fill the picture."""
+    """A row of zeros reads as a scale of e^0 = 1 m and an opacity of 1/2: it would fill the image."""
     cloud = crowd()
     fs.save_ply(cloud, tmp_path / "good.ply")
     with warnings.catch_warnings():

@@ -12,7 +12,7 @@ SIZES = {"A": 7, "B": 8, "C": 4, "D": 5, "E": 5, "F": 6, "G": 5}
 
 @pytest.mark.parametrize("case", all_cases(), ids=lambda case: case.name)
 def test_case(renderer, case, monkeypatch):
-    """All its pictures agree with the reference, and all its findings hold."""
+    """All its specs agree with the reference, and all its findings hold."""
     monkeypatch.setattr(check, "reference_images", reference_images)  # each drawn once for all devices
     result, _ = check.run_case(renderer, case)
     assert result.wrong == []

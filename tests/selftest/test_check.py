@@ -20,12 +20,12 @@ from fidsplat.util.errors import DeviceError
 CLOUD = random_splats(40, seed=41, depth=(1.0, 4.0), scale=(0.02, 0.5))
 
 
-def pictures():
+def specs():
     yield FrameSpec(CLOUD, camera(40, 30, 40.0), outputs=("rgb", "alpha", "depth"))
 
 
 def good(renderer):
-    yield from pictures()
+    yield from specs()
     yield Finding("a number", 1.0, 1.0)
 
 
@@ -114,7 +114,7 @@ def test_certificates_are_small_where_nothing_is_hard():
 
 
 def test_certificates_name_what_single_precision_cannot_decide():
-    # a needle 1e-4 px wide across the picture, through pixel centres; a splat at the cut-off; a tie
+    # a needle 1e-4 px wide across the image, through pixel centres; a splat at the cut-off; a tie
     needle = splats([[0.00625, 0.00625, 1]], rotation((0, 0, 1), 45), (0.4, 1.25e-6))
     faint = splats([[0.00625, 0.00625, 1]], (1, 0, 0, 0), 0.2, np.float32(1 / 255) * (1 + 1e-6))
     tie = splats([[0, 0, 1], [0, 0, 2]], (1, 0, 0, 0), 50.0, [0.5, 1.0], labels=[1, 2])
@@ -131,8 +131,8 @@ def test_certificates_name_what_single_precision_cannot_decide():
 def test_too_many_uncertain_pixels_fail(renderer, monkeypatch):
     reference_images = check.reference_images
 
-    def uncertain(picture):
-        truth = reference_images(picture)
+    def uncertain(spec):
+        truth = reference_images(spec)
         return truth | {"certificate": truth["certificate"] + 0.06}
 
     monkeypatch.setattr(check, "reference_images", uncertain)

@@ -48,8 +48,8 @@ def test_the_scenes_are_hard():
     edge_on = near = total = grouped = tilted = 0
     largest, smallest, counts, flat, opacities = 0.0, np.inf, [], 1.0, set()
     for seed in range(150):
-        picture = fuzz.scene_of(seed)
-        cloud, view = picture.cloud, picture.camera
+        spec = fuzz.scene_of(seed)
+        cloud, view = spec.cloud, spec.camera
         turn = view.world_to_camera[:3, :3]
         p = cloud.means @ turn.T
         axes = turn @ quaternion_to_matrix(cloud.quats)
@@ -111,8 +111,8 @@ def test_a_failing_seed_is_named(renderer, monkeypatch):
     class Wrong(dict):
         """Images of a device that is off by a little where it is sure."""
 
-    def wrong(one, picture):
-        frame = render(one, picture)
+    def wrong(one, spec):
+        frame = render(one, spec)
         return Wrong({name: frame[name] + (1e-3 if name == "alpha" else 0) for name in frame})
 
     render = fuzz.render

@@ -16,8 +16,8 @@ def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
     camera = inputs.sized(width, height)
     generator = np.random.default_rng(0)
     pixels = generator.integers(0, height, 200), generator.integers(0, width, 200)
-    picture = FrameSpec(cloud, camera)
-    truth, frame = reference_images(picture, pixels), render(renderer, picture)
+    spec = FrameSpec(cloud, camera)
+    truth, frame = reference_images(spec, pixels), render(renderer, spec)
     for name in ("rgb", "alpha"):
         error = np.abs(frame[name][pixels] - truth[name])
         error = error.max(-1) if error.ndim > 1 else error
@@ -32,14 +32,14 @@ def opencl(renderer):
 
 @pytest.mark.parametrize("budget", [None, 40])
 def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, budget):
-    """E3: a picture of more than 2^32 pairs keeps its places modulo 2^32. The places of a small one are moved
+    """E3: a frame of more than 2^32 pairs has list offsets modulo 2^32. The offsets of a small one are moved
     up until they wrap amid its tiles.
     """
     from fidsplat.backends.opencl import probe, tiling
 
     backend = opencl(renderer)
     cloud = random_splats(60, seed=46, depth=(1.0, 4.0), scale=(0.05, 0.4))
-    wanted = renderer.render(cloud, inputs.VIEW, ("rgb", "depth"))
+    expected = renderer.render(cloud, inputs.VIEW, ("rgb", "depth"))
     stage = {"ordered": "count_pairs", "tiled": "start_lists"}[backend.shape.lists]
     original = getattr(tiling, stage)
 
@@ -54,7 +54,7 @@ def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, bud
     monkeypatch.setattr(tiling, stage, moved)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     frame = renderer.render(cloud, inputs.VIEW, ("rgb", "depth"))
-    assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+    assert all(np.array_equal(frame[name], expected[name]) for name in frame)
 
 
 def test_a_buffer_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer):

@@ -1,4 +1,4 @@
-"""Group C: order, ties and keys."""
+"""Cases of group C: depth order, ties and sort keys."""
 
 import math
 
@@ -26,13 +26,13 @@ from fidsplat.selftest.order import (
 
 @pytest.mark.parametrize("away", [0.0, 1.0])
 def test_fronto_parallel_splats_do_tie(renderer, away):
-    """numerics C1: rounding leaves few depths to 200 splats; otherwise the case decides nothing."""
+    """Case C1 requires ties: rounding leaves few distinct depths of 200 splats."""
     keys = trace(renderer, order.fronto_parallel(away))["keys"]
     assert len(np.unique(keys)) < 50
 
 
-def test_a_tag_jumps_only_where_depth_decides(renderer):
-    """Face to face, half of the depths change places within one step of 1e-4 degrees."""
+def test_a_tag_jumps_only_in_centre_order(renderer):
+    """Fronto-parallel, half of the depths change order within one step of 1e-4 degrees."""
     cloud = tag()
     before = largest_jump(renderer, camera_path(cloud, "centre", steps=2))[0]
     after = largest_jump(renderer, camera_path(cloud, "auto", steps=2))[0]
@@ -40,8 +40,8 @@ def test_a_tag_jumps_only_where_depth_decides(renderer):
     assert after < 1e-4
 
 
-def test_a_tag_before_a_wall_does_not_jump(renderer):
-    """Ten times the step of the aim, and nothing but edges moves."""
+def test_a_tag_in_front_of_a_wall_does_not_jump(renderer):
+    """With ten times the step, only edges move."""
     cloud = order.tag_before_wall(2000)
     for tilt in (0.0, 30.0, 60.0):
         before, after = (
@@ -53,38 +53,37 @@ def test_a_tag_before_a_wall_does_not_jump(renderer):
 
 
 @pytest.mark.parametrize("name", ["crossing", "fan"])
-def test_splats_that_cross_do_not_jump(renderer, name):
-    """Every splat by itself is what its picture alone shows, composited in the order of depths there."""
+def test_intersecting_splats_equal_their_composited_images(renderer, name):
+    """Images of single splats, composited by depth at each pixel, equal the image of all."""
     cloud = getattr(order, name)(30)
     view = Camera.pinhole(40, 30, 40.0, 40.0, 20.0, 15.0)
-    got, wanted = composited_parts(
+    got, expected = composited_parts(
         renderer, [subset_of(cloud, np.array([k])) for k in range(30)], view, "pixel"
     )
-    assert np.abs(got - wanted).max() < 1e-5
+    assert np.abs(got - expected).max() < 1e-5
     centre = composited_parts(renderer, [subset_of(cloud, np.array([k])) for k in range(30)], view, "centre")[
         0
     ]
-    assert np.abs(centre - wanted).max() > 0.1
+    assert np.abs(centre - expected).max() > 0.1
 
 
 @pytest.mark.parametrize(
     "cloud",
-    # the last has more in a tile than is looked at together
+    # the last has more splats in a tile than a chunk
     [order.crossing(), order.fan(), order.crossing(200)],
     ids=["crossing", "fan", "many"],
 )
-def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):
-    """Room for one fragment at a pixel, or a few: the list is gone through again until the picture is the
-    same, bit for bit."""
-    picture = FrameSpec(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ALL_OUTPUTS)
+def test_images_do_not_depend_on_the_size_of_the_k_buffer(renderer, cloud):
+    """A k-buffer of one or few fragments needs several passes and is bit-identical."""
+    spec = FrameSpec(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ALL_OUTPUTS)
     shapes = renderer.backend.shapes("k_buffer")
-    wanted = trace(renderer, picture)
+    expected = trace(renderer, spec)
     for name, shape in shapes.items():
-        assert differing(trace(renderer, picture, shape), wanted, picture.outputs) == 0, name
+        assert differing(trace(renderer, spec, shape), expected, spec.outputs) == 0, name
 
 
 def _faint(count, seed, depth, scale, opacity=0.3, across=2.0):
-    """Splats at random that let light through, so that all of a list is drawn."""
+    """Random translucent splats, so that complete lists are composited."""
     generator = np.random.default_rng(seed)
     means = np.column_stack(
         [generator.uniform(-across, across, (count, 2)), generator.uniform(*depth, count)]
@@ -94,7 +93,7 @@ def _faint(count, seed, depth, scale, opacity=0.3, across=2.0):
 
 
 def _near_elsewhere() -> dict[str, fs.SplatCloud]:
-    """Large splats, whose nearest points lie in other tiles than most of their fragments."""
+    """Large splats whose nearest points are in other tiles than most of their fragments."""
     generator = np.random.default_rng(4)
     nearly_edge_on = [
         clouds.rotation((1, 0, 0) if flat else (0, 1, 0), angle)
@@ -108,12 +107,12 @@ def _near_elsewhere() -> dict[str, fs.SplatCloud]:
         "crossing": _faint(400, 3, (0.5, 4.0), (0.2, 0.8)),
         "behind a fisheye": _faint(300, 3, (0.5, 4.0), (0.2, 0.8)),
         "boxes": _faint(300, 12, (1.0, 4.0), (0.1, 0.4)).with_boxes(),
-        # more than are kept together
+        # more than can be deferred
         "thousands": _faint(2600, 8, (1.0, 4.0), (1.0, 3.0), 0.01),
         "edge-on": edge_on,
         "through the camera": _faint(300, 9, (-0.5, 1.5), (0.5, 4.0), 0.05),
         "huge": _faint(300, 10, (1.0, 30.0), (50.0, 1000.0), 0.05),
-        # as layers lie nearer than what of them is looked at
+        # layers are nearer than the depths of their splats in lookahead
         "bent sheets": _faint(400, 13, (1.0, 3.0), (0.2, 0.8)).with_coplanar_groups(planes),
         "through a sheet": fs.SplatCloud.concatenate(
             [_faint(100, 7, (1.5, 4.0), (0.3, 1.5), 0.1), printed, _faint(200, 11, (2.5, 4.0), (0.3, 1.5))]
@@ -125,27 +124,26 @@ NEAR_ELSEWHERE = _near_elsewhere()
 
 
 @pytest.mark.parametrize("name", NEAR_ELSEWHERE)
-def test_bounds_of_what_follows_hide_nothing(renderer, name):
-    """Splats that are put in order for a tile, or looked at before they are drawn, are composited as where
-    what waits is bounded by the whole splats' nearest depths: bit for bit."""
+def test_deferral_and_lookahead_are_bit_identical(renderer, name):
+    """Deferred splats and lookahead (CPUs) are bit-identical with bounds by the nearest depths of splats."""
     if not renderer.device.name.startswith("opencl"):
-        pytest.skip("Warp's schedules have the same bounds, those of whole splats")
+        pytest.skip("Warp's schedules have no deferral")
     views = {
-        "thousands": clouds.camera(5, 4, 4.0),  # all are drawn, and groups hold eight
+        "thousands": clouds.camera(5, 4, 4.0),  # all are composited; groups have k-buffers of eight
         "behind a fisheye": Camera.fisheye(34, 20, math.radians(100)),
     }
     view = views.get(name, clouds.camera(34, 20, 30.0))
-    picture = FrameSpec(NEAR_ELSEWHERE[name], view, fs.Quality(order="pixel"), ("rgb", "depth", "normal"))
+    spec = FrameSpec(NEAR_ELSEWHERE[name], view, fs.Quality(order="pixel"), ("rgb", "depth", "normal"))
     groups = renderer.backend.shapes("schedule")["groups"]
-    assert differing(trace(renderer, picture, groups), trace(renderer, picture), picture.outputs) == 0
+    assert differing(trace(renderer, spec, groups), trace(renderer, spec), spec.outputs) == 0
 
 
-def test_of_equal_depths_that_wait_the_first_is_in_front(renderer):
-    """A column of pixels shows two splats of one depth before a wall; the next shows the second alone, before
-    what waited first: there it is put further in front, here it is not."""
+def test_of_equal_depths_in_the_k_buffer_the_first_is_in_front(renderer):
+    """One column of pixels has two splats of equal depth in front of a wall; the next column has only the
+    second one, in front of the fragment that was inserted first."""
     column = 4 / 50  # of a pixel, at the depth of the wall
     cloud = fs.SplatCloud(
-        # a wall whose nearest point is the nearest of all; a line across the next column, which leans forward
+        # a wall with the smallest nearest depth; a line across the next column that leans forward
         [(0, 0, 4), (column, 0, 3.9), (0, 0, 3), (0, 0, 3)],
         [(math.cos(0.4), 0, math.sin(0.4), 0), (math.cos(0.6), math.sin(0.6), 0, 0), *[(1, 0, 0, 0)] * 2],
         [(9, 9), (0.01, 1), (0.01, 1), (1, 1)],
@@ -161,7 +159,7 @@ def test_of_equal_depths_that_wait_the_first_is_in_front(renderer):
 
 @pytest.mark.exhaustive
 def test_every_pixel_of_a_hundred_thousand_splats(renderer):
-    """Against the sort of every pixel in float64; docs/correctness.md has what `-s` prints."""
+    """Against a float64 sort of each pixel."""
     cloud, _ = load_scene("r100k_720p")
     camera, quality = standard_camera(320, 180), fs.Quality(order="pixel")
     differences = against_reference(renderer, FrameSpec(cloud, camera, quality, ("rgb", "depth")))
@@ -169,23 +167,23 @@ def test_every_pixel_of_a_hundred_thousand_splats(renderer):
     assert all(difference.agrees for difference in differences)
 
 
-def test_a_faint_splat_between_decides_nothing(renderer):
-    """Drawn or not, with 1/255: a cut layer changed by 0.26."""
+def test_a_faint_splat_inside_of_a_group_changes_little(renderer):
+    """A splat at the alpha cut-off of 1/255; a layer that it divided would change by 0.26."""
     with_it, without = (render(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
     assert 0 < np.abs(with_it - without).max() < 1.01 / 255
 
 
 @pytest.mark.parametrize("side", order.SIDES)
-def test_a_layer_lies_where_its_depth_says(renderer, side):
-    """The big splat's centre alone would put it on the other side."""
-    got, wanted = composited_parts(renderer, tag_and_large_splat(side), order.ON_TAGS)
-    assert wanted.max() > 0.5
-    assert np.abs(got - wanted).max() < 1e-6
+def test_a_layer_is_composited_at_its_depth(renderer, side):
+    """The centre of the large splat is on the other side."""
+    got, expected = composited_parts(renderer, tag_and_large_splat(side), order.ON_TAGS)
+    assert expected.max() > 0.5
+    assert np.abs(got - expected).max() < 1e-6
 
 
-def test_a_cutoff_moves_no_layer(renderer):
-    """Tails of a tilted plane's splats, drawn or not, before a splat 2 mm behind it: bounded by what of a
-    splat is not fainter than 1/255 they moved it back by 6 mm."""
+def test_a_cutoff_does_not_move_a_layer(renderer):
+    """Faint tails of a tilted group in front of a splat 2 mm behind it: clamped to the range above 1/255
+    they would move the layer back by 6 mm."""
     tilted, along = (math.cos(math.pi / 6), 0, math.sin(math.pi / 6), 0), np.array([0.5, 0, -(0.75**0.5)])
     spot = splats([(0, 0, 2)], tilted, 0.05, 0.5, (1, 0, 0))
     tails = splats([np.array([0, 0, 2]) - 4 * along] * 20, tilted, 1.0, 1.0, (1, 0, 0))
@@ -200,21 +198,21 @@ def test_a_cutoff_moves_no_layer(renderer):
     assert np.abs(few - all_of_them).max() < 0.02
 
 
-def test_any_number_of_layers_wait(renderer):
-    """Three sheets one behind the other, and a big splat between whose centre is nearer than all."""
+def test_several_layers_in_the_k_buffer(renderer):
+    """Three groups one behind the other, and a large splat between them with the nearest centre."""
     colors = np.eye(3)
     sheets = [
         splats([(0, 0, z)], (1, 0, 0, 0), 0.5, 0.6, colors[k]).with_coplanar_groups(0)
         for k, z in enumerate((2, 4, 6))
     ]
     view = Camera.pinhole(17, 17, 20.0, 20.0, 8.5, 8.5)
-    got, wanted = composited_parts(renderer, [*sheets, splats([(0, 0, 5)], (1, 0, 0, 0), 2.0, 0.5)], view)
-    assert np.abs(got - wanted).max() < 1e-6
+    got, expected = composited_parts(renderer, [*sheets, splats([(0, 0, 5)], (1, 0, 0, 0), 2.0, 0.5)], view)
+    assert np.abs(got - expected).max() < 1e-6
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_planes_that_cross_each_other(renderer, seed):
-    """More layers wait at a pixel than a backend may have room for, and one that ends lies before others."""
+def test_intersecting_coplanar_groups(renderer, seed):
+    """More layers at a pixel than the k-buffer holds; a completed layer may be in front of others."""
     cloud = random_splats(24, seed, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
     cloud = cloud.with_coplanar_groups(np.arange(24) // 4 - 1)
     assert_agrees(renderer, cloud, Camera.pinhole(37, 22, 30.0, 30.0, 18.0, 11.0), ("rgb", "depth"))

@@ -1,4 +1,4 @@
-"""Devices whose stages can be looked at."""
+"""Devices with access to the buffers between stages."""
 
 import pytest
 
@@ -6,5 +6,5 @@ import pytest
 @pytest.fixture(scope="module")
 def backend(renderer):
     if not renderer.backend.traits.probed:
-        pytest.skip("draws in one piece")
+        pytest.skip("has no separate stages")
     return renderer.backend

@@ -1,4 +1,4 @@
-"""The lists of splats per tile: made in two ways, however much there is to list, and in small buffers."""
+"""Tile binning: equal lists by all strategies, of any length, and with small buffers."""
 
 from dataclasses import replace
 
@@ -17,15 +17,15 @@ from fidsplat.selftest.agreement import out_of_order
 
 
 @pytest.mark.parametrize("scale", [(1e-3, 0.5), (0.1, 50.0)])
-def test_both_ways_of_listing_give_the_same_lists(backend, scale):
-    """Small splats and ones that touch more tiles than a window of list/tiled.cl has."""
+def test_binning_strategies_make_equal_lists(backend, scale):
+    """Small splats, and splats that overlap more tiles than a window of list/tiled.cl."""
     cloud = random_splats(2500, seed=5, scale=scale)
     tiled, ordered = (
         traced(backend, cloud, fs.Quality(lowpass="none"), shape=listing(backend, lists))[0]
         for lists in ("tiled", "ordered")
     )
     assert max(np.diff(tiled["starts"].astype(int))) > 20
-    # both hold every tile that a splat touches (the test above) and may differ a little in what else
+    # both list every tile that a splat overlaps (test_stages.py), and few others
     different = 0
     for tile in range(len(tiled["starts"]) - 1):
         ours, theirs = (t["lists"][t["starts"][tile] : t["starts"][tile + 1]] for t in (tiled, ordered))
@@ -34,9 +34,9 @@ def test_both_ways_of_listing_give_the_same_lists(backend, scale):
     assert np.array_equal(tiled["rgb"], ordered["rgb"])
 
 
-def test_of_a_whole_picture_no_splat_lies_beside_its_band(backend):
-    """Of large ones behind the camera, and where the last tiles reach below the picture: a splat that lies
-    beside a band has no window, and lists would be made of whatever memory holds."""
+def test_no_splat_of_a_complete_image_is_outside_of_its_band(backend):
+    """Large splats behind the camera, and a last row of tiles below the image: a splat outside of the band
+    has no window, and binning would read unwritten memory."""
     cloud = random_splats(3000, seed=7, depth=(-4, 4), scale=(0.1, 0.5), across=3.0)
     camera = fs.Camera.pinhole(33, 17, 30.0, 30.0, 5.0, 3.0)
     features, view = prepare(cloud, fs.Capture(camera, quality=fs.Quality(lowpass="pixel")))
@@ -48,9 +48,8 @@ def test_of_a_whole_picture_no_splat_lies_beside_its_band(backend):
 @pytest.mark.parametrize(
     ("lists", "budget"), [("ordered", 0), ("tiled", 0), ("gathered", 0), ("gathered", 5000)]
 )
-def test_views_of_a_batch_are_listed_apart(backend, monkeypatch, lists, budget):
-    """gathered: tiles so few that they are counted in local memory, by groups of 4096 splats; with a budget
-    of pairs in bands."""
+def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budget):
+    """gathered: few tiles, counted in local memory by groups of 4096 splats; a pair budget makes bands."""
     cloud = random_splats(5000, seed=5, scale=(1e-3, 0.5))
     quality = fs.Quality(lowpass="none")
     captures = [
@@ -72,19 +71,18 @@ def test_views_of_a_batch_are_listed_apart(backend, monkeypatch, lists, budget):
     if lists == "tiled":
         monkeypatch.setattr(tiling, "GATHER_TILES", 0)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
-    pictures = pipeline.render_batch(resident, batch)
+    batch_images = pipeline.render_batch(resident, batch)
     assert (launched.count("emit_gathered") > (2 if budget else 0)) == (lists == "gathered")
     for name in ("visible", "pairs"):
-        assert pictures.stats[name] == sum(picture.stats[name] for picture in alone)
-    for picture, own in zip(pictures.read("rgb"), alone, strict=True):
-        assert np.array_equal(picture, own.read("rgb"))
+        assert batch_images.stats[name] == sum(images.stats[name] for images in alone)
+    for images, own in zip(batch_images.read("rgb"), alone, strict=True):
+        assert np.array_equal(images, own.read("rgb"))
 
 
 @pytest.mark.parametrize("budget", [0, 5000])
-def test_neighbours_that_share_tiles_are_counted_together(backend, monkeypatch, budget):
-    """As those of a store: by groups of 4096 splats of one place, of one that is left of the picture, and of
-    all of a picture of more tiles than local memory has room for; then drawn again, as it was launched, and
-    as one of two views."""
+def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
+    """Groups of 4096 splats that are close together, outside of the image, or spread over more tiles than
+    local memory holds; then replayed, and rendered as one view of two."""
     generator = np.random.default_rng(8)
     cloud = random_splats(3 * 4096 + 50, seed=5, scale=(1e-3, 0.03))
     means, near = cloud.means.copy(), generator.normal(size=(2 * 4096, 3)).astype(np.float32)
@@ -95,8 +93,8 @@ def test_neighbours_that_share_tiles_are_counted_together(backend, monkeypatch, 
     capture = fs.Capture(camera, ALL_OUTPUTS, fs.Quality(lowpass="none"))
     features, view = prepare(cloud, capture)
     pipeline, resident = backend.pipeline(features, listing(backend, "tiled")), backend.upload(cloud)
-    wanted = pipeline.render(resident, view)
-    assert 1000 < wanted.stats["visible"] < 2.2 * 4096
+    expected = pipeline.render(resident, view)
+    assert 1000 < expected.stats["visible"] < 2.2 * 4096
     gathered, launched = tiling.launch_gathered, []
 
     def gather(self, kernel, **given):
@@ -108,50 +106,50 @@ def test_neighbours_that_share_tiles_are_counted_together(backend, monkeypatch, 
     resident = backend.upload(cloud)
     resident.neighbours = True
     for _ in range(3):
-        picture = pipeline.render(resident, view)
-        assert picture.stats == wanted.stats
+        images = pipeline.render(resident, view)
+        assert images.stats == expected.stats
         for name in ALL_OUTPUTS:
-            assert np.array_equal(picture.read(name), wanted.read(name)), name
-    # in bands each time; else twice, and then as it was launched before
+            assert np.array_equal(images.read(name), expected.read(name)), name
+    # in bands each time; else twice, then replayed
     assert launched.count("tally_gathered") == (3 if budget else 2)
     moved = replace(capture, camera=fs.Camera.look_at(641, 549, 1.0, (0.3, 0.0, 0.0), (0.0, 0.0, 3.0)))
-    pictures = pipeline.render_batch(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
+    batch_images = pipeline.render_batch(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
     other = pipeline.render(backend.upload(cloud), prepare(cloud, moved)[1])
-    for picture, own in zip(pictures.read("rgb"), (other, wanted), strict=True):
-        assert np.array_equal(picture, own.read("rgb"))
+    for images, own in zip(batch_images.read("rgb"), (other, expected), strict=True):
+        assert np.array_equal(images, own.read("rgb"))
     assert launched.count("tally_gathered") > (3 if budget else 2)
 
 
-def test_lists_that_outgrow_their_buffers_are_made_again(backend):
-    """A picture that has far more pairs, or big splats, than the last one."""
+def test_lists_that_overflow_are_made_again(backend):
+    """A frame with many more pairs and big splats than the previous one."""
     groups = listing(backend, "tiled")
     few, many = random_splats(30, seed=2, scale=(1e-3, 0.05)), random_splats(9000, seed=2, scale=(0.5, 5.0))
     features, quality = select(few, fs.Capture(outputs=ALL_OUTPUTS)), fs.Quality()
     camera = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
     view = View.of(fs.Capture(camera, quality=quality), few.origin)
-    backend = type(backend)(backend.device)  # with buffers that no other test has made larger
+    backend = type(backend)(backend.device)  # with new buffers
     pipeline = backend.pipeline(features, groups)
     fresh = pipeline.render(backend.upload(many), view)
-    wanted = {name: fresh.read(name) for name in ALL_OUTPUTS}
+    expected = {name: fresh.read(name) for name in ALL_OUTPUTS}
     backend = type(backend)(backend.device)
     pipeline = backend.pipeline(features, groups)
     pipeline.render(backend.upload(few), view)
-    again = pipeline.render(backend.upload(many), view)
-    assert again.stats == fresh.stats
-    assert again.stats["pairs"] > 1e5
+    repeated = pipeline.render(backend.upload(many), view)
+    assert repeated.stats == fresh.stats
+    assert repeated.stats["pairs"] > 1e5
     for name in ALL_OUTPUTS:
-        assert np.array_equal(again.read(name), wanted[name]), name
+        assert np.array_equal(repeated.read(name), expected[name]), name
 
 
 @pytest.mark.parametrize("spare", [1, 0, -1])
-def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
-    """Lists are made again if and only if there is no room for all of them."""
+def test_a_capacity_of_exactly_the_pairs_of_a_frame(backend, spare):
+    """Lists are made again if and only if they overflow."""
     cloud, quality = random_splats(3000, seed=5, scale=(1e-3, 0.5)), fs.Quality()
     groups = listing(backend, "tiled")
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
     drawn = []
     for room in (None, spare):
-        own = type(backend)(backend.device)  # with buffers of its own
+        own = type(backend)(backend.device)  # with new buffers
         if room is not None:
             pairs = drawn[0].stats["pairs"] + room
             own.pool.scratch("lists", 4 * pairs)
@@ -173,8 +171,8 @@ def test_a_list_longer_than_local_memory_is_sorted(backend):
     assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
 
 
-def test_arrays_of_a_cloud_begin_anywhere(backend):
-    """Kernels read whole vectors, and a CPU reads a cloud's own arrays."""
+def test_unaligned_arrays_of_a_cloud(backend):
+    """Unaligned arrays of a cloud, which kernels read in vectors and CPUs without a copy."""
     base = random_splats(50, seed=6)
     arrays = {"quats": base.quats, "scales": base.scales}
     for name, array in arrays.items():
@@ -184,8 +182,8 @@ def test_arrays_of_a_cloud_begin_anywhere(backend):
         arrays[name] = flat[1:].reshape(array.shape)
     cloud = fs.SplatCloud(means=base.means, opacities=base.opacities, colors=base.colors, **arrays)
     assert all(getattr(cloud, name).ctypes.data % 16 for name in arrays)
-    pictures = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (base, cloud)]
-    assert np.array_equal(*pictures)
+    batch_images = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (base, cloud)]
+    assert np.array_equal(*batch_images)
 
 
 DEPTHS = {
@@ -198,8 +196,8 @@ DEPTHS = {
 
 
 @pytest.mark.parametrize("depths", DEPTHS)
-def test_a_list_is_sorted_however_its_depths_are_spread(backend, depths):
-    """tile_lists.cl spreads a list over ranges of depth, and sorts it by a network where one is crowded."""
+def test_lists_of_all_depth_distributions_are_sorted(backend, depths):
+    """tile_lists.cl uses a bucket sort by depth, and a network if a bucket is overfull."""
     n, generator = 1500, np.random.default_rng(4)
     cloud = random_splats(n, seed=4, scale=(0.05, 0.3))
     z = generator.permutation(DEPTHS[depths](n))
@@ -223,11 +221,11 @@ def test_a_list_is_sorted_however_its_depths_are_spread(backend, depths):
 
 @pytest.mark.parametrize("lists", ["ordered", "tiled"])
 @pytest.mark.parametrize("budget", [1, 50, 1000])
-def test_a_small_pair_budget_gives_the_same_bits(backend, monkeypatch, budget, lists):
-    """numerics E3: a picture with more pairs than fit is drawn in bands of tiles."""
+def test_a_small_pair_budget_is_bit_identical(backend, monkeypatch, budget, lists):
+    """Case E3: a frame with more pairs than the budget is rendered in bands of tiles."""
     cloud = random_splats(300, seed=12)
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS))
-    # what lists in order draws a CPU's picture too: the way in which it is mostly drawn in bands
+    # the shape of a CPU for its own strategy, which uses bands most often
     shape = backend.shape if lists == "ordered" else listing(backend, lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
     whole = pipeline.render(resident, view)

@@ -1,5 +1,5 @@
-"""A splat has a place for its derivatives for each tile that lists it, and none besides: one too many nobody
-would write, and other splats' numbers would be added up, others on each run."""
+"""Gradient buffer offsets: a splat has one entry for each tile that lists it. A surplus entry would be read
+without being written."""
 
 import numpy as np
 import pyopencl as cl
@@ -9,7 +9,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.scenes.random_clouds import random_splats
 
 BACKEND = "opencl"
-# found among 160,000 random ones: the chord of a row of tiles was rounded to be wider than the widest of all
+# found by fuzzing: rounding makes the chord of a row of tiles wider than the bounds
 WIDE = fs.SplatCloud(
     means=[[1.4574198, 0.11504277, 2.0842366]],
     quats=[[0.70251703, -0.14637895, 0.6260615, -0.3051065]],
@@ -19,7 +19,7 @@ WIDE = fs.SplatCloud(
 )
 
 
-def test_splats_have_a_place_for_each_tile_that_lists_them(renderer):
+def test_splats_have_an_offset_for_each_tile_that_lists_them(renderer):
     backend, camera = renderer.backend, fs.Camera.look_at(800, 800, 1.0, (0, 0, 0), (0, 0, 3.0))
     features, view = prepare(WIDE, fs.Capture(camera))
     random = random_splats(300, 0, scale=(0.02, 0.6), depth=(1.5, 4.0), sh_degree=None)

@@ -1,4 +1,4 @@
-"""What passes between the stages of each backend that has them, against brute force."""
+"""Buffers between the stages of each backend against brute force."""
 
 from itertools import pairwise
 
@@ -51,8 +51,8 @@ def footprint(cloud, view, index, dot=True):
 
 @pytest.mark.parametrize("lists", ["ordered", "tiled"])
 @pytest.mark.parametrize(("seed", "scale"), [(1, (1e-3, 2.0)), (7, (0.1, 50.0)), (3, (1e-5, 0.05))])
-def test_every_touched_tile_has_the_splat_and_few_others_do(backend, seed, scale, lists):
-    """numerics A1, A3 to A5: nothing is lost, wherever the disk lies; bounds in front are tight."""
+def test_lists_have_all_overlapped_tiles_and_few_others(backend, seed, scale, lists):
+    """Cases A1, A3 to A5: no tile is missing for any pose; bounds in front of the camera are tight."""
     cloud = random_splats(120, seed, scale=scale)
     shape = listing(backend, lists)
     trace, view = traced(backend, cloud, fs.Quality(alpha_cutoff=1 / 255), shape=shape)
@@ -76,9 +76,9 @@ def test_every_touched_tile_has_the_splat_and_few_others_do(backend, seed, scale
     assert listed_in_front <= 1.05 * needed_in_front + 5
 
 
-def test_bounds_hold_the_rims_of_huge_disks(backend):
-    """Disks up to 10^8 samples wide with an edge in the picture: what a float32 place may be off is room that
-    bounds have."""
+def test_bounds_contain_the_rims_of_huge_disks(backend):
+    """Disks up to 10^8 samples wide with an edge in the image: bounds are padded by the float32 rounding of
+    positions."""
     random = np.random.default_rng(8)
     radius, depth = 10 ** random.uniform(4, 6, 48), random.uniform(0.7, 1.5, 48)
     away = np.repeat([[1, 0], [-1, 0], [0, 1], [0, -1]], 12, axis=0) * radius[:, None]
@@ -127,47 +127,47 @@ def test_keys_are_depths_and_the_order_is_total(backend):
     assert set(trace["lists"]) <= set(visible)
 
 
-def test_quaternions_of_any_length_turn_a_splat(backend):
-    """To the bit, where all are twice as long."""
+def test_quaternions_are_normalised(backend):
+    """Bit-identical for quaternions of twice the length."""
     cloud, longer = random_splats(100, seed=6), random_splats(100, seed=6)
     object.__setattr__(longer, "quats", 2 * longer.quats)
-    pictures = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (cloud, longer)]
-    assert np.array_equal(*pictures)
-    assert pictures[0].any()
+    batch_images = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (cloud, longer)]
+    assert np.array_equal(*batch_images)
+    assert batch_images[0].any()
 
 
 def test_culled_splats_change_nothing(backend):
     cloud = random_splats(400, seed=6)
     trace, _ = traced(backend, cloud, fs.Quality())
-    kept = np.flatnonzero(trace["keys"] != CULLED)
-    assert 0 < len(kept) < 400
+    visible = np.flatnonzero(trace["keys"] != CULLED)
+    assert 0 < len(visible) < 400
     fewer = fs.SplatCloud(
-        cloud.means[kept],
-        cloud.quats[kept],
-        cloud.scales[kept],
-        cloud.opacities[kept],
-        colors=cloud.colors[kept],
+        cloud.means[visible],
+        cloud.quats[visible],
+        cloud.scales[visible],
+        cloud.opacities[visible],
+        colors=cloud.colors[visible],
     )
     assert np.array_equal(traced(backend, fewer, fs.Quality())[0]["rgb"], trace["rgb"])
 
 
 @pytest.mark.parametrize("lists", ["ordered", "tiled"])
 def test_splats_between_the_samples_are_culled(backend, lists):
-    """Without a low-pass a splat that is smaller than a sample mostly meets no ray; it costs no list."""
+    """Without a low-pass a splat smaller than a sample mostly intersects no ray and is not listed."""
     cloud = random_splats(20000, seed=3, scale=(1e-5, 3e-4))
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, fs.Quality(lowpass="none")))
     pipeline = backend.pipeline(features, listing(backend, lists))
     trace = pipeline.trace(backend.upload(cloud), view)
-    kept = trace["keys"] != CULLED
-    x0, x1, y0, y1 = backend.probe().boxes(pipeline, trace)[kept].T
-    assert 5 < kept.sum() < 1000
+    visible = trace["keys"] != CULLED
+    x0, x1, y0, y1 = backend.probe().boxes(pipeline, trace)[visible].T
+    assert 5 < visible.sum() < 1000
     assert (x0 < x1).all()
     assert (y0 < y1).all()
     assert trace["rgb"].any()
 
 
-def test_tile_size_leaves_every_bit_as_it_was(backend):
-    """numerics A4 and A5: one test that finds every bug of the bounds."""
+def test_tile_sizes_are_bit_identical(backend):
+    """Cases A4 and A5: detects errors of the bounds."""
     cloud = random_splats(300, seed=3)
     quality = fs.Quality()
     base, _ = traced(backend, cloud, quality)
@@ -178,8 +178,8 @@ def test_tile_size_leaves_every_bit_as_it_was(backend):
 
 
 @pytest.mark.parametrize("lowpass", ["screen", "none"])
-def test_the_box_of_a_record_holds_all_that_the_splat_touches(backend, lowpass):
-    """What a block of a GPU passes over, it must not have needed."""
+def test_the_box_of_a_record_contains_all_fragments(backend, lowpass):
+    """GPU blocks skip splats by this box."""
     quality = fs.Quality(lowpass=lowpass)
     cloud = random_splats(200, seed=5, scale=(1e-3, 5.0))
     features = select(cloud, fs.Capture(outputs=ALL_OUTPUTS, quality=quality))
@@ -187,32 +187,32 @@ def test_the_box_of_a_record_holds_all_that_the_splat_touches(backend, lowpass):
     pipeline = backend.pipeline(features)
     trace = pipeline.trace(backend.upload(cloud), view)
     boxes = backend.probe().boxes(pipeline, trace)
-    seen = 0
+    fragments = 0
     for index in np.flatnonzero(trace["keys"] != CULLED):
         rows, columns = footprint(cloud, view, index, dot=lowpass == "screen")
         for axis, places in enumerate((columns, rows)):
             first, end = boxes[index, 2 * axis : 2 * axis + 2]
             assert np.all((places >= first) & (places < end)), index
-        seen += len(rows)
-    assert seen > 1000
+        fragments += len(rows)
+    assert fragments > 1000
 
 
 def test_the_bounds_of_a_box_are_its_corners(backend):
-    """And half a sample around them, where it fades."""
+    """Padded by half a sample for the antialiased edge."""
     box = fs.SplatCloud([(0.2, 0.1, 3)], [(1, 0, 0, 0)], [(0.3, 0.2)], [1.0], colors=[(1, 1, 1)]).with_boxes()
     features, view = prepare(box, fs.Capture(CAMERA, ALL_OUTPUTS))
     pipeline = backend.pipeline(features)
     bounds = backend.probe().boxes(pipeline, pipeline.trace(backend.upload(box), view))[0]
     low, high = (view.rotation @ (x, y, 3) + view.translation for x, y in ((-0.1, -0.1), (0.5, 0.3)))
-    wanted = [
+    expected = [
         *(view.focal_x * corner[0] / corner[2] + view.center_x for corner in (low, high)),
         *(view.focal_y * corner[1] / corner[2] + view.center_y for corner in (low, high)),
     ]
-    assert np.abs(bounds - wanted).max() <= 1.5
+    assert np.abs(bounds - expected).max() <= 1.5
 
 
-def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
-    """Four planes whose layers wait for one another, and splats of none."""
+def test_layers_do_not_depend_on_tile_size_or_schedule(backend, renderer):
+    """Four intersecting coplanar groups, and ungrouped splats."""
     planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
     cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_coplanar_groups(planes)
     base, _ = traced(backend, cloud, fs.Quality())
@@ -220,27 +220,27 @@ def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.abs(other[name] - base[name]).max() < 2e-5, name
     *_, (size, shape) = backend.shapes("tiles").items()
-    again, _ = traced(backend, cloud, fs.Quality(), shape=shape)
+    tiled, _ = traced(backend, cloud, fs.Quality(), shape=shape)
     for name in ALL_OUTPUTS:
-        assert np.array_equal(again[name], base[name]), f"{name} differs with {size}"
+        assert np.array_equal(tiled[name], base[name]), f"{name} differs with {size}"
 
 
-def test_splats_of_a_plane_share_its_key(backend):
-    """They arrive together, whatever lies between their centres."""
+def test_splats_of_a_coplanar_group_share_its_key(backend):
+    """They are adjacent in the lists, whatever is between their centres."""
     generator = np.random.default_rng(2)
     cloud = random_splats(200, seed=2, depth=(2.0, 4.0)).with_coplanar_groups(generator.integers(-1, 3, 200))
     trace, view = traced(backend, cloud, fs.Quality())
     for plane, key in enumerate(PlaneTable(cloud).keys(view)):
         keys = trace["keys"][cloud.coplanar_groups == plane]
         bits = np.array([key]).view(np.uint32)
-        wanted = ~bits if bits[0] & 0x80000000 else bits | 0x80000000
-        assert (keys[keys != CULLED] == wanted).all()
+        expected = ~bits if bits[0] & 0x80000000 else bits | 0x80000000
+        assert (keys[keys != CULLED] == expected).all()
         for start, end in pairwise(trace["starts"]):
             places = np.flatnonzero(cloud.coplanar_groups[trace["lists"][start:end]] == plane)
             assert len(places) == 0 or len(places) == np.ptp(places) + 1
 
 
-def test_both_schedules_draw_the_same_picture(backend, renderer):
+def test_schedules_agree(backend, renderer):
     cloud = random_splats(300, seed=9)
     base, _ = traced(backend, cloud, fs.Quality())
     other, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])

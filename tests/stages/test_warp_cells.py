@@ -1,4 +1,4 @@
-"""Which cells of a tile Warp's blending lets a splat draw, against the samples where it has fragments."""
+"""Culling by cells of a tile in Warp's blending, against the samples with fragments."""
 
 import numpy as np
 import pytest
@@ -15,11 +15,11 @@ CLOUDS = {
     "needles": lambda: random_splats(300, seed=4, depth=(2.0, 5.0), scale=(0.002, 0.6)),
 }
 MORE = {"around": 2.5, "needles": 1.06}
-"""as many cells at most; where a horizon is near the box says which, not the ellipse"""
+"""maximum ratio of marked cells to cells with fragments; near a horizon the box is used, not the ellipse"""
 
 
 def marked(picture):
-    """(splats, tiles, cells of a tile), as blending's blocks of threads mark them."""
+    """(splats, tiles, cells of a tile): cells that blending marks."""
     wp, program = runtime.load(), picture.program
     effects, outputs = program.needs.among(("lowpass_screen", "ray_depth")), program.needs.blending
     cells = runtime.kernels("cells").make_cells(effects, outputs)
@@ -49,7 +49,7 @@ def marked(picture):
 
 
 def covered(records, names, view, rows, columns):
-    """The same from every sample of a padded grid: cells in which a splat has fragments."""
+    """(splats, tiles, cells of a tile): cells with fragments, from every sample of a padded grid."""
     of = {name: records[:, k, None, None].astype(np.float64) for k, name in enumerate(names)}
     y, x = np.mgrid[:rows, :columns]
     x, y = x - of["ax"], y - of["ay"]
@@ -66,7 +66,7 @@ def covered(records, names, view, rows, columns):
 
 @pytest.mark.parametrize("quality", ["surfel", "standard"])
 @pytest.mark.parametrize("cloud", CLOUDS)
-def test_cells_hold_all_fragments_and_little_else(renderer, cloud, quality):
+def test_marked_cells_contain_all_fragments_and_few_others(renderer, cloud, quality):
     backend = renderer.backend
     if backend.device.is_cuda:
         pytest.skip("asked one by one on the CPU; blending itself is compared with the reference")
