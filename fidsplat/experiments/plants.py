@@ -23,7 +23,7 @@ from fidsplat.util.arguments import whole_number
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
 from fidsplat.util.provenance import code_hash
-from fidsplat.worlds.plant_meshes import GOLDEN, MESHES, Mesh
+from fidsplat.worlds.plants import GOLDEN, KINDS, Mesh
 
 BACKGROUND = (0.9, 0.2, 0.9)
 """behind plants in training: no plant has it, so that holes show"""
@@ -61,8 +61,8 @@ class PlantSettings:
 
     def __post_init__(self) -> None:
         for kind in self.kind:
-            if kind not in MESHES:
-                raise InputError(unknown("kind of plant", kind, MESHES))
+            if kind not in KINDS:
+                raise InputError(unknown("kind of plant", kind, KINDS))
         ranges = {"each": (1, 1000), "views": (2, 1000), "test": (1, 1000), "samples": (1, 10_000)}
         ranges |= {"splats": (100, 1_000_000), "iterations": (0, 1_000_000), "seed": (0, 2**32 - 1)}
         for name, (least, most) in ranges.items():
@@ -71,11 +71,11 @@ class PlantSettings:
     @property
     def names(self) -> list[tuple[str, int]]:
         """Kind and number of each plant, one of every kind first."""
-        return [(kind, number) for number in range(self.each) for kind in self.kind or MESHES]
+        return [(kind, number) for number in range(self.each) for kind in self.kind or KINDS]
 
     def mesh(self, kind: str, number: int) -> Mesh:
         """A plant's surface."""
-        return MESHES[kind](np.random.default_rng([self.seed, list(MESHES).index(kind), number]))
+        return KINDS[kind](np.random.default_rng([self.seed, list(KINDS).index(kind), number]))
 
 
 def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:

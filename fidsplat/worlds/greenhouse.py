@@ -1,5 +1,5 @@
-"""A greenhouse of splats: rows of plants on benches under glass, with tags and QR codes, and what a robot in
-it collides with. z is up; rows run along x, the first at y = 0."""
+"""Greenhouse: rows of plants on benches under glass, with AprilTags and QR codes, and its MuJoCo model for
+collisions. z is up; rows run along x, the first at y = 0."""
 
 from __future__ import annotations
 
@@ -19,23 +19,25 @@ from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError
 from fidsplat.worlds.plants import KINDS, disks
 
-MOST = 200
-"""rows, and plants in each"""
+MAX_COUNT = 200
+"""rows, and plants per row"""
 AISLE = 1.5
-"""metres from row to row"""
+"""metres between rows"""
 SPACING = 0.6
-"""metres from plant to plant"""
+"""metres between plants"""
 BENCH = 0.4, 0.5
 """metres: width and height"""
+PLANT_SPLATS = 500
+"""splats of a generated plant"""
 END = 1.6
-"""metres of floor beyond the rows' ends"""
+"""metres of floor beyond the ends of the rows"""
 ROOF = 3.2
 PANEL = 0.1
-"""metres between the disks of a flat thing, at most"""
+"""metres between the disks of a panel, at most"""
 TAG, QR = 0.16, 0.24
 """metres: edges of the codes"""
 TAG_HEIGHT, TAG_SPACING = 0.3, 1.8
-"""metres: tags stand on the benches' sides, below the leaves"""
+"""metres: tags are on the sides of the benches, below the leaves"""
 DARK, EARTH, FRAME = (0.2, 0.16, 0.12), (0.45, 0.4, 0.34), (0.75, 0.77, 0.78)
 
 
@@ -53,11 +55,11 @@ class GreenhouseSettings:
     """Mixture of the markers: exact, fitted, facets or paper. By default exact."""
 
     def __post_init__(self) -> None:
-        for name, most in (("rows", MOST), ("plants", MOST), ("seed", 2**32 - 1)):
+        for name, highest in (("rows", MAX_COUNT), ("plants", MAX_COUNT), ("seed", 2**32 - 1)):
             value = getattr(self, name)
-            least = 0 if name == "seed" else 1
-            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-                raise InputError(f"{name} of a greenhouse must be {least} to {most}, got {value!r}")
+            lowest = 0 if name == "seed" else 1
+            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+                raise InputError(f"{name} of a greenhouse must be {lowest} to {highest}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -66,26 +68,26 @@ class Greenhouse(GreenhouseSettings):
 
     stock: Mapping[str, Sequence[SplatCloud]] | None = field(default=None, compare=False, repr=False)
     """Plants by kind, one kind per row, each in its own frame (`fidsplat.worlds.plants.load_plants`); None
-    grows them as disks."""
+    generates them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.stock is not None and not (self.stock and all(self.stock.values())):
-            raise InputError("the stock of a greenhouse must have plants of each kind; None grows them")
+            raise InputError("stock must have plants of each kind; None generates them")
 
     @property
     def length(self) -> float:
-        """Metres of a row."""
+        """Length of a row in metres."""
         return self.plants * SPACING
 
     @property
     def middles(self) -> list[float]:
-        """y of the rows."""
+        """y of each row."""
         return [AISLE * row for row in range(self.rows)]
 
     @cached_property
     def scene(self) -> Scene:
-        """All of it, with a camera that looks into the first aisle."""
+        """The complete scene, with a camera that looks into the first aisle."""
         eye = (-END + 0.2, AISLE / 2, 0.9)
         camera = Camera.look_at(
             1280, 720, math.radians(70), eye, (self.length / 2, AISLE / 2, 0.7), (0, 0, 1)
@@ -125,7 +127,11 @@ class Greenhouse(GreenhouseSettings):
                 turn = rng.uniform(0, 2 * math.pi)
                 foot = ((k + 0.5) * SPACING + rng.normal(0, 0.03), y + rng.normal(0, 0.02), BENCH[1])
                 pose = rigid_matrix(foot, (math.cos(turn / 2), 0, 0, math.sin(turn / 2)))
-                plant = KINDS[kind](rng) if self.stock is None else _one_of(self.stock[kind], rng)
+                plant = (
+                    KINDS[kind](rng).splats(PLANT_SPLATS)
+                    if self.stock is None
+                    else _one_of(self.stock[kind], rng)
+                )
                 found.append(plant.transformed(pose))
         return SplatCloud.concatenate(found)
 
@@ -158,7 +164,7 @@ class Greenhouse(GreenhouseSettings):
         return SplatCloud.concatenate(found)
 
     def _house(self) -> SplatCloud:
-        """The roof of glass, and its bars."""
+        """Glass roof and its frame."""
         low, high = -AISLE, self.middles[-1] + AISLE
         middle, across = (low + high) / 2, high - low
         long = self.length + 2 * END
@@ -172,8 +178,7 @@ class Greenhouse(GreenhouseSettings):
         return SplatCloud.concatenate(found)
 
     def mjcf(self, robot: str = "") -> str:
-        """A MuJoCo model of the floor and the benches, to collide with, and of a robot's body, if its XML is
-        given."""
+        """MuJoCo model of the floor and the benches for collisions, and of a robot if its XML is given."""
         width, height = BENCH
         boxes = "\n".join(
             f'    <geom name="bench {row + 1}" type="box" pos="{self.length / 2:g} {y:g} {height / 2:g}" '
@@ -193,9 +198,8 @@ def _one_of(plants: Sequence[SplatCloud], rng: np.random.Generator) -> SplatClou
 
 
 def facing(place: tuple[float, float, float], towards: tuple[float, float]) -> np.ndarray:
-    """World from marker (4, 4) of one that hangs upright at a place and is read from the side (x, y) that it
-    faces, where z is up."""
-    normal = np.array([-towards[0], -towards[1], 0.0])  # a marker is seen from its -z
+    """Pose (4, 4) of an upright marker that faces the horizontal direction (x, y); z is up."""
+    normal = np.array([-towards[0], -towards[1], 0.0])  # a marker is visible from its -z
     down = np.array([0.0, 0.0, -1.0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([np.cross(down, normal), down, normal], axis=1)
@@ -204,7 +208,7 @@ def facing(place: tuple[float, float, float], towards: tuple[float, float]) -> n
 
 
 def _panel(middle, along, across, length: float, width: float, color, opacity: float = 0.95) -> SplatCloud:
-    """A rectangle of one colour, of disks that overlap."""
+    """Rectangle of one colour, made of overlapping disks."""
     step = min(PANEL, width / 2)
     counts = [max(1, round(size / step)) for size in (length, width)]
     u, v = (

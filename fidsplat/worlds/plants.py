@@ -1,10 +1,11 @@
-"""Plants of disks, grown from a seed: each a cloud in its own frame, z up, its foot at the origin."""
+"""Plants: meshes generated from a seed, and splat files; z up, the foot at the origin, in metres."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,10 @@ from fidsplat.sim.poses import quaternions_of
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
 
-Colour = Sequence[float]
-_UP = np.array([0.0, 0.0, 1.0])
+LEAF, STALK, TOMATO, CUCUMBER = (0.2, 0.46, 0.13), (0.38, 0.5, 0.2), (0.85, 0.13, 0.07), (0.16, 0.4, 0.1)
+LETTUCE = (0.38, 0.62, 0.16)
+GOLDEN = 2.39996
+"""radians from one leaf to the next"""
 
 
 def disks(
@@ -26,8 +29,16 @@ def disks(
     colors: np.ndarray,
     opacity: float = 0.95,
 ) -> SplatCloud:
-    """Disks at centers (n, 3) with normals (n, 3), whose first axis lies along (n, 3) and whose standard
-    deviations are sizes (n, 2); colours (n, 3)."""
+    """Splats of plain colours.
+
+    Args:
+        centers: (n, 3).
+        along: (n, 3) directions of the first axis, projected into each disk's plane.
+        normals: (n, 3).
+        sizes: (n, 2) standard deviations in metres.
+        colors: (n, 3).
+        opacity: of every disk.
+    """
     normal = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     first = along - (along * normal).sum(1, keepdims=True) * normal
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -37,48 +48,121 @@ def disks(
     )
 
 
-def tomato(rng: np.random.Generator) -> SplatCloud:
-    """A stem of 1 to 1.4 m, feathered leaves, trusses of fruits."""
-    height = rng.uniform(1.0, 1.4)
-    stem = _stem(rng, height, 0.01)
-    leaves = _leaves(rng, height, 26, length=0.16, width=0.06, droop=0.5, parts=4)
-    return _whole(stem, leaves, _fruits(rng, height, 9, 0.03, (0.8, 0.15, 0.08)))
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Quadrilaterals with a colour per vertex."""
+
+    vertices: np.ndarray
+    """(n, 3) metres"""
+    quads: np.ndarray
+    """(m, 4) vertex indices around each face"""
+    colors: np.ndarray
+    """(n, 3) unlit surface colours in display space"""
+
+    def splats(self, count: int, seed: int = 0) -> SplatCloud:
+        """Cover the surface evenly with `count` disks."""
+        rng = np.random.default_rng(seed)
+        # each quadrilateral as two triangles
+        corners = np.concatenate([self.quads[:, [0, 1, 2]], self.quads[:, [0, 2, 3]]])
+        at, colour = self.vertices[corners], self.colors[corners]
+        normals = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+        area = np.linalg.norm(normals, axis=1) / 2
+        # stratified by area: independent samples would leave holes
+        steps = (np.arange(count) + rng.uniform()) / count * area.sum()
+        face = np.minimum(np.searchsorted(np.cumsum(area), steps), len(area) - 1)
+        share = rng.uniform(size=(count, 2))
+        share = np.where(share.sum(1, keepdims=True) > 1, 1 - share, share)
+        weights = np.column_stack([1 - share.sum(1), share])[:, :, None]
+        size = 0.7 * math.sqrt(area.sum() / count)
+        return disks(
+            (at[face] * weights).sum(1),
+            at[face, 1] - at[face, 0],
+            normals[face],
+            np.full((count, 2), size),
+            (colour[face] * weights).sum(1),
+        )
 
 
-def cucumber(rng: np.random.Generator) -> SplatCloud:
-    """A stem of 1.3 to 1.7 m, large leaves, long hanging fruits."""
+def tomato(rng: np.random.Generator) -> Mesh:
+    """Tomato plant: a stem of 1.1 to 1.4 m, leaves of seven leaflets, trusses of fruits."""
+    height = rng.uniform(1.1, 1.4)
+    stem = _stem(rng, height)
+    parts = [_tube(stem, 0.008, STALK)]
+    for at, turn, share in _nodes(rng, stem, 18):
+        length = rng.uniform(0.26, 0.34) * (1.15 - 0.5 * share)
+        rachis = _placed(_arc(length, rng.uniform(0.2, 0.5), 1.3), at, turn)
+        parts.append(_tube(rachis, 0.003, STALK))
+        shade = _shade(rng, LEAF)
+        for where, side in ((0.4, 1.1), (0.65, 1.0), (0.85, 0.9)):
+            foot = rachis[round(where * (len(rachis) - 1))]
+            for sign in (-1, 1):
+                parts.append(
+                    _blade(rng, foot, turn + sign * side, 0.45 * length * (1.2 - 0.5 * where), 0.55, shade)
+                )
+        parts.append(_blade(rng, rachis[-1], turn, 0.45 * length, 0.6, shade))
+    for at, turn, _ in _nodes(rng, stem, 4, 0.25, 0.7):
+        truss = _placed(_arc(0.13, 0.3, 2.2), at, turn)
+        parts.append(_tube(truss, 0.003, STALK))
+        for foot in truss[2::2]:
+            radius = rng.uniform(0.02, 0.032)
+            parts.append(
+                _ball(foot - [0, 0, radius], (radius, radius, 0.9 * radius), _shade(rng, TOMATO, 0.1))
+            )
+    return _merged(parts)
+
+
+def cucumber(rng: np.random.Generator) -> Mesh:
+    """Cucumber plant: a stem of 1.3 to 1.7 m, broad leaves on stalks, long hanging fruits."""
     height = rng.uniform(1.3, 1.7)
-    stem = _stem(rng, height, 0.009)
-    leaves = _leaves(rng, height, 20, length=0.14, width=0.12, droop=0.3, parts=3)
-    return _whole(stem, leaves, _fruits(rng, height, 5, 0.022, (0.16, 0.38, 0.1), stretch=4.0))
+    stem = _stem(rng, height)
+    parts = [_tube(stem, 0.007, STALK)]
+    for at, turn, share in _nodes(rng, stem, 20):
+        stalk = _placed(_arc(rng.uniform(0.1, 0.16) * (1.15 - 0.4 * share), 0.6, 0.6), at, turn)
+        parts.append(_tube(stalk, 0.004, STALK))
+        size = rng.uniform(0.18, 0.26) * (1.15 - 0.5 * share)
+        parts.append(_blade(rng, stalk[-1], turn, size, 1.05, _shade(rng, LEAF), lobes=0.18, droop=0.9))
+    for at, turn, _ in _nodes(rng, stem, 5, 0.3, 0.75):
+        stalk = _placed(_arc(0.07, 0.2, 2.0), at, turn)
+        half = rng.uniform(0.08, 0.13)
+        parts.append(_tube(stalk, 0.003, STALK))
+        parts.append(_ball(stalk[-1] - [0, 0, half], (0.02, 0.02, half), _shade(rng, CUCUMBER, 0.1)))
+    return _merged(parts)
 
 
-def lettuce(rng: np.random.Generator) -> SplatCloud:
-    """A rosette of 0.3 m."""
-    count = 40
-    around = rng.uniform(0, 2 * math.pi, count)
-    rise = np.linspace(0.15, 1.3, count) + rng.normal(0, 0.08, count)
-    outward = np.stack([np.cos(around), np.sin(around), np.zeros(count)], 1)
-    along = np.cos(rise)[:, None] * outward + np.sin(rise)[:, None] * _UP
-    reach = rng.uniform(0.06, 0.14, count)
-    centers = along * reach[:, None] + [0, 0, 0.02]
-    normals = -np.sin(rise)[:, None] * outward + np.cos(rise)[:, None] * _UP
-    sizes = np.stack([0.5 * reach, 0.45 * reach], 1)
-    return disks(centers, along, normals, sizes, _greens(rng, count, (0.35, 0.6, 0.18)))
+def lettuce(rng: np.random.Generator) -> Mesh:
+    """Lettuce: a rosette of 0.3 m with wavy leaves, upright inside."""
+    parts, count = [], 26
+    for k in range(count):
+        rise = 0.15 + 1.2 * k / count + rng.normal(0, 0.05)
+        length = rng.uniform(0.15, 0.19) * (1.0 - 0.35 * k / count)
+        parts.append(
+            _blade(
+                rng,
+                np.array([0, 0, 0.01]),
+                GOLDEN * k,
+                length,
+                0.9,
+                _shade(rng, LETTUCE),
+                rise=rise,
+                droop=0.5,
+                waves=0.2,
+            )
+        )
+    return _merged(parts)
 
 
-KINDS: dict[str, Callable[[np.random.Generator], SplatCloud]] = {
+KINDS: dict[str, Callable[[np.random.Generator], Mesh]] = {
     "tomato": tomato,
     "cucumber": cucumber,
     "lettuce": lettuce,
 }
+"""mesh generators by kind"""
 
 
 def load_plants(folder: str | Path) -> dict[str, list[SplatCloud]]:
-    """Plants that are there, by kind: KIND-NUMBER.ply of a folder, each in its own frame, z up, its foot at
-    the origin.
+    """Plants of a folder with KIND-NUMBER.ply, by kind; each in its own frame, z up, its foot at the origin.
 
-    Raises InputError where there is none, or one cannot be read.
+    Raises InputError if there is no such file, or one cannot be read.
     """
     found: dict[str, list[SplatCloud]] = {}
     files = {file: re.fullmatch(r"(.+)-(\d+)", file.stem) for file in Path(folder).glob("*.ply")}
@@ -87,14 +171,14 @@ def load_plants(folder: str | Path) -> dict[str, list[SplatCloud]]:
         found.setdefault(kind, []).append(_plain(load_ply(file)))
     if not found:
         raise InputError(
-            f"{folder} holds no plants; they are KIND-NUMBER.ply, e.g. tomato-0.ply, as "
+            f"{folder} must hold plants as KIND-NUMBER.ply, e.g. tomato-0.ply; "
             "`fidsplat experiment plants` writes them"
         )
     return found
 
 
 def _plain(cloud: SplatCloud) -> SplatCloud:
-    """With colours in place of SH of degree 0, which would make SH of a whole scene."""
+    """The cloud with colours instead of SH of degree 0: one cloud with SH makes the complete scene SH."""
     colors = cloud.plain_colors
     if cloud.sh is None or colors is None:
         return cloud
@@ -103,70 +187,106 @@ def _plain(cloud: SplatCloud) -> SplatCloud:
     return SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors, origin=cloud.origin)
 
 
-def _whole(*parts: SplatCloud) -> SplatCloud:
-    return SplatCloud.concatenate(parts)
+def _shade(rng: np.random.Generator, colour: Sequence[float], spread: float = 0.2) -> np.ndarray:
+    return np.clip(np.asarray(colour) * (1 + rng.uniform(-spread, spread)), 0, 1)
 
 
-def _greens(rng: np.random.Generator, count: int, colour: Colour) -> np.ndarray:
-    """Shades of a colour, each a little lighter or darker."""
-    return np.asarray(colour) * rng.uniform(0.7, 1.25, (count, 1)) + rng.normal(0, 0.02, (count, 3))
+def _stem(rng: np.random.Generator, height: float) -> np.ndarray:
+    """(24, 3) centre line of a swaying stem."""
+    z = np.linspace(0, height, 24)
+    phase, pace = rng.uniform(0, 2 * math.pi, 2), rng.uniform(3, 6, 2)
+    sway = 0.02 * (np.sin(pace * z[:, None] + phase) - np.sin(phase))
+    return np.column_stack([sway, z])
 
 
-def _stem(rng: np.random.Generator, height: float, radius: float) -> SplatCloud:
-    """Upright disks, crossed, so that it is seen from every side."""
-    count = math.ceil(height / 0.05)
-    z = np.repeat((np.arange(count) + 0.5) * height / count, 2)
-    sway = 0.03 * np.sin(z * rng.uniform(2, 5) + rng.uniform(0, 6))
-    centers = np.stack([sway, 0.6 * sway[::-1], z], 1)
-    across = np.tile([[1.0, 0, 0], [0, 1.0, 0]], (count, 1))
-    sizes = np.tile([0.6 * height / count, radius], (2 * count, 1))
-    return disks(
-        centers, np.tile(_UP, (2 * count, 1)), across, sizes, _greens(rng, 2 * count, (0.3, 0.45, 0.15))
+def _nodes(
+    rng: np.random.Generator, stem: np.ndarray, count: int, low: float = 0.12, high: float = 0.98
+) -> list[tuple[np.ndarray, float, float]]:
+    """Position, azimuth and relative height of each leaf base on a stem."""
+    shares = np.linspace(low, high, count) + rng.normal(0, 0.01, count)
+    turns = GOLDEN * np.arange(count) + rng.uniform(0, 2 * math.pi) + rng.normal(0, 0.25, count)
+    line = [np.interp(shares, np.linspace(0, 1, len(stem)), axis) for axis in stem.T]
+    return list(zip(np.column_stack(line), turns.tolist(), shares.tolist(), strict=True))
+
+
+def _arc(length: float, rise: float, bend: float, points: int = 8) -> np.ndarray:
+    """(points, 3) arc from the origin along x, from elevation `rise` down by `bend` radians."""
+    angles = rise - bend * np.linspace(0, 1, points - 1) ** 1.5
+    steps = length / (points - 1) * np.column_stack([np.cos(angles), 0 * angles, np.sin(angles)])
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def _placed(points: np.ndarray, at: np.ndarray, turn: float) -> np.ndarray:
+    """Points (..., 3) rotated about z, then translated."""
+    c, s = math.cos(turn), math.sin(turn)
+    return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + at
+
+
+def _tube(line: np.ndarray, radius: float, colour: Sequence[float], sides: int = 6) -> Mesh:
+    """Tapered tube along a line (n, 3)."""
+    along = np.gradient(line, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.cross(along, [0.35, 0.9, 0.25])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    around = np.arange(sides) * 2 * math.pi / sides
+    thick = radius * np.linspace(1, 0.6, len(line))
+    ring = (
+        np.cos(around)[:, None] * across[:, None] + np.sin(around)[:, None] * np.cross(along, across)[:, None]
     )
+    return _grid(line[:, None] + thick[:, None, None] * ring, np.asarray(colour), closed=True)
 
 
-def _leaves(
-    rng: np.random.Generator, height: float, count: int, length: float, width: float, droop: float, parts: int
-) -> SplatCloud:
-    """Leaves around a stem, spiralling up, each of some disks in a row that bends down."""
-    k = np.arange(count)
-    around = k * 2.4 + rng.normal(0, 0.3, count)  # the golden angle
-    z = height * (0.15 + 0.85 * (k + rng.uniform(0, 1, count)) / count)
-    scale = rng.uniform(0.7, 1.2, count) * (1.15 - 0.5 * z / height)
-    outward = np.stack([np.cos(around), np.sin(around), np.zeros(count)], 1)
-    found = []
-    for part in range(parts):
-        share = (part + 0.5) / parts
-        bend = rng.uniform(0.1, 0.4, count) - droop * share * 2
-        along = np.cos(bend)[:, None] * outward + np.sin(bend)[:, None] * _UP
-        reach = (length * scale * 2 * share)[:, None]
-        centers = outward * reach + np.stack([0 * z, 0 * z, z - droop * reach[:, 0] * share], 1)
-        normals = np.cross(np.cross(along, _UP), along) + rng.normal(0, 0.15, (count, 3))
-        wide = width * scale * (1 - 0.5 * abs(2 * share - 1))
-        sizes = np.stack([length * scale / parts, 0.5 * wide], 1)
-        found.append(disks(centers, along, normals, sizes, _greens(rng, count, (0.16, 0.42, 0.12))))
-    return _whole(*found)
+def _blade(
+    rng: np.random.Generator,
+    foot: np.ndarray,
+    turn: float,
+    length: float,
+    wide: float,
+    colour: np.ndarray,
+    rise: float = 0.35,
+    droop: float = 1.0,
+    lobes: float = 0.08,
+    waves: float = 0.05,
+) -> Mesh:
+    """Leaf towards azimuth `turn`, `wide` times as wide as long, folded and darker at its midrib."""
+    rows, columns = 11, 9
+    u, v = np.linspace(0, 1, rows)[:, None], np.linspace(-1, 1, columns)
+    half = wide / 2 * length * np.sin(math.pi * np.clip(u, 0.02, 0.99) ** 0.75) ** 0.8
+    half = half * (1 + lobes * np.cos(6 * math.pi * u))
+    middle = _arc(length, rise, droop, rows)[:, None]
+    phase = rng.uniform(0, 2 * math.pi)
+    lift = half * (0.25 * np.abs(v) + waves * np.abs(v) ** 2 * np.sin(4 * math.pi * u + 3 * v + phase))
+    points = middle + np.stack([0 * lift, half * v, lift], axis=-1)
+    light = 1 + 0.18 * np.abs(v) - 0.08 * np.cos(8 * math.pi * (u - 0.3 * np.abs(v)))
+    return _grid(_placed(points, foot, turn), np.clip(colour * light[..., None], 0, 1))
 
 
-def _fruits(
-    rng: np.random.Generator, height: float, count: int, radius: float, colour: Colour, stretch: float = 1.0
-) -> SplatCloud:
-    """Balls, or what hangs longer by `stretch`: a shell of twelve disks each."""
-    rays = np.array([[0, a, b] for a in (1, -1) for b in (1.618, -1.618)])
-    rays = np.concatenate([rays, rays[:, [2, 0, 1]], rays[:, [1, 2, 0]]])
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)  # the corners of an icosahedron
-    around = rng.uniform(0, 2 * math.pi, count)
-    feet = np.stack([0.07 * np.cos(around), 0.07 * np.sin(around), height * rng.uniform(0.2, 0.75, count)], 1)
-    size = radius * rng.uniform(0.8, 1.2, count)
-    shape = np.array([1.0, 1.0, stretch])
-    centers = feet[:, None] + size[:, None, None] * rays * shape
-    normals = np.broadcast_to(rays / shape, centers.shape).reshape(-1, 3)
-    along = np.cross(normals, [0.3, 0.5, 0.8])
-    wide = np.repeat(0.75 * size * stretch**0.5, 12)
-    return disks(
-        centers.reshape(-1, 3),
-        along,
-        normals,
-        np.stack([wide, wide], 1),
-        _greens(rng, 12 * count, colour),
+def _ball(middle: np.ndarray, radii: Sequence[float], colour: np.ndarray) -> Mesh:
+    """Ellipsoid mesh."""
+    rows, columns = 9, 12
+    down = np.linspace(0.02, math.pi - 0.02, rows)[:, None]
+    around = np.arange(columns) * 2 * math.pi / columns
+    rays = np.stack(
+        [np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down) + 0 * around], -1
+    )
+    return _grid(middle + rays * radii, colour, closed=True)
+
+
+def _grid(points: np.ndarray, colour: np.ndarray, closed: bool = False) -> Mesh:
+    """Surface through a grid of points (rows, columns, 3); `closed` joins the last column to the first."""
+    rows, columns = points.shape[:2]
+    number = np.arange(rows * columns).reshape(rows, columns)
+    if closed:
+        number = np.column_stack([number, number[:, 0]])
+    quads = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], -1).reshape(-1, 4)
+    return Mesh(points.reshape(-1, 3), quads, np.broadcast_to(colour, points.shape).reshape(-1, 3))
+
+
+def _merged(parts: Sequence[Mesh]) -> Mesh:
+    firsts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    quads = [part.quads + first for part, first in zip(parts, firsts, strict=True)]
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate(quads),
+        np.concatenate([part.colors for part in parts]),
     )

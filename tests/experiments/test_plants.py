@@ -15,13 +15,12 @@ from fidsplat.experiments.plants import PlantSettings, cameras_around, write_pla
 from fidsplat.images.files import read_rgba
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.worlds.greenhouse import Greenhouse
-from fidsplat.worlds.plant_meshes import MESHES, Mesh
-from fidsplat.worlds.plants import load_plants
+from fidsplat.worlds.plants import KINDS, Mesh, load_plants
 
 
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_mesh_stands_on_its_foot_and_splats_cover_it(kind):
-    mesh = MESHES[kind](np.random.default_rng(0))
+    mesh = KINDS[kind](np.random.default_rng(0))
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     assert -0.02 < low[2] < 0.02
     assert (0.1 if kind == "lettuce" else 1.0) < high[2] < 2.0
@@ -54,7 +53,7 @@ def test_splats_lie_in_the_faces_and_have_their_colours():
     np.testing.assert_allclose(cloud.colors[large, 0], red, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_cameras_see_the_whole_plant(kind):
     mesh = PlantSettings().mesh(kind, 0)
     cameras = cameras_around(mesh, 12)
@@ -99,7 +98,7 @@ def test_a_stock_of_sampled_plants_fills_a_greenhouse(tmp_path, capsys):
         assert main([*words, *more]) == 2
         assert message in capsys.readouterr().err
     assert main(["greenhouse", "-o", str(tmp_path / "h"), "--plants-from", str(tmp_path)]) == 2
-    assert "holds no plants" in capsys.readouterr().err
+    assert "must hold plants as KIND-NUMBER.ply" in capsys.readouterr().err
     with pytest.raises(fs.InputError, match="must have plants of each kind"):
         Greenhouse(1, 1, stock={"tomato": []})
 
