@@ -104,7 +104,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     monkeypatch.setattr(tiling, "launch_gathered", gather)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     resident = backend.upload(cloud)
-    resident.neighbours = True
+    resident.coherent = True
     for _ in range(3):
         images = pipeline.render(resident, view)
         assert images.stats == expected.stats

@@ -12,7 +12,7 @@ import pytest
 from store_views import TURNED, look, made_stores
 
 import fidsplat as fs
-from fidsplat.backends.opencl import buffers, chunks
+from fidsplat.backends.opencl import buffers, chunk_cache
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.store.chunked_splats import ChunkedSplats
@@ -26,10 +26,9 @@ def stores(tmp_path_factory):
 
 
 def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatch):
-    sent, put = [], chunks.OpenCLChunks._put
-    monkeypatch.setattr(
-        chunks.OpenCLChunks, "_put", lambda self, key, *rest: sent.append(key) or put(self, key, *rest)
-    )
+    cache = chunk_cache.OpenCLChunkCache
+    sent, load = [], cache._load
+    monkeypatch.setattr(cache, "_load", lambda self, key, *rest: sent.append(key) or load(self, key, *rest))
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     resident, cameras = renderer.upload(store), [look(), look(turn=TURNED), look()]
     for camera in cameras:
@@ -91,8 +90,8 @@ def test_slots_that_cannot_become_more_keep_what_they_hold(stores, monkeypatch):
 def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monkeypatch):
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     # two chunks fit, and no picture is put together as a whole
-    monkeypatch.setattr(chunks, "_SHARE", renderer.backend.memory_budget // 10000)
-    monkeypatch.setattr(chunks, "_WHOLE", renderer.backend.memory_budget // 10000)
+    monkeypatch.setattr(chunk_cache, "_SHARE", renderer.backend.memory_budget // 10000)
+    monkeypatch.setattr(chunk_cache, "_GATHERED", renderer.backend.memory_budget // 10000)
     resident, outputs = renderer.upload(store), ("rgb", "splat_id")
     for camera in (look(), look(turn=TURNED)):
         ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
@@ -106,7 +105,7 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
     assert set(cache._slots) == held
     # nor does one chunk that is fetched ahead for another
     every = device_chunks.of(scene.all_chunks(), True)
-    cache._drawn = set()
+    cache._rendered = set()
     cache.bring(every[:2])
     cache.bring(every)
     assert set(cache._slots) == {chunk.key for chunk in every[:2]}
@@ -187,8 +186,8 @@ def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypat
         # room is left for all that the cache may come to take, whatever it holds yet
         empty = limited.backend.chunk_cache(resident.data.chunks, cache._rows)
         gathered = empty.gather(resident.data.chunks.of(resident.data.scene.all_chunks(), True))
-        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * gathered.room
-        assert len(store) <= gathered.room <= 9 / 8 * len(store)
+        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * gathered.capacity
+        assert len(store) <= gathered.capacity <= 9 / 8 * len(store)
         assert empty.memory_bytes == 0
         del limited, resident, frame, cache, empty, gathered
         gc.collect()

@@ -13,7 +13,7 @@ from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.interface import Backend, ChunkedScene, DeviceInfo, DeviceTraits, Rates
 from fidsplat.backends.opencl.ahead import Ahead
 from fidsplat.backends.opencl.assemble import Source, assemble
-from fidsplat.backends.opencl.chunks import OpenCLChunks
+from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
@@ -109,9 +109,9 @@ class OpenCLBackend(Workspace, Backend):
         """The cloud in device buffers."""
         return Resident(self, cloud)
 
-    def chunk_cache(self, scene: ChunkedScene, rows: int) -> OpenCLChunks:
+    def chunk_cache(self, scene: ChunkedScene, rows: int) -> OpenCLChunkCache:
         """A cache of a scene's chunks, each of at most `rows` splats."""
-        return OpenCLChunks(self, scene, rows)
+        return OpenCLChunkCache(self, scene, rows)
 
     def termination_depths(self, images: OpenCLImages) -> TerminationDepths:
         """Termination depth per tile of a frame with the effect `termination_depths`."""

@@ -118,7 +118,7 @@ class MemoryPlanner:
             fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._slopes)
         record = self._source.records["Splat"].itemsize
         budget, largest = self._device.memory_budget, self._device.largest_buffer
-        return plan_of(resident.room, record, upload, fixed, shape.lists, budget, largest)
+        return plan_of(resident.capacity, record, upload, fixed, shape.lists, budget, largest)
 
     def parts(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[Part]:
         """The parts of a batch. reserved: bytes of all output images."""
@@ -133,7 +133,7 @@ class MemoryPlanner:
         samples, tables = self._samples_and_tables(views.view)
         splat = self._source.records["Splat"].itemsize + KEYS + WINDOWS
         splat += SORTED if self._shape.lists == "ordered" else 0
-        each = resident.room * splat + tables + 4 * self._channels * samples
+        each = resident.capacity * splat + tables + 4 * self._channels * samples
         free = min(self._device.memory_budget - plan.held + each, self._device.largest_buffer)
         most = min(free, PART_BYTES.get(self._device.kind, OTHER_PART_BYTES)) // each
         together = max(1, min(most, _PART_SAMPLES // samples))

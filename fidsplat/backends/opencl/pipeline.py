@@ -80,7 +80,7 @@ class OpenCLPipeline(Pipeline):
             cached = resident.cached_frames.get(key)
             if cached is not None and (images := self._replay(resident, view, cached)) is not None:
                 return images
-            if resident.neighbours and self.shape.lists == "tiled":
+            if resident.coherent and self.shape.lists == "tiled":
                 return self._listing("gathered").render(resident, view)
             plan = self._planner.frame(resident, view)
             if plan.chunk and self.shape.lists != "ordered":
@@ -150,7 +150,7 @@ class OpenCLPipeline(Pipeline):
     def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
         """The next frame of a kind; None if the buffers of the last were released."""
         workspace, recorded = self.workspace, cached.recorded
-        workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.held, resident.room)
+        workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.held, resident.capacity)
         if not tiling.pair_capacity(workspace):
             return None
         queue = workspace.switch_to(workspace.replay_queue)
@@ -170,7 +170,7 @@ class OpenCLPipeline(Pipeline):
             rendered = Rendered.of(frame, timed=False)
             cached.recorded = recorded = RecordedFrame(frame)
         images = self._images(view, rendered, Replay(self, resident, view, recorded))
-        if not resident.fixed:
+        if not resident.immutable:
             images.settle()
         return images
 
@@ -208,7 +208,7 @@ class OpenCLPipeline(Pipeline):
         """A frame with the buffers that it requires."""
         # buffers of other kinds of frames are released; those of its own kind are part of the plan
         free = self.workspace.memory_budget - plan.held
-        self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.room)
+        self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.capacity)
         commands = self._commands if commands is None else commands
         frame = self._frame(resident, view, plan, commands, pair_limit=pair_limit)
         frame.lease_images(self.features.images)
@@ -217,8 +217,8 @@ class OpenCLPipeline(Pipeline):
 
     def _buffer_kind(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
         """Frames of one kind have buffers of the same sizes."""
-        alike = resident.alike if not plan.chunk else None
-        return self, view.width, view.height, alike or (resident.room, plan)
+        alike = resident.buffer_key if not plan.chunk else None
+        return self, view.width, view.height, alike or (resident.capacity, plan)
 
     def _is_replayable(self, frame: DeviceFrame) -> bool:
         """Whether the next frame of its kind can be recorded."""
@@ -265,7 +265,7 @@ class OpenCLPipeline(Pipeline):
                 views = batch.views
                 stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
                 pipeline = self._for_part(resident, plan, stack)
-                kind = pipeline, "views", resident.room, plan
+                kind = pipeline, "views", resident.capacity, plan
                 workspace.pool.make_way(kind, workspace.memory_budget - plan.held)
                 frame = DeviceFrame(
                     *(workspace, pipeline._commands, pipeline.shape, resident, batch.one(first), plan),
@@ -283,7 +283,7 @@ class OpenCLPipeline(Pipeline):
         if plan.chunk:
             return self._listing("ordered")  # as `render`
         few = stack is not None and self._planner.tiles(stack.view) <= tiling.GATHER_TILES
-        return self._listing("gathered") if few or resident.neighbours else self
+        return self._listing("gathered") if few or resident.coherent else self
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one frame and return what the stages pass on.

@@ -26,15 +26,15 @@ _VECTOR = 16
 class Resident(ResidentData):
     """A SplatCloud on the device.
 
-    A CPU reads the cloud's own arrays, without a copy. On other devices they are copied, labels and colours
-    when a picture first asks for them, or, where they would take more than half of the memory budget, a chunk
-    at a time for every picture (`streamed`).
+    A CPU reads the cloud's own arrays, without a copy. Other devices have copies: of labels and colours when
+    a frame first reads them, and of clouds that exceed half of the memory budget a chunk at a time for every
+    frame (`streamed`).
     """
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         self._workspace = workspace
-        self.count = self.room = len(cloud)
-        """its splats, and those for which pictures have buffers"""
+        self.count = self.capacity = len(cloud)
+        """splats, and splats for which frames have buffers"""
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
         self.has_coplanar_groups = cloud.coplanar_groups is not None
@@ -61,12 +61,12 @@ class Resident(ResidentData):
         self._buffers: dict[str, cl.Buffer] = {}
         self.cached_frames: dict[Hashable, Any] = {}
         """frames of the cloud that are replayed, by their kind"""
-        self.fixed = True
-        """whether its arrays stay as they are; a picture of others cannot be drawn again later"""
-        self.alike: object = None
-        """the same for all whose pictures take smaller buffers where they are fewer"""
-        self.neighbours = False
-        """whether splats that follow each other lie near each other, as those of stores do"""
+        self.immutable = True
+        """whether its arrays never change; a frame of others cannot be rendered again later"""
+        self.buffer_key: object = None
+        """key under which clouds share buffers"""
+        self.coherent = False
+        """whether consecutive splats are close to each other, as in stores"""
         total = self.count * self._bytes_of(self._arrays)
         widest = max(array.nbytes for array in self._arrays.values())
         device = workspace.device
@@ -82,15 +82,17 @@ class Resident(ResidentData):
                     self._whole(name)
                 workspace.queue.finish()
             except cl.Error as error:
-                raise DeviceError(f"{workspace.info.title} failed while taking the cloud: {error}") from error
+                raise DeviceError(
+                    f"{workspace.info.title} failed while copying the cloud: {error}"
+                ) from error
 
     def _bytes_of(self, names: Iterable[str]) -> int:
-        """Bytes of a splat in these arrays."""
+        """Bytes per splat of these arrays."""
         return sum(self._array(name).nbytes // max(self.count, 1) for name in names)
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """What a picture that asks for these arrays makes of the cloud: bytes that stay on the device, and
-        bytes per splat that each picture copies there."""
+        """Memory of the cloud in a frame that reads these arrays: bytes that stay on the device, and bytes
+        per splat that each frame copies there."""
         if self._shared:
             return 0, 0
         if self.streamed:
@@ -99,7 +101,7 @@ class Resident(ResidentData):
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes that the cloud holds on the device; a CPU's are the host's."""
+        """Bytes on the device; 0 where it reads the host's arrays."""
         return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
 
     def color_range(self) -> tuple[float, float]:
@@ -120,7 +122,7 @@ class Resident(ResidentData):
         return whole.get_sub_region(first * row, (end - first) * row)
 
     def _array(self, name: str) -> np.ndarray:
-        """The array on the host; ids are made when a picture first asks for them."""
+        """The array on the host; ids are made when a frame first reads them."""
         if name == "splat_ids" and name not in self._arrays:
             self._arrays[name] = np.arange(self.count, dtype=np.int32)
         return self._arrays[name]
@@ -142,8 +144,8 @@ class Resident(ResidentData):
 
 
 def _finish(process: int, *queues: cl.CommandQueue) -> None:
-    """Before the host's arrays go: kernels may be reading them, of pictures and derivatives that nobody waits
-    for. Queues of the process that this one was forked from are left alone."""
+    """Wait for kernels that may be reading the host's arrays, before these are released. Queues of the
+    process from which this one was forked are not touched."""
     if process == os.getpid():
         for queue in queues:
             with suppress(cl.Error):
@@ -151,11 +153,11 @@ def _finish(process: int, *queues: cl.CommandQueue) -> None:
 
 
 def _aligned(array: np.ndarray) -> np.ndarray:
-    """The array, or a copy of it that begins where a vector may: a CPU reads it where it lies."""
+    """The array, or a copy of it at an aligned address, as vector loads require."""
     if array.ctypes.data % _VECTOR == 0:
         return array
-    room = np.empty(array.nbytes + _VECTOR, np.uint8)
-    first = -room.ctypes.data % _VECTOR
-    copy = room[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
+    memory = np.empty(array.nbytes + _VECTOR, np.uint8)
+    first = -memory.ctypes.data % _VECTOR
+    copy = memory[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
     copy[...] = array
     return copy

@@ -74,7 +74,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:
     """Elements of buffers per splat and view; those of a complete cloud are reused by larger clouds."""
     resident = frame.resident
-    return frame.views * (resident.room if count == resident.count else count)
+    return frame.views * (resident.capacity if count == resident.count else count)
 
 
 # on CPUs: sort by depth, then list

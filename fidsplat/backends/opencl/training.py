@@ -56,13 +56,13 @@ class ResidentArrays(ResidentData):
     """Splats in arrays of the device, as pictures read them: disks without labels and planes."""
 
     has_coplanar_groups, footprint, ellipsoids, group_table = False, "gaussian", "none", None
-    streamed = fixed = False
+    streamed = immutable = coherent = False
 
     def __init__(
         self, buffers: Mapping[str, cl.Buffer], count: int, sh_degree: int, origin: np.ndarray
     ) -> None:
         self._buffers, self.count, self.origin = dict(buffers), count, origin
-        self.room, self.alike = count, None
+        self.capacity, self.buffer_key = count, None
         self.sh_degree = sh_degree
         self.cached_frames: dict[Hashable, Any] = {}
 

@@ -1,7 +1,8 @@
-"""Chunks of a scene in device buffers, and pictures that are drawn of some of them.
+"""Device chunk cache with prefetch: chunks of a scene in device buffers, and clouds gathered from them.
 
-A buffer for each array has slots of one size. What a picture is drawn of is copied from there, on the device,
-into arrays in the order of the scene, which decides ties of depth: so the picture has the bits of the whole.
+Each array has a buffer with slots of one size. The chunks of a frame are copied from there, on the device,
+into arrays in the order of the scene. That order decides ties of depth, so the images are bit-identical to
+those of the complete scene.
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.workspace import Workspace
 
 _SHARE = 4
-"""the cache takes at most this part of the memory budget"""
-_WHOLE = 3
-"""and what a picture is drawn of at most this, if it is put together as a whole"""
+"""the cache takes at most this fraction of the memory budget"""
+_GATHERED = 3
+"""and a gathered cloud at most this one, unless it is streamed"""
 _FIRST_SLOTS = 16
 _LAUNCH = 1 << 15
-"""chunks of a launch: what every device takes as the second dimension of one"""
+"""most chunks of a launch: the limit of every device for its second dimension"""
 _NOWHERE = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
 class Copies:
-    """What copies rows of chunks that have slots."""
+    """Parameters of the kernels that copy rows of cached chunks."""
 
     pieces: cl.Buffer
     """as `gather_chunks.cl` reads them"""
@@ -41,13 +42,13 @@ class Copies:
     count: int
     """chunks"""
     rows: int
-    """of the chunk with most"""
-    changes: int
-    """of slots, before it was made"""
+    """of the largest chunk"""
+    evictions: int
+    """evictions before it was made"""
 
 
-class OpenCLChunks(ChunkCache):
-    """As `ChunkCache`."""
+class OpenCLChunkCache(ChunkCache):
+    """Chunk cache in the slots of device buffers."""
 
     def __init__(self, workspace: Workspace, whole: ChunkedScene, rows: int) -> None:
         self.workspace, self.whole, self._rows = workspace, whole, max(rows, 1)
@@ -58,15 +59,15 @@ class OpenCLChunks(ChunkCache):
         self._size = 0
         self._free: list[int] = []
         self._slots: OrderedDict[Hashable, int] = OrderedDict()
-        """by chunk, least recently used first"""
+        """of each chunk, least recently used first"""
         self.token = object()
-        """what tells it from others, which is not to keep it"""
-        self._changes = 0
-        """how often a chunk has lost its slot"""
-        self._drawn: set[Hashable] = set()
+        """identity that can be compared without keeping the cache alive"""
+        self._evictions = 0
+        """number of evictions"""
+        self._rendered: set[Hashable] = set()
         self._lock = threading.RLock()
         self._queue = cl.CommandQueue(workspace.context)
-        """for transfers, beside what is drawn"""
+        """for transfers while a frame is rendered"""
         self._last: cl.Event | None = None
         """the last copy out of slots"""
         program = build(
@@ -80,33 +81,33 @@ class OpenCLChunks(ChunkCache):
         return self._size * self._rows * sum(self.widths.values())
 
     def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> GatheredChunks:
-        """As `ChunkCache.gather`."""
+        """Concatenate chunks on the device, when a frame reads their arrays."""
         with self._lock:
-            self._drawn = {chunk.key for chunk in chunks}
+            self._rendered = {chunk.key for chunk in chunks}
             if not self.widths:
-                self._learn(chunks[0].load())
+                self._set_widths(chunks[0].load())
         return GatheredChunks(self, chunks, first_id)
 
     def bring(self, chunks: Sequence[Chunk]) -> None:
-        """As `ChunkCache.bring`."""
-        wanted = {chunk.key for chunk in chunks}  # one of these does not make room for another
+        """Prefetch chunks of the next frame, as far as capacity allows."""
+        requested = {chunk.key for chunk in chunks}  # these do not evict each other
         for chunk in chunks:
             with self._lock:
                 if chunk.key in self._slots or not self.widths:
                     continue
             arrays = chunk.load()
             with self._lock:
-                if chunk.key not in self._slots and not self._put(chunk.key, arrays, self._drawn | wanted):
+                pinned = self._rendered | requested
+                if chunk.key not in self._slots and not self._load(chunk.key, arrays, pinned):
                     return
 
     def copy(
         self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer, known: Copies | None
     ) -> Copies | None:
-        """Rows of chunks to an array that a picture is drawn of, on the queue of pictures. spans: of each
-        chunk (k, 3) its first row, where that goes, and how many rows. known: what this has returned for the
-        same rows of another array."""
-        with self._lock, self.workspace.failing("taking splats"):
-            if known is not None and known.changes == self._changes:
+        """Copy rows of chunks into an array, on the queue of frames. spans: (k, 3) first row of each chunk,
+        its destination, and the number of rows. known: the result for the same rows of another array."""
+        with self._lock, self.workspace.failing("copying splats"):
+            if known is not None and known.evictions == self._evictions:
                 self._launch(name, known, target)
                 return known
             rounds = list(self._rounds(chunks))
@@ -117,14 +118,14 @@ class OpenCLChunks(ChunkCache):
             return copies if len(rounds) == 1 else None
 
     def wait(self) -> None:
-        """Until all copies are done."""
-        with self._lock, self.workspace.failing("taking splats"):
+        """Wait for all copies."""
+        with self._lock, self.workspace.failing("copying splats"):
             if self._last is not None:
                 self._last.wait()
 
     def _rounds(self, chunks: Sequence[Chunk]) -> Iterator[tuple[int, int]]:
-        """Ranges of chunks for all of which there are slots at once."""
-        most, first, keys = self._most, 0, set()
+        """Ranges of chunks that fit the slots at once."""
+        most, first, keys = self._max_slots, 0, set()
         for number, chunk in enumerate(chunks):
             keys.add(chunk.key)
             if len(keys) > most or number - first == _LAUNCH:
@@ -133,8 +134,8 @@ class OpenCLChunks(ChunkCache):
         yield first, len(chunks)
 
     def _copies(self, chunks: Sequence[Chunk], spans: np.ndarray) -> Copies:
-        """How they are copied, once they are all there."""
-        slots = self._there(chunks)
+        """Cache the chunks, and return the parameters of their copies."""
+        slots = self._cached(chunks)
         table = np.full((len(chunks), 4), _NOWHERE, np.uint32)
         begins = np.array([chunk.first for chunk in chunks])
         table[:, 0] = np.array(slots) * self._rows + begins + spans[:, 0]
@@ -142,14 +143,14 @@ class OpenCLChunks(ChunkCache):
         poses = [(number, chunk.pose) for number, chunk in enumerate(chunks) if chunk.pose is not None]
         table[[number for number, _ in poses], 3] = np.arange(len(poses))
         return Copies(
-            pieces=self._sent(table),
-            poses=self._sent(np.stack([pose for _, pose in poses])) if poses else None,
+            pieces=self._constant(table),
+            poses=self._constant(np.stack([pose for _, pose in poses])) if poses else None,
             count=len(chunks),
             rows=int(table[:, 2].max(initial=0)),
-            changes=self._changes,
+            evictions=self._evictions,
         )
 
-    def _sent(self, array: np.ndarray) -> cl.Buffer:
+    def _constant(self, array: np.ndarray) -> cl.Buffer:
         flags = cl.mem_flags
         return cl.Buffer(self.workspace.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=array)
 
@@ -166,19 +167,19 @@ class OpenCLChunks(ChunkCache):
         size = -(-items // 64) * 64, copies.count
         self._last = cl.enqueue_nd_range_kernel(self.workspace.queue, kernel, size, (64, 1))
 
-    def _there(self, chunks: Sequence[Chunk]) -> list[int]:
-        """The slots of chunks, for all of which there is room."""
+    def _cached(self, chunks: Sequence[Chunk]) -> list[int]:
+        """Load chunks that are not cached, and return the slots of all."""
         keys = {chunk.key for chunk in chunks}
         for chunk in chunks:
             if chunk.key in self._slots:
                 self._slots.move_to_end(chunk.key)
             else:
-                self._put(chunk.key, chunk.load(), keys)
+                self._load(chunk.key, chunk.load(), keys)
         return [self._slots[chunk.key] for chunk in chunks]
 
-    def _put(self, key: Hashable, arrays: Mapping[str, np.ndarray], kept: Collection[Hashable]) -> bool:
-        """Brings a chunk to a slot; whether there was one that none of those has that are kept."""
-        slot = self._slot(kept)
+    def _load(self, key: Hashable, arrays: Mapping[str, np.ndarray], pinned: Collection[Hashable]) -> bool:
+        """Load a chunk into a slot. Returns False if all slots have pinned chunks."""
+        slot = self._slot(pinned)
         if slot is None:
             return False
         try:
@@ -192,33 +193,32 @@ class OpenCLChunks(ChunkCache):
         self._slots[key] = slot
         return True
 
-    def _slot(self, kept: Collection[Hashable]) -> int | None:
-        if not self._free and self._size < self._most:
-            self._grow(min(self._most, max(_FIRST_SLOTS, 2 * self._size)))
+    def _slot(self, pinned: Collection[Hashable]) -> int | None:
+        if not self._free and self._size < self._max_slots:
+            self._grow(min(self._max_slots, max(_FIRST_SLOTS, 2 * self._size)))
         if self._free:
             return self._free.pop()
-        oldest = next((key for key in self._slots if key not in kept), None)
+        oldest = next((key for key in self._slots if key not in pinned), None)
         if oldest is None:
             return None
         if self._last is not None:
-            self._last.wait()  # it may be read just now
-        self._changes += 1
+            self._last.wait()  # a kernel may be reading it
+        self._evictions += 1
         return self._slots.pop(oldest)
 
     @property
     def reserved_bytes(self) -> int:
-        """Bytes that slots may come to take: pictures leave room for all of them."""
-        return self._most * self._slot_bytes
+        """Bytes of the slots when the cache is full: the memory plan reserves them."""
+        return self._max_slots * self._slot_bytes
 
     @property
     def _slot_bytes(self) -> int:
-        """Of a slot in all arrays, and once more in the widest: one that becomes larger is there twice for a
-        while."""
+        """Bytes of a slot in all arrays, and once more in the widest, which exists twice while it grows."""
         return self._rows * (sum(self.widths.values()) + max(self.widths.values()))
 
     @property
-    def _most(self) -> int:
-        """Slots, at most."""
+    def _max_slots(self) -> int:
+        """Maximum number of slots."""
         share = self.workspace.memory_budget // _SHARE // self._slot_bytes
         widest = self.workspace.device.max_mem_alloc_size // (self._rows * max(self.widths.values()))
         return max(1, self._size, min(share, widest, self.whole.distinct(self.applies_poses)))
@@ -229,64 +229,63 @@ class OpenCLChunks(ChunkCache):
         for name, width in self.widths.items():
             buffer = self.workspace.pool.fresh(f"chunks of {name}", size * self._rows * width)
             if self._size:
-                held = self._size * self._rows * width
-                # waited for one by one: where the next has no room, this one holds what it held
-                cl.enqueue_copy(self._queue, buffer, self._arrays[name], byte_count=held).wait()
+                used = self._size * self._rows * width
+                # one by one: if the next allocation fails, this array is still complete
+                cl.enqueue_copy(self._queue, buffer, self._arrays[name], byte_count=used).wait()
             self._arrays[name] = buffer
         self._free += range(size - 1, self._size - 1, -1)
         self._size = size
 
-    def _learn(self, arrays: Mapping[str, np.ndarray]) -> None:
+    def _set_widths(self, arrays: Mapping[str, np.ndarray]) -> None:
         for name, array in arrays.items():
             self.widths[name] = array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
 
 
-def _roomy(count: int) -> int:
-    """At least as many, and at most an eighth more: one of a few numbers."""
+def _rounded_up(count: int) -> int:
+    """At least `count`, and at most an eighth more: one of a few numbers, so that buffers are reused."""
     step = 1 << max(count.bit_length() - 4, 0)
     return -(-count // step) * step
 
 
 class GatheredChunks(ResidentData):
-    """What a picture is drawn of, as `Resident`: copied out of slots when a picture first asks for an array,
-    or, where that would take more than its part of the memory budget, some splats at a time for every
-    picture (`streamed`)."""
+    """A cloud of cached chunks. An array is copied out of the slots when a frame first reads it; a cloud that
+    exceeds its share of the memory budget is copied in parts for every frame (`streamed`)."""
 
-    def __init__(self, cache: OpenCLChunks, chunks: Sequence[Chunk], first_id: int) -> None:
+    def __init__(self, cache: OpenCLChunkCache, chunks: Sequence[Chunk], first_id: int) -> None:
         whole, workspace = cache.whole, cache.workspace
         self._cache, self._chunks, self._workspace = cache, chunks, workspace
         self._first_id = first_id
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
         self.count = int(self._ends[-1])
-        self.room = _roomy(self.count)
-        """splats for which pictures have buffers: those of the next view, of about as many, are the same"""
+        self.capacity = _rounded_up(self.count)
+        """splats for which frames have buffers; the next view, with about as many, reuses them"""
         self.origin, self.sh_degree, self.footprint = whole.origin, whole.sh_degree, whole.footprint
         self.has_coplanar_groups, self.group_table = whole.has_coplanar_groups, whole.group_table
         self.ellipsoids = whole.ellipsoids
         self.cached_frames: dict[Hashable, Any] = {}
-        """as that of a Resident"""
-        self.fixed = True
-        self.alike = cache.token
-        self.neighbours = True
+        """frames that are replayed, by their kind"""
+        self.immutable = True
+        self.buffer_key = cache.token
+        self.coherent = True
         self._buffers: dict[str, cl.Buffer] = {}
         self._leased: list[tuple[str, cl.Buffer]] = []
         weakref.finalize(self, workspace.pool.give_back, self._leased)
         self._copies: tuple[int, int, Copies | None] = (0, 0, None)
-        """of splats [first, end), as they were copied last"""
-        total, widest = self.room * sum(cache.widths.values()), self.room * max(cache.widths.values())
+        """parameters of the last copy, of splats [first, end)"""
+        total, widest = self.capacity * sum(cache.widths.values()), self.capacity * max(cache.widths.values())
         self.streamed = (
-            total > workspace.memory_budget // _WHOLE or widest > workspace.device.max_mem_alloc_size
+            total > workspace.memory_budget // _GATHERED or widest > workspace.device.max_mem_alloc_size
         )
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """As that of a Resident: what the cache may take stays."""
-        asked, stays = {*names, *self._buffers}, self._cache.reserved_bytes
-        each = sum(self._width(name) for name in asked)
-        return (stays, each) if self.streamed else (stays + self.room * each, 0)
+        """Bytes that stay on the device, with the full cache, and bytes per splat that each frame copies."""
+        read, stays = {*names, *self._buffers}, self._cache.reserved_bytes
+        each = sum(self._width(name) for name in read)
+        return (stays, each) if self.streamed else (stays + self.capacity * each, 0)
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes on the device, the cache among them."""
+        """Bytes on the device, the cache included."""
         return self._cache.memory_bytes + sum(buffer.size for buffer in self._buffers.values())
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
@@ -297,12 +296,12 @@ class GatheredChunks(ResidentData):
             self._fill(name, first, end, buffer)
             return buffer
         if name not in self._buffers:
-            # that of the last view, if it is large enough: to have new memory takes as long as to fill it
+            # the last view's, if it is large enough: allocating memory takes as long as filling it
             label = f"the splats' {name}"
-            whole = self._workspace.pool.lease(label, self.room * width, larger=True)
+            whole = self._workspace.pool.lease(label, self.capacity * width, larger=True)
             self._leased.append((label, whole))
             self._fill(name, 0, self.count, whole)
-            self._cache.wait()  # pictures may be drawn on another queue
+            self._cache.wait()  # frames may be rendered on another queue
             self._buffers[name] = whole
         whole = self._buffers[name]
         return (
