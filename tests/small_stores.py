@@ -1,4 +1,4 @@
-"""Small stores that are cut as large ones are."""
+"""Small stores with as many chunks and buckets as large ones."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ WINDOW, NOTED = 1000, 3
 
 
 def two_files(folder: Path) -> list[Path]:
-    """Files of COUNT splats each: with SH of degree 1 and planes, and with labels and 3D Gaussians."""
+    """Files of COUNT splats each: SH of degree 1 and coplanar groups; labels and 3D Gaussians."""
     first = random_splats(COUNT, 1, sh_degree=1).with_labels(0)
     first = first.with_coplanar_groups(np.where(np.arange(COUNT) % 1000 < 3, np.arange(COUNT) // 3000, -1))
     fs.save_ply(first, folder / "a.ply")
@@ -37,8 +37,7 @@ def two_files(folder: Path) -> list[Path]:
 
 
 def store_fixtures() -> tuple[Any, Any, Any]:
-    """Fixtures of a module: what it builds is sorted in many buckets and noted often, few splats though it
-    has; files, and their store."""
+    """Fixtures: builds with many buckets and frequent saves; two files; their store."""
 
     @pytest.fixture(scope="module", autouse=True)
     def cut():
@@ -61,5 +60,5 @@ def store_fixtures() -> tuple[Any, Any, Any]:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """What the files of a folder hold, by their names."""
+    """Content of the files of a folder, by name."""
     return {file.name: file.read_bytes() for file in folder.iterdir()}

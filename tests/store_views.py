@@ -1,4 +1,4 @@
-"""Stores of small splats on all sides, cut into small chunks, and cameras among them."""
+"""Stores of small splats around the origin in small chunks, and cameras among them."""
 
 import math
 

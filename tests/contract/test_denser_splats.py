@@ -1,5 +1,4 @@
-"""Splats with an opacity above 1, which stand for others in a store: drawn as far as they reach, further than
-any other, and not left out where others would be."""
+"""Merged splats with an opacity above 1 are rendered out to their larger radius and not culled too early."""
 
 import math
 
@@ -16,8 +15,7 @@ from fidsplat.streaming.frustum_culling import in_frustum
 SIZE, FOCAL, DEPTH, SIGMA = (61, 47), 4000.0, 2.0, 200.0
 CAMERA = fs.Camera.pinhole(*SIZE, FOCAL, FOCAL, 30.5, 23.5)
 CUTOFF, BEYOND = 0.05, 2.8
-"""standard deviations that it lies beside the outermost pixels: the cut-off ends opacities of 1 at 2.45, of 4
-at 2.96"""
+"""standard deviations from the outermost pixels: the cut-off radius is 2.45 for opacity 1, 2.96 for 4"""
 ALPHA = MAX_OPACITY * math.exp(-(BEYOND**2) / 2)
 SIDES = {"left": (-1, 0), "right": (1, 0), "above": (0, -1), "below": (0, 1)}
 KINDS = {"screen": "screen", "none": "none", "pixel": "pixel", "thick": "screen"}
@@ -28,10 +26,10 @@ def quality_of(kind):
     return fs.Quality(lowpass=KINDS[kind], alpha_cutoff=CUTOFF)
 
 
-def beside(side, thick=False):
-    """Such a splat, wide and faint at the picture's border."""
+def splat_outside(side, thick=False):
+    """A wide merged splat next to the image, faint at its border."""
     across, down = SIDES[side]
-    # from the middle of the picture to its outermost pixels, and on
+    # from the image centre to the outermost pixels, and beyond
     way = np.array([across * (SIZE[0] - 1) / 2, down * (SIZE[1] - 1) / 2]) + BEYOND * SIGMA * np.array(
         [across, down]
     )
@@ -47,8 +45,8 @@ def beside(side, thick=False):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("side", SIDES)
-def test_they_reach_into_the_picture(renderer, side, kind):
-    cloud = beside(side, kind == "thick")
+def test_they_reach_into_the_frame(renderer, side, kind):
+    cloud = splat_outside(side, kind == "thick")
     frame = assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha"), quality_of(kind))
     assert frame["alpha"].max() == pytest.approx(ALPHA, rel=0.05)
 
@@ -58,14 +56,14 @@ def test_they_reach_into_the_rows_of_a_rolling_shutter(renderer, side):
     shutter = fs.Shutter(readout=0.5, rows_per_band=7)
     moving = fs.Motion(lambda time: CAMERA.world_to_camera)
     capture = fs.Capture(CAMERA, ("rgb", "alpha"), quality_of("screen"), motion=moving, shutter=shutter)
-    alpha = renderer.render(beside(side), capture)["alpha"]
+    alpha = renderer.render(splat_outside(side), capture)["alpha"]
     assert alpha.max() == pytest.approx(ALPHA, rel=0.05)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("side", SIDES)
 def test_boxes_of_them_are_in_the_frustum(side, kind):
-    cloud = beside(side, kind == "thick")
+    cloud = splat_outside(side, kind == "thick")
     features, view = prepare(cloud, fs.Capture(CAMERA, quality=quality_of(kind)))
     reach = cloud.scales.max(axis=1).astype(np.float64)
 

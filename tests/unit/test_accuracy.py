@@ -1,4 +1,4 @@
-"""Errors between pictures, and the picture of the same definition at full precision."""
+"""Errors between images, and reference images at full precision."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def test_errors_of_known_differences():
     assert found.psnr == pytest.approx(-20 * np.log10(found.rmse))
 
 
-def test_equal_pictures_have_no_error():
+def test_equal_images_have_no_error():
     assert errors(np.ones((2, 3)), np.ones((2, 3))) == Errors(0.0, 0.0, 0.0, float("inf"))
 
 
@@ -34,7 +34,7 @@ def test_differences_are_not_rounded_to_float32():
 
 
 @pytest.mark.parametrize(
-    ("picture", "want", "message"),
+    ("image", "want", "message"),
     [
         (np.zeros((2, 3)), np.zeros((3, 2)), r"shape \(3, 2\) .* got \(2, 3\)"),
         (np.zeros((0, 3)), np.zeros((0, 3)), "must have values"),
@@ -42,12 +42,12 @@ def test_differences_are_not_rounded_to_float32():
         (np.zeros(2), np.array([np.inf, np.nan]), "reference must be finite, got 2 of 2"),
     ],
 )
-def test_what_cannot_be_compared(picture, want, message):
+def test_what_cannot_be_compared(image, want, message):
     with pytest.raises(InputError, match=message):
-        errors(picture, want)
+        errors(image, want)
 
 
-def test_truth_keeps_the_definition_and_leaves_nothing_out():
+def test_full_precision_keeps_the_definition():
     like = fs.Quality(
         samples=2,
         lowpass="pixel",
@@ -62,7 +62,7 @@ def test_truth_keeps_the_definition_and_leaves_nothing_out():
     assert (best.transmittance_stop, best.opacity_ceiling, best.stop_rule) == (0.0, 1.0, "inclusive")
 
 
-def test_truth_of_a_device_is_that_of_the_reference(renderer):
+def test_the_reference_image_of_a_device_agrees_with_the_reference(renderer):
     cloud = random_splats(60, seed=3, depth=(1.0, 6.0), scale=(0.05, 1.0))
     best = full_precision(fs.Capture(), fs.Renderer("reference")).quality
     reference = reference_pixels(cloud, CAMERA, ("rgb",), best)
@@ -74,7 +74,7 @@ def test_truth_of_a_device_is_that_of_the_reference(renderer):
 
 
 def test_rays_of_lenses_and_fog_are_float32():
-    """They have a truth all the same."""
+    """They have a reference image too."""
     renderer, cloud = fs.Renderer("opencl"), random_splats(20, seed=1, depth=(1.0, 6.0))
     lens = replace(CAMERA, lens=fs.Fisheye())
     fog = fs.Fog(0.2)
@@ -82,11 +82,11 @@ def test_rays_of_lenses_and_fog_are_float32():
     assert full_precision(fs.Capture(fog=fog), renderer).quality.blend_precision == "float32"
     capture = fs.Capture(lens, fog=fog)
     assert full_precision(capture, renderer).fog == fog
-    picture = reference_image(renderer, cloud, capture)
-    assert errors(picture, reference_image(fs.Renderer("reference"), cloud, capture)).maximum < 1e-4
+    image = reference_image(renderer, cloud, capture)
+    assert errors(image, reference_image(fs.Renderer("reference"), cloud, capture)).maximum < 1e-4
 
 
-def test_the_reference_gives_its_float64():
+def test_the_reference_returns_float64():
     cloud = random_splats(20, seed=1, depth=(1.0, 6.0))
     plane = reference_image(fs.Renderer("reference"), cloud, fs.Capture(CAMERA, background=(0.1, 0.2, 0.3)))
     assert (plane != plane.astype(np.float32)).any()

@@ -1,5 +1,5 @@
-"""What the README and the pages of docs/ print works as printed: their Python runs, their scene files load,
-their commands run, or parse where they take minutes, their links lead somewhere."""
+"""Code blocks of README and docs/ work: Python runs, scene files load, commands run (or parse, if slow), and
+links lead to files."""
 
 import re
 import runpy
@@ -34,7 +34,7 @@ GIVEN = {
 
 
 def load_scene(example: Example) -> None:
-    """A scene file is kept under the name in its first comment, else scene.toml, for later blocks."""
+    """Save and load a scene file, named by its first comment, else scene.toml."""
     name = re.match(r"# (\S+\.toml)", example.parsed)
     path = Path(name[1] if name else "scene.toml")
     path.write_text(example.parsed, "utf-8")
@@ -51,7 +51,7 @@ PARSED_ONLY = {
     "train": "minutes; tests/unit/test_train_command.py",
     "view": "ends when it is stopped; tests/unit/test_viewer_*.py",
 }
-"""commands that are not run here, and why; all others are"""
+"""commands that are parsed but not run, with the reason"""
 PARSED_WORDS = {
     "--device": "a machine's own",
     "--max-error": "tests/unit/test_quality_within.py",
@@ -61,7 +61,7 @@ PARSED_WORDS = {
     "city/city.toml": "a hundred frames of 1280 x 720; tests/unit/test_flights.py",
 }
 SMALLER = {"store demo": ["--splats", "20000", "--houses", "1", "--views", "0", "--markers", "2"]}
-"""what is added to a command so that it takes a second"""
+"""options that make a command fast"""
 EXTRAS = {
     "experiments": ("pandas", "matplotlib", "pupil_apriltags", "flip_evaluator", "jinja2"),
     "logs": ("mcap", "rosbags"),
@@ -70,11 +70,11 @@ EXTRAS = {
     "video": ("imageio_ffmpeg",),
     "viewer": ("viser",),
 }
-"""modules of extras; those of an extra that a line and its page do not mention are hidden while it runs"""
+"""modules of extras; they are hidden from lines whose page does not mention the extra"""
 
 
 def check_commands(text: str, run=lambda words, line: None) -> None:
-    """Every `fidsplat` parses, and goes to `run` with its line; every script for Python is there."""
+    """Parse every `fidsplat` command and pass it to `run`; check that Python scripts exist."""
     for line in text.replace("\\\n", " ").splitlines():
         words = shlex.shlex(line, posix=True, punctuation_chars=";&|>")
         words.whitespace_split = True
@@ -93,12 +93,11 @@ def check_command(words: list[str]) -> None:
     if words[:1] == ["fidsplat"]:
         _parse(words[1:])
     elif words[:1] == ["python"] and words[1].endswith(".py"):
-        assert (TREE / words[1]).exists(), f"{words[1]} is not there"
+        assert (TREE / words[1]).exists(), f"{words[1]} does not exist"
 
 
 def run_command(words: list[str], line: str, page: str) -> None:
-    """Run a command in the folder of the test, with the files that it names and without the extras that are
-    not mentioned."""
+    """Run a command in the folder of the test, without extras that are not mentioned."""
     verb = " ".join(words[:2]) if words[0] == "store" else words[0]
     if verb in PARSED_ONLY or set(PARSED_WORDS) & set(words):
         return
@@ -118,7 +117,7 @@ def run_command(words: list[str], line: str, page: str) -> None:
 
 
 def save_city(name: str):
-    """A row of splats before the camera, as a PLY file or a store."""
+    """Save a row of splats in front of the camera, as a PLY file or a store."""
     places = np.stack([np.linspace(-1, 1, 20), np.zeros(20), np.full(20, 3.0)], 1)
     row = fs.SplatCloud(places, np.tile([1.0, 0, 0, 0], (20, 1)), np.full((20, 2), 0.1), np.full(20, 0.9),
                         colors=np.full((20, 3), 0.5))  # fmt: skip
@@ -130,7 +129,7 @@ def save_city(name: str):
 
 
 def copy_examples() -> None:
-    """The scenes of `examples/`, an eighth of their size."""
+    """Copy the scenes of `examples/`, at an eighth of their size."""
     shutil.copytree(EXAMPLES, "examples")
     for file in Path("examples").glob("*.toml"):
         lines = re.sub(
@@ -163,7 +162,7 @@ READERS_FILES = {
     "house.fss": lambda: save_city("house.fss"),
     "examples/*.toml": copy_examples,
 }
-"""files that readers have, by their names on the pages; made before the first command that names them"""
+"""files of readers, created before the first command that names them"""
 
 
 def run_commands(example: Example) -> None:
@@ -181,8 +180,8 @@ BLOCKS = Sybil(
 )
 
 
-def given_room() -> None:
-    """A splat file such as a reader has, kept as room.ply."""
+def create_room() -> None:
+    """Create a splat file room.ply of a reader."""
     far = np.array([[0.0, 0.0, 3.0]])
     room = fs.SplatCloud(far, [[1.0, 0, 0, 0]], [[1.0, 1.0]], [0.9], colors=[[0.7, 0.6, 0.5]])
     fs.save_ply(room, "room.ply")
@@ -192,14 +191,14 @@ def given_room() -> None:
 def test_code_blocks_work_as_printed(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     if page.name in GIVEN:
-        given_room()
+        create_room()
     for example in BLOCKS.parse(page).examples():
         example.evaluate()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_block_says_its_language(page):
-    """So that none is passed over by the test above: text, or what that test knows."""
+def test_every_block_has_a_language(page):
+    """Only languages that the test above handles, or text."""
     known = {"python", "toml", "bash", "text"}
     fences = re.findall(r"^ *```(.*)$", page.read_text("utf-8"), re.MULTILINE)
     assert set(fences[::2]) <= known
@@ -207,18 +206,18 @@ def test_every_block_says_its_language(page):
 
 
 @pytest.mark.parametrize("page", [*PAGES, *DEVLOG], ids=lambda page: page.name)
-def test_every_link_and_picture_is_there(page):
+def test_every_link_leads_to_a_file(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text("utf-8")):
         assert (page.parent / target).exists(), f"{page.name} points at {target}"
 
 
 @pytest.mark.parametrize("line", ["pip install . && fidsplat demo", "pip install '.[test]' && pytest"])
-def test_the_two_commands_stand_in_the_readme(line):
+def test_the_readme_has_the_install_commands(line):
     assert line in README.read_text("utf-8").splitlines()
 
 
 @pytest.mark.parametrize("line", ["fidsplat render scene.toml --no-such", "python benchmarks/no_such.py"])
-def test_a_line_that_would_fail_is_noticed(line):
+def test_invalid_lines_are_detected(line):
     with pytest.raises((SystemExit, AssertionError)):
         check_commands(line)
 

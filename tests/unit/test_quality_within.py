@@ -89,7 +89,7 @@ def layers(count, opacity, color=1.0):
     [(0.1, 100, 1.0), (1e-2, 100, 1.0), (1e-3, 1000, 1.0), (1e-4, 100, 1.0), (1e-2, 100, 1000.0)],
 )
 def test_the_promise_names_its_class_of_scenes(renderer, error, count, colors):
-    """The worst of the class: as many layers as it has, each as opaque as what is left out may be."""
+    """The hardest scene of the class: the maximum number of layers just below the cut-off."""
     quality = fs.quality_within(error, device=renderer, layers=count, colors=colors)
     haze = layers(count, 0.99 * quality.alpha_cutoff, colors)
     light = fs.SplatCloud.concatenate([layers(30, 0.5, 0.0), layers(1, 1.0, colors).transformed(AWAY)])
@@ -109,18 +109,18 @@ def test_the_promise_names_its_class_of_scenes(renderer, error, count, colors):
         ({"colors": 0}, "got 0"),
     ],
 )
-def test_a_class_that_nothing_keeps(renderer, words, message):
+def test_a_class_of_scenes_without_a_promise(renderer, words, message):
     with pytest.raises(InputError, match=message):
         fs.quality_within(1e-3, device=renderer, **words)
 
 
 def coarse(renderer):
-    """A choice that was never measured."""
+    """A choice that was not measured."""
     return Choice(fs.Quality.named("fast"), 0.0, 1.0, 1.0, "measured", renderer.device.name, {})
 
 
 @in_turn()
-def test_a_choice_is_certified_or_made_finer_until_it_is(renderer):
+def test_a_choice_is_refined_until_certified(renderer):
     haze = layers(300, 1e-3)
     scene = fs.Scene([haze], camera=SMALL)
     choice = certify(coarse(renderer), 1e-3, None, scene, scene.capture, renderer)
@@ -136,7 +136,7 @@ def test_a_choice_is_certified_or_made_finer_until_it_is(renderer):
         certify(coarse(renderer), 1e-3, 1e-6, scene, scene.capture, renderer)
 
 
-def test_a_choice_without_a_certificate_says_why(renderer):
+def test_a_choice_without_a_certificate_has_a_remark(renderer):
     scene = fs.Scene([layers(3, 0.5)], camera=SMALL, fog=fs.Fog(0.1))
     choice = certify(coarse(renderer), 1e-3, None, scene, scene.capture, renderer)
     assert choice.certified is None
@@ -144,7 +144,7 @@ def test_a_choice_without_a_certificate_says_why(renderer):
     assert "fog" in choice.summary
 
 
-def test_less_error_is_never_cheaper(renderer):
+def test_a_lower_error_is_never_faster(renderer):
     cost = {json.dumps(s.settings): s.cost for s in candidates.load(renderer.device.kind)}
     chosen = [choose(error, device=renderer) for error in (0.3, *BOUNDS)]
     assert all(choice.error <= error for choice, error in zip(chosen, (0.3, *BOUNDS), strict=True))
@@ -162,7 +162,7 @@ def test_the_definition_stays():
         assert (parity.opacity_ceiling, parity.stop_rule, parity.order) == (1.0, "inclusive", "centre")
 
 
-# calibration
+# measured errors
 
 
 @in_turn()
@@ -176,7 +176,7 @@ def test_a_measured_error_is_the_error(renderer, held_out):
             assert choice.source == "measured"
 
 
-def test_what_the_truth_may_be_off_is_added(renderer, held_out, monkeypatch):
+def test_the_error_of_the_reference_is_added(renderer, held_out, monkeypatch):
     scene, _ = held_out[0]
     capture = fs.Capture(scene.camera, background=scene.background)
 
@@ -189,7 +189,7 @@ def test_what_the_truth_may_be_off_is_added(renderer, held_out, monkeypatch):
     assert measured() == plain + 0.25
 
 
-def test_errors_are_those_before_the_sensor(renderer, held_out):
+def test_errors_are_measured_before_the_sensor(renderer, held_out):
     scene, _ = held_out[0]
     plain, dark = (within(renderer, scene, 1e-3, sensor=fs.Sensor(exposure=e)) for e in (1.0, 1e-3))
     assert dark.error == plain.error
@@ -197,14 +197,14 @@ def test_errors_are_those_before_the_sensor(renderer, held_out):
 
 @in_turn(1)
 def test_a_measured_quality_is_faster_than_a_promised_one(renderer, held_out):
-    """Most scenes need less than the worst of the list does."""
+    """Most scenes need less than the hardest one."""
     cutoff = fs.quality_within(error=1e-3, device=renderer).alpha_cutoff
     own = [within(renderer, scene, 1e-3).quality.alpha_cutoff for scene, _ in held_out[:6]]
     assert np.median(own) > cutoff
 
 
 @in_turn()
-def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monkeypatch):
+def test_choices_are_cached_and_a_damaged_file_is_replaced(renderer, scene, monkeypatch):
     first = within(renderer, scene, 1e-3)
     (file,) = cache.folder().iterdir()
     with monkeypatch.context() as patch:
@@ -223,7 +223,7 @@ def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monk
 
 
 @in_turn(1)
-def test_what_is_kept_is_for_one_question(renderer, scene):
+def test_cache_keys_differ_by_question(renderer, scene):
     within(renderer, scene, 1e-3)
     within(renderer, scene, 1e-2)
     within(renderer, scene, 1e-3, quality="reference")
@@ -235,7 +235,7 @@ def test_what_is_kept_is_for_one_question(renderer, scene):
 
 
 @in_turn()
-def test_a_folder_that_cannot_be_written_is_no_obstacle(renderer, scene, tmp_path, monkeypatch):
+def test_a_cache_folder_that_cannot_be_written_is_ignored(renderer, scene, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(cache, "folder", lambda: tmp_path / "file" / "cache")
     assert within(renderer, scene, 1e-2).source == "measured"
@@ -246,7 +246,7 @@ def test_functions_have_no_key():
     assert _key(1, (2.0, None)) != _key(1, (2.0, 0))
 
 
-def test_a_scene_says_the_rest_itself(renderer, held_out):
+def test_a_scene_has_its_own_capture(renderer, held_out):
     scene, want = held_out[3]
     rest = {"camera": scene.camera, "background": scene.background, "quality": fs.Quality(first_hit=0.2)}
     whole = fs.Scene([scene.cloud], **rest)
@@ -255,8 +255,8 @@ def test_a_scene_says_the_rest_itself(renderer, held_out):
     assert errors(renderer.render(whole, quality=quality)["rgb"], want).maximum <= 1e-3
 
 
-def test_a_device_without_a_knob(renderer, held_out, monkeypatch):
-    """Here one that sets up in float64 alone; Warp has no blending in float64."""
+def test_a_device_without_a_setting(renderer, held_out, monkeypatch):
+    """A device that projects in float64 only."""
     draw = fs.Renderer.render
 
     def lacking(self, cloud, capture=None, outputs=None, quality=None, **more):
@@ -273,12 +273,12 @@ def test_a_device_without_a_knob(renderer, held_out, monkeypatch):
         within(renderer, scene, 1e-12)
 
 
-# times: a clock that knows what each candidate costs, so that nothing hangs on how busy the machine is
+# times, with a simulated clock
 
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Frames take ten milliseconds a decade of the cut-off."""
+    """Frames take ten milliseconds per decade of the cut-off."""
 
     def timer(self, quality):
         clock = Clock()
@@ -306,8 +306,8 @@ def test_error_and_time_together(renderer, scene, clock):
         within(renderer, scene, 1e-4, 25)
 
 
-def test_a_time_is_kept_by_nine_frames_of_ten():
-    """A candidate whose median frame is in time and whose late ones are not is not taken."""
+def test_nine_frames_of_ten_keep_a_time():
+    """A candidate whose median is in time but not its 90th percentile is rejected."""
     late = {1e-2: 2.0, 1e-4: 9.0}
 
     class Known:
@@ -349,23 +349,23 @@ def test_late_frames_are_the_90th_percentile_without_the_first(renderer, scene, 
 
 
 @pytest.mark.parametrize("ms", [0, -3, 1e-6])
-def test_a_time_that_nothing_keeps(renderer, scene, clock, ms):
+def test_an_impossible_time(renderer, scene, clock, ms):
     with pytest.raises(InputError, match=r"ms must be at least [\d.]+ .* quality has an error of"):
         within(renderer, scene, ms=ms)
 
 
 @in_turn(1)
-def test_frames_are_really_timed(renderer, scene):
+def test_frames_are_timed(renderer, scene):
     choice = within(renderer, scene, ms=10_000)
     assert 0 < choice.ms <= choice.ms_late <= 10_000
     assert choice.error < 1e-4
 
 
-# what cannot be
+# invalid requests
 
 
 @pytest.mark.parametrize("error", [0, -1e-3, 1e-9])
-def test_an_error_that_nothing_keeps(renderer, scene, error):
+def test_an_impossible_error(renderer, scene, error):
     with pytest.raises(InputError, match=r"error must be at least \d.* to be promised"):
         fs.quality_within(error=error, device=renderer)
     with pytest.raises(InputError, match=r"error must be at least \d.*allow \d"):
@@ -390,6 +390,6 @@ def test_an_error_that_nothing_keeps(renderer, scene, error):
         ({"error": 1e-3, "capture": "best"}, "camera is 'best'"),
     ],
 )
-def test_what_makes_no_budget(words, message):
+def test_invalid_bounds(words, message):
     with pytest.raises(InputError, match=message):
         fs.quality_within(**words)

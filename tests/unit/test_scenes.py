@@ -31,7 +31,7 @@ def cloud_of(n=5, seed=0, **changes):
 def fake_marker(
     spec, size=1.0, mixture=None, quiet_zone=None, quality=None, max_splats=1_000_000, progress=None, **own
 ):
-    """What a scene needs of a marker, without partitioning one: two splats and four corners."""
+    """A minimal marker without partitioning: two splats and four corners."""
     if "unknown" in spec:
         raise fs.InputError(f"unknown spec {spec!r}")
     knobs = replace(quality or fs.MarkerQuality(), **own | ({"mixture": mixture} if mixture else {}))
@@ -115,7 +115,7 @@ def test_the_contracts_scene(load):
     assert scene.cloud().labels.tolist() == [0] * 5 + [1] * 2
 
 
-def test_everything_that_a_scene_file_can_say(load):
+def test_all_keys_of_a_scene_file(load):
     scene = load("""
         markers = [{spec = "qr:a", size = 2, mixture = "paper", quiet_zone = 0}, {spec = "qr:b", size = 1}]
         [camera]
@@ -170,7 +170,7 @@ def test_an_empty_cloud_is_a_scene(tmp_path, load):
     assert len(load('[[splats]]\nfile = "empty.ply"\nscale = 2.0').cloud()) == 0
 
 
-def test_images_of_markers_are_looked_for_beside_the_scene_file(load, tmp_path):
+def test_images_of_markers_are_relative_to_the_scene_file(load, tmp_path):
     scene = load('[[markers]]\nspec = "image:art/tag.png"\nsize = 1.0')
     assert scene.markers[0].marker.spec == f"image:{tmp_path / 'art' / 'tag.png'}"
     (tmp_path / "deep").mkdir()
@@ -207,7 +207,7 @@ def test_a_placed_markers_cloud_is_its_own():
     origin=st.sampled_from([None, (5e5, 4.5e6, 300.0)]),
 )
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_saved_and_loaded_again(tmp_path, seed, turn, move, size, text, quality, origin):
+def test_saving_and_loading(tmp_path, seed, turn, move, size, text, quality, origin):
     pose = rigid_matrix(move, turn)
     camera = fs.Camera.pinhole(33, 77, 50.1, 60.2, 1 / 3, 40.0, np.linalg.inv(pose), near=0.3)
     marker = fake_marker("qr:" + text + '"\\\x7f\n', size, "paper", 3)
@@ -259,7 +259,7 @@ BETWEEN = fs.Quality(
 
 
 @pytest.mark.parametrize("quality", [BETWEEN, "fast,samples=2,marker.template=9"])
-def test_a_quality_between_the_presets_is_saved_whole(tmp_path, quality):
+def test_a_quality_other_than_presets_is_saved(tmp_path, quality):
     fs.Scene(quality=quality).save(tmp_path / "a.toml")
     assert fs.Scene.load(tmp_path / "a.toml").quality == quality
 
@@ -286,7 +286,7 @@ def test_markers_are_saved_as_they_were_made(tmp_path, made, quality):
         assert again.growth in (made.growth, 0.4)  # which the fitted templates were made with
 
 
-def test_how_many_splats_a_marker_may_have_is_saved(tmp_path):
+def test_the_splat_limit_of_a_marker_is_saved(tmp_path):
     allowed = [1_000_000, 5_000_000]
     markers = [PlacedMarker(fake_marker("qr:a", max_splats=most)) for most in allowed]
     fs.Scene(markers=markers).save(tmp_path / "a.toml")
@@ -295,7 +295,7 @@ def test_how_many_splats_a_marker_may_have_is_saved(tmp_path):
     assert [placed.marker.max_splats for placed in again] == allowed
 
 
-def test_knobs_of_a_scene_file(tmp_path):
+def test_quality_settings_of_a_scene_file(tmp_path):
     file = tmp_path / "a.toml"
     file.write_text(
         """
@@ -330,14 +330,14 @@ def test_knobs_of_a_scene_file(tmp_path):
         ("markers = [{spec = 'qr:a', size = 1, template = 4}]", "markers[0]: marker quality: template is 4"),
     ],
 )
-def test_knobs_of_a_scene_file_that_cannot_be(tmp_path, text, says):
+def test_invalid_quality_settings_of_a_scene_file(tmp_path, text, says):
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(fs.InputError) as caught:
         fs.Scene.load(tmp_path / "a.toml")
     assert says in str(caught.value)
 
 
-def test_text_that_is_no_unicode_cannot_be_saved(tmp_path):
+def test_text_that_is_not_unicode_cannot_be_saved(tmp_path):
     with pytest.raises(fs.InputError, match="not Unicode"):
         fs.Scene(markers=[PlacedMarker(fake_marker("qr:\ud800"))]).save(tmp_path / "a.toml")
 
@@ -361,7 +361,7 @@ def test_a_folder_that_cannot_be_written(tmp_path):
         ({"outputs": (1,)}, "outputs must be one or more names"),
     ],
 )
-def test_parts_of_the_wrong_kind(arguments, words):
+def test_fields_of_the_wrong_type(arguments, words):
     with pytest.raises(fs.InputError, match=words):
         fs.Scene(**arguments)
 

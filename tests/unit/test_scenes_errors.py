@@ -1,4 +1,4 @@
-"""Scene files that say something wrong: one line that names the file, the key, and what would be right."""
+"""Errors of scene files: one line that names the file, the key and the valid values."""
 
 import re
 
@@ -112,7 +112,7 @@ CHANGES = [
 
 
 @pytest.mark.parametrize(("old", "new", "words"), CHANGES)
-def test_one_thing_wrong(refused, old, new, words):
+def test_one_error(refused, old, new, words):
     assert old in GOOD
     refused(GOOD.replace(old, new, 1), re.escape(words))
 
@@ -134,7 +134,7 @@ def test_one_thing_wrong(refused, old, new, words):
         ('spec = "apriltag:36h11:5"\n', "", "markers[0].spec is missing"),
     ],
 )
-def test_a_marker_wrong(refused, old, new, words):
+def test_an_error_of_a_marker(refused, old, new, words):
     assert old in MARKER
     refused(GOOD + MARKER.replace(old, new, 1), re.escape(words))
 
@@ -167,7 +167,7 @@ def test_the_second_of_two_is_named(refused):
         ("{}", "must be a list of 4 rows of 4 numbers, got a table"),
     ],
 )
-def test_a_matrix_wrong(refused, rows, words):
+def test_an_invalid_matrix(refused, rows, words):
     pose = f"world_to_camera = {rows}\n"
     refused(f"[camera]\nwidth = 4\nheight = 4\nfov_x_deg = 60\n{pose}", words)
 
@@ -188,18 +188,18 @@ def test_a_matrix_wrong(refused, rows, words):
         (b"splats = 'a'", r"splats must be written \[\[splats\]\]"),
     ],
 )
-def test_what_is_no_scene_file(refused, content, words):
+def test_files_that_are_not_scene_files(refused, content, words):
     refused(content, words)
 
 
-def test_the_mark_of_editors_is_no_text(tmp_path):
-    """Windows' editors begin a file in UTF-8 with a byte order mark."""
+def test_a_byte_order_mark_is_skipped(tmp_path):
+    """Windows editors add a byte-order mark to UTF-8."""
     path = tmp_path / "scene.toml"
     path.write_text("[render]\nbackground = [0.5, 0.25, 0.0]\n", "utf-8-sig")
     assert fs.Scene.load(path).background == (0.5, 0.25, 0.0)
 
 
-def test_dots_that_join_no_keys_are_read(tmp_path):
+def test_dots_outside_of_keys_are_accepted(tmp_path):
     path = tmp_path / "scene.toml"
     dots = "a." * 1000
     path.write_text(
@@ -213,7 +213,7 @@ def test_dots_that_join_no_keys_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("path", [5, None, b"a.toml", "\ud800", [], "a\0b", "a" * 256, "a/" * 2048 + "b"])
-def test_what_is_no_path(path):
+def test_invalid_paths(path):
     from fidsplat.images.files import read_image
 
     cloud = fs.SplatCloud.empty()

@@ -1,10 +1,10 @@
-"""Pictures by several devices: the bits of one, whichever rows each draws."""
+"""Frames of several devices are bit-identical to those of one."""
 
 import threading
 
 import numpy as np
 import pytest
-from test_store_drawing import TURNED, look, made_store, splats
+from test_store_rendering import TURNED, look, made_store, splats
 
 import fidsplat as fs
 from fidsplat.store import build_plan
@@ -22,7 +22,7 @@ def two():
     return fs.SeveralDevices(["opencl", "opencl"])
 
 
-def test_bands_of_devices_have_the_bits_of_one(store, two):
+def test_bands_of_several_devices_are_bit_identical(store, two):
     outputs = ("rgb", "splat_id", "depth")
     alone, cloud = fs.Renderer("opencl"), store.cloud()
     for scene in (store, cloud, fs.Scene([cloud], look())):
@@ -39,13 +39,13 @@ def test_bands_of_devices_have_the_bits_of_one(store, two):
 
 
 def _around():
-    """A panorama before a panorama."""
+    """A panorama camera with a panorama background."""
     image = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
     return fs.Capture(fs.Camera.equirectangular(64, 32), background=fs.Panorama(image))
 
 
 def _moving():
-    """A camera and a group that move while rows are read out one after another."""
+    """A moving camera and group with a rolling shutter."""
     path = fs.Trajectory([0.0, 1.0], [look().world_to_camera, look(at=(0.4, 0.1, 0.0)).world_to_camera])
     aside = np.eye(4) + np.eye(4, k=3) * 0.3
     groups = {0: fs.Trajectory([0.0, 1.0], [np.eye(4), aside])}
@@ -54,8 +54,8 @@ def _moving():
 
 
 @pytest.mark.parametrize("capture", [_around(), _moving()], ids=["panorama", "shutter"])
-def test_bands_of_what_has_rows_of_its_own(two, capture):
-    """Rays by the row of a panorama, and poses by the row of a shutter, are those of the whole picture."""
+def test_bands_of_effects_that_depend_on_the_row(two, capture):
+    """Rays of a panorama and poses of a shutter are those of the complete frame."""
     cloud = splats(1).with_labels(np.arange(len(splats(1))) % 2)
     whole = fs.Renderer("opencl").render(cloud, capture)["rgb"]
     given = two.upload(cloud)
@@ -65,8 +65,8 @@ def test_bands_of_what_has_rows_of_its_own(two, capture):
     assert len(np.unique(whole.reshape(-1, 3), axis=0)) > 100
 
 
-def test_splats_beside_a_band_are_not_taken_for_big_ones():
-    # what another picture has left on the device must not show where a big splat stands
+def test_splats_outside_a_band_are_not_big():
+    # buffers of an earlier frame must not show in a big splat
     big = fs.SplatCloud([[0.0, 0.0, 2.0]], [[1.0, 0, 0, 0]], [[3.0, 3.0]], [0.1], colors=np.ones((1, 3)))
     cloud = fs.SplatCloud.concatenate([big, splats(1)])
     lower, camera = (fs.Camera.look_at(320, 240, 1.0, (0, 0, 0), (0, y, 1)) for y in (0.5, 0))
@@ -77,7 +77,7 @@ def test_splats_beside_a_band_are_not_taken_for_big_ones():
         assert np.array_equal(renderer.render_band(band, cloud, camera)["rgb"][rows], whole[rows])
 
 
-def test_a_device_holds_the_chunks_that_its_band_sees(store, two):
+def test_a_device_caches_the_visible_chunks_of_its_band(store, two):
     given = two.upload(store)
     two._shares = np.array([0.0, 0.5, 1.0])
     two.render(given, look()).wait()
@@ -88,18 +88,18 @@ def test_a_device_holds_the_chunks_that_its_band_sees(store, two):
     assert max(each) < alone.data.nodes <= sum(each)
 
 
-def test_views_are_shared_out_and_come_in_their_order(store, two):
+def test_views_are_distributed_and_returned_in_order(store, two):
     cameras = [look(at=(x, 0, 0)) for x in (0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8)]
     alone = fs.Renderer("opencl")
     frames = two.render_views(two.upload(store), iter(cameras))
     for camera, frame in zip(cameras, frames, strict=True):
         assert np.array_equal(frame["rgb"], alone.render(store.cloud(), camera)["rgb"])
-    # one output may be given by its name, as to a renderer
+    # one output can be given by name
     assert two.render(store, cameras[0], "rgb").outputs == ("rgb",)
     assert [frame.outputs for frame in two.render_views(store, cameras[:1], "rgb")] == [("rgb",)]
 
 
-def test_bands_are_cut_where_devices_take_as_long(two):
+def test_bands_adapt_to_the_speed_of_devices(two):
     two._shares = np.array([0.0, 0.5, 1.0])
     two._cut_anew([50, 50], [3.0, 1.0])
     assert two._shares == pytest.approx([0, 1 / 3, 1])
@@ -113,7 +113,7 @@ def test_bands_are_cut_where_devices_take_as_long(two):
     assert two._bands(1) == [(0, 1)]
 
 
-def test_what_several_devices_cannot_draw_is_said(store, two):
+def test_unsupported_requests_are_refused(store, two):
     with pytest.raises(fs.InputError, match="devices is empty"):
         fs.SeveralDevices([])
     with pytest.raises(fs.InputError, match="of different kinds"):
@@ -132,7 +132,7 @@ def test_what_several_devices_cannot_draw_is_said(store, two):
         renderer.render_band(5, store, look())  # type: ignore[arg-type]
 
 
-def test_pictures_come_before_the_failure_of_what_asks_for_them(store, two):
+def test_frames_precede_a_failure_of_the_captures(store, two):
     def failing(count):
         for x in range(count):
             yield look(at=(0.1 * x, 0, 0))
@@ -159,7 +159,7 @@ def test_pictures_come_before_the_failure_of_what_asks_for_them(store, two):
         next(frames)
 
 
-def test_views_may_be_left_before_their_end(store, two):
+def test_iteration_can_stop_early(store, two):
     before = threading.active_count()
     frames = two.render_views(two.upload(store), (look() for _ in range(1000)))
     next(frames)

@@ -1,4 +1,4 @@
-"""Stores: what they hold, damaged, placed."""
+"""Stores: content, damage, instances."""
 
 import json
 import tracemalloc
@@ -17,27 +17,27 @@ from fidsplat.store.merge import REDUCTION
 cut, files, store = store_fixtures()
 
 
-def sorted_by_place(cloud):
+def sorted_by_position(cloud):
     order = np.lexsort((*cloud.means.T, cloud.opacities))
     arrays = ("means", "quats", "scales", "opacities", "sh", "labels", "thickness")
     return {name: getattr(cloud, name)[order] for name in arrays}
 
 
-def test_a_store_holds_the_splats_of_its_files_and_nothing_else(files, store):
+def test_a_store_contains_exactly_the_splats_of_its_files(files, store):
     made, given = store.cloud(), fs.SplatCloud.concatenate([fs.load_ply(file) for file in files])
     assert len(store) == len(given) == 2 * COUNT
     assert store.ellipsoids == "some"
     assert store.sh_degree == 1
-    ours, theirs = sorted_by_place(made), sorted_by_place(given)
+    ours, theirs = sorted_by_position(made), sorted_by_position(given)
     for name, array in theirs.items():
         assert np.array_equal(ours[name], array), name
-    # planes of both files stay apart, and stand last
+    # coplanar groups of both files stay distinct, and are last
     assert np.array_equal(np.unique(made.coplanar_groups), np.unique(given.coplanar_groups))
     assert (made.coplanar_groups[store.header.pinned :] >= 0).all()
     assert (made.coplanar_groups[: store.header.pinned] < 0).all()
 
 
-def test_neighbours_stand_near_each_other(store):
+def test_neighbours_in_space_are_near_in_order(store):
     chunks = store.nodes[store.nodes["level"] == 0]
     assert chunks["count"].max() <= 500
     assert chunks["count"].sum() == len(store)
@@ -47,7 +47,7 @@ def test_neighbours_stand_near_each_other(store):
 
 
 @pytest.mark.parametrize("sigmas", [0.0, 2.0, 5.0, 9.0])
-def test_boxes_hold_their_splats(store, sigmas):
+def test_boxes_contain_their_splats(store, sigmas):
     low, high = store.boxes(sigmas)
     for number in range(len(store.nodes)):
         part = store.load(number)
@@ -56,7 +56,7 @@ def test_boxes_hold_their_splats(store, sigmas):
         assert (part["means"] + reach <= high[number] + 1e-12).all()
 
 
-def test_every_node_stands_for_the_four_below_it(store):
+def test_every_node_replaces_four_of_the_level_below(store):
     nodes, inner = store.nodes, store.nodes["level"] > 0
     pinned = (nodes["level"] == 0) & (nodes["first"] >= store.header.pinned)
     roots = np.flatnonzero((nodes["parent"] < 0) & ~pinned)
@@ -74,7 +74,7 @@ def test_every_node_stands_for_the_four_below_it(store):
         assert (nodes["far_low"][number] <= children["far_low"].min(axis=0)).all()
 
 
-def test_labels_are_read_a_chunk_at_a_time(store):
+def test_labels_are_read_by_chunks(store):
     tracemalloc.start()
     labels = store.labels()
     _, peak = tracemalloc.get_traced_memory()
@@ -92,7 +92,7 @@ def copied(store, tmp_path):
 
 
 @pytest.mark.parametrize(("column", "row"), [("means", 0), ("sh", 700), ("labels", 2 * COUNT - 1)])
-def test_a_flipped_bit_is_found_and_its_chunk_named(store, tmp_path, column, row):
+def test_verify_reports_the_chunk_of_a_flipped_bit(store, tmp_path, column, row):
     folder = copied(store, tmp_path)
     file, content = folder / f"{column}.npy", bytearray((folder / f"{column}.npy").read_bytes())
     size = np.load(file, mmap_mode="r")[0].nbytes
@@ -106,7 +106,7 @@ def test_a_flipped_bit_is_found_and_its_chunk_named(store, tmp_path, column, row
     assert store.verify() == []
 
 
-def test_a_column_that_is_cut_short_names_the_chunk(store, tmp_path):
+def test_a_truncated_column_is_refused_with_its_chunk(store, tmp_path):
     folder, node = copied(store, tmp_path), store.nodes[3]
     row = int(node["first"]) + 1
     file = folder / "quats.npy"
@@ -115,7 +115,7 @@ def test_a_column_that_is_cut_short_names_the_chunk(store, tmp_path):
         fs.Store(folder)
 
 
-def test_what_is_no_whole_store_is_refused(store, tmp_path):
+def test_an_incomplete_store_is_refused(store, tmp_path):
     def refused(match):
         with pytest.raises(fs.InputError, match=match):
             fs.Store(folder)
@@ -155,7 +155,7 @@ def test_what_is_no_whole_store_is_refused(store, tmp_path):
 
 
 def crafted(folder, nodes=None, **changes):
-    """Changes a store as somebody who knows its checksums."""
+    """Change a store and its checksums."""
     header = json.loads((folder / "store.json").read_text()) | changes
     if nodes is not None:
         np.save(folder / "nodes.npy", nodes)
@@ -189,8 +189,8 @@ def crafted(folder, nodes=None, **changes):
         ("far_high", 2, -1e9, "within the larger one"),
     ],
 )
-def test_an_index_that_does_not_fit_is_refused(store, tmp_path, name, number, value, match):
-    """With valid checksums too: a negative count took a device beyond its buffers."""
+def test_an_index_that_contradicts_its_header_is_refused(store, tmp_path, name, number, value, match):
+    """Also with valid checksums: a negative count would overrun buffers."""
     folder, nodes = copied(store, tmp_path), store.nodes.copy()
     nodes[name][number] = value
     crafted(folder, nodes)
@@ -200,7 +200,7 @@ def test_an_index_that_does_not_fit_is_refused(store, tmp_path, name, number, va
         fs.Store(folder)
 
 
-def test_a_header_that_does_not_fit_its_index_is_refused(store, tmp_path):
+def test_a_header_that_contradicts_its_index_is_refused(store, tmp_path):
     folder, columns = copied(store, tmp_path), store.header.columns
     for changes, match in [
         ({"splats": store.header.splats - 1}, "chunks must have"),
@@ -236,12 +236,12 @@ def test_a_header_that_does_not_fit_its_index_is_refused(store, tmp_path):
         ({"sh_degree": 4}, "sh_degree must be .* got 4"),
     ],
 )
-def test_numbers_that_make_no_store(files, tmp_path, options, match):
+def test_invalid_build_options_are_refused(files, tmp_path, options, match):
     with pytest.raises(fs.InputError, match=match):
         fs.build_store(files, tmp_path / "a.fss", **options)
 
 
-def test_names_that_make_no_store(files, store, tmp_path):
+def test_invalid_names_are_refused(files, store, tmp_path):
     with pytest.raises(fs.InputError, match=r"must end with \.fss"):
         fs.build_store(files, tmp_path / "a.ply")
     with pytest.raises(fs.InputError, match="at least one splat file"):
@@ -258,7 +258,7 @@ def test_names_that_make_no_store(files, store, tmp_path):
     assert len(fs.Store(folder)) == COUNT
 
 
-def test_colours_are_kept_as_asked(files, store, tmp_path):
+def test_colours_are_stored_in_the_requested_type(files, store, tmp_path):
     half = fs.Store(fs.build_store(files, tmp_path / "half.fss", colors="float16", **SMALL))
     error = np.abs(half.cloud().sh - store.cloud().sh).max()
     assert half.cloud().sh.dtype == np.float32
@@ -272,7 +272,7 @@ def test_colours_are_kept_as_asked(files, store, tmp_path):
     assert plain.cloud().colors == pytest.approx(np.maximum(kept, 0), abs=1e-6)
 
 
-def test_a_store_of_places_has_the_splats_as_many_times(store, files, tmp_path):
+def test_an_instanced_store_repeats_the_splats(store, files, tmp_path):
     flat = fs.Store(fs.build_store(files[1:], tmp_path / "one.fss", **SMALL))
     with pytest.raises(fs.InputError, match="coplanar groups"):
         fs.place_store(store, tmp_path / "p.fss", [np.eye(4)])
@@ -315,7 +315,7 @@ def test_a_store_of_places_has_the_splats_as_many_times(store, files, tmp_path):
         fs.Store(street.path)
 
 
-def test_sh_turns_with_its_splats(store, files, tmp_path):
+def test_sh_is_rotated_with_its_splats(store, files, tmp_path):
     from fidsplat.store.partial_cloud import transformed
 
     part = store.load(0)

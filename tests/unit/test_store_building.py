@@ -1,4 +1,4 @@
-"""Stores built out of core: stopped and gone on with, on a full disk, two at once."""
+"""Out-of-core builds of stores: interrupted, on a full disk, concurrent."""
 
 import os
 import re
@@ -25,7 +25,7 @@ STOPS = [("reading splats", NOTED + 1), ("sorting", 3), ("level of detail 1", 5)
 
 
 @pytest.mark.parametrize(("words", "after"), STOPS)
-def test_a_build_that_is_stopped_goes_on(files, store, tmp_path, words, after):
+def test_an_interrupted_build_resumes(files, store, tmp_path, words, after):
     calls = []
 
     def stop(what, share):
@@ -44,7 +44,7 @@ def test_a_build_that_is_stopped_goes_on(files, store, tmp_path, words, after):
     assert again.count("reading splats") == left
 
 
-def test_a_build_that_was_killed_between_two_steps_leaves_nothing_behind(files, store, tmp_path, monkeypatch):
+def test_a_killed_build_leaves_no_files(files, store, tmp_path, monkeypatch):
     calls, folder = [], tmp_path / "both.fss"
 
     def stop(what, share):
@@ -67,7 +67,7 @@ def test_a_build_that_was_killed_between_two_steps_leaves_nothing_behind(files, 
         fs.build_store(files, folder, **SMALL)
     monkeypatch.undo()
     fs.build_store(files, folder, **SMALL)
-    # what a process that was killed while it replaced a store has left
+    # files of a process that was killed while replacing a store
     (tmp_path / ".both.fss.old").mkdir()
     (tmp_path / ".both.fss.old" / "means.npy").touch()
     fs.build_store(files, folder, overwrite=True, **SMALL)
@@ -76,7 +76,7 @@ def test_a_build_that_was_killed_between_two_steps_leaves_nothing_behind(files, 
 
 
 @pytest.mark.parametrize("words", ["reading splats", "sorting"])
-def test_a_build_whose_files_were_lost_in_a_power_cut_is_begun_anew(files, store, tmp_path, words):
+def test_a_build_restarts_if_files_were_lost(files, store, tmp_path, words):
     calls = []
 
     def stop(what, share):
@@ -92,8 +92,8 @@ def test_a_build_whose_files_were_lost_in_a_power_cut_is_begun_anew(files, store
     assert contents(tmp_path / "both.fss") == contents(store.path)
 
 
-def test_chunks_whose_levels_take_more_than_the_memory_are_refused(files, tmp_path, monkeypatch):
-    """What is said to do is done, and one node is made at a time where memory is for one."""
+def test_chunks_too_large_for_the_memory_are_refused(files, tmp_path, monkeypatch):
+    """The suggested chunk size works, and nodes are merged one by one if memory allows only one."""
     under_way, most, lock, made = 0, 0, Lock(), build.merged
 
     def merged(*given):
@@ -132,7 +132,7 @@ def test_two_builds_of_one_store_at_once(files, store, tmp_path):
     assert contents(tmp_path / "both.fss") == contents(store.path)
 
 
-def test_places_hold_nothing_of_a_build_that_was_stopped(files, tmp_path):
+def test_an_instanced_store_contains_no_files_of_an_interrupted_build(files, tmp_path):
     def stop(what, share):
         raise Stopped
 
@@ -143,7 +143,7 @@ def test_places_hold_nothing_of_a_build_that_was_stopped(files, tmp_path):
     assert set(contents(tmp_path / "both.fss")) == {"store.json", "places.npy"}
 
 
-def test_what_is_begun_from_other_files_is_begun_anew(files, store, tmp_path):
+def test_a_build_restarts_for_other_inputs(files, store, tmp_path):
     def stop(what, share):
         if what == "sorting":
             raise Stopped
@@ -154,7 +154,7 @@ def test_what_is_begun_from_other_files_is_begun_anew(files, store, tmp_path):
     assert contents(tmp_path / "both.fss") == contents(store.path)
 
 
-def test_a_full_disk_is_said_and_gone_on_with(files, store, tmp_path):
+def test_a_full_disk_is_reported_and_the_build_resumes(files, store, tmp_path):
     with (
         small_files(100_000),
         pytest.raises(fs.InputError, match="free some space, then run the same command"),
@@ -165,7 +165,7 @@ def test_a_full_disk_is_said_and_gone_on_with(files, store, tmp_path):
     assert contents(tmp_path / "both.fss") == contents(store.path)
 
 
-def test_a_disk_without_room_is_said_first(files, tmp_path, monkeypatch):
+def test_too_little_disk_space_is_reported_first(files, tmp_path, monkeypatch):
     monkeypatch.setattr(build.shutil, "disk_usage", lambda folder: type("", (), {"free": 10_000})())
     with pytest.raises(fs.InputError, match="free some space, or build elsewhere"):
         fs.build_store(files, tmp_path / "both.fss", **SMALL)

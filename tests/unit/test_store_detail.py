@@ -1,4 +1,4 @@
-"""Levels of detail: what they are chosen by, what is measured of them, the city that they are tried on."""
+"""Levels of detail: selection, measured errors, and the city for tests."""
 
 import json
 import math
@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_store_drawing import splats
+from test_store_rendering import splats
 
 import fidsplat as fs
 from fidsplat.accuracy.candidates import load as load_candidates
@@ -46,12 +46,12 @@ def renderer():
     return fs.Renderer("opencl")
 
 
-def seen_from(away, size=(48, 32)):
+def camera_at(away, size=(48, 32)):
     middle = np.array([PITCH, 0, PITCH])
     return fs.Camera.look_at(*size, 1.0, middle + away * np.array([0.6, -0.5, 0.6]), middle)
 
 
-def chosen(store, camera, limits):
+def selected_nodes(store, camera, limits):
     splats = ChunkedSplats([store])
     features, view = prepare(splats, fs.Capture(camera, quality=QUALITY))
     return select(splats, [view], features, limits).nodes[0], view
@@ -59,8 +59,8 @@ def chosen(store, camera, limits):
 
 @pytest.mark.parametrize("limit", [0.05, 0.3, 1.0, 4.0])
 @pytest.mark.parametrize("away", [20.0, 200.0, 2000.0])
-def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, limit, away):
-    numbers, view = chosen(store, seen_from(away), limit)
+def test_nodes_cover_every_chunk_once_and_none_that_is_too_near(store, limit, away):
+    numbers, view = selected_nodes(store, camera_at(away), limit)
     nodes = store.nodes
     covered: list[int] = []
     for number in numbers:
@@ -75,7 +75,7 @@ def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, l
             depth = (nodes["low"][number] + nodes["high"][number]) / 2 @ view.rotation[2] + view.translation[
                 2
             ]
-            # the middle lies no nearer than the nearest point, by which it was chosen
+            # the middle lies no nearer than the nearest point, by which it was selected_nodes
             assert nodes["size"][number] * view.focal_x / depth <= limit
     assert len(covered) == len(set(covered))
     if away >= 200:  # all of the city is in the picture
@@ -83,28 +83,28 @@ def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, l
     assert list(numbers) == sorted(numbers)
 
 
-def test_what_a_node_stands_for_is_not_drawn_beside_it_whatever_is_allowed_below(store):
-    # cells of the first level are too large, those of all others are small enough
+def test_children_of_a_selected_node_are_not_selected(store):
+    # only cells of the first level are too large
     limits = (0.0, 1e-9, *[1e9] * (store.levels - 1))
-    numbers, _ = chosen(store, seen_from(200.0), (limits,))
+    numbers, _ = selected_nodes(store, camera_at(200.0), (limits,))
     assert store.levels > 1
     assert store.nodes["level"][list(numbers)].tolist() == [store.levels]
 
 
-def test_cells_above_a_panorama_are_as_wide_as_it_shows_them(store):
+def test_sizes_of_cells_near_the_poles_of_a_panorama(store):
     camera = fs.Camera.pinhole(80, 40, 80 / math.tau, 80 / math.tau, 40, 20, lens=fs.Equirectangular())
     _, view = prepare(store, fs.Capture(camera))
     corners = np.array([[0.1, -5.0, 0.0], [5.0, 0.1, 0.0], [-1.0, -5.0, -1.0]])
     high = corners + np.array([[0.01], [0.01], [2.0]])
     above, beside, around = projected_sizes(view, lambda sigmas: (corners, high), np.full(3, 0.05))
-    # by the longitudes from which they are seen
+    # by longitude
     assert above > 0.9 * 80 / math.tau * 0.05 / 0.11
     assert beside < 0.2
     assert around == math.inf
 
 
-def test_cells_through_a_distorting_lens_have_the_sizes_of_a_pinhole(store):
-    """0.05 m on the axis 5 m ahead, and a box that begins beside the camera's plane."""
+def test_cells_of_a_distorted_lens_have_the_sizes_of_a_pinhole(store):
+    """0.05 m on the axis at 5 m, and a box next to the camera's plane."""
     corners = np.array([[-0.1, -0.1, 5.0], [3.0, -0.1, 4.0]])
     high = corners + np.array([[0.2, 0.2, 1.0], [1.0, 0.2, 1.0]])
     found = []
@@ -116,12 +116,15 @@ def test_cells_through_a_distorting_lens_have_the_sizes_of_a_pinhole(store):
     assert np.array_equal(*found)
 
 
-def test_less_is_drawn_of_what_is_further_away(store):
-    counts = [sum(store.counts(np.array(chosen(store, seen_from(away), 0.5)[0]))) for away in (60, 600, 6000)]
+def test_fewer_splats_are_selected_further_away(store):
+    counts = [
+        sum(store.counts(np.array(selected_nodes(store, camera_at(away), 0.5)[0])))
+        for away in (60, 600, 6000)
+    ]
     assert len(store) >= counts[0] > counts[1] > counts[2]
 
 
-def test_errors_grow_with_the_size_of_cells_and_are_kept_beside_the_store(store, renderer):
+def test_errors_grow_with_cell_size_and_are_saved(store, renderer):
     made, *coarser = measure_detail(store, renderer, views=4 * store.levels)
     assert [one.level for one in (made, *coarser)] == list(range(1, store.levels + 1))
     met = [(size, error) for size, error in zip(made.sizes, made.errors, strict=True) if error is not None]
@@ -143,12 +146,12 @@ def test_errors_grow_with_the_size_of_cells_and_are_kept_beside_the_store(store,
 
 
 @pytest.mark.parametrize("device", ["opencl", "warp:cpu"])
-def test_pictures_keep_to_the_error_that_is_allowed(store, renderer, device):
+def test_frames_keep_the_allowed_error(store, renderer, device):
     measure_detail(store, renderer, views=4 * store.levels)
     renderer = fs.Renderer(device)
     resident = renderer.upload(fs.Store(store.path))
     for away in (300.0, 1500.0):
-        camera = seen_from(away)
+        camera = camera_at(away)
         exact = renderer.render(resident, camera, quality=QUALITY)
         for error in (0.01, 0.05):
             frame = renderer.render(resident, camera, quality=QUALITY.with_(detail_error=error))
@@ -158,8 +161,8 @@ def test_pictures_keep_to_the_error_that_is_allowed(store, renderer, device):
         assert ids.max() < len(store)
 
 
-def test_a_picture_at_no_allowed_error_is_exact(store, renderer):
-    resident, camera = renderer.upload(store), seen_from(2000.0)
+def test_a_frame_without_an_allowed_error_is_exact(store, renderer):
+    resident, camera = renderer.upload(store), camera_at(2000.0)
     ours = renderer.render(resident, camera, quality=QUALITY)["rgb"]
     assert np.array_equal(ours, renderer.render(store.cloud(), camera, quality=QUALITY)["rgb"])
 
@@ -168,18 +171,18 @@ def measured(level, sizes, errors):
     return DetailErrors("pixel", level, sizes, errors, 3, "here", "today")
 
 
-def test_the_view_that_needs_most_decides_the_levels_of_a_batch(store, renderer):
+def test_the_strictest_view_decides_the_levels_of_a_batch(store, renderer):
     sizes, errors = (0.05, 0.5, 4.0), (1e-4, 1e-3, 1e-2)
     save_detail_errors(store.path, store.identity, [measured(level, sizes, errors) for level in range(1, 9)])
     resident, quality = renderer.upload(fs.Store(store.path)), QUALITY.with_(detail_error=0.05)
 
     def batch_of(*away, quality=quality):
         return renderer.render_batch(
-            resident, [fs.Capture(seen_from(each, (160, 120)), quality=quality) for each in away]
+            resident, [fs.Capture(camera_at(each, (160, 120)), quality=quality) for each in away]
         )
 
     def alone(away, quality=quality):
-        return renderer.render(resident, seen_from(away, (160, 120)), quality=quality)
+        return renderer.render(resident, camera_at(away, (160, 120)), quality=quality)
 
     far, near, exact = alone(700.0), alone(200.0), alone(700.0, QUALITY)
     assert far.stats["splats"] < near.stats["splats"] < exact.stats["splats"]
@@ -193,17 +196,17 @@ def test_the_view_that_needs_most_decides_the_levels_of_a_batch(store, renderer)
     assert off[0] < off[1]
 
 
-def test_sizes_that_no_view_met_are_not_promised():
+def test_unmeasured_sizes_are_not_used():
     one = measured(1, (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1))
     assert allowed_cell_size([one], 1, 0.001) == 0.0
     assert allowed_cell_size([one], 1, MARGIN * 0.002) == 0.2
     assert allowed_cell_size([one], 1, 0.1) == 0.2
     assert allowed_cell_size([one], 1, MARGIN * 0.1) == 0.8
-    # what was worse at a smaller size counts at a larger one
+    # a larger error at a smaller size counts
     assert allowed_cell_size([measured(1, (0.1, 0.2), (0.5, 0.001))], 1, 0.01) == 0.0
 
 
-def test_what_the_levels_beside_it_err_by_counts_for_a_level():
+def test_errors_of_adjacent_levels_count():
     errors = {1: (0.001, None), 2: (None, 0.003), 3: (0.1, 0.2), 5: (0.001, 0.002)}
     every = [measured(level, (0.1, 0.2), own) for level, own in errors.items()]
     assert [allowed_cell_size(every, level, 0.01) for level in range(7)] == [
@@ -217,7 +220,7 @@ def test_what_the_levels_beside_it_err_by_counts_for_a_level():
     ]
 
 
-def test_what_was_measured_with_another_store_does_not_count(tmp_path):
+def test_errors_of_other_content_are_ignored(tmp_path):
     details = [DetailErrors(name, 1, (0.1,), (0.2,), 1, "here", "today") for name in ("pixel", "screen")]
     save_detail_errors(tmp_path, "a", details)
     save_detail_errors(tmp_path, "a", [DetailErrors("pixel", 1, (0.3,), (None,), 1, "here", "today")])
@@ -236,7 +239,7 @@ def test_what_was_measured_with_another_store_does_not_count(tmp_path):
             load_detail_errors(tmp_path, "a")
 
 
-def test_what_cannot_be_measured_is_said(store, renderer, tmp_path):
+def test_stores_without_detail_are_refused(store, renderer, tmp_path):
     placed = fs.Store(fs.place_store(store, tmp_path / "p.fss", [np.eye(4)]))
     with pytest.raises(fs.InputError, match="is instanced; measure"):
         measure_detail(placed, renderer)
@@ -252,7 +255,7 @@ def test_what_cannot_be_measured_is_said(store, renderer, tmp_path):
         fs.Quality(detail_error=1.0)
 
 
-def test_views_of_a_measurement_meet_all_sizes(store):
+def test_measured_views_contain_all_sizes(store):
     focal = 160 / math.tan(math.radians(30))
     nodes = store.nodes
     edges = [
@@ -264,11 +267,11 @@ def test_views_of_a_measurement_meet_all_sizes(store):
         sizes = [edge * focal / distance for distance in away[first :: len(edges)]]
         assert min(sizes) < 0.15
         assert max(sizes) > 0.4
-    errors = errors_of(store, fs.Renderer("reference"), fs.Capture(seen_from(50.0, (8, 6))), [1e-6, 1e-5], 1)
+    errors = errors_of(store, fs.Renderer("reference"), fs.Capture(camera_at(50.0, (8, 6))), [1e-6, 1e-5], 1)
     assert errors == [None, None]
 
 
-def test_a_city_is_the_same_however_it_is_read():
+def test_a_city_does_not_depend_on_how_it_is_read():
     city = City(150_000, houses=3, seed=4)
     source = city.source
     kinds = {"means": "<f4", "colors": "<f4", "quats": "<f4", "scales": "<f4", "opacities": "<f4"}
@@ -289,7 +292,7 @@ def test_a_city_is_the_same_however_it_is_read():
     assert path.times[-1] == 8.0
 
 
-def test_a_city_that_is_too_small_for_levels_is_drawn_exactly(tmp_path, capsys):
+def test_a_city_too_small_for_levels_is_rendered_exactly(tmp_path, capsys):
     assert main(["store", "demo", "-o", str(tmp_path), "--splats", "50", "--houses", "1"]) == 0
     assert "50 splats in 1 chunk, in" in capsys.readouterr().out
     assert fs.Scene.load(tmp_path / "city.toml").capture.quality.detail_error == 0
@@ -301,7 +304,7 @@ def test_a_city_that_is_too_small_for_levels_is_drawn_exactly(tmp_path, capsys):
 
 def test_an_error_bound_allows_levels_of_detail(store, renderer):
     measure_detail(store, renderer, views=4 * store.levels)
-    capture = fs.Capture(seen_from(1500.0), quality="lowpass=pixel")
+    capture = fs.Capture(camera_at(1500.0), quality="lowpass=pixel")
     quality = fs.quality_within(error=0.08, scene=fs.Store(store.path), capture=capture, device=renderer)
     assert quality.detail_error == 0.04
     exact = reference_image(renderer, store, capture.with_(quality=quality))
@@ -312,7 +315,7 @@ def test_an_error_bound_allows_levels_of_detail(store, renderer):
 
 
 def test_a_time_bound_allows_levels_of_detail(store, renderer, monkeypatch, tmp_path):
-    """The errors that are tried go up until they would exceed what was found."""
+    """Allowed errors rise until they exceed the best one found."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     measure_detail(store, renderer, views=4 * store.levels)
     tried, errors = [], {0.0: None, 1 / 255: 0.2, 4 / 255: 0.03, 16 / 255: 0.1, 0.5: 0.0}
@@ -327,7 +330,7 @@ def test_a_time_bound_allows_levels_of_detail(store, renderer, monkeypatch, tmp_
         return Choice(own, errors[base.detail_error], 1.0, 1.0, "measured", "here", candidate.settings)
 
     monkeypatch.setattr(sys.modules["fidsplat.accuracy.quality_within"], "_search", found)
-    asked = {"scene": store, "capture": seen_from(1500.0), "device": renderer}
+    asked = {"scene": store, "capture": camera_at(1500.0), "device": renderer}
     asked["capture"] = fs.Capture(asked["capture"], quality="lowpass=pixel")
     for _ in range(2):  # the second is kept
         assert fs.quality_within(ms=1.0, **asked).detail_error == 4 / 255
@@ -337,7 +340,7 @@ def test_a_time_bound_allows_levels_of_detail(store, renderer, monkeypatch, tmp_
         fs.quality_within(ms=2.0, **asked)
 
 
-def test_a_cloud_in_memory_knows_no_detail(renderer):
+def test_a_cloud_in_memory_is_exact(renderer):
     cloud = splats(7)
     camera = fs.Camera.look_at(48, 32, 1.0, (0, 0, 0), (0, 0, 1))
     exact = renderer.render(cloud, camera, quality=QUALITY)["rgb"]

@@ -1,4 +1,4 @@
-"""What a device holds of a store: chunks that stay, within its memory budget."""
+"""Chunk cache of a device, and bands, within the memory budget."""
 
 import gc
 import threading
@@ -25,7 +25,7 @@ def stores(tmp_path_factory):
     return made_stores(tmp_path_factory.mktemp("stores"))
 
 
-def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatch):
+def test_chunks_are_sent_to_a_device_once(stores, tmp_path, monkeypatch):
     cache = chunk_cache.OpenCLChunkCache
     sent, load = [], cache._load
     monkeypatch.setattr(cache, "_load", lambda self, key, *rest: sent.append(key) or load(self, key, *rest))
@@ -36,14 +36,14 @@ def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatc
             renderer.render(resident, camera)["rgb"], renderer.render(store.cloud(), camera)["rgb"]
         )
     assert 0 < len(sent) == len(set(sent)) <= store.chunks
-    # of a store of places the splats are there once
+    # splats of an instanced store are sent once
     sent.clear()
     placed = fs.Store(fs.place_store(store, tmp_path / "p.fss", [np.eye(4), rigid_matrix((0, 0, 0.5))]))
     renderer.render(renderer.upload(placed), look())
     assert len(sent) == len(set(sent)) <= store.chunks
 
 
-def test_a_part_of_what_is_gathered_may_begin_within_a_chunk(stores):
+def test_gathered_parts_can_begin_within_a_chunk(stores):
     backend, scene = fs.Renderer("opencl").backend, ChunkedSplats([stores["disks"]])
     device_chunks = DeviceChunks(scene)
     gathered = backend.chunk_cache(device_chunks, device_chunks.largest_chunk).gather(
@@ -55,8 +55,8 @@ def test_a_part_of_what_is_gathered_may_begin_within_a_chunk(stores):
     assert np.array_equal(found, stores["disks"].cloud().opacities[70:200])
 
 
-def test_slots_that_cannot_become_more_keep_what_they_hold(stores, monkeypatch):
-    """Even where copies take their time, and of two arrays only the first has room."""
+def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
+    """Also with slow copies, and if only the first of two arrays fits."""
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     resident = renderer.upload(store)
     renderer.render(resident, look())
@@ -87,9 +87,9 @@ def test_slots_that_cannot_become_more_keep_what_they_hold(stores, monkeypatch):
     assert all(np.array_equal(contents_of(name), array) for name, array in wanted.items())
 
 
-def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monkeypatch):
+def test_a_cache_smaller_than_a_view(stores, monkeypatch):
     renderer, store = fs.Renderer("opencl"), stores["disks"]
-    # two chunks fit, and no picture is put together as a whole
+    # two chunks fit, and no frame is gathered at once
     monkeypatch.setattr(chunk_cache, "_SHARE", renderer.backend.memory_budget // 10000)
     monkeypatch.setattr(chunk_cache, "_GATHERED", renderer.backend.memory_budget // 10000)
     resident, outputs = renderer.upload(store), ("rgb", "splat_id")
@@ -100,10 +100,10 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
     cache, scene, device_chunks = resident.data._cache, resident.data.scene, resident.data.chunks
     held = set(cache._slots)
     assert 0 < len(held) <= 2
-    # what is drawn does not make room for what is fetched ahead
+    # prefetching does not evict chunks of the current frame
     cache.bring(device_chunks.of(scene.all_chunks(), True))
     assert set(cache._slots) == held
-    # nor does one chunk that is fetched ahead for another
+    # nor other prefetched chunks
     every = device_chunks.of(scene.all_chunks(), True)
     cache._rendered = set()
     cache.bring(every[:2])
@@ -111,11 +111,11 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
     assert set(cache._slots) == {chunk.key for chunk in every[:2]}
 
 
-def before_the_wall(x=0.0):
+def facing_the_wall(x=0.0):
     return fs.Camera.look_at(120, 90, 1.4, (x, 0, -1), (x, 0, 3))
 
 
-def test_what_does_not_fit_at_once_is_drawn_in_bands_of_what_each_sees(stores, monkeypatch):
+def test_views_that_do_not_fit_are_rendered_in_bands(stores, monkeypatch):
     store, drawn, most = stores["wall"], [], 5500
     cloud, plain, limited = store.cloud(), fs.Renderer("opencl"), fs.Renderer("opencl")
 
@@ -125,16 +125,16 @@ def test_what_does_not_fit_at_once_is_drawn_in_bands_of_what_each_sees(stores, m
 
     monkeypatch.setattr(OpenCLPipeline, "fits", fits)
     resident, outputs = limited.upload(store), ("rgb", "splat_id", "depth")
-    sampled = fs.Capture(before_the_wall(), quality="samples=2", outputs=outputs)
-    moved = fs.Capture(before_the_wall(x=0.1), outputs=outputs)
-    # what hangs on a pixel's place in the picture
+    sampled = fs.Capture(facing_the_wall(), quality="samples=2", outputs=outputs)
+    moved = fs.Capture(facing_the_wall(x=0.1), outputs=outputs)
+    # effects that depend on the pixel position
     sensor = fs.Sensor(gain=0.8, full_well=500, read_noise=3, vignetting=(-0.5,))
     more = ("rgb", "alpha", "depth_median", "normal", "label")
     by_pixel = fs.Capture(
-        before_the_wall(), more, "order=pixel", fog=fs.Fog(0.2, (0.5, 0.6, 0.7)), sensor=sensor
+        facing_the_wall(), more, "order=pixel", fog=fs.Fog(0.2, (0.5, 0.6, 0.7)), sensor=sensor
     )
-    widened = fs.Capture(before_the_wall(), outputs=outputs, quality="lowpass=pixel,alpha_cutoff=1e-8")
-    for capture in (fs.Capture(before_the_wall(), outputs=outputs), sampled, by_pixel, widened, moved):
+    widened = fs.Capture(facing_the_wall(), outputs=outputs, quality="lowpass=pixel,alpha_cutoff=1e-8")
+    for capture in (fs.Capture(facing_the_wall(), outputs=outputs), sampled, by_pixel, widened, moved):
         drawn.clear()
         ours, whole = limited.render(resident, capture), plain.render(cloud, capture)
         for output in capture.outputs:
@@ -142,22 +142,22 @@ def test_what_does_not_fit_at_once_is_drawn_in_bands_of_what_each_sees(stores, m
         assert sum(count < most for count in drawn) >= 2
         assert ours.stats["visible"] >= whole.stats["visible"]
         assert set(ours.timings) == set(whole.timings)
-    # the next view begins with the bands of the last, each asked for once
+    # the next view begins with the bands of the previous one
     drawn.clear()
     limited.render(resident, moved)
     assert max(drawn) < most
-    # a band of a picture is cut as the whole
+    # a band of a frame is split too
     frame = limited.render_band((5, 80), resident, moved)
     assert np.array_equal(frame["rgb"][5:80], plain.render(cloud, moved)["rgb"][5:80])
-    # where all rows see all, cutting is of no use
+    # splitting does not help where all rows need all splats
     drawn.clear()
-    fisheye, most = fs.Capture(replace(before_the_wall(), lens=fs.Fisheye())), 1
+    fisheye, most = fs.Capture(replace(facing_the_wall(), lens=fs.Fisheye())), 1
     assert np.array_equal(limited.render(resident, fisheye)["rgb"], plain.render(cloud, fisheye)["rgb"])
     assert len(drawn) == 1
 
 
-def test_a_budget_of_memory_makes_bands(stores):
-    store, camera = stores["wall"], before_the_wall()
+def test_a_memory_budget_makes_bands(stores):
+    store, camera = stores["wall"], facing_the_wall()
     limited, plain = fs.Renderer("opencl", memory_budget=2 << 20), fs.Renderer("opencl")
     resident = limited.upload(store)
     ours = limited.render(resident, camera)
@@ -165,7 +165,7 @@ def test_a_budget_of_memory_makes_bands(stores):
     assert len(resident.data._splitter._cuts[0, 90]) > 2
 
 
-def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypatch):
+def test_frames_and_cached_chunks_keep_the_budget(stores, monkeypatch):
     live, peak, store = weakref.WeakSet(), [0], stores["wall"]
 
     class Counted(buffers.DeviceBuffer):
@@ -178,7 +178,7 @@ def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypat
     for budget in (2200 << 10, 3 << 20):
         peak[0], limited = 0, fs.Renderer("opencl", memory_budget=budget)
         resident = limited.upload(store)
-        for frame in limited.render_views(resident, [before_the_wall(x=0.05 * k) for k in range(5)]):
+        for frame in limited.render_views(resident, [facing_the_wall(x=0.05 * k) for k in range(5)]):
             assert frame["rgb"].any()
         assert 0.5 * budget < peak[0] <= budget
         cache = resident.data._cache
@@ -193,7 +193,7 @@ def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypat
         gc.collect()
 
 
-def test_pictures_of_fewer_splats_take_what_those_of_more_have_left():
+def test_smaller_frames_reuse_buffers():
     pool = fs.Renderer("opencl").backend.pool
     pool.clear()
     pool.make_way("stores", 1 << 30, 100)
@@ -206,7 +206,7 @@ def test_pictures_of_fewer_splats_take_what_those_of_more_have_left():
     assert not pool.memory_bytes
 
 
-def test_bands_that_fitted_together_are_drawn_together():
+def test_bands_that_fit_together_are_merged():
     made = bands.BandSplitter()
     whole = SimpleNamespace(rows=(0, 64), count=64)
     whole.with_rows = lambda first, end: SimpleNamespace(

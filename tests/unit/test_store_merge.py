@@ -1,4 +1,4 @@
-"""Splats that become fewer: their light and their place, and the order in which neighbours are found."""
+"""Merging splats for levels of detail, and Morton codes."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from fidsplat.store.merge import MAX_OPACITY, merged, quaternions_of
 from fidsplat.store.morton import Grid, grid_around
 
 
-def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
+def test_merging_preserves_opacity_times_area_and_position():
     generator = np.random.default_rng(3)
     means = generator.normal(0, 0.2, (400, 3)).astype(np.float32) * [1, 1, 0]
     turns = np.tile(np.float32([1, 0, 0, 0]), (400, 1))
@@ -25,7 +25,7 @@ def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
     assert light.sum() == pytest.approx(400 * 0.1 * 1e-4, rel=1e-5)
     assert np.average(made["means"], axis=0, weights=light) == pytest.approx(means.mean(axis=0), abs=1e-6)
     assert np.average(made["colors"], axis=0, weights=light) == pytest.approx(splats["colors"].mean(axis=0))
-    # flat as they are, and as wide: the mean square about the middle of all is that of the splats
+    # as flat and as wide: equal mean square distance from the centre
     square = (made["scales"] ** 2).sum(axis=1) + (made["means"][:, :2] ** 2).sum(axis=1)
     given = 2 * 0.01**2 + (means[:, :2] ** 2).sum(axis=1)
     assert np.average(square, weights=light) == pytest.approx(given.mean(), rel=1e-5)
@@ -35,8 +35,8 @@ def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
 
 
 @pytest.mark.parametrize("thick", [False, True], ids=["disks", "ellipsoids"])
-def test_merged_splats_of_any_rotation_have_the_moments_of_those_they_stand_for(thick):
-    """Mass, mean and second moments; of disks in the planes of the merged ones, whose thinnest axis goes."""
+def test_merging_preserves_moments(thick):
+    """Opacity times area, mean and second moments, for disks without the thinnest axis."""
     generator = np.random.default_rng(8)
     count, turns = 300, generator.normal(size=(300, 4))
     splats = {"means": generator.uniform((2, -1, 5), (2.3, -0.8, 5.6), (count, 3))}
@@ -69,7 +69,7 @@ def test_merged_splats_of_any_rotation_have_the_moments_of_those_they_stand_for(
         assert lost.max() < 0.5 * np.linalg.eigvalsh(second - np.outer(mean, mean)).max()
 
 
-def test_splats_on_top_of_each_other_become_several():
+def test_overlapping_splats_are_merged_into_copies():
     count = 64
     generator = np.random.default_rng(4)
     means = np.column_stack([generator.uniform(0, 0.01, (count, 2)), np.zeros(count)]).astype(np.float32)
@@ -84,7 +84,7 @@ def test_splats_on_top_of_each_other_become_several():
     assert made["scales"].max() < 0.02 * 1.4
 
 
-def test_bright_and_dark_splats_of_a_cell_stay_apart():
+def test_bright_and_dark_splats_are_merged_separately():
     means = np.zeros((40, 3), np.float32)
     means[:, 0] = np.linspace(0.01, 0.02, 40)
     splats = {"means": means, "quats": np.tile(np.float32([1, 0, 0, 0]), (40, 1))}

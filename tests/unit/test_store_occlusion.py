@@ -1,4 +1,4 @@
-"""What other splats hide is not drawn, and the picture is that of all, bit for bit."""
+"""Occlusion culling: occluded chunks are not rendered, and frames are bit-identical."""
 
 import math
 
@@ -49,8 +49,8 @@ def town(tmp_path_factory):
 
 
 @pytest.fixture
-def asked(monkeypatch):
-    """Every view is asked for what is hidden; gives what each was drawn of, of how many splats."""
+def culling(monkeypatch):
+    """Occlusion culling of every view; returns the splats of each first pass, and of the view."""
     drawn, counts = occlusion_culling.OcclusionCulling.render, []
     monkeypatch.setattr(occlusion_culling, "MIN_SPLATS", 0)
     monkeypatch.setattr(occlusion_culling, "_INITIAL_SPLATS", 3000)
@@ -74,7 +74,7 @@ def view(turn=0.0, along=0.0):
 
 
 PATH = [view(), view(0.05, 0.1), view(1.6, -2.0), view(1.7, -7.0)]
-WAYS = {
+QUALITIES = {
     "centres": "lowpass=screen",
     "pixels": "lowpass=screen,order=pixel",
     "samples": "lowpass=none,samples=2",
@@ -86,26 +86,27 @@ WAYS = {
 
 
 @pytest.mark.parametrize(
-    ("way", "schedule"), [*((way, "own") for way in WAYS), ("centres", "groups"), ("pixels", "groups")]
+    ("name", "schedule"),
+    [*((name, "own") for name in QUALITIES), ("centres", "groups"), ("pixels", "groups")],
 )
-def test_pictures_have_the_bits_of_all_splats(town, asked, way, schedule):
+def test_frames_are_bit_identical_to_those_of_all_splats(town, culling, name, schedule):
     renderer = fs.Renderer("opencl")
     if schedule == "groups":
         renderer.backend.shape = renderer.backend.shapes("schedule")["groups"]
     cloud, resident = town.cloud(), renderer.upload(town)
-    asking, path = {"quality": WAYS[way], "outputs": ALL_OUTPUTS}, PATH
+    asking, path = {"quality": QUALITIES[name], "outputs": ALL_OUTPUTS}, PATH
     if schedule == "groups":  # which takes its time
         asking["outputs"], path = ("rgb", "splat_id"), PATH[:1]
     for number, frame in enumerate(renderer.render_views(resident, path, **asking)):
         whole = renderer.render(cloud, path[number], **asking)
         for output in whole:
             assert np.array_equal(frame[output], whole[output]), (output, number)
-    assert len(asked) == len(path)
-    if way in ("centres", "pixels", "samples"):
-        assert asked[0][0] < 0.95 * asked[0][1]
+    assert len(culling) == len(path)
+    if name in ("centres", "pixels", "samples"):
+        assert culling[0][0] < 0.95 * culling[0][1]
 
 
-def test_what_is_hidden_is_not_read(town, asked):
+def test_occluded_chunks_are_not_read(town, culling):
     renderer = fs.Renderer("opencl")
     resident = renderer.upload(town)
     for _ in renderer.render_views(resident, PATH[:2]):
@@ -116,7 +117,7 @@ def test_what_is_hidden_is_not_read(town, asked):
     assert resident.data.nodes < 0.95 * len(seen)
 
 
-def test_the_same_view_is_drawn_once(town, asked, monkeypatch):
+def test_a_repeated_view_is_rendered_in_one_pass(town, culling, monkeypatch):
     renderer, times = fs.Renderer("opencl"), []
     ask = type(renderer.backend).termination_depths
     monkeypatch.setattr(
@@ -132,14 +133,14 @@ def test_the_same_view_is_drawn_once(town, asked, monkeypatch):
     assert len(times) == 1
 
 
-@pytest.mark.parametrize("way", ["centres", "pixels", "samples", "odd samples", "groups", "bands"])
-def test_what_is_missing_is_drawn_in_its_tiles_alone(town, asked, monkeypatch, way):
-    """The last view's ends are taken too near, so that some of what shows is not drawn at first."""
+@pytest.mark.parametrize("name", ["centres", "pixels", "samples", "odd samples", "groups", "bands"])
+def test_missing_chunks_are_rendered_in_their_tiles(town, culling, monkeypatch, name):
+    """With termination depths that are too near, visible chunks are missing in the first pass."""
     monkeypatch.setattr(occlusion_culling, "_MOTION_SLACK", -6.0)
     monkeypatch.setattr(occlusion_culling, "_PATCH_RATIO", 1)
     renderer, taken, path = fs.Renderer("opencl"), [], [view(), view(0.02, 0.1), view(0.03, 0.5)]
     backend = type(renderer.backend)
-    take, outputs = backend.copy_tiles, ALL_OUTPUTS if way != "groups" else ("rgb", "splat_id")
+    take, outputs = backend.copy_tiles, ALL_OUTPUTS if name != "groups" else ("rgb", "splat_id")
 
     def noted(self, images, other, tiles):
         own, others = (dict(each.stats) for each in (images, other))
@@ -148,22 +149,22 @@ def test_what_is_missing_is_drawn_in_its_tiles_alone(town, asked, monkeypatch, w
         taken.append(tiles.mean())
 
     monkeypatch.setattr(backend, "copy_tiles", noted)
-    if way == "groups":
+    if name == "groups":
         renderer.backend.shape = renderer.backend.shapes("schedule")["groups"]
-    quality = {**WAYS, "odd samples": "samples=3", "groups": "", "bands": ""}[way] or None
-    drawing = fs.SeveralDevices(["opencl", "opencl"]) if way == "bands" else renderer
+    quality = {**QUALITIES, "odd samples": "samples=3", "groups": "", "bands": ""}[name] or None
+    drawing = fs.SeveralDevices(["opencl", "opencl"]) if name == "bands" else renderer
     resident, cloud = drawing.upload(town), town.cloud()
     for camera in path:
         frame = drawing.render(resident, camera, quality=quality, outputs=outputs)
         whole = renderer.render(cloud, camera, quality=quality, outputs=outputs)
         for output in whole:
             assert np.array_equal(frame[output], whole[output]), output
-    # pixels with samples in two tiles are drawn with the whole picture
-    assert bool(taken) == (way != "odd samples")
+    # pixels with samples in two tiles need a complete pass
+    assert bool(taken) == (name != "odd samples")
     assert not taken or min(taken) < 0.4
 
 
-def test_views_of_about_as_many_splats_take_no_new_memory(town, asked, monkeypatch):
+def test_views_of_similar_size_reuse_memory(town, culling, monkeypatch):
     renderer, fresh = fs.Renderer("opencl"), []
     pool, resident = renderer.backend.pool, renderer.upload(town)
     make, counts = pool.fresh, []
@@ -173,12 +174,12 @@ def test_views_of_about_as_many_splats_take_no_new_memory(town, asked, monkeypat
         frame = renderer.render(resident, view(turn, along))
         assert frame["rgb"].any()
         counts.append((frame.stats["splats"], len(fresh) - before))
-    # the first find out how much; then there may be more
+    # buffers grow with the first views
     assert counts[2][0] > counts[1][0] > counts[0][0]
     assert [taken for _, taken in counts[2:]] == [0, 0]
 
 
-def test_of_what_lets_light_through_nothing_is_hidden(tmp_path, asked, monkeypatch):
+def test_transparent_splats_occlude_nothing(tmp_path, culling, monkeypatch):
     monkeypatch.setattr(occlusion_culling, "_PAUSE", 2)
     monkeypatch.setattr(occlusion_culling, "_PROBE_SHARE", 4)
     monkeypatch.setattr(occlusion_culling, "_INITIAL_SPLATS", 500)
@@ -190,11 +191,11 @@ def test_of_what_lets_light_through_nothing_is_hidden(tmp_path, asked, monkeypat
     resident = renderer.upload(store)
     for _ in range(4):
         assert np.array_equal(renderer.render(resident, look())["rgb"], renderer.render(faint, look())["rgb"])
-    assert len(asked) == 2  # and then not for two views
-    assert all(count > 0.6 * of for count, of in asked)  # pieces beside the picture are left out
+    assert len(culling) == 2  # and then not for two views
+    assert all(count > 0.6 * of for count, of in culling)  # pieces beside the picture are left out
 
 
-def test_levels_of_detail_and_places_are_hidden_too(town, tmp_path, asked, monkeypatch):
+def test_levels_of_detail_and_instances_are_culled(town, tmp_path, culling, monkeypatch):
     poses = [np.eye(4), rigid_matrix((1, 0, 16)), rigid_matrix((-2, 0, 30))]
     places = fs.Store(fs.place_store(town.stores[1], tmp_path / "places.fss", poses))
     whole = fs.Scene(stores=(town.stores[0], places))
@@ -213,19 +214,19 @@ def test_levels_of_detail_and_places_are_hidden_too(town, tmp_path, asked, monke
         monkeypatch.setattr(occlusion_culling, "MIN_SPLATS", 0)
         for output in every:
             assert np.array_equal(ours[output], every[output])
-    assert all(count < 0.9 * of for count, of in asked)
+    assert all(count < 0.9 * of for count, of in culling)
 
 
-def test_bands_of_several_devices_hide_for_themselves(town, asked):
+def test_bands_of_several_devices_are_culled_separately(town, culling):
     devices, renderer = fs.SeveralDevices(["opencl", "opencl"]), fs.Renderer("opencl")
     there = devices.upload(town)
     for camera in PATH[:3]:
         whole = renderer.render(town.cloud(), camera)["rgb"]
         assert np.array_equal(devices.render(there, camera)["rgb"], whole)
-    assert any(count < of for count, of in asked)
+    assert any(count < of for count, of in culling)
 
 
-def test_too_little_memory_for_what_shows(town, asked):
+def test_too_little_memory_for_visible_chunks(town, culling):
     renderer = fs.Renderer("opencl", memory_budget=4 * 2**20)
     resident = renderer.upload(town)
     whole = fs.Renderer("opencl").render(town.cloud(), view())["rgb"]
@@ -246,8 +247,8 @@ CAPTURES = {
 
 
 @pytest.mark.parametrize("name", CAPTURES)
-def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(name):
-    """Splat by splat: what says that it is hidden if all the tiles ended a little before its key says so."""
+def test_splats_are_within_the_bounds_of_their_box(name):
+    """Each splat, against the key and rectangle that the device computes."""
     cloud, backend = splats(2, thick=True), fs.Renderer("opencl").backend
     capture = CAPTURES[name].with_(outputs=("alpha",))
     features, view = prepare(cloud, capture)
@@ -262,7 +263,7 @@ def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(n
     keys = TerminationDepths.of_keys(trace["keys"], (1, 1)).depths
     least = occlusion_test.minimum_keys(view, features, boxes)
     assert (least[shown] <= keys[shown]).all()
-    # of one tile for each sample: what each splat touches ends behind all, the rest before all
+    # one tile for each sample: only tiles that the splat touches do not terminate
     records, rectangles = trace["records"], np.full((len(cloud), 4), -1)
     for i in shown:
         rectangles[i] = records["y0"][i], records["y1"][i], records["x0"][i], records["x1"][i]
@@ -279,8 +280,8 @@ def test_splats_lie_behind_the_least_key_and_within_the_rectangle_of_their_box(n
 
 @pytest.mark.parametrize("schedule", ["own", "groups"])
 @pytest.mark.parametrize("order", ["centre", "pixel"])
-def test_a_tile_ends_where_all_of_its_pixels_are_finished(order, schedule):
-    """Opaque boxes over parts of tiles: no tile ends before that, and none ends nearer than what it shows."""
+def test_tiles_terminate_where_all_pixels_are_opaque(order, schedule):
+    """Opaque boxes over parts of tiles."""
     generator, backend = np.random.default_rng(3), fs.Renderer("opencl").backend
     if schedule == "groups":
         backend.shape = backend.shapes("schedule")["groups"]
@@ -306,12 +307,12 @@ def test_a_tile_ends_where_all_of_its_pixels_are_finished(order, schedule):
     assert 3 < finished.sum() < len(tiles) - 3
     ends_known = np.isfinite(found.depths)
     assert not (ends_known & ~finished).any()
-    # groups look at batches of a list by centres, and these lists are shorter than one
+    # work-groups test batches of a list by centres, and these lists are shorter than one
     assert np.array_equal(ends_known, finished) or (order, schedule) == ("centre", "groups")
 
 
-def test_ends_of_some_tiles():
-    """Nothing shows in the others; and those of another picture take the place of some."""
+def test_termination_depths_of_selected_tiles():
+    """-inf in the others; and replacement by those of another frame."""
     depths, tiles = (
         np.array([[1.0, np.inf], [3.0, 4.0]], np.float32),
         np.array([[True, True], [False, False]]),
@@ -322,7 +323,7 @@ def test_ends_of_some_tiles():
     assert np.array_equal(some.replaced(tiles, others).depths, [[7.0, 7.0], [3.0, 4.0]])
 
 
-def test_the_largest_in_rectangles():
+def test_range_maximum():
     generator = np.random.default_rng(0)
     values = generator.normal(size=(13, 21))
     tops, lefts = generator.integers(0, 13, 300), generator.integers(0, 21, 300)
@@ -332,7 +333,7 @@ def test_the_largest_in_rectangles():
         assert found[k] == values[top:bottom, left:right].max(initial=-np.inf)
 
 
-def test_a_needle_that_ewa_draws_into_a_wide_picture_is_on_it():
+def test_a_needle_that_ewa_widens_is_not_occluded():
     focal = 1000 / math.tan(math.radians(80))
     camera = fs.Camera.pinhole(2000, 2, focal, focal, 1000, 1)
     sigmas = np.array([[1e-3, 1e-3, 0.06]], np.float32)

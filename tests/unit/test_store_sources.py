@@ -1,4 +1,4 @@
-"""What stores are built of: files with splats that cannot be drawn, files that are cut short, none."""
+"""Sources of stores: files with invalid splats, truncated files, empty files."""
 
 import math
 
@@ -9,7 +9,7 @@ import fidsplat as fs
 from fidsplat.scenes.random_clouds import random_splats
 
 
-def test_a_file_that_lies_about_its_count_builds_nothing(tmp_path):
+def test_a_file_with_a_wrong_count_is_refused(tmp_path):
     fs.save_ply(random_splats(9000, 1), tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes()
     liar = tmp_path / "liar.ply"
@@ -19,7 +19,7 @@ def test_a_file_that_lies_about_its_count_builds_nothing(tmp_path):
     assert set(tmp_path.iterdir()) == {liar, tmp_path / "a.ply"}
 
 
-def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path):
+def test_invalid_splats_are_omitted_and_counted(tmp_path):
     cloud = random_splats(3000, 5)
     fs.save_ply(cloud, tmp_path / "a.ply")
     content = bytearray((tmp_path / "a.ply").read_bytes())

@@ -1,5 +1,4 @@
-"""Pictures of stores: what a view does not see is not read, and the picture is that of all splats in memory,
-bit for bit."""
+"""Rendering stores: culled chunks are not read, and frames are bit-identical to those in memory."""
 
 import copy
 import math
@@ -64,7 +63,7 @@ def reference():
 
 
 @pytest.mark.parametrize("name", CAPTURES)
-def test_views_are_drawn_of_what_they_see(stores, reference, name):
+def test_views_read_visible_chunks_only(stores, reference, name):
     kinds = ["thick"] if name in ("pinhole", "off-centre", "fisheye", "aside") else []
     kinds += ["sh"] if "aside" in name else []  # whose colours follow the position of the camera
     for kind in ["disks", *kinds]:
@@ -80,8 +79,8 @@ def test_views_are_drawn_of_what_they_see(stores, reference, name):
             assert read < 0.75 * every
 
 
-def test_a_box_around_each_splat_is_seen_where_the_splat_is(stores, reference):
-    """What is left out shows nowhere: splat by splat."""
+def test_boxes_outside_the_frustum_do_not_contribute(stores, reference):
+    """Splats whose boxes are culled change no pixel."""
     cloud = stores["thick"].cloud()
     for name in ("pinhole", "off-centre", "near and far", "distorted", "fisheye", "parallel", "pixel"):
         capture = CAPTURES[name]
@@ -107,8 +106,8 @@ WIDENED = {
 
 
 @pytest.mark.parametrize("name", WIDENED)
-def test_what_the_low_pass_pixel_draws_into_the_picture_is_seen(reference, name):
-    """Disks beside the picture that are seen nearly edge-on, their near ends further inwards."""
+def test_splats_that_the_low_pass_pixel_widens_are_in_the_frustum(reference, name):
+    """Disks next to the image that are nearly edge-on, their near ends further inwards."""
     camera, most = WIDENED[name]
     generator, count = np.random.default_rng(4), 1500
     outward = np.column_stack([generator.uniform(-0.8, 0.8, count), np.zeros((count, 2))])
@@ -143,15 +142,15 @@ def test_what_the_low_pass_pixel_draws_into_the_picture_is_seen(reference, name)
 
 
 @pytest.mark.parametrize("name", ["pixel, parallel", "pixel, distorted"])
-def test_where_a_footprint_has_no_bound_all_ahead_is_read(name):
+def test_unbounded_footprints_are_culled_by_depth_only(name):
     cloud = fs.SplatCloud([(50.0, 0, 1)], [(1, 0, 0, 0)], [(0.1, 0.1)], [0.9], colors=[(1, 1, 1)])
     features, view = prepare(cloud, CAPTURES[name])
     assert in_frustum(view, features, lambda sigmas: (cloud.means, cloud.means), np.array([0.1])).all()
 
 
 @pytest.mark.parametrize("lens", [None, fs.Fisheye(k1=0.02), fs.BrownConrady(k1=-0.1)], ids=str)
-def test_walls_beside_the_camera_under_the_low_pass_pixel(tmp_path, lens):
-    """A street from random places in it, whose walls are seen edge-on: the bits of all of it."""
+def test_walls_next_to_the_camera_under_the_low_pass_pixel(tmp_path, lens):
+    """A street from random positions, with walls edge-on."""
     generator, count = np.random.default_rng(9), 4000
     means = generator.uniform((-1, -1.5, -12), (1, 0.5, 12), (count, 3))
     means[:, 0] = np.sign(means[:, 0])  # to the left and right
@@ -178,7 +177,7 @@ def test_walls_beside_the_camera_under_the_low_pass_pixel(tmp_path, lens):
     assert (min(read) < 0.6 * count) or isinstance(lens, fs.BrownConrady)
 
 
-def test_a_needle_that_ewa_draws_into_a_wide_picture_is_seen(reference):
+def test_a_needle_that_ewa_widens_is_in_the_frustum(reference):
     focal = 1000 / math.tan(math.radians(80))
     camera = fs.Camera.pinhole(2000, 2, focal, focal, 1000, 1)
     capture = fs.Capture(camera, quality=fs.Quality(ellipsoid="ewa"), outputs=("alpha",))
@@ -196,7 +195,7 @@ def test_a_needle_that_ewa_draws_into_a_wide_picture_is_seen(reference):
     assert not in_frustum(view, exact, boxes, sigmas.max(axis=1).astype(np.float64)).any()
 
 
-def test_what_moves_into_the_picture_by_itself_is_read(tmp_path, reference):
+def test_moving_groups_are_culled_at_their_poses(tmp_path, reference):
     behind = random_splats(200, 6, depth=(-4, -2), scale=(0.05, 0.1), across=0.5).with_labels(3)
     store = made_store(tmp_path, behind, "behind")
     half_turn = rigid_matrix((0, 0, 0), (0, 0, 1, 0))
@@ -207,7 +206,7 @@ def test_what_moves_into_the_picture_by_itself_is_read(tmp_path, reference):
     assert not reference.render(store, look())["rgb"].any()
 
 
-def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
+def test_stores_are_bit_identical_on_a_device(stores, tmp_path):
     renderer = fs.Renderer("opencl")
     for kind in ("disks", "sh"):
         store = stores[kind]
@@ -223,7 +222,7 @@ def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
                 assert np.array_equal(batch["rgb"][number], renderer.render(cloud, camera)["rgb"])
 
 
-def test_what_cannot_be_fetched_ahead_is_told_by_the_picture_that_needs_it(stores, reference, monkeypatch):
+def test_a_failed_prefetch_is_ignored(stores, reference, monkeypatch):
     tried, told = [], []
 
     def prefetch(self, selection):
@@ -239,7 +238,7 @@ def test_what_cannot_be_fetched_ahead_is_told_by_the_picture_that_needs_it(store
     assert not told
 
 
-def test_a_device_draws_splats_beside_stores_bit_for_bit(stores):
+def test_stores_with_splats_in_memory_are_bit_identical(stores):
     renderer = fs.Renderer("opencl")
     beside = random_splats(200, 8, depth=(1.0, 2.0), scale=(0.02, 0.1), across=0.5)
     scene = fs.Scene([beside], look(), stores=(stores["disks"],))
@@ -247,11 +246,11 @@ def test_a_device_draws_splats_beside_stores_bit_for_bit(stores):
     for camera in (look(), look(turn=TURNED)):
         ours, whole = (renderer.render(each, camera)["rgb"] for each in (resident, scene.cloud()))
         assert np.array_equal(ours, whole)
-    # in parts as large as the chunks of the store
+    # split into chunks of the size of the store's
     assert resident.data._cache._rows < 200
 
 
-def test_what_is_pickled_of_a_store_is_its_path_and_of_its_cloud_the_splats(stores):
+def test_stores_are_pickled_by_path_and_their_clouds_by_content(stores):
     store, cloud = stores["thick"], stores["thick"].cloud()
     assert pickle.loads(pickle.dumps(store)).identity == store.identity
     for again in (pickle.loads(pickle.dumps(cloud)), copy.deepcopy(cloud)):
@@ -262,7 +261,7 @@ def test_what_is_pickled_of_a_store_is_its_path_and_of_its_cloud_the_splats(stor
     assert len(pickle.loads(pickle.dumps(scene)).splats) == COUNT
 
 
-def test_nothing_is_transferred_for_the_same_part(stores, reference, monkeypatch):
+def test_the_same_selection_is_not_uploaded_again(stores, reference, monkeypatch):
     uploads = []
     upload = reference.backend.upload
     monkeypatch.setattr(
@@ -277,7 +276,7 @@ def test_nothing_is_transferred_for_the_same_part(stores, reference, monkeypatch
     assert uploads[0] < COUNT
 
 
-def test_scenes_hold_stores_beside_markers_and_clouds(stores, reference, tmp_path):
+def test_scenes_with_stores_markers_and_clouds(stores, reference, tmp_path):
     marker = fs.marker("apriltag:36h11:5", size=0.4, mixture="exact")
     placed = fs.scenes.PlacedMarker(marker, rigid_matrix((0, 0, 1.5)))
     other = random_splats(50, 8, depth=(1.0, 2.0), scale=(0.02, 0.1), across=0.5)
@@ -290,7 +289,7 @@ def test_scenes_hold_stores_beside_markers_and_clouds(stores, reference, tmp_pat
     for output in ours:
         assert np.array_equal(ours[output], whole[output]), output
     assert (ours["label"] == 1).any()
-    # behind the scene there is nothing but what every picture has
+    # away from the scene only pinned chunks are read
     away = look(at=(0, 0, 50))
     assert len(np.unique(reference.render(scene, away)["rgb"])) == 1
     scene.save(tmp_path / "scene.toml")
@@ -304,7 +303,7 @@ def test_scenes_hold_stores_beside_markers_and_clouds(stores, reference, tmp_pat
         fs.Scene.load(tmp_path / "scene.toml")
 
 
-def test_stores_with_origins_of_their_own_stand_where_they_were_built(tmp_path, reference):
+def test_stores_with_different_origins(tmp_path, reference):
     ahead = [random_splats(300, seed, depth=(1, 4), scale=(0.01, 0.1), across=0.8) for seed in (11, 12)]
     given = {name: getattr(ahead[1], name) for name in ("quats", "scales", "opacities", "colors")}
     moved = fs.SplatCloud(ahead[1].means - np.float32([8, 0, 0]), origin=(8.0, 0, 0), **given)
@@ -320,7 +319,7 @@ def test_stores_with_origins_of_their_own_stand_where_they_were_built(tmp_path, 
     assert ours["rgb"] == pytest.approx(apart["rgb"], abs=1e-4)
 
 
-def test_a_scene_has_no_more_splats_than_indices(stores, monkeypatch):
+def test_too_many_splats_are_refused(stores, monkeypatch):
     monkeypatch.setattr(chunked_splats, "MAX_SPLATS", 2 * COUNT - 1)
     with pytest.raises(fs.InputError, match="at most 5,999 splats, got 6,000"):
         ChunkedSplats([stores["disks"], stores["thick"]])
@@ -329,7 +328,7 @@ def test_a_scene_has_no_more_splats_than_indices(stores, monkeypatch):
         build_plan.plan_build([source_of(splats(1), stores["disks"].path, "test")])
 
 
-def test_planes_of_stores_are_always_whole(tmp_path, reference):
+def test_coplanar_groups_of_stores_are_part_of_every_frame(tmp_path, reference):
     marker = fs.marker("apriltag:36h11:5", size=0.4, mixture="fitted").cloud.transformed(
         rigid_matrix((0, 0, 2))
     )
@@ -348,7 +347,7 @@ def test_planes_of_stores_are_always_whole(tmp_path, reference):
     assert ChunkedSplats([store]).ids(selection).tolist() == list(range(len(store) - len(marker), len(store)))
 
 
-def test_a_flight_over_a_store_goes_on_by_its_content(stores, tmp_path):
+def test_the_key_of_a_flight_is_the_content_of_its_store(stores, tmp_path):
     from fidsplat.render.flight import Flight
 
     path = fs.Trajectory([0.0, 1.0], [np.eye(4), rigid_matrix((0, 0, 1))])
