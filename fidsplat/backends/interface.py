@@ -151,7 +151,7 @@ class ChunkCache(ABC):
         first splat."""
 
     @abstractmethod
-    def bring(self, chunks: Sequence[Chunk]) -> None:
+    def prefetch(self, chunks: Sequence[Chunk]) -> None:
         """Prefetch chunks of the next frame while one is rendered, as far as capacity allows. Called from
         another thread."""
 

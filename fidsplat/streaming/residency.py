@@ -162,7 +162,7 @@ class Residency:
                 if self._cache is None:
                     self.scene.prefetch(band.selection)
                 else:
-                    self._cache.bring(self.chunks.of(band.selection, self._cache.applies_poses))
+                    self._cache.prefetch(self.chunks.of(band.selection, self._cache.applies_poses))
 
         self._prefetch_thread = threading.Thread(target=work, name="fidsplat-prefetch", daemon=True)
         self._prefetch_thread.start()

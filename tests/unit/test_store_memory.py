@@ -101,13 +101,13 @@ def test_a_cache_smaller_than_a_view(stores, monkeypatch):
     held = set(cache._slots)
     assert 0 < len(held) <= 2
     # prefetching does not evict chunks of the current frame
-    cache.bring(device_chunks.of(scene.all_chunks(), True))
+    cache.prefetch(device_chunks.of(scene.all_chunks(), True))
     assert set(cache._slots) == held
     # nor other prefetched chunks
     every = device_chunks.of(scene.all_chunks(), True)
     cache._rendered = set()
-    cache.bring(every[:2])
-    cache.bring(every)
+    cache.prefetch(every[:2])
+    cache.prefetch(every)
     assert set(cache._slots) == {chunk.key for chunk in every[:2]}
 
 

@@ -88,7 +88,7 @@ class OpenCLChunkCache(ChunkCache):
                 self._set_widths(chunks[0].load())
         return GatheredChunks(self, chunks, first_id)
 
-    def bring(self, chunks: Sequence[Chunk]) -> None:
+    def prefetch(self, chunks: Sequence[Chunk]) -> None:
         """Prefetch chunks of the next frame, as far as capacity allows."""
         requested = {chunk.key for chunk in chunks}  # these do not evict each other
         for chunk in chunks:
