@@ -1,4 +1,4 @@
-"""A scene pays only for what it calls for: the text of the kernels, and what it costs."""
+"""Kernels contain only the effects that a scene requests: their source text, arguments and memory."""
 
 import re
 from pathlib import Path
@@ -46,7 +46,7 @@ def record_bytes(features):
     return assemble(features, SHAPE).records["Splat"].itemsize
 
 
-def test_base_text_names_no_effect_that_was_not_asked_for():
+def test_base_text_names_no_other_effect():
     text = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).text
     assert "//" not in text
     absent = set(LAYOUTS) - {
@@ -63,15 +63,15 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "footprint_gaussian",
         "arithmetic_fast",
     }
-    of_knobs = ("wide", "WIDE")
+    of_quality = ("wide", "WIDE")
     of_layers = ("coplanar_groups", "plane_keys", "layer", "Layer", "open_layer", "optical_depth")
     of_order = (*of_layers, "k_buffer", "KBuffer", "K_BUFFER_SIZE", "nearest")
-    for name in (*absent, *FURTHER, "sh", "finished", *of_order, *of_knobs):
+    for name in (*absent, *FURTHER, "sh", "finished", *of_order, *of_quality):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
 
 @pytest.mark.parametrize("output", FURTHER)
-def test_an_output_brings_its_text_and_nothing_else(output):
+def test_an_output_adds_its_own_text_only(output):
     base = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
     with_output = assemble(select(COLORS, fs.Capture(outputs=(output,), quality=PLAIN)), SHAPE)
     assert with_output.digest != base.digest
@@ -93,8 +93,8 @@ def test_an_output_brings_its_text_and_nothing_else(output):
 
 
 @pytest.mark.parametrize("outputs", [("rgb",), tuple(FURTHER)])
-def test_only_splats_on_planes_bring_layers(outputs):
-    """What an output says of layers stays out as well, and layers bring the depth that places them."""
+def test_only_coplanar_groups_add_layers(outputs):
+    """Sections of outputs for layers are absent too; layers add the fragment depth that they require."""
     words = ("Layer", "layer_close", "layer_add", "plane_keys", "label_tau", "share")
     plain = assemble(select(COLORS, fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
     layered = assemble(
@@ -113,7 +113,7 @@ def test_only_splats_on_planes_bring_layers(outputs):
     assert layered.count("float z_numerator;") == 1
 
 
-def test_only_a_scene_of_both_footprints_pays_for_the_choice():
+def test_only_a_scene_of_both_footprints_selects_per_splat():
     features = {
         kind: select(Traits(has_coplanar_groups=True, footprint=kind), fs.Capture(outputs=("depth", "label")))
         for kind in ("gaussian", "box", "mixed")
@@ -127,7 +127,7 @@ def test_only_a_scene_of_both_footprints_pays_for_the_choice():
     assert sizes == sorted(sizes)
 
 
-def test_record_sizes_are_what_the_effects_declare():
+def test_record_sizes_follow_from_the_effects():
     def record(outputs, quality=PLAIN, degree=-1):
         return record_bytes(select(Traits(degree), fs.Capture(outputs=outputs, quality=quality)))
 
@@ -140,20 +140,20 @@ def test_record_sizes_are_what_the_effects_declare():
     assert record_bytes(select(Traits(has_coplanar_groups=True), fs.Capture(quality=PLAIN))) == 96
 
 
-def test_scenes_without_3d_gaussians_have_the_text_that_they_have_without_such_a_thing():
+def test_options_of_3d_gaussians_do_not_change_other_scenes():
     """No option of 3D Gaussians changes the text of a scene without them."""
     words = ("thickness", "THICK_HERE", "bulge", "conjugate_disk", "slopes", "ellipsoid", "conic_facing")
     for outputs, shape in ((("rgb",), SHAPE), (tuple(FURTHER), GROUP)):
         plain = assemble(select(COLORS, fs.Capture(outputs=outputs)), shape)
         assert not [word for word in words if word in plain.text]
         for way in ELLIPSOID:
-            asked = fs.Capture(outputs=outputs, quality=fs.Quality(ellipsoid=way))
-            assert assemble(select(COLORS, asked), shape).digest == plain.digest
-            assert assemble(select(Traits(ellipsoids="some"), asked), shape).digest != plain.digest
+            requested = fs.Capture(outputs=outputs, quality=fs.Quality(ellipsoid=way))
+            assert assemble(select(COLORS, requested), shape).digest == plain.digest
+            assert assemble(select(Traits(ellipsoids="some"), requested), shape).digest != plain.digest
 
 
-def test_clouds_of_3d_gaussians_alone_have_smaller_records():
-    """Every splat is a disk that faces the camera there: what all have alike is in no record."""
+def test_clouds_of_3d_gaussians_only_have_smaller_records():
+    """All splats are disks that face the camera: constant fields are not in records."""
     constant = {"nuy", "d0", "dx", "dy", "d_near"}
     for shape in (SHAPE, GROUP):
         alone, among = (
@@ -166,7 +166,7 @@ def test_clouds_of_3d_gaussians_alone_have_smaller_records():
     assert record_bytes(select(Traits(ellipsoids="some"), fs.Capture())) == 80
 
 
-def test_a_section_that_no_stage_has_is_refused(monkeypatch):
+def test_a_section_of_an_unknown_hook_is_refused(monkeypatch):
     monkeypatch.setattr(assembly, "sections_of", lambda path: {"no_such_hook": [(1, ("x",))]})
     with pytest.raises(fs.DeviceError, match="no_such_hook"):
         assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
@@ -196,11 +196,11 @@ def test_a_scene_without_effects_has_lines_of_these_files_only(schedule, lowpass
         {"lanes": SHAPE, "group": GROUP}[schedule],
     )
     culling = {"part/cull_frustum"} if (schedule, lowpass) == ("lanes", "screen") else set()
-    wanted = SHARED_FILES | SCHEDULE_FILES[schedule] | LOWPASS_FILES[lowpass] | culling
-    assert kernel_files(source) == wanted
+    expected = SHARED_FILES | SCHEDULE_FILES[schedule] | LOWPASS_FILES[lowpass] | culling
+    assert kernel_files(source) == expected
 
 
-# of each kernel of the base: arguments, those of them that are buffers, bytes of local memory
+# of each kernel without effects: arguments, buffers among them, bytes of local memory
 TAKEN = {
     "lanes": {
         "bin_count": (9, 5, 0),
@@ -226,23 +226,24 @@ TAKEN = {
 
 
 @pytest.mark.parametrize("schedule", ["lanes", "group"])
-def test_what_the_kernels_of_the_base_take(renderer, schedule):
-    """An effect must not change it, nor registers and private memory, which follow from the text."""
+def test_arguments_and_local_memory_without_effects(renderer, schedule):
+    """Absent effects must not add any."""
     shape = SHAPE if schedule == "lanes" else GROUP
     pipeline = renderer.backend.pipeline(select(COLORS, fs.Capture(quality=PLAIN)), shape)
     local = cl.kernel_work_group_info.LOCAL_MEM_SIZE
     taken = {}
-    for name, kernel in pipeline.program.kernels.items():
+    for name in pipeline.source.arguments:
+        kernel = pipeline.program.own_kernel(name)
         head = re.search(rf"void {name}\(([^{{]*?)\)\s*\{{", pipeline.source.text)
         assert head, name
         taken[name] = kernel.num_args, len(re.findall(r"\bglobal\b", head[1]))
-        # drivers may pad it
+        # drivers may pad local memory
         staged = kernel.get_work_group_info(local, renderer.backend.device)
         assert 0 <= staged - TAKEN[schedule][name][2] < 64, name
     assert taken == {name: numbers[:2] for name, numbers in TAKEN[schedule].items()}
 
 
-def test_the_page_of_the_kernels_has_every_hook_and_no_other():
+def test_the_readme_lists_exactly_the_hooks_of_the_kernels():
     folder = Path(__file__).resolve().parents[2] / "kernels"
     page = (folder / "README.md").read_text("utf-8")
     texts = [file.read_text("utf-8") for file in (folder / "opencl").rglob("*.cl")]
@@ -253,12 +254,12 @@ def test_the_page_of_the_kernels_has_every_hook_and_no_other():
     assert listed == hooks
 
 
-def test_no_kernel_calls_what_opencl_promises_nothing_of():
+def test_no_kernel_calls_functions_without_error_bounds():
     for file in (Path(__file__).resolve().parents[2] / "kernels" / "opencl").rglob("*.cl"):
         assert not re.search(r"\b(native|half)_\w+\(", file.read_text("utf-8")), file
 
 
-# what the compile matrix (test_matrix.py) does not have with everything
+# settings that the compile matrix (test_matrix.py) does not combine with everything
 KNOBS = {
     "double": {"quality": fs.Quality(blend_precision="float64")},
     "precise": {"quality": fs.Quality(arithmetic="precise")},
@@ -267,7 +268,7 @@ KNOBS = {
 
 @pytest.mark.parametrize("name", KNOBS)
 @pytest.mark.parametrize("outputs", [("rgb",), ("rgb", *FURTHER)], ids=["rgb", "all"])
-def test_knobs_compile_and_run_with_every_output_and_none(renderer, name, outputs):
+def test_quality_settings_compile_and_run_with_all_outputs_and_none(renderer, name, outputs):
     cloud = random_splats(20, seed=1, depth=(1, 4)).with_coplanar_groups(np.arange(20) // 2 - 1)
     if name == "double" and not renderer.device.float64:
         pytest.skip("the device has no float64")
@@ -281,7 +282,7 @@ def test_knobs_compile_and_run_with_every_output_and_none(renderer, name, output
 MOVING = fs.Motion(lambda time: np.eye(4))
 
 
-def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres():
+def test_only_pinhole_frames_of_several_poses_are_culled_by_spheres():
     lens = fs.Camera.fisheye(20, 20, 2.0)
     for expected, footprint, quality, camera, exposed in (
         (True, "gaussian", fs.Quality(), None, True),

@@ -1,4 +1,4 @@
-"""What layout.py declares, compared with what the device's compiler makes of it; effects from elsewhere."""
+"""Declarations of layout.py compared with the compiled kernels; effects from outside of the tree."""
 
 import re
 import subprocess
@@ -32,40 +32,40 @@ SETS = {
 
 
 def offsets_on(backend, source: Source) -> dict[str, dict[str, int]]:
-    """By record and field where the device has it, and under "" the record's size."""
+    """Offsets on the device by record and field, and under "" the size of the record."""
     structs = re.findall(
         r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.programs["picture"].compiled
     )
     assert len(structs) == len(source.records)
-    asked, lines = [], []
+    requested, lines = [], []
     for record, dtype in source.records.items():
         for field in ("", *(dtype.names or ())):
             place = f"(char *)&of_{record}.{field} - (char *)&of_{record}" if field else f"sizeof({record})"
-            lines.append(f"    out[{len(asked)}] = (int)({place});\n")
-            asked.append((record, field))
+            lines.append(f"    out[{len(requested)}] = (int)({place});\n")
+            requested.append((record, field))
     variables = "".join(f"    {record} of_{record};\n" for record in source.records)
     real = f"typedef {source.scalars.real} real;\n#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n"
     body = f"kernel void places(global int *out) {{\n{variables}{''.join(lines)}}}\n"
     program = build(backend, real + "\n".join(structs) + "\n" + body)
-    found = np.empty(len(asked), np.int32)
+    found = np.empty(len(requested), np.int32)
     out = cl.Buffer(backend.context, cl.mem_flags.READ_WRITE, found.nbytes)
     program.places(backend.queue, (1,), None, out)
     cl.enqueue_copy(backend.queue, found, out)
     places: dict[str, dict[str, int]] = {record: {} for record in source.records}
-    for (record, field), place in zip(asked, found.tolist(), strict=True):
+    for (record, field), place in zip(requested, found.tolist(), strict=True):
         places[record][field] = place
     return places
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_records_lie_on_the_device_as_the_host_has_them(renderer, name):
-    asked = combination(SETS[name])
+def test_records_have_equal_layouts_on_host_and_device(renderer, name):
+    requested = combination(SETS[name])
     if not renderer.device.float64:
         pytest.skip("records of a device without float64 are those of `setup_precision` float32")
-    features = asked.features()
+    features = requested.features()
     if name == "double":
-        quality = asked.capture.quality.with_(blend_precision="float64")
-        features = select(asked.cloud, asked.capture.with_(quality=quality))
+        quality = requested.capture.quality.with_(blend_precision="float64")
+        features = select(requested.cloud, requested.capture.with_(quality=quality))
     source = assemble(features, gpu_shape())
     places = offsets_on(renderer.backend, source)
     for record, dtype in source.records.items():
@@ -74,10 +74,10 @@ def test_records_lie_on_the_device_as_the_host_has_them(renderer, name):
 
 
 @pytest.mark.parametrize("shape", [cpu_shape(), gpu_shape(256)], ids=["lanes", "group"])
-def test_kernels_take_what_is_declared(renderer, shape):
-    """Names, types and address spaces of all arguments, as the compiler has understood them."""
-    asked = combination(everything("fisheye") if shape.schedule == "lanes" else everything(None))
-    source = assemble(asked.features(), shape)
+def test_kernels_have_the_declared_arguments(renderer, shape):
+    """Names, types and address spaces of all arguments, as reported by the compiler."""
+    requested = combination(everything("fisheye") if shape.schedule == "lanes" else everything(None))
+    source = assemble(requested.features(), shape)
     programs = [
         build(renderer.backend, program.compiled, "-cl-kernel-arg-info")
         for program in source.programs.values()
@@ -101,13 +101,13 @@ def test_kernels_take_what_is_declared(renderer, shape):
         assert found == declared, name
 
 
-def test_every_effect_is_laid_out_and_brings_what_its_output_needs():
+def test_every_effect_has_a_layout_with_the_parts_of_its_output():
     assert set(CATALOGUE) <= set(LAYOUTS)
     for name, effect in CATALOGUE.items():
         assert set(effect.needs) <= set(LAYOUTS[name].parts), name
 
 
-TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is drawn; 0 where there is none.
+TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment; 0 where there is none.
 //@ state
     vfloat nearest;
 //@ start
@@ -123,14 +123,14 @@ TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is dra
 //@ resolve_end
     nearest_out[out] = nearest < INFINITY ? nearest : 0.0f;
 """
-TOY_STEP = """// The negative of what the sensor gives.
+TOY_STEP = """// The negative of the sensor's image.
 //@ resolve_end
     for (size_t k = 3 * out; k < 3 * out + 3; k++) rgb_out[k] = white - rgb_out[k];
 """
 
 
 class Negative(fs.Sensor):
-    """A sensor with a step that this package does not have."""
+    """A sensor with an additional step."""
 
     @property
     def steps(self):
@@ -142,7 +142,7 @@ class Negative(fs.Sensor):
 
 @pytest.fixture
 def toys(monkeypatch, tmp_path):
-    """An output and a sensor's step: for each a line in the catalogue, one in the layouts, and a file."""
+    """An output and a sensor step: each a line in the catalogue, one in the layouts, and a file."""
     (tmp_path / "nearest.cl").write_text(TOY_OUTPUT)
     (tmp_path / "negative.cl").write_text(TOY_STEP)
     output = Output(
@@ -167,7 +167,7 @@ def toys(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_an_output_and_a_step_from_elsewhere_are_drawn(renderer, toys):
+def test_an_output_and_a_step_from_outside_are_rendered(renderer, toys):
     cloud = random_splats(60, seed=4, depth=(1, 4))
     camera = fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0)
     plain = renderer.render(cloud, camera, ("rgb", "depth", "depth_first"), fs.Quality(first_hit=1e-3))
@@ -175,9 +175,9 @@ def test_an_output_and_a_step_from_elsewhere_are_drawn(renderer, toys):
     np.testing.assert_array_equal(toy["rgb"], np.float32(2) - plain["rgb"])
     np.testing.assert_array_equal(toy["depth"], plain["depth"])
     assert ((toy["nearest"] > 0) >= (plain["depth"] > 0)).all()
-    seen = plain["depth_first"] > 0
-    assert (toy["nearest"][seen] <= plain["depth_first"][seen]).all()
-    assert seen.any()
+    hit = plain["depth_first"] > 0
+    assert (toy["nearest"][hit] <= plain["depth_first"][hit]).all()
+    assert hit.any()
 
 
 def test_an_output_is_compared_listed_and_written_as_it_is_declared(toys, tmp_path):
@@ -211,15 +211,15 @@ def test_help_of_render_lists_all_outputs(capsys):
         assert declared_output(name).summary[:40] in " ".join(listed.replace("│", " ").split()), name
 
 
-def test_effects_from_elsewhere_leave_other_texts_as_they_were(request):
-    asked = [select(random_splats(3, seed=1), fs.Capture(outputs=(name,))) for name in OUTPUTS]
-    before = [assemble(features, cpu_shape()).digest for features in asked]
+def test_effects_from_outside_do_not_change_other_texts(request):
+    requested = [select(random_splats(3, seed=1), fs.Capture(outputs=(name,))) for name in OUTPUTS]
+    before = [assemble(features, cpu_shape()).digest for features in requested]
     request.getfixturevalue("toys")
-    assert [assemble(features, cpu_shape()).digest for features in asked] == before
-    assert "nearest" not in layouts_of(asked[0])
+    assert [assemble(features, cpu_shape()).digest for features in requested] == before
+    assert "nearest" not in layouts_of(requested[0])
 
 
-def test_a_mistake_in_a_kernel_is_told_with_its_file_and_line(renderer, toys):
+def test_compiler_errors_name_the_kernel_file_and_line(renderer, toys):
     (toys / "wrong.cl").write_text("// wrong\n//@ resolve_end\n    nearest_out[out] = no_such_name;\n")
     layout = Layout(str(toys / "wrong.cl"), splat=(member("int wrong"),))
     with pytest.MonkeyPatch.context() as patch:
@@ -229,7 +229,7 @@ def test_a_mistake_in_a_kernel_is_told_with_its_file_and_line(renderer, toys):
             renderer.backend.pipeline(features)
 
 
-def test_line_directives_lead_to_the_lines_of_the_files():
+def test_line_directives_match_the_lines_of_the_files():
     from fidsplat.util.files import kernels_folder
 
     source = assemble(combination(everything("distortion")).features(), cpu_shape())
@@ -249,7 +249,7 @@ def test_line_directives_lead_to_the_lines_of_the_files():
     assert compared > 800
 
 
-def test_the_text_needs_no_opencl():
+def test_assembling_needs_no_opencl():
     code = (
         "import sys; sys.modules['pyopencl'] = None\n"
         "import fidsplat as fs\n"
@@ -273,7 +273,7 @@ for more in (["--outputs", "rgb,depth"], ["--schedule", "group"]):
 """
 
 
-def test_a_scene_s_program_is_printed_without_opencl(tmp_path, capsys):
+def test_source_prints_without_opencl(tmp_path, capsys):
     cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
     fs.save_ply(cloud, str(file))
     done = subprocess.run([sys.executable, "-c", SOURCES, str(file)], capture_output=True, text=True)
@@ -285,10 +285,10 @@ def test_a_scene_s_program_is_printed_without_opencl(tmp_path, capsys):
     assert "schedule/group.cl" in group
     assert "schedule/group.cl" not in lanes
     assert main(["source", str(file), "--device", "reference"]) == 2
-    assert "reference is no OpenCL device" in capsys.readouterr().err
+    assert "--device must be an OpenCL device, got reference" in capsys.readouterr().err
 
 
-def test_the_program_of_a_device_is_what_it_compiles(renderer, tmp_path, capsys):
+def test_source_prints_what_the_device_compiles(renderer, tmp_path, capsys):
     cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
     fs.save_ply(cloud, str(file))
     frame = renderer.render(cloud, fs.Camera.pinhole(8, 8, 8.0, 8.0, 4.0, 4.0))

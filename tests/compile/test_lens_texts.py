@@ -1,4 +1,4 @@
-"""Lenses and shutters are in the kernels of the pictures that call for them, and in no others."""
+"""Only frames that request a lens or shutter have its kernel code."""
 
 import re
 
@@ -48,22 +48,22 @@ def test_numbers_of_a_lens_are_not_in_its_text():
     assert features[0] == features[1]
 
 
-def test_values_that_mean_nothing_call_for_nothing(renderer):
+def test_values_without_effect_select_nothing(renderer):
     nothing = fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0, lens=fs.BrownConrady())
     assert select(COLORS, fs.Capture(nothing, quality=PLAIN)) == select(COLORS, fs.Capture(quality=PLAIN))
-    # a shutter that needs no time is no shutter, and a motion without one is where it is then
+    # a shutter with no exposure time selects nothing, and a motion is evaluated at its time
     cloud = random_splats(10, seed=1, depth=(1, 4))
     before = set(renderer.backend._pipelines)
     motion = fs.Motion(lambda time: CAMERAS["pinhole"].world_to_camera)
     renderer.render(cloud, nothing, quality=PLAIN, motion=motion, shutter=fs.Shutter(time=0.5, sub_poses=9))
-    # nor is one before which nothing moves
+    # nor does a shutter without motion
     renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure_time=0.1, readout=0.2))
     added = set(renderer.backend._pipelines) - before
     assert not any("shutter" in slot or "motion" in slot for features, _ in added for slot in features.slots)
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_a_lens_brings_its_own_text_alone(kind):
+def test_a_lens_adds_its_own_text_only(kind):
     text = assemble(select(COLORS, fs.Capture(CAMERAS[kind], quality=PLAIN)), SHAPE).text
     words = {
         "brown_conrady": ("lens_fold",),
@@ -78,8 +78,8 @@ def test_a_lens_brings_its_own_text_alone(kind):
     assert not re.search(r"\b(expose|moving)\b", text)
 
 
-def test_what_lenses_take():
-    """Bytes of a record and words of bounds; the base's are those of test_assemble."""
+def test_record_sizes_of_lenses():
+    """Bytes of a record; test_assemble.py has those without lenses."""
 
     def record(kind):
         return record_bytes(select(COLORS, fs.Capture(CAMERAS[kind], quality=PLAIN)))
@@ -98,8 +98,7 @@ def test_what_lenses_take():
 
 @pytest.mark.parametrize("kind", sampled(list(CAMERAS), 2, 3))
 def test_every_lens_builds_with_everything_but_a_shutter(renderer, kind):
-    """All outputs, layers, colours that depend on the view, moving groups; test_matrix.py has a shutter
-    too."""
+    """With all outputs, layers, view-dependent colour and moving groups; test_matrix.py adds a shutter."""
     cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=1).with_coplanar_groups(np.repeat([-1, 0], 10))
     motion = fs.Motion(None, {1: lambda time: np.eye(4)})
     frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *OUTPUTS), None, motion=motion)

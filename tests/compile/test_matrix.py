@@ -1,8 +1,7 @@
-"""The compile matrix: each effect alone, all, all but one, all pairs; their texts, and pictures against the
-reference.
+"""Compile matrix: each effect, all, all but one, all pairs; source texts, and images against the reference.
 
-Texts are put together for all; kernels are built, and pictures compared, of all effects behind each lens and
-of a sample of the others: `pytest -m exhaustive` does the rest."""
+Texts are assembled for all. Kernels are built, and images compared, for all effects with each lens and for a
+sample of the others; `pytest -m exhaustive` runs the rest."""
 
 import re
 from itertools import combinations
@@ -21,7 +20,7 @@ PAIRS = [pair for pair in combinations(SWITCHES, 2) if goes(pair)]
 
 
 def assert_well_formed(names, shapes=SHAPES):
-    """Every hook is filled, and every kernel has its arguments and no other."""
+    """All hooks are expanded, and each kernel has exactly its arguments."""
     features = combination(names).features()
     for shape in shapes:
         source = assemble(features, shape)
@@ -36,7 +35,7 @@ def assert_well_formed(names, shapes=SHAPES):
             lines = [line.strip(" ,") for line in heads[kernel].splitlines() if line and line[0] != "#"]
             declared = [one.text.replace("wide", source.scalars.wide) for one in arguments]
             assert lines == declared, kernel
-        # GPUs resolve as they blend
+        # resolve may be fused into blend
         taken = {one.name for one in source.arguments.get("resolve", source.arguments["blend"])}
         assert {f"{output.name}_out" for output in features.images} <= taken
         assert {one.name for one, _ in source.samples} <= taken
@@ -51,13 +50,13 @@ def test_texts_of_each_effect():
 
 @pytest.mark.parametrize("first", [0, pytest.param(1, marks=pytest.mark.exhaustive)])
 def test_texts_of_every_pair(first):
-    """For one schedule and the other by turns."""
+    """Schedules alternate."""
     for k, pair in enumerate(PAIRS, first):
         assert_well_formed(pair, [SHAPES[k % 2]])
 
 
-def test_most_pictures_list_their_splats_by_the_same_program():
-    """What a driver keeps by its text is compiled once for all of them."""
+def test_most_feature_sets_share_the_program_of_lists():
+    """The driver's cache then compiles it once."""
     for shape in SHAPES:
         texts = [assemble(combination((name,)).features(), shape).programs["lists"] for name in SWITCHES]
         assert max(map(texts.count, texts)) > 0.8 * len(SWITCHES)
@@ -71,7 +70,7 @@ def test_texts_of_all_effects_and_of_all_but_one(lens):
         assert_well_formed([name for name in names if name != left_out])
 
 
-# tests/contract has each alone on every device: lenses, shutters, sensors ... in files of their own
+# tests/contract has each effect on every device in a file of its own
 @pytest.mark.parametrize("name", sampled(list(SWITCHES), 3, 12))
 def test_each_effect_alone(renderer, name):
     assert_drawn(renderer, (name,))

@@ -1,5 +1,5 @@
-"""Kernels as users have them, optimised: other tests draw with kernels that hardly are
-(tests/optimisation.py), and those of users have the same bits."""
+"""Optimised kernels, as users compile them, are bit-identical with those of other tests, which are compiled
+with little optimisation (tests/optimisation.py)."""
 
 import hashlib
 import multiprocessing
@@ -15,11 +15,11 @@ from fidsplat.selftest.catalogue import all_cases
 from fidsplat.selftest.check import run_case
 
 LENS = "fisheye"
-PICTURES = {
+FRAMES = {
     "one lens": {"base": (), LENS: everything(LENS)},
     "the others": {str(lens): everything(lens) for lens in (None, *LENSES) if lens != LENS},
 }
-"""what is switched on in each picture: all behind every lens, which takes a device 5 to 10 s of compiling"""
+"""effects of each frame: all with every lens, 5 to 10 s of compilation per device"""
 DEVICES = [
     info.name for info in fs.devices() if info.usable and info.kind == "cpu" and info.name != "reference"
 ]
@@ -27,23 +27,23 @@ ARGUMENTS = np.random.default_rng(3).uniform(1e-6, 80.0, 1 << 16).astype(np.floa
 
 
 def digest(images):
-    """Of arrays by name."""
+    """Digest of named arrays."""
     ordered = (np.ascontiguousarray(images[name]).tobytes() for name in sorted(images))
     return hashlib.sha256(b"".join(ordered)).hexdigest()
 
 
-def drawn(renderer, names):
-    """The digest of a combination's images."""
-    asked = combination(names)
-    frame = renderer.render(asked.cloud, asked.capture)
-    return digest({name: frame[name] for name in asked.capture.outputs})
+def rendered(renderer, names):
+    """Digest of the images of a combination."""
+    requested = combination(names)
+    frame = renderer.render(requested.cloud, requested.capture)
+    return digest({name: frame[name] for name in requested.capture.outputs})
 
 
-def found(device, pictures):
-    """The level of optimisation, and digests by what they are of: pictures, and short functions. The cases
-    of the catalogue that ask what a compiler makes of arithmetic hold."""
+def digests_of(device, frames):
+    """Level of optimisation, and digests of the frames and fast functions. Checks the cases of group F that
+    depend on the compiler."""
     renderer = fs.Renderer(device)
-    digests = {title: drawn(renderer, names) for title, names in PICTURES[pictures].items()}
+    digests = {title: rendered(renderer, names) for title, names in FRAMES[frames].items()}
     functions = renderer.backend.probe().arithmetic(-ARGUMENTS, ARGUMENTS / 80.0, ARGUMENTS, ARGUMENTS[::-1])
     digests["functions"] = digest({name: functions[name] for name in ("fast_exp", "fast_log", "fma")})
     wrong = [run_case(renderer, case)[0].wrong for case in all_cases("F") if case.name in ("F1", "F2", "F3")]
@@ -52,14 +52,14 @@ def found(device, pictures):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("pictures", ["one lens", pytest.param("the others", marks=pytest.mark.exhaustive)])
-def test_what_users_have_draws_the_same_bits(device, pictures):
+@pytest.mark.parametrize("frames", ["one lens", pytest.param("the others", marks=pytest.mark.exhaustive)])
+def test_optimised_kernels_are_bit_identical(device, frames):
     if level() == "as users have it":
-        pytest.skip("all tests run what users have")
+        pytest.skip("all tests run optimised kernels")
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         with as_users_compile():
-            optimised = pool.submit(found, device, pictures)
-        here, digests = found(device, pictures)
+            optimised = pool.submit(digests_of, device, frames)
+        here, digests = digests_of(device, frames)
         there, of_users = optimised.result()
     assert here == "hardly"
     assert there == "as users have it"

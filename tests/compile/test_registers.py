@@ -1,4 +1,4 @@
-"""Registers and spills of the base are what they were, where a driver tells them."""
+"""Registers and spills of kernels without effects, where the driver reports them."""
 
 import json
 import shutil
@@ -58,12 +58,12 @@ def test_the_log_of_this_assembler_is_read(tmp_path):
     assert all(0 < numbers["registers"] < 64 for numbers in found.values())
 
 
-def test_the_base_takes_the_registers_that_it_took(renderer):
-    """A change of the stages themselves records new numbers; an effect must not need to."""
+def test_registers_without_effects_equal_the_record(renderer):
+    """A change of a stage records new numbers; an effect must not change them."""
     backend = renderer.backend
     kind = generation(backend)
     if kind is None:
-        pytest.skip("only NVIDIA's driver tells registers")
+        pytest.skip("only NVIDIA's driver reports registers")
     recorded = json.loads(RECORD.read_text("utf-8")).get(kind)
     driver = backend.device.driver_version
     if recorded is None or recorded["driver"] != driver:

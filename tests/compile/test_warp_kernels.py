@@ -1,4 +1,4 @@
-"""The Warp kernels' text: what a scene asked for and nothing else; CUDA's compiler takes it, GPU or not."""
+"""Source text of Warp kernels has requested effects only; CUDA's compiler accepts it, GPU or not."""
 
 import re
 
@@ -18,7 +18,7 @@ OF_SAMPLES = ("depth_weight", "depth_median", "depth_first", "heaviest", "blende
 TAKEN = {
     "1.19.0": {"blend": {"registers": 64, "stack": 48}, "project": {"registers": 96, "stack": 64}},
 }
-"""by Warp's version: what the base takes of an H100 (sm_90)"""
+"""by Warp's version: registers and memory of kernels without effects on an H100 (sm_90)"""
 OF_LAYERS = ("Layer", "thickest", "tau")
 LENSES = [
     ("camera_orthographic", "lowpass_screen"),
@@ -33,8 +33,8 @@ def made(name, *arguments):
 
 
 def compiled(kernel, folder, block=256, assembly=False):
-    """Source text, without comments, that NVRTC compiled for a GPU of 2020; or the PTX that it made of it."""
-    kernel.module.options.update(block_dim=block, optimization_level=3)  # below it the long ones take minutes
+    """Source text without comments, compiled by NVRTC for sm_80; or the PTX."""
+    kernel.module.options.update(block_dim=block, optimization_level=3)  # lower levels take minutes
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=80, module_dir=folder, use_ptx=True)
     (result,) = folder.glob("*.ptx")
@@ -42,7 +42,7 @@ def compiled(kernel, folder, block=256, assembly=False):
 
 
 def measured(kernel, folder, block):
-    """The source text, and what the machine code for an H100 takes."""
+    """Source text, and resources of the machine code for an H100."""
     kernel.module.options.update(block_dim=block, optimization_level=3)
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=90, module_dir=folder, use_ptx=False)
@@ -60,7 +60,7 @@ def projecting(*effects, outputs=NORMAL, terms=0, precision="float64", every_bou
 
 
 def everything():
-    """All that outputs and fog are made of."""
+    """Files of all outputs and fog."""
     return made("output.with_needed", {*made("output.known"), "fog"})
 
 
@@ -77,7 +77,7 @@ OF_GRADIENTS = (("lowpass_screen", "ray_depth"), ("depth", "distortion", "normal
 
 
 def blending_back(*effects):
-    """The derivatives of blending, of a tile as large as the device's."""
+    """Backward pass of blending, with the device's tile size."""
     drawn = ((*effects, *OF_GRADIENTS[0]), OF_GRADIENTS[1])
     return made("blend_backward.make_blend_backward", *drawn, GRADIENTS, True, 256).kernel
 
@@ -142,7 +142,7 @@ def started():
     ],
 )
 def test_the_kernels_compile_for_cuda(kernel, tmp_path):
-    """Those that tests below compile excepted."""
+    """Except kernels that other tests compile."""
     assert "wp::launch_bounds_t" in compiled(kernel(), tmp_path)
 
 
@@ -154,7 +154,7 @@ def test_the_base_has_nothing_of_absent_effects_and_takes_no_more_of_a_gpu(tmp_p
     project, projection = measured(projecting(outputs=()), tmp_path / "project", 128)
     for name in FILTERS:
         assert name not in project, name
-    if wp.__version__ in TAKEN:  # which brings the compiler
+    if wp.__version__ in TAKEN:  # includes the compiler
         assert {"blend": blend, "project": projection} == TAKEN[wp.__version__]
     text = compiled(blending(*MIXED, waiting=2), tmp_path / "all")
     project = compiled(projecting(*MIXED, "lowpass_pixel"), tmp_path / "mixed", 128)
@@ -164,7 +164,7 @@ def test_the_base_has_nothing_of_absent_effects_and_takes_no_more_of_a_gpu(tmp_p
 
 
 def test_records_move_as_whole_lines(tmp_path):
-    """Field by field, each store would touch 32 records of a warp."""
+    """Stores by field would access 32 records per warp."""
     project = compiled(projecting(*RECORD, terms=16), tmp_path / "project", 128, assembly=True)
     assert project.count("st.global.v4") == 7
     blend = compiled(blending(*RECORD, outputs=NORMAL, waiting=2), tmp_path / "blend", assembly=True)
@@ -174,7 +174,7 @@ def test_records_move_as_whole_lines(tmp_path):
 
 
 def test_derivatives_read_records_where_they_lie(tmp_path):
-    """They stage none: what `staging.line` finds in shared memory then is not a record."""
+    """They stage no records."""
     assert "staged" in compiled(blending(outputs=()), tmp_path / "blend")
     assert "staged" not in compiled(blending_back("stop_exclusive", "arithmetic_fast"), tmp_path / "back")
 

@@ -1,7 +1,6 @@
-"""The compile matrix on Warp: effects alone, all that it has, and pairs, against the reference.
+"""Compile matrix on Warp: single effects, all, and pairs, against the reference.
 
-Warp compiles a stage for seconds, so plain pytest takes a sample, of single effects too; `pytest -m
-exhaustive` does the rest."""
+Warp compiles a stage in seconds, so plain pytest runs a sample; `pytest -m exhaustive` runs the rest."""
 
 from itertools import combinations
 
@@ -32,7 +31,7 @@ def test_each_effect_alone(renderer, name):
     assert_drawn(renderer, (name,))
 
 
-# the others with other effects beside them in test_combinations.py and test_gpu_schedule.py of tests/contract
+# other combinations are in test_combinations.py and test_gpu_schedule.py of tests/contract
 @pytest.mark.parametrize("lens", sampled([None, *LENSES], 3, 2))
 def test_all_effects(renderer, lens):
     assert_drawn(renderer, [name for name in everything(lens) if has(name)])
