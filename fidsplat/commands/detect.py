@@ -119,8 +119,7 @@ class Detect:
         if scene is not None and is_video(path):
             raise InputError(
                 f"--scene needs the camera's pose of each frame, which the video {path} lacks; give the "
-                "folder "
-                "of the flight, or its log"
+                "folder of the flight, or its log"
             )
         folder = path_of(path)
         for name, image in pictures(folder / "rgb" if (folder / RECORD).is_file() else path):
@@ -140,8 +139,7 @@ class Detect:
                 if pose is None:
                     raise InputError(
                         f"--scene needs a pose of {one.frame!r} in /tf at the time of {one.name}, which "
-                        f"{path} "
-                        "lacks; detect without --scene"
+                        f"{path} lacks; detect without --scene"
                     )
                 then = seen_from(scene, pose, one.stamp / 1e9)
             yield one.name, one.image, then

@@ -24,7 +24,7 @@ from fidsplat.commands.sweeps import run_interleaved
 from fidsplat.experiments.plants import PlantSettings
 from fidsplat.experiments.settings import CountedSettings
 from fidsplat.experiments.trained import BaselineSettings
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, unknown
 
 
 @repeatable
@@ -59,7 +59,7 @@ class Dataset(CountedSettings):
         from fidsplat.util.files import writable_folder
 
         if self.truth not in TRUTHS:
-            raise InputError(f"unknown truth {self.truth!r}; known: {', '.join(TRUTHS)}")
+            raise InputError(unknown("truth", self.truth, TRUTHS))
         self.check()
         if self.truth.startswith("blender-"):
             check_pictures(self.blender, self.truth.removeprefix("blender-"), self.seed)

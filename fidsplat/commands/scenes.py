@@ -161,7 +161,7 @@ def load_user_scenes(
     if files and named:
         raise InputError("--scene and --scenes exclude each other; give one of them")
     if cameras is not None and not files:
-        raise InputError("--cameras needs --scene; give that as well")
+        raise InputError("--cameras needs --scene FILE")
     path = None if cameras is None else load_trajectory(cameras)
     found: dict[str, BenchScene] = {}
     for name in files:

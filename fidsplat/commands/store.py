@@ -215,13 +215,13 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
 
 @dataclass
 class Measure:
-    """Measure what levels of detail cost: pictures with cells merged up to a size against the exact ones.
+    """Measure the error of levels of detail against exact images.
 
-    From random places around and inside the store, at 320 x 180 pixels. What is found is kept beside the
-    store, and lets Quality.detail_error choose, with the cut-off that it was measured with: fidsplat render
-    city.fss --quality lowpass=pixel,alpha_cutoff=1e-8,detail_error=0.004
-    The error holds on the measured views, with a margin of 3; other views may exceed it, fewer of them the
-    more views are measured.
+    Renders random views around and inside the store at 320 x 180 pixels. The store keeps the errors, so that
+    Quality.detail_error can select levels, with the same cut-off: fidsplat render city.fss --quality
+    lowpass=pixel,alpha_cutoff=1e-8,detail_error=0.004
+    The error holds on the measured views with a margin of 3. Other views may exceed it, the fewer the more
+    views are measured.
 
     Examples:
       fidsplat store measure city.fss

@@ -145,7 +145,7 @@ def find_checkpoint(source: Path) -> Path | None:
     found = sorted(source.glob(f"*{CHECKPOINT}")) if source.is_dir() else []
     if len(found) > 1:
         names = ", ".join(file.name for file in found)
-        raise InputError(f"{source} holds several training runs; name one of {names} there")
+        raise InputError(f"{source} must hold one training run, got several; name one of {names} there")
     return found[0] if found else None
 
 
@@ -168,8 +168,7 @@ def flight_source(folder: Path) -> tuple[str, str]:
         ) from None
     if not file.exists():
         raise InputError(
-            f"the scene {source} of the flight {folder} no longer exists; give its new place with "
-            "--trajectory "
+            f"the scene {source} of the flight {folder} must exist; give its new place, with --trajectory "
             f"{poses}"
         )
     return str(file), str(poses)

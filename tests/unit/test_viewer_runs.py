@@ -158,7 +158,7 @@ def test_several_runs_in_a_folder_are_named(tmp_path):
     assert find_checkpoint(tmp_path) is None
     for name in ("a", "b"):
         (tmp_path / f"{name}.training.npz").touch()
-    with pytest.raises(fs.InputError, match=r"several training runs; name one of a.training.npz, b.training"):
+    with pytest.raises(fs.InputError, match=r"got several; name one of a.training.npz, b.training"):
         find_checkpoint(tmp_path)
     with pytest.raises(fs.InputError, match="as a checkpoint"):
         Training(tmp_path / "a.training.npz")
