@@ -85,7 +85,6 @@ def frames(record: dict) -> dict[str, str]:
         "x roofline": times(record, "frame"),
         "splats/s": f"{rate / 1e6:.{0 if rate > 1e8 else 2}f} M",
         "memory": "-" if memory is None else f"{memory / 2**30:.3g} GiB",
-        "date": record["date"],
     }
 
 
@@ -193,6 +192,16 @@ def growth(curve: tuple[str, str, dict[str, float | None]]) -> dict[str, str]:
     return {"device": title, "over": series} | cells
 
 
+def newest_of_each_device(records: list[dict]) -> list[dict]:
+    """Newest record of each scene on each device name."""
+    newest: dict[tuple[str, str], dict] = {}
+    for record in records:
+        key = record["scene"], record["device"]
+        if key not in newest or record["date"] > newest[key]["date"]:
+            newest[key] = record
+    return [record for record in records if any(record is one for one in newest.values())]
+
+
 def first_of_each_scene(records: list[dict]) -> list[dict]:
     """First record of each scene."""
     scenes = dict.fromkeys(record["scene"] for record in records)
@@ -209,7 +218,7 @@ def tables(records: dict[str, list[dict]]) -> dict[str, str]:
     rows = {
         "counts": map(counts, first_of_each_scene(measured)),
         "rates": map(rates, {record["title"]: record for record in measured if record.get("rates")}.values()),
-        "frames": map(frames, measured),
+        "frames": map(frames, newest_of_each_device(measured)),
         "backends": map(backends, zip(records["backends"][::2], records["backends"][1::2], strict=True)),
         "stages": map(stages, measured),
         "peers": map(peers, pairs),
