@@ -1,4 +1,4 @@
-"""Capture: everything that a picture is but the splats; plain data."""
+"""Capture: everything that defines a frame except the splats."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ from fidsplat.util.errors import InputError, unknown
 
 @dataclass(frozen=True, eq=False)
 class Capture(PickledByFields):
-    """How a picture is taken: from where, of what, and how well.
+    """Camera, outputs, quality, background, motion, shutter, sensor and fog of a frame.
 
-    The same object works on every device. Raises InputError for a value of the wrong kind; whether an output
-    exists is checked when it is drawn.
+    The same object works on every device. Raises InputError for a value of the wrong kind; output names are
+    checked when the frame is rendered.
     """
 
     camera: Camera | None = None
-    """None: still to be said; no picture is drawn without one"""
+    """None: to be set before rendering"""
     outputs: tuple[str, ...] = ("rgb",)
-    """names of the output images; one may be given as it is"""
+    """names of the output images; a single name may be a str"""
     quality: Quality = field(default_factory=Quality)
     """a Quality, or text such as "fast" or "fast,samples=2" (`Quality.of`); None: standard"""
     background: Background = (0.0, 0.0, 0.0)
     """behind the splats: RGB in display space, a Gradient or a Panorama"""
     motion: Motion = field(default_factory=Motion)
-    """how the camera and groups of splats move; None: they stand still"""
+    """motion of the camera and of groups of splats; None: none"""
     shutter: Shutter = field(default_factory=Shutter)
-    """when the picture is taken, and how long that takes; None: at time 0, at once"""
+    """time, exposure and readout; None: at time 0, without duration"""
     sensor: Sensor = field(default_factory=Sensor)
-    """what becomes of rgb on its way out; None: nothing"""
+    """sensor applied to rgb; None: none"""
     fog: Fog | None = None
-    """between the camera and what it sees"""
+    """fog between the camera and the splats"""
     external_depth: ExternalDepth | None = None
     """image with depths of another renderer, an opaque surface among the splats; of the camera's size"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         if self.camera is not None and not isinstance(self.camera, Camera):
-            raise InputError(f"camera is {self.camera!r}; it must be a Camera, e.g. fs.Camera.look_at(...)")
+            raise InputError(f"camera must be a Camera, e.g. fs.Camera.look_at(...), got {self.camera!r}")
         put(self, "outputs", output_names(self.outputs))
         put(self, "quality", Quality.of(self.quality))
         put(self, "background", background_of(self.background))
@@ -56,25 +56,24 @@ class Capture(PickledByFields):
 
     @cached_property
     def foggy(self) -> bool:
-        """Whether there is fog to be seen."""
+        """Whether the fog is visible."""
         return self.fog is not None and self.fog.density > 0
 
     @cached_property
     def backdrop(self) -> Background:
-        """What is seen behind everything: fog, of which there is enough there to hide any background, or else
-        the background."""
+        """Background behind all splats: the colour of the fog if there is fog, else the background."""
         return self.fog.color if self.fog is not None and self.foggy else self.background
 
     @cached_property
     def exposed(self) -> bool:
-        """Whether the picture is made of several poses."""
+        """Whether the frame has several sub-frames."""
         if self.motion.is_still:
             return False
         rows = self.shutter.rows_per_band + 1 if self.camera is None else self.camera.height
         return len(self.shutter.bands(rows)) > 1 or len(self.shutter.times(0.0)) > 1
 
     def picklable(self) -> Capture:
-        """The same capture, with poses at the times of its shutter in place of the motion's functions."""
+        """A copy that can be pickled: motion functions are replaced by poses at the times of the shutter."""
         if self.motion.is_still or self.camera is None:
             return self
         shutter = self.shutter
@@ -83,7 +82,7 @@ class Capture(PickledByFields):
         return replace(self, motion=self.motion.sampled(times))
 
     def with_(self, **changes: Any) -> Capture:
-        """A copy with some parts changed; those that are None stay as they are.
+        """A copy with some parts changed; None keeps a part.
 
         Raises:
             InputError: an unknown part, or a value of the wrong kind.
@@ -96,7 +95,7 @@ class Capture(PickledByFields):
 
 
 class CaptureParts(TypedDict, total=False):
-    """Parts of a capture as arguments by name beside `outputs` and `quality`; None: as the capture has it."""
+    """Keyword arguments that change parts of a capture; None keeps a part."""
 
     camera: Camera | None
     background: Background | Iterable[float] | None
@@ -108,19 +107,20 @@ class CaptureParts(TypedDict, total=False):
 
 
 def output_names(outputs: Any) -> tuple[str, ...]:
-    """Names of outputs, each once, from one or several. Raises InputError for anything else, and for none."""
+    """Distinct names of outputs from one name or several. Raises InputError for anything else, and if
+    empty."""
     try:
         names: tuple[Any, ...] = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    except TypeError:  # an array of no dimension, too, passes for an Iterable
+    except TypeError:  # a 0-dimensional array is an Iterable too
         names = (outputs,)
     if not names:
         raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
     if not all(isinstance(name, str) for name in names):
-        raise InputError(f"outputs must be one or more names, not {outputs!r}")
+        raise InputError(f"outputs must be one or more names, got {outputs!r}")
     return tuple(dict.fromkeys(names))
 
 
 def _of_kind(name: str, value: Any, kind: type) -> Any:
     if value is not None and not isinstance(value, kind):
-        raise InputError(f"{name} is {value!r}; it must be a {kind.__name__}")
+        raise InputError(f"{name} must be a {kind.__name__}, got {value!r}")
     return value

@@ -1,4 +1,4 @@
-"""What lies around and between the splats: fog, and what is seen behind everything; plain data."""
+"""Environment of the splats: fog, backgrounds and external depth images."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ MAX_PANORAMA = 16384
 
 @dataclass(frozen=True)
 class Fog:
-    """Fog of even density: of what is seen at distance r, exp(-density r) is left, the rest is the fog's
-    colour.
+    """Homogeneous fog: a surface at distance r keeps exp(-density r) of its colour, the rest is the fog's.
 
-    It is also all that is seen behind the splats. Raises InputError for a density that is no number of at
-    least 0, or a colour that is not three finite numbers.
+    The fog also replaces the background. Raises InputError for a density below 0 or a colour that is not
+    three finite numbers.
     """
 
     density: float
@@ -34,14 +33,14 @@ class Fog:
         ok = isinstance(self.density, (int, float)) and not isinstance(self.density, bool)
         if not (ok and 0 <= self.density <= LARGEST):
             raise InputError(
-                f"fog: density is {self.density!r}; it must be a number of at least 0 (1 / metres)"
+                f"fog: density must be a number of at least 0 (1 / metres), got {self.density!r}"
             )
         object.__setattr__(self, "color", three_numbers("fog: color", self.color))
 
 
 @dataclass(frozen=True)
 class Gradient:
-    """A background between two colours, by the sine of the ray's height above the horizon.
+    """Background gradient between two colours, by the sine of the elevation of the ray.
 
     Raises InputError for a colour or direction that is not three finite numbers, or a direction of length 0.
     """
@@ -57,13 +56,12 @@ class Gradient:
         for name in ("top", "bottom", "up"):
             object.__setattr__(self, name, three_numbers(f"background: {name}", getattr(self, name)))
         if not 0 < np.linalg.norm(self.up) < math.inf:
-            raise InputError(f"background: up is {self.up!r}; it must be a direction, e.g. (0, -1, 0)")
+            raise InputError(f"background: up must be a direction, e.g. (0, -1, 0), got {self.up!r}")
 
 
 @dataclass(frozen=True, eq=False)
 class Panorama(PickledByFields):
-    """An equirectangular picture of the world as background: its middle column lies towards +z, to the right
-    of it is +x, its top row is -y.
+    """Equirectangular background image: its middle column faces +z, +x is to its right, its top row is -y.
 
     Raises InputError for anything but an (h, w, 3) array of finite numbers with 2 to 16384 pixels a side.
     """
@@ -71,7 +69,7 @@ class Panorama(PickledByFields):
     image: np.ndarray
     """(h, w, 3) float32 RGB, read-only; uint8 is taken as 255ths, uint16 as 65535ths"""
     file: str | None = None
-    """where it came from"""
+    """its file"""
 
     def __post_init__(self) -> None:
         try:
@@ -80,26 +78,25 @@ class Panorama(PickledByFields):
             given = np.empty(0)
         if given.ndim != 3 or given.shape[2] != 3 or given.dtype.kind not in "fiu":
             raise InputError(
-                f"background: a panorama must be (h, w, 3) numbers, not {given.shape} {given.dtype}"
+                f"background: a panorama must be (h, w, 3) numbers, got {given.shape} {given.dtype}"
             )
         if not 2 <= min(given.shape[:2]) <= max(given.shape[:2]) <= MAX_PANORAMA:
             height, width = given.shape[:2]
             raise InputError(
-                f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
+                f"background: a panorama must have 2 to {MAX_PANORAMA} pixels a side, got {width} x {height}"
             )
         whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
         with np.errstate(over="ignore"):  # what float32 cannot hold is refused below
             image = np.array(given, np.float32, order="C") / np.float32(whole)
         if not np.isfinite(image).all():
             which = f"the panorama {self.file}" if self.file else "the panorama"
-            raise InputError(f"background: {which} holds numbers that are not finite; replace them")
+            raise InputError(f"background: {which} must hold finite numbers; replace the others")
         image.flags.writeable = False
         object.__setattr__(self, "image", image)
 
     @staticmethod
     def load(path) -> Panorama:
-        """From a picture file, whole numbers of 8 or 16 bits or floats. Raises InputError when it cannot be
-        read."""
+        """Read an image file of 8 or 16 bits or floats. Raises InputError if it cannot be read."""
         from fidsplat.images.files import read_image
 
         return Panorama(read_image(path, deep=True), str(path))
@@ -160,26 +157,27 @@ Background = tuple[float, float, float] | Gradient | Panorama
 
 
 def background_of(value: Any) -> Background:
-    """A background as it is, or three numbers as a colour, which a gradient between equal colours is too.
-    Raises InputError for anything else."""
+    """Validated background; a gradient between equal colours becomes that colour.
+
+    Raises InputError for anything but three numbers, a Gradient or a Panorama."""
     if isinstance(value, Gradient) and value.top == value.bottom:
         return value.top
     if isinstance(value, (Gradient, Panorama)):
         return value
     if isinstance(value, np.ndarray) and value.ndim > 1:
         raise InputError(
-            f"background is an array of shape {value.shape}; give three numbers, or a picture as "
+            f"background must be three numbers, got an array of shape {value.shape}; give an image as "
             "fs.Panorama(array)"
         )
     return three_numbers("background", value)
 
 
 def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
-    """Three finite floats. Raises InputError, with the name, for anything else."""
+    """Validated tuple of three finite floats; errors name it."""
     try:
         numbers = tuple(float(number) for number in value)
     except (TypeError, ValueError):
         numbers = ()
     if len(numbers) != 3 or not all(abs(number) <= LARGEST for number in numbers):
-        raise InputError(f"{name} must be three finite numbers, at most {LARGEST:g}, not {value!r}")
+        raise InputError(f"{name} must be three finite numbers, at most {LARGEST:g}, got {value!r}")
     return numbers  # type: ignore[return-value]

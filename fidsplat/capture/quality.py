@@ -1,7 +1,4 @@
-"""Every knob that trades accuracy for time, and the named presets.
-
-A `Quality` says what is computed, never where: the same object works on every backend.
-"""
+"""Quality settings that trade accuracy for time, and the named presets. They do not depend on the device."""
 
 from __future__ import annotations
 
@@ -26,8 +23,8 @@ MAX_SAMPLES = 8
 MIXTURES = ("exact", "fitted", "paper", "facets")
 BY_FORMULA = LADDER, NESTED = 121, 562
 TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, *BY_FORMULA)
-"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in those
-by a formula (fidsplat/markers/nested.py)"""
+"""Gaussians per rectangle in the templates of fidsplat/markers/templates.json, and in those computed by
+fidsplat/markers/nested.py"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
@@ -38,38 +35,36 @@ def _one_of(what: str, value: Any, known: tuple) -> None:
 
 @dataclass(frozen=True)
 class MarkerQuality:
-    """Knobs of making a marker of splats: how its rectangles become Gaussians.
+    """Conversion of the rectangles of a marker to splats.
 
-    More Gaussians follow sharp edges better and cost time in every picture. `fs.marker` takes these that it
-    is not given, and so do the markers of scene files and `fidsplat marker`.
+    More Gaussians reproduce sharp edges better and cost time in every frame. These are the defaults of
+    `fs.marker`, of the markers of scene files and of `fidsplat marker`.
 
     Raises:
-        InputError: a value lies outside its range; the message names the range.
+        InputError: a value is out of range.
     """
 
     mixture: str = "exact"
-    """`exact`: one box per rectangle, with edges that the pixel filters; opaque and clean at any distance.
-    `fitted`: Gaussians by templates optimised for whole markers, which files hold and other renderers draw.
-    `facets`: Gaussians in planes that cross along the edges of modules; opaque and sharp, but only where the
-    order is by depth at each pixel. `paper`: Gaussians by the construction of the paper's section 3.2."""
+    """`exact`: one box per rectangle, with edges filtered by the pixel; opaque and sharp at any distance.
+    `fitted`: Gaussians by templates optimised on complete markers, for splat files and other renderers.
+    `facets`: Gaussians in planes that cross along the edges of modules; opaque and sharp, but only with
+    `order="pixel"`. `paper`: Gaussians by the construction of the paper's section 3.2."""
 
     levels: int = 4
-    """Of `paper`: L, 1 to 8; 2^(L+2) - 7 Gaussians a rectangle at density 1, edges blurred over 2^-L half
-    widths."""
+    """Levels L of `paper`, 1 to 8: 2^(L+2) - 7 Gaussians per rectangle at density 1, edges blurred over 2^-L
+    half widths."""
 
     density: int = 3
-    """Of `paper`: copies of all levels but the last, 1 to 100: opaque insides against more to blend."""
+    """Copies of all levels but the last in `paper`, 1 to 100: more are more opaque and slower."""
 
     growth: float | None = None
-    """Modules, 0 to 1, by which a rectangle reaches into its own colour across shared sides (a long one
-    further along its axis): closes seams, and rounds what lies behind. None: what the mixture was made with
-    (0.4 for fitted, 0 for paper)."""
+    """Modules, 0 to 1, by which a rectangle extends into neighbours of its own colour (a long one further
+    along its axis). Closes seams and rounds corners. None: 0.4 for fitted, 0 for paper."""
 
     template: int = 25
-    """Of `fitted`, and of the Gaussians that stand for `exact` in files: Gaussians of a rectangle up to an
-    aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9, 13, 25, 41, 121 or 562. Fewer are drawn faster and
-    leave edges blurred and corners round; 562 are opaque and clean, under a low-pass from 24 px a module on;
-    121 are to be refined (`fs.train.refine`)."""
+    """Gaussians per rectangle of `fitted`, and of `exact` in splat files, up to an aspect ratio of 6: 1, 5,
+    9, 13, 25, 41, 121 or 562. Fewer render faster, with blurred edges and round corners; 562 are opaque and
+    sharp, with a low-pass from 24 pixels per module; 121 are a start for `fs.train.refine`."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)
@@ -78,94 +73,89 @@ class MarkerQuality:
         _one_of("marker quality: template", self.template, TEMPLATE_SIZES)
         growth = self.growth
         if growth is not None and not (isinstance(growth, Real) and 0 <= growth <= 1):
-            raise InputError(f"marker quality: growth is {growth!r}; it must lie from 0 to 1 module")
+            raise InputError(f"marker quality: growth must lie from 0 to 1 module, got {growth!r}")
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Knobs of one rendering. What they leave out of an image has no bound that holds for every scene: the
-    output `error` bounds it for one frame (docs/accuracy.md).
+    """Quality settings of a frame. Their error has no bound that holds for every scene; the output `error`
+    bounds it for one frame (docs/accuracy.md).
 
     Raises:
-        InputError: a value lies outside its range; the message names the range.
+        InputError: a value is out of range.
     """
 
     alpha_cutoff: float = 1e-5
-    """Alpha, in (0, 1), default 1e-5: contributions below it are not drawn. It sets each splat's radius:
-    R^2 = 2 ln(opacity / cutoff), the same R in bounds and in the per-pixel test. Lower costs area, higher
-    bites rims and haze: at 1/255, as other systems have it, pictures are off by 0.018 where splats overlap,
-    and 100 layers of alpha 0.0039 lose 32 % opacity (docs/accuracy.md)."""
+    """Minimum alpha of a fragment, in (0, 1), default 1e-5. It sets the radius of each splat, R^2 = 2
+    ln(opacity / cutoff), in bounds and in the per-pixel test. Lower values cost area, higher ones remove rims
+    and haze: at 1/255, the value of other renderers, images are off by 0.018 where splats overlap, and 100
+    splats of alpha 0.0039 lose 32 % opacity (docs/accuracy.md)."""
 
     transmittance_stop: float = 1e-4
-    """Transmittance, in [0, 1), default 1e-4: a pixel is finished once its own is at or below this, and what
-    lies behind changes it by that much at most. Higher saves the splats behind opaque ones; 0 never stops."""
+    """Transmittance at which a pixel is finished, in [0, 1), default 1e-4: splats behind change the pixel by
+    at most this. Higher values skip more occluded splats; 0 never stops."""
 
     stop_rule: str = "inclusive"
-    """`inclusive`: the fragment that reaches the stop is still drawn. `exclusive` (gsplat, 2DGS authors): it
-    is dropped, which leaks up to 1 % of the background through opaque splats; kept for parity only."""
+    """`inclusive`: the fragment that reaches the stop is composited. `exclusive` (gsplat, 2DGS authors): it
+    is dropped, which leaks up to 1 % of the background through opaque splats; for parity only."""
 
     opacity_ceiling: float = 1.0
-    """Alpha, in (0, 1], default 1: upper bound of one fragment's. gsplat and the 2DGS authors use 0.99, which
-    keeps their gradients finite and lets 1 % of the background through; it saves no time."""
+    """Maximum alpha of a fragment, in (0, 1], default 1. gsplat and the 2DGS authors use 0.99, which keeps
+    their gradients finite and leaks 1 % of the background; it saves no time."""
 
     lowpass: str = "screen"
-    """`screen`: the object-space low-pass of 2DGS (a Gaussian of sigma 0.707 px around the projected centre,
-    the larger of the two weights wins); for scenes that were trained with it, as 2DGS scenes are. `pixel`:
-    each splat convolved in its plane with a Gaussian of a sample's footprint (sigma 0.5 samples), its opacity
-    scaled by the ratio of the areas, so that it conserves energy; for splats far below a pixel. `none`: the
-    exact splat; for markers of Gaussians, with several samples per pixel. Boxes filter themselves."""
+    """Low-pass filter of splats. `screen`: as in 2DGS, the maximum of the splat and a Gaussian of sigma 0.707
+    pixels around the projected centre; for scenes trained with it. `pixel`: the splat convolved in its plane
+    with a Gaussian of sigma 0.5 samples, at constant energy; for splats much smaller than a pixel. `none`: no
+    filter; for markers of Gaussians, with several samples per pixel. Boxes are always filtered exactly."""
 
     ellipsoid: str = "ewa"
-    """How 3D Gaussians are drawn. `ewa`: as 3DGS and gsplat draw them, an ellipse around the centre's image,
-    widened by 0.3 square pixels, at the centre's depth; captures look as they did to their trainers.
-    `ewa_antialiased`: their opacity falls as they are widened (Mip-Splatting), for captures trained so.
-    `exact`: the largest value along each ray and the depth where it is, under `lowpass`; true near the camera
-    and at wide angles, as 3DGUT and ray tracers have it (docs/primitives.md). Lenses with distortion,
-    fisheyes and panoramas have `exact` always."""
+    """Projection of 3D Gaussians. `ewa`: as in 3DGS and gsplat, an image-space ellipse dilated by 0.3 square
+    pixels at the depth of the centre. `ewa_antialiased`: with opacity compensation, as in Mip-Splatting.
+    `exact`: the maximum along each ray and its depth, under `lowpass`; correct near the camera and at wide
+    angles, as in 3DGUT and ray tracers (docs/primitives.md). Distorted, fisheye and panorama cameras always
+    use `exact`."""
 
     order: str = "auto"
-    """By which depth what overlaps is composited. `pixel`: each fragment by its own, where the ray meets its
-    splat; splats that are printed on one plane (markers) are one layer, whose colour depends on no order.
-    `centre`: every splat by the depth of its centre, as other renderers do and captured scenes were trained;
-    large splats swap places as the camera turns. `auto`: `pixel` where splats are printed on planes, `centre`
-    elsewhere (docs/correctness.md says why)."""
+    """Compositing order. `pixel`: by the depth of each fragment, where the ray meets the splat; coplanar
+    groups (markers) are one layer without an order. `centre`: by the depth of splat centres, as in other
+    renderers and in the training of captured scenes; large splats pop as the camera turns. `auto`: `pixel`
+    for scenes with coplanar groups, else `centre` (docs/correctness.md)."""
 
     samples: int = 1
-    """n, 1 to 8, default 1: each pixel is the mean of n x n samples on a regular grid. More smooth edges, and
-    cost n^2 times the blending."""
+    """Samples per pixel side, 1 to 8, default 1: a pixel is the mean of n x n samples on a regular grid.
+    Blending costs n^2 as much."""
 
     detail_error: float = 0.0
-    """Of stores: largest error of rgb where cells of splats are drawn as one, in [0, 1), on the views that
-    were measured with the store, this low-pass and an `alpha_cutoff` of 1e-8. It is not a bound for every
-    view: others may exceed it, the more with a larger cut-off (docs/large-scenes.md). 0 is the exact scene.
-    Scenes in memory are always exact."""
+    """Error of rgb allowed for levels of detail of stores, in [0, 1), as measured on sample views of the
+    store with this low-pass and an `alpha_cutoff` of 1e-8. Other views may exceed it, more so with a larger
+    cut-off (docs/large-scenes.md). 0 renders all splats. Scenes in memory have no levels of detail."""
 
     first_hit: float = 0.1
-    """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment
-    or layer behind which the transmittance is at most 1 less this."""
+    """Accumulated opacity of the surface in depth_first and distance_first, in (0, 1): the first fragment or
+    layer behind which the transmittance is at most 1 - first_hit."""
 
     setup_precision: str = "float64"
-    """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses; it moves
-    small and grazing splats (docs/correctness.md), and saves time on devices whose float64 is slow."""
+    """Arithmetic of the per-splat set-up. `float32` shifts small and grazing splats (docs/correctness.md) and
+    saves time on devices with slow float64; devices without float64 always use it."""
 
     arithmetic: str = "fast"
-    """Exponentials and logarithms of blending. `fast`: our own polynomials, bit-identical wherever devices
-    fuse multiply-adds (images are not: compilers decide on the rest); exponentials within 2.3 units of the
-    last place, logarithms within 1.1. `precise`: the library's, of which OpenCL promises 3. Colours
-    differ by less than 1e-6, and by the stop at most where a pixel reaches it a splat earlier."""
+    """Exponentials and logarithms of blending. `fast`: polynomials, within 2.3 ulp for exponentials and 1.1
+    for logarithms, bit-identical on devices with fused multiply-adds. `precise`: the device library's, 3 ulp
+    in OpenCL. Colours differ by less than 1e-6, or by the stop if a pixel reaches it one splat earlier."""
 
     blend_precision: str = "float32"
-    """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many
-    times slower, whose arithmetic is always precise; needs float64 in the device and in the set-up."""
+    """Arithmetic of fragments: intersection, weight and blending. `float64` is a reference image of the
+    device, many times slower and always precise; it needs float64 in the device and in the set-up."""
 
     marker: MarkerQuality = field(default_factory=MarkerQuality)
-    """How markers become splats."""
+    """Conversion of markers to splats."""
 
     def __post_init__(self) -> None:
-        for knob in fields(self):
-            value = getattr(self, knob.name)
-            if isinstance(value, np.generic):  # as `own_scalars`, but a quality loads no other module
-                object.__setattr__(self, knob.name, value.item())
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if isinstance(value, np.generic):  # like `own_scalars`, without loading another module
+                object.__setattr__(self, setting.name, value.item())
 
         def within(name: str, low: float, high: float, low_open: bool, high_open: bool) -> None:
             value = getattr(self, name)
@@ -177,9 +167,7 @@ class Quality:
             )
             if not ok:
                 left, right = "(" if low_open else "[", ")" if high_open else "]"
-                raise InputError(
-                    f"quality: {name} is {value!r}; it must lie in {left}{low:g}, {high:g}{right}"
-                )
+                raise InputError(f"quality: {name} must lie in {left}{low:g}, {high:g}{right}, got {value!r}")
 
         within("alpha_cutoff", 0.0, 1.0, True, True)
         within("transmittance_stop", 0.0, 1.0, False, True)
@@ -197,7 +185,7 @@ class Quality:
         ):
             _one_of(f"quality: {name}", getattr(self, name), known)
         if not isinstance(self.marker, MarkerQuality):
-            raise InputError(f"quality: marker is {self.marker!r}; it must be an fs.MarkerQuality(...)")
+            raise InputError(f"quality: marker must be an fs.MarkerQuality(...), got {self.marker!r}")
         if self.blend_precision == "float64" and self.setup_precision != "float64":
             raise InputError(
                 "quality: blend_precision='float64' means nothing after a set-up in float32; use "
@@ -221,25 +209,25 @@ class Quality:
     def of(cls, quality: Quality | str | None) -> Quality:
         """A `Quality` from itself, from text, or the default from None.
 
-        Text is a preset's name, knobs as key=value, or both: "fast", "alpha_cutoff=1e-3",
-        "fast,samples=2,marker.template=9". Without a name the knobs are changed in standard.
+        Text is the name of a preset, settings as key=value, or both: "fast", "alpha_cutoff=1e-3",
+        "fast,samples=2,marker.template=9". Without a name the settings change standard.
 
         Raises:
-            InputError: an unknown preset or knob, or a value that it cannot have.
+            InputError: an unknown preset or setting, or a value out of range.
         """
         if quality is None:
             return PRESETS["standard"]
         if isinstance(quality, cls):
             return quality
         if not isinstance(quality, str):
-            raise InputError(f"quality is {quality!r}; it must be an fs.Quality or text")
+            raise InputError(f"quality must be an fs.Quality or text, got {quality!r}")
         first, *rest = (part.strip() for part in quality.split(","))
         chosen = PRESETS["standard"] if "=" in first else cls.named(first)
         changes: dict[str, Any] = {}
         for part in [first, *rest] if "=" in first else rest:
             name, equals, value = (piece.strip() for piece in part.partition("="))
             if not equals:
-                raise InputError(f"quality: {part!r} must be a knob as key=value, e.g. alpha_cutoff=1e-3")
+                raise InputError(f"quality: {part!r} must be a setting as key=value, e.g. alpha_cutoff=1e-3")
             if name.startswith("marker."):
                 own = name.removeprefix("marker.")
                 changes.setdefault("marker", {})[own] = _read(MarkerQuality, own, value)
@@ -248,9 +236,9 @@ class Quality:
         return chosen.with_(**changes)
 
     def with_(self, **changes) -> Quality:
-        """A copy with some knobs changed; an unknown knob is an error that names the known ones.
+        """A copy with some settings changed; an unknown setting is an error that names the known ones.
 
-        marker: a `MarkerQuality`, or a dict of those of its knobs that change.
+        marker: a `MarkerQuality`, or a dict of its settings to change.
         """
         for name in changes:
             _check_known(Quality, name)
@@ -262,24 +250,24 @@ class Quality:
         return replace(self, **changes)
 
 
-def knobs(kind: type[Quality] | type[MarkerQuality]) -> dict[str, str]:
-    """Type of every knob that is a single value, as it is written: `float`, `int | None` ..."""
-    return {knob.name: str(knob.type) for knob in fields(kind) if knob.name != "marker"}
+def setting_types(kind: type[Quality] | type[MarkerQuality]) -> dict[str, str]:
+    """Annotated type of each scalar setting by name: `float`, `int | None` ..."""
+    return {setting.name: str(setting.type) for setting in fields(kind) if setting.name != "marker"}
 
 
 def _check_known(kind: type[Quality] | type[MarkerQuality], name: str) -> None:
-    known = [knob.name for knob in fields(kind)]
+    known = [setting.name for setting in fields(kind)]
     if name not in known:
         whose = "marker quality" if kind is MarkerQuality else "quality"
-        raise InputError(unknown(f"knob of {whose}", name, known))
+        raise InputError(unknown(f"setting of {whose}", name, known))
 
 
 def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> Any:
-    """A knob's value from text."""
+    """Parse the value of a setting."""
     if name == "marker":
-        raise InputError("quality: marker has knobs of its own; write e.g. marker.template=9")
+        raise InputError("quality: marker has its own settings; write e.g. marker.template=9")
     _check_known(kind, name)
-    wanted = knobs(kind)[name]
+    wanted = setting_types(kind)[name]
     if wanted.endswith("| None") and text.lower() == "none":
         return None
     convert = {"float": float, "int": int, "str": str}[wanted.split()[0]]
@@ -287,13 +275,12 @@ def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> An
         return convert(text)
     except ValueError:
         what = "a whole number" if convert is int else "a number"
-        raise InputError(f"quality: {name} is {text!r}; it must be {what}") from None
+        raise InputError(f"quality: {name} must be {what}, got {text!r}") from None
 
 
 # gsplat: gsplat 1.5/1.6 `rasterization_2dgs`; surfel: the 2DGS authors' diff-surfel-rasterization.
-# Both clamp alpha at 0.99, cut at 1/255 and drop the fragment that would take T below 1e-4. What differs
-# between them (bounding boxes, low-pass centre, near plane) is a defect of theirs, not a constant: see
-# docs/conventions.md.
+# Both clamp alpha at 0.99, cut at 1/255 and drop the fragment that would take T below 1e-4. Their differences
+# (bounding boxes, low-pass centre, near plane) are defects, not constants: see docs/conventions.md.
 _PARITY = Quality(
     alpha_cutoff=1.0 / 255.0,
     transmittance_stop=1e-4,
@@ -303,9 +290,8 @@ _PARITY = Quality(
     arithmetic="precise",
 )
 
-# standard: of the qualities that docs/accuracy.md measures the cheapest whose largest error is at most 1/512
-# on every scene, the hard cases included; in fast arithmetic, which is cheaper on CPUs and at most 1 % slower
-# on GPUs
+# standard: the cheapest quality of docs/accuracy.md with an error of at most 1/512 on every scene, hard cases
+# included; with fast arithmetic, which is cheaper on CPUs and at most 1 % slower on GPUs
 PRESETS: dict[str, Quality] = {
     "standard": Quality(),
     "fast": Quality(alpha_cutoff=2.0 / 255.0, transmittance_stop=1.0 / 256.0, setup_precision="float32"),

@@ -1,4 +1,4 @@
-"""Sensor: what becomes of the light on its way to a file; plain data."""
+"""Sensor model: exposure, vignetting, noise, gain, response and quantisation."""
 
 from __future__ import annotations
 
@@ -14,59 +14,55 @@ from fidsplat.util.errors import InputError
 RESPONSES = ("linear", "srgb")
 BITS = (8, 16)
 GAMMAS = 0.01, 100.0
-"""least and most"""
+"""range of gammas"""
 LARGEST = 1e15
-"""of factors and of a curve's values: what is made of them stays within float32"""
+"""largest factor and curve value: results stay within float32"""
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A camera's sensor. The picture's values are taken as light; each step below is taken only if its value
-    does something, in this order.
+    """Sensor of a camera. Values of the frame are linear light; the steps are applied in this order, and a
+    step with its default value costs nothing.
 
     Raises:
-        InputError: a value lies outside its range; the message names the range.
+        InputError: a value is out of range.
     """
 
     exposure: float = 1.0
-    """factor of the light that is gathered, 0 and above"""
+    """factor of the gathered light, at least 0"""
     vignetting: tuple[float, ...] = ()
     """up to three numbers a, b, c: light times 1 + a r^2 + b r^4 + c r^6, with r the distance from the
-    principal point in halves of the picture's diagonal"""
+    principal point in half diagonals of the image"""
     full_well: float = math.inf
-    """electrons of the value 1, 1 or more: n electrons have a shot noise of sqrt(n); infinitely many have
-    none"""
+    """electrons of the value 1, at least 1: n electrons have a shot noise of sqrt(n); inf has none"""
     read_noise: float = 0.0
-    """electrons, standard deviation of each read-out, 0 to full_well, which it needs"""
+    """standard deviation of each read-out in electrons, 0 to full_well; needs full_well"""
     seed: int = 0
-    """which noise, 0 to 2^32 - 1; the same seed gives the same noise, so change it from picture to picture"""
+    """seed of the noise, 0 to 2^32 - 1; use another one for each frame"""
     gain: float = 1.0
-    """factor after the read-out, 0 and above"""
+    """factor after the read-out, at least 0"""
     response: str | float | tuple[float, ...] = "linear"
     """"linear"; "srgb", its transfer function; a gamma: v^(1 / gamma); or the curve's values at two or more
     even steps of v from 0 to 1. All but "linear" clamp v to [0, 1]."""
     bits: int | None = None
-    """8 or 16: values are rounded to as many whole steps of [0, 1], and rgb is written so; None: not
-    rounded"""
+    """bits of quantisation and of the rgb file, 8 or 16; None: no quantisation"""
 
     def __post_init__(self) -> None:
         own_scalars(self)
         if not (_is_number(self.full_well) and self.full_well >= 1):
             raise InputError(
-                f"sensor: full_well is {self.full_well!r}; it must be a number of electrons, 1 or more"
+                f"sensor: full_well must be a number of electrons, 1 or more, got {self.full_well!r}"
             )
-        for name, most in (("exposure", LARGEST), ("gain", LARGEST), ("read_noise", self.full_well)):
+        for name, highest in (("exposure", LARGEST), ("gain", LARGEST), ("read_noise", self.full_well)):
             value = getattr(self, name)
-            if not (_is_number(value) and 0 <= value <= most and value < math.inf):
+            if not (_is_number(value) and 0 <= value <= highest and value < math.inf):
                 raise InputError(
-                    f"sensor: {name} is {value!r}; it must be a number of at least 0, at most {most:g}"
+                    f"sensor: {name} must be a number of at least 0, at most {highest:g}, got {value!r}"
                 )
         if self.read_noise > 0 and math.isinf(self.full_well):
-            raise InputError(
-                f"sensor: read_noise is {self.read_noise!r} electrons, which means nothing without full_well"
-            )
+            raise InputError(f"sensor: read_noise is {self.read_noise!r} electrons; give full_well with it")
         if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and 0 <= self.seed < 2**32):
-            raise InputError(f"sensor: seed is {self.seed!r}; it must be a whole number from 0 to 2^32 - 1")
+            raise InputError(f"sensor: seed must be a whole number from 0 to 2^32 - 1, got {self.seed!r}")
         if self.bits is not None and not (isinstance(self.bits, int) and self.bits in BITS):
             raise InputError(f"sensor: bits is {self.bits!r}; known: 8, 16, or none")
         object.__setattr__(self, "vignetting", _numbers("vignetting", self.vignetting, 0, 3))
@@ -87,7 +83,7 @@ class Sensor:
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """Names of the effects that do something, in their order."""
+        """Names of the active effects, in their order."""
         found = [
             ("exposure", self.exposure != 1),
             ("vignetting", any(self.vignetting)),
@@ -103,10 +99,10 @@ class Sensor:
             line = np.linspace(0, 1, len(self.response))
             found.append(("response_table", not np.array_equal(self.response, line)))
         found.append(("quantise", self.bits is not None))
-        return tuple(name for name, does in found if does)
+        return tuple(name for name, active in found if active)
 
     def uniform(self, name: str) -> tuple[Any, ...]:
-        """Numbers of a step, in the order of its kernel arguments."""
+        """Kernel arguments of a step, in their order."""
         match name:
             case "noise":
                 variance = 1 / self.full_well
@@ -123,27 +119,27 @@ class Sensor:
                 return (getattr(self, name),)
 
     def changes(self) -> dict[str, Any]:
-        """What differs from a sensor that does nothing, by name."""
-        plain = Sensor()
+        """Values that differ from the default sensor, by name."""
+        default = Sensor()
         pairs = ((f.name, getattr(self, f.name)) for f in fields(self))
-        return {name: value for name, value in pairs if value != getattr(plain, name)}
+        return {name: value for name, value in pairs if value != getattr(default, name)}
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not math.isnan(as_float(value))
 
 
-def _numbers(name: str, values: Any, least: int, most: int) -> tuple[float, ...]:
+def _numbers(name: str, values: Any, lowest: int, highest: int) -> tuple[float, ...]:
     try:
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError):
         numbers = None
     if (
         numbers is None
-        or not least <= len(numbers) <= most
+        or not lowest <= len(numbers) <= highest
         or not all(abs(number) <= LARGEST for number in numbers)
     ):
         raise InputError(
-            f"sensor: {name} is {values!r}; it must be {least} to {most} finite numbers, at most {LARGEST:g}"
+            f"sensor: {name} must be {lowest} to {highest} finite numbers up to {LARGEST:g}, got {values!r}"
         )
     return numbers

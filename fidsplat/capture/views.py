@@ -1,5 +1,4 @@
-"""The views of a batch: captures of one size and the same effects, from poses of the camera and of groups of
-splats."""
+"""Views of a batch: captures of one size, with poses of the camera and of groups of splats."""
 
 from __future__ import annotations
 
@@ -18,19 +17,19 @@ from fidsplat.util.errors import InputError
 
 @dataclass(frozen=True)
 class Views:
-    """What a batch is asked to draw: v views, each a capture, with poses that take the place of its own.
+    """The v views of a batch: captures, with poses that replace those of the captures.
 
-    Raises InputError for numbers of views that differ, and for poses of what moves already.
+    Raises InputError for different numbers of views, and for poses of something that a motion already moves.
     """
 
     captures: tuple[Capture, ...]
     """one for each view, or one for all"""
     poses: np.ndarray | None = None
-    """(v, 4, 4) float64 camera to world, rigid; None: each capture's camera stands where it is"""
+    """(v, 4, 4) float64 camera to world, rigid; None: the poses of the cameras"""
     groups: Mapping[int, np.ndarray] | None = None
-    """label: (v, 4, 4) float64, rigid, the motion of the world that its splats make"""
+    """label: (v, 4, 4) float64, rigid world transforms of its splats"""
     mask: np.ndarray | None = None
-    """(v,) bool: views that are drawn; None: all"""
+    """(v,) bool: views to render; None: all"""
 
     def __post_init__(self) -> None:
         counts = {"captures": len(self.captures)} if len(self.captures) != 1 else {}
@@ -40,8 +39,8 @@ class Views:
             counts = {"captures": 1}
         counts |= {} if self.mask is None else {"mask": len(self.mask)}
         if len(set(counts.values())) > 1:
-            told = ", ".join(f"{name} has {count}" for name, count in counts.items())
-            raise InputError(f"a batch must have one number of views: {told}")
+            listed = ", ".join(f"{name} has {count}" for name, count in counts.items())
+            raise InputError(f"a batch must have one number of views: {listed}")
         if not len(self):
             raise InputError(f"a batch must have one view or more; {next(iter(counts))} is empty")
         for number, capture in enumerate(self.captures):
@@ -49,18 +48,16 @@ class Views:
 
     def _refuse_two_motions(self, number: int, motion: Motion) -> None:
         if self.poses is not None and motion.camera is not None:
-            raise InputError(
-                f"poses say where the camera of view {number} is, and its motion does too; leave one out"
-            )
+            raise InputError(f"poses and the motion of view {number} both move its camera; leave one out")
         for label in self.groups or ():
             if label in motion.groups:
                 raise InputError(
-                    f"groups say how the splats of label {label} move, and the motion of view {number} does "
-                    "too; leave one out"
+                    f"groups and the motion of view {number} both move the splats of label {label}; leave "
+                    "one out"
                 )
 
     def __len__(self) -> int:
-        """Views, those that are not drawn among them."""
+        """Number of views, masked ones included."""
         if len(self.captures) > 1:
             return len(self.captures)
         of_poses = () if self.poses is None else (self.poses,)
@@ -68,17 +65,17 @@ class Views:
 
     @property
     def drawn(self) -> list[int]:
-        """Numbers of the views that are drawn."""
+        """Indices of the views to render."""
         return list(range(len(self))) if self.mask is None else np.flatnonzero(self.mask).tolist()
 
     def capture(self, number: int) -> Capture:
-        """The capture of one view: drawn alone it gives the same bits."""
+        """Capture of one view; rendered alone, it is bit-identical."""
         base = self.captures[number if len(self.captures) > 1 else 0]
         camera, motion = base.camera, base.motion
         if self.poses is not None and camera is not None:
             camera = camera_at(camera, self.poses[number])
         if self.groups:
-            moved = {label: _standing(each[number]) for label, each in self.groups.items()}
+            moved = {label: _constant(each[number]) for label, each in self.groups.items()}
             motion = Motion(motion.camera, {**motion.groups, **moved})
         return (
             base
@@ -87,7 +84,7 @@ class Views:
         )
 
     def refuse_other_sizes(self) -> None:
-        """Raises InputError where captures differ in size or in the names of their outputs."""
+        """Raise InputError if captures differ in size or outputs."""
         first = self.captures[0]
         for number, capture in enumerate(self.captures[1:], 1):
             for what, one, other in (
@@ -97,12 +94,12 @@ class Views:
                 if one != other:
                     raise InputError(
                         f"the views of a batch must have the same {what}: view 0 has {one}, view {number} "
-                        f"has {other}; draw them in batches of their own"
+                        f"has {other}; render them in separate batches"
                     )
 
 
 def camera_at(camera: Camera, pose: np.ndarray) -> Camera:
-    """The camera at a pose (4, 4) camera to world, whose position it keeps as it is."""
+    """The camera at a pose (4, 4), camera to world, with an unchanged position."""
     matrix = np.eye(4)
     matrix[:3, :3] = pose[:3, :3].T
     matrix[:3, 3] = -matrix[:3, :3] @ pose[:3, 3]
@@ -110,17 +107,16 @@ def camera_at(camera: Camera, pose: np.ndarray) -> Camera:
 
 
 def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None, mask: Any = None) -> Views:
-    """The views that `Renderer.render_batch` is asked for.
+    """Validated views of `Renderer.render_batch`.
 
     Raises:
-        InputError: arrays of another shape or with values that are no poses, numbers of views or sizes that
-            differ.
+        InputError: arrays of another shape or without poses, or different numbers of views or sizes.
     """
     if groups is not None and not isinstance(groups, Mapping):
-        raise InputError(f"groups is {groups!r}; it must be {{label: poses (views, 7)}}")
+        raise InputError(f"groups must be {{label: poses (views, 7)}}, got {groups!r}")
     for label in groups or ():
         if isinstance(label, bool) or not isinstance(label, (int, np.integer)):
-            raise InputError(f"groups: the label {label!r} is no whole number; splats have such")
+            raise InputError(f"keys of groups must be integer labels, got {label!r}")
     given = {int(label): pose_matrices(f"groups[{label}]", each) for label, each in (groups or {}).items()}
     if mask is not None:
         mask = _mask(mask)
@@ -140,17 +136,16 @@ def pose_matrices(name: str, poses: Any) -> np.ndarray:
     given = real_array(name, poses, "(views, 7) numbers: x y z, quaternion w x y z")
     if given.ndim != 2 or given.shape[1] != 7:
         raise InputError(
-            f"{name} must have the shape (views, 7), x y z and a quaternion w x y z, but the shape is "
-            f"{given.shape}"
+            f"{name} must have the shape (views, 7), x y z and a quaternion w x y z, got {given.shape}"
         )
-    with np.errstate(over="ignore"):  # what is too long for a float is infinitely long, and refused
+    with np.errstate(over="ignore"):  # an overflow becomes infinite, and is refused
         lengths = np.linalg.norm(given[:, 3:], axis=1)
         wrong = ~((np.abs(given[:, :3]) <= LARGEST).all(1) & (lengths > 0) & (lengths < np.inf))
     if wrong.any():
         view = int(np.argmax(wrong))
         raise InputError(
-            f"{name}[{view}] is no pose: {given[view].tolist()}; it must be x y z, at most {LARGEST:g} "
-            "metres, and a finite quaternion w x y z that is not all 0"
+            f"{name}[{view}] must be x y z, at most {LARGEST:g} metres, and a finite quaternion w x y z that "
+            f"is not all 0, got {given[view].tolist()}"
         )
     matrices = np.zeros((len(given), 4, 4))
     matrices[:, :3, :3] = quaternion_to_matrix(given[:, 3:])
@@ -165,14 +160,12 @@ def _mask(given: Any) -> np.ndarray:
     except ValueError:  # rows that differ in length
         mask = np.empty(0, object)
     if mask.dtype != bool or mask.ndim != 1:
-        raise InputError(
-            f"mask must be (views,) bools, but it has the shape {mask.shape} and the type {mask.dtype}"
-        )
+        raise InputError(f"mask must be (views,) bools, got shape {mask.shape} and type {mask.dtype}")
     return mask
 
 
-def _standing(pose: np.ndarray):
-    """The same pose at every time."""
+def _constant(pose: np.ndarray):
+    """A motion with one pose at every time."""
     return lambda time: pose
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fidsplat.capture.quality import PRESETS, MarkerQuality, Quality, knobs
+from fidsplat.capture.quality import PRESETS, MarkerQuality, Quality, setting_types
 from fidsplat.scenes.table import Table, names_of
 
 _RENDER_KEYS = ("samples", "lowpass", "first_hit")
@@ -16,7 +16,7 @@ def read_quality(top: Table, render: Table) -> Quality | str | None:
     if "quality" in top:
         if given:
             raise render.error(given[0], "and the table [quality] exclude each other; write it there")
-        table = top.table("quality", ("preset", *knobs(Quality), "marker"))
+        table = top.table("quality", ("preset", *setting_types(Quality), "marker"))
         with table.at("preset"):
             plain = Quality.named(table.text("preset", "standard"))
         changes = table.values(Quality)
@@ -54,7 +54,7 @@ def quality_tables(quality: Quality | str | None) -> tuple[dict[str, Any], dict[
 
 def _changes(given: Quality | MarkerQuality, plain: Quality | MarkerQuality) -> dict[str, Any]:
     """Settings in which two differ, with the values of the first."""
-    pairs = {name: (getattr(given, name), getattr(plain, name)) for name in knobs(type(given))}
+    pairs = {name: (getattr(given, name), getattr(plain, name)) for name in setting_types(type(given))}
     return {name: value for name, (value, before) in pairs.items() if value != before}
 
 

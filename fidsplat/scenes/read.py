@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.capture.environment import Fog
-from fidsplat.capture.quality import MarkerQuality, Quality, knobs
+from fidsplat.capture.quality import MarkerQuality, Quality, setting_types
 from fidsplat.capture.sensor import Sensor
 from fidsplat.formats import Progress, load_splats
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
@@ -36,7 +36,7 @@ CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLE
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale", "motion")
 MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion", "bundle")
-MARKERS = (*MARKER, *knobs(MarkerQuality))
+MARKERS = (*MARKER, *setting_types(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 
 # Finds a dotted key of too many parts; strings and comments are matched to be skipped. Quantifiers are

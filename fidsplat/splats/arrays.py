@@ -92,7 +92,7 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     wanted = "(n, 3)" if name == "means" else str(shape)
     if name == "scales":
         wanted += f" or {(shape[0], 3)}"
-    raise InputError(f"{name} must have the shape {wanted}, but its shape is {array.shape}")
+    raise InputError(f"{name} must have the shape {wanted}, got shape {array.shape}")
 
 
 def check_scale(colors: np.ndarray) -> np.ndarray:
@@ -105,9 +105,9 @@ def check_scale(colors: np.ndarray) -> np.ndarray:
 def whole_numbers(labels, n: int, name: str = "labels") -> np.ndarray:
     array = real_numbers(name, 0 if labels is None else labels)
     if array.dtype.kind == "f" and array.size:
-        raise InputError(f"{name} must be ints, not {array.dtype}")
+        raise InputError(f"{name} must be ints, got {array.dtype}")
     if array.shape not in ((), (n,)):
-        raise InputError(f"{name} must be one int or have the shape ({n},), but its shape is {array.shape}")
+        raise InputError(f"{name} must be one int or have the shape ({n},), got shape {array.shape}")
     limits = np.iinfo(np.int32)
     if array.size and (int(array.min()) < limits.min or int(array.max()) > limits.max):
         raise InputError(f"{name} must lie in {limits.min} to {limits.max}")
@@ -117,7 +117,7 @@ def whole_numbers(labels, n: int, name: str = "labels") -> np.ndarray:
 def check_origin(origin) -> np.ndarray:
     array = real_numbers("origin", origin).astype(np.float64)
     if array.shape != (3,) or rows_beyond(array, LARGEST) is not None:
-        raise InputError(f"origin must be three numbers, at most {LARGEST:g} metres, not {origin!r}")
+        raise InputError(f"origin must be three numbers, at most {LARGEST:g} metres, got {origin!r}")
     return array
 
 

@@ -109,9 +109,7 @@ class SplatCloud(PickledByFields, Summarised):
             k = arrays["sh"].shape[1] if arrays["sh"].ndim == 3 else 0
             if k not in [(d + 1) ** 2 for d in range(MAX_DEGREE + 1)]:
                 got = arrays["sh"].shape
-                raise InputError(
-                    f"sh must have the shape ({n}, k, 3), k = 1, 4, 9 or 16, but its shape is {got}"
-                )
+                raise InputError(f"sh must have the shape ({n}, k, 3), k = 1, 4, 9 or 16, got shape {got}")
             shapes["sh"] = (n, k, 3)
         for name, array in arrays.items():
             check_shape(name, array, shapes[name])

@@ -27,7 +27,7 @@ def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
     position to the splat's centre, in the world frame. Raises InputError for a degree outside 0..3.
     """
     if degree not in range(MAX_DEGREE + 1):
-        raise InputError(f"SH degree must be 0 to {MAX_DEGREE}, not {degree}")
+        raise InputError(f"SH degree must be 0 to {MAX_DEGREE}, got {degree}")
     x, y, z = np.asarray(dirs, np.float64).T
     columns = [np.full(x.shape, C0)]
     if degree >= 1:

@@ -62,11 +62,11 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     """
     m = real_array(name, matrix, "a 4x4 matrix of numbers")
     if m.shape != (4, 4):
-        raise InputError(f"{name} must be a 4x4 matrix, but its shape is {m.shape}")
+        raise InputError(f"{name} must be a 4x4 matrix, got shape {m.shape}")
     if not (np.isfinite(m).all() and (np.abs(m[:3, 3]) <= LARGEST).all()):
         raise InputError(f"{name} holds a value that is not finite, or moves by more than {LARGEST:g} metres")
     if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
-        raise InputError(f"{name} must have the last row (0, 0, 0, 1), not {tuple(m[3].tolist())}")
+        raise InputError(f"{name} must have the last row (0, 0, 0, 1), got {tuple(m[3].tolist())}")
     linear = m[:3, :3]
     with np.errstate(over="ignore"):  # as of a quaternion
         scale = float(np.linalg.norm(linear)) / np.sqrt(3.0)
@@ -99,15 +99,15 @@ def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) 
     """
     move, turn = real_array("position", position), real_array("quaternion", quaternion)
     if move.shape != (3,) or not np.isfinite(move).all():
-        raise InputError(f"position must be three finite numbers, not {position!r}")
+        raise InputError(f"position must be three finite numbers, got {position!r}")
     with np.errstate(over="ignore"):  # what is too long for a float is infinitely long, and refused
         length = np.linalg.norm(turn) if turn.shape == (4,) else np.nan
     if not (0 < length < np.inf):
         raise InputError(
-            f"quaternion must be four finite numbers (w, x, y, z), not all 0, but it is {quaternion!r}"
+            f"quaternion must be four finite numbers (w, x, y, z), not all 0, got {quaternion!r}"
         )
     if not (0 < scale < np.inf):
-        raise InputError(f"scale must be above 0 and finite, not {scale!r}")
+        raise InputError(f"scale must be above 0 and finite, got {scale!r}")
     matrix = np.eye(4)
     matrix[:3, :3] = scale * quaternion_to_matrix(turn)
     matrix[:3, 3] = move

@@ -44,7 +44,7 @@ class City:
         for name, most in (("splats", MOST), ("houses", 100), ("seed", 2**32 - 1)):
             value, least = getattr(self, name), int(name != "seed")
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-                raise InputError(f"{name} of a city is {value!r}; it must be {least} to {most:,}")
+                raise InputError(f"{name} of a city must be {least} to {most:,}, got {value!r}")
 
     @property
     def side(self) -> float:

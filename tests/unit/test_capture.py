@@ -25,16 +25,16 @@ def test_parts_may_be_words_and_left_out():
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"camera": "front"}, "camera is 'front'; it must be a Camera"),
+        ({"camera": "front"}, "camera must be a Camera"),
         ({"outputs": ()}, "outputs is empty; name at least one"),
         ({"outputs": (1, 2)}, "outputs must be one or more names"),
         ({"outputs": 7}, "outputs must be one or more names"),
         ({"quality": "fats"}, "did you mean 'fast'"),
         ({"background": (1, 2)}, "background must be three finite numbers"),
-        ({"motion": 3}, "motion is 3; it must be a Motion"),
-        ({"shutter": "slow"}, "shutter is 'slow'; it must be a Shutter"),
-        ({"sensor": 8}, "sensor is 8; it must be a Sensor"),
-        ({"fog": 0.1}, "fog is 0.1; it must be a Fog"),
+        ({"motion": 3}, "motion must be a Motion"),
+        ({"shutter": "slow"}, "shutter must be a Shutter"),
+        ({"sensor": 8}, "sensor must be a Sensor"),
+        ({"fog": 0.1}, "fog must be a Fog"),
     ],
 )
 def test_a_part_of_the_wrong_kind_is_named_with_what_would_do(parts, message):

@@ -1,4 +1,4 @@
-"""The knobs: their ranges, what goes together, and where they come from."""
+"""Quality settings: ranges, combinations and sources."""
 
 import json
 from importlib.resources import files
@@ -27,7 +27,7 @@ def test_a_value_out_of_range_is_named_with_what_would_do(name):
 
 
 @pytest.mark.parametrize("name", WRONG_OF_MARKERS)
-def test_so_is_a_knob_of_markers(name):
+def test_so_is_a_setting_of_markers(name):
     with pytest.raises(fs.InputError, match=f"{name} (is|must) .*"):
         fs.MarkerQuality(**{name: WRONG_OF_MARKERS[name]})
 
@@ -112,6 +112,6 @@ def test_numbers_of_numpy_are_numbers_and_truth_values_are_not():
     made = fs.Quality(alpha_cutoff=np.float32(0.25), samples=np.int64(2), first_hit=np.float64(0.5))
     assert made == fs.Quality(alpha_cutoff=0.25, samples=2, first_hit=0.5)
     assert {type(made.alpha_cutoff), type(made.samples)} == {float, int}
-    for knob in ("samples", "opacity_ceiling"):
-        with pytest.raises(fs.InputError, match=f"{knob} .*True"):
-            fs.Quality(**{knob: True})
+    for name in ("samples", "opacity_ceiling"):
+        with pytest.raises(fs.InputError, match=f"{name} .*True"):
+            fs.Quality(**{name: True})
