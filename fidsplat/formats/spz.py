@@ -19,6 +19,7 @@ from fidsplat.formats.plain import world_means as means_of
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
+from fidsplat.util.limits import check_expansion
 
 _HEAD = struct.Struct("<IIIBBBB")
 _MAGIC = 0x5053474E
@@ -56,6 +57,8 @@ def load_spz(path: Path) -> SplatCloud:
     size = _HEAD.size + n * sum(widths.values())
     if max(_FEW, len(data)) < n and size <= 1040 * len(data):
         raise InputError(f"{path}: {n} splats in {len(data)} bytes; no scene is so small, and it is not read")
+    if size <= 1040 * len(data):  # its bytes, and position, opacity, color, scales, rotation, harmonics
+        check_expansion(path, n * (sum(widths.values()) + 4 * (14 + widths["rest"])), f"{n:,} splats")
     try:
         # nothing is made larger than the header says, and no file grows by more than gzip can
         stream = zlib.decompressobj(31)

@@ -1,5 +1,6 @@
 """Small files that declare or expand to huge contents are refused unread, by one limit that can be raised."""
 
+import gzip
 import json
 import os
 import struct
@@ -183,6 +184,22 @@ def test_the_limit_follows_the_size_of_a_file_and_is_raised_by_the_environment(t
     monkeypatch.setenv(VARIABLE, "lots")
     with pytest.raises(fs.InputError, match=f"{VARIABLE} must be a number of bytes above 0, got 'lots'"):
         read_image(path)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_splats_that_a_small_spz_file_declares(tmp_path, monkeypatch, degree):
+    """At most one in each byte of a file, as before, which still is 300 bytes of memory for each."""
+    count, rest = 3 * 2**20, {0: 0, 3: 45}[degree]
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, count, degree, 12, 0, 0)
+    body = np.random.default_rng(0).integers(0, 256, count, np.uint8).tobytes()  # does not compress
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(head + body + bytes(count * (19 + rest)), 1))
+    monkeypatch.setattr("fidsplat.util.limits.FLOOR", 2**20)
+    monkeypatch.setattr("fidsplat.util.limits.RATIO", 8)
+    with pytest.raises(
+        fs.InputError, match=rf"must expand to at most .* got 3,145,728 splats, .*{VARIABLE}="
+    ):
+        load_splats(path)
 
 
 def test_includes_that_double_and_models_that_nest(tmp_path):
