@@ -17,8 +17,8 @@ NOT_THE_LAST = (
 )
 
 
-class TooLittleRoom(Exception):
-    """A picture that nobody has waited for had more pairs of splats and tiles than there was room for."""
+class CapacityExceeded(Exception):
+    """A frame was submitted without waiting for its counts, and exceeded the capacity of its lists."""
 
 
 class DifferentiableImages:

@@ -293,7 +293,7 @@ class GradientPipeline(ABC):
         `backward` needs until the device renders another frame.
 
         waits: until it is known that the buffers were large enough. If they were not, `backward` may raise
-        TooLittleRoom, and nothing of the frame counts.
+        CapacityExceeded, and nothing of the frame counts.
 
         Raises:
             DeviceError: the device runs out of memory or fails; or the frame needs bands or chunks, which
@@ -322,13 +322,14 @@ class GradientPipeline(ABC):
             are bit-identical on every run and valid until the next call.
 
         Raises:
-            TooLittleRoom: the buffers of a frame that was not waited for were too small; the next has more.
+            CapacityExceeded: the buffers of a frame that was not waited for were too small; the next is
+                given larger ones.
             InputError: another frame has been rendered since, or a gradient is of no output or has a wrong
                 shape.
             DeviceError: the device runs out of memory or fails.
         """
 
-    def take_back(self, images: Any, gradients: Mapping[str, Any]) -> Any:
+    def backward_to_tiles(self, images: Any, gradients: Mapping[str, Any]) -> Any:
         """`backward` up to the sums over tiles, whose result `TrainingKernels.step` accepts; its method
         `gradients` completes it. Only on devices that train."""
         raise NotImplementedError
@@ -388,7 +389,7 @@ class TrainingKernels(ABC):
 
     @abstractmethod
     def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add screen gradients and visibility to their sums. taken: from `GradientPipeline.take_back`."""
+        """Add screen gradients and visibility to their sums. taken: from `backward_to_tiles`."""
 
     @abstractmethod
     def step(
@@ -402,7 +403,7 @@ class TrainingKernels(ABC):
         """Apply a step of Adam.
 
         Args:
-            taken: from `GradientPipeline.take_back`.
+            taken: from `GradientPipeline.backward_to_tiles`.
             sizes: step sizes of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest`.
             numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
                 `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does

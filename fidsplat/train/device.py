@@ -87,9 +87,9 @@ class DeviceWork:
         """Derivatives of the loss of normals by depths and normals, times its weight."""
         return self._kernels.surface(images, view, self._cameras[view], weight)
 
-    def take_back(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> Any:
+    def backward_to_tiles(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> Any:
         """What `count` and `step` take of a picture, from the derivatives by it."""
-        return pipeline.take_back(images, slopes)
+        return pipeline.backward_to_tiles(images, slopes)
 
     def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""

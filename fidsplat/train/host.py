@@ -79,7 +79,7 @@ class HostWork:
         _, by_depth, by_normal = normal_loss(images.read("depth"), images.read("normal"), counted, *lens)
         return {"depth": by_depth, "normal": by_normal}
 
-    def take_back(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> dict[str, Any]:
+    def backward_to_tiles(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> dict[str, Any]:
         """What `count` and `step` take of a picture, from the derivatives by it."""
         return pipeline.backward(images, slopes)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.gradients import TooLittleRoom
+from fidsplat.backends.gradients import CapacityExceeded
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
@@ -229,7 +229,7 @@ class Trainer:
         view = self.dataset.views[number]
         try:
             value, taken = self._compared(iteration, number, waits=False)
-        except TooLittleRoom:
+        except CapacityExceeded:
             value, taken = self._compared(iteration, number, waits=True)
         self._waiting.append((iteration, view.name, value))
         if not late or len(self._waiting) > self._work.late or settings.densifies_after(iteration):
@@ -297,7 +297,7 @@ class Trainer:
             view = self.dataset.views[number]
             counts = np.ones(view.image.shape[:2], np.float32) if view.mask is None else view.mask
             slopes["distortion"] = counts * np.float32(by_distortions / counts.size)
-        return value, self._work.take_back(pipeline, images, slopes)
+        return value, self._work.backward_to_tiles(pipeline, images, slopes)
 
     def _stored(self) -> Splats:
         self._settle()

@@ -17,7 +17,7 @@ from derivative_errors import (
 )
 
 import fidsplat as fs
-from fidsplat.backends.gradients import TooLittleRoom, on_host
+from fidsplat.backends.gradients import CapacityExceeded, on_host
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.effects.differentiable import with_distortion
@@ -168,7 +168,7 @@ def test_pictures_that_nobody_waits_for_have_the_same_derivatives(backend, rende
     first = taken_back(*few, waits=True)
     assert taken_back(*few, waits=False) == first
     if renderer.device.name.startswith("opencl"):
-        with pytest.raises(TooLittleRoom):
+        with pytest.raises(CapacityExceeded):
             taken_back(*crowd, waits=False)
     many = taken_back(*crowd, waits=True)
     assert taken_back(*crowd, waits=False) == many

@@ -241,7 +241,7 @@ def taken_back(renderer, device, view, resident, lanes, outputs=("rgb",)):
     pipeline = renderer.backend.differentiate(features, shape)
     images = pipeline.forward(resident, seen)
     loss = random_loss(features, seen)
-    return device.take_back(pipeline, images, {name: loss[name] for name in outputs})
+    return device.backward_to_tiles(pipeline, images, {name: loss[name] for name in outputs})
 
 
 @pytest.mark.parametrize("sparse", [False, True])

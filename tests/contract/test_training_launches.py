@@ -10,10 +10,10 @@ import pytest
 from training_scene import QUICK, scene
 
 import fidsplat as fs
-from fidsplat.backends.gradients import TooLittleRoom
-from fidsplat.backends.opencl import gradients_again
+from fidsplat.backends.gradients import CapacityExceeded
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.gradients import OpenCLGradients
+from fidsplat.backends.opencl.recorded_frame import RecordedFrame
 from fidsplat.backends.prepare import prepare
 from fidsplat.train import Trainer, TrainingError
 from fidsplat.train.losses import Loss
@@ -62,12 +62,18 @@ def test_steps_are_launched_again_with_the_same_bits(on_groups, dataset, monkeyp
     again.step()
     assert not launched
     again.run()
-    monkeypatch.setattr(gradients_again.Again, "keep", lambda *_: None)
+    never_replay(monkeypatch)
     monkeypatch.setattr(CommandList, "set", set_all)
     planned.run()
     assert splats_of(again) == splats_of(planned)
     for name, array in planned.history.items():
         np.testing.assert_array_equal(again.history[name], array)
+
+
+def never_replay(monkeypatch):
+    """Record every frame and every step."""
+    monkeypatch.setattr(RecordedFrame, "valid", False)
+    monkeypatch.setattr(CommandList, "key", property(lambda _: object(), lambda *_: None), raising=False)
 
 
 set_changed = CommandList.set
@@ -84,19 +90,19 @@ def set_all(self, values):
 def test_a_picture_with_more_pairs_than_there_is_room_for_is_not_launched_as_the_last(on_groups, monkeypatch):
     """Splats that have grown since fill more tiles: the kept launches say so, and it is drawn with room."""
     wide, losses, refused = scene(size=(80, 64)), [], []
-    take_back = gradients_again.Again.take_back
+    check_capacity = OpenCLGradients._check_capacity
 
-    def told(self, picture, given, ask):
+    def checked(self, frame):
         try:
-            return take_back(self, picture, given, ask)
-        except TooLittleRoom:
-            refused.append(picture)
+            return check_capacity(self, frame)
+        except CapacityExceeded:
+            refused.append(frame)
             raise
 
-    monkeypatch.setattr(gradients_again.Again, "take_back", told)
+    monkeypatch.setattr(OpenCLGradients, "_check_capacity", checked)
     for kept in (True, False):
         if not kept:
-            monkeypatch.setattr(gradients_again.Again, "keep", lambda *_: None)
+            never_replay(monkeypatch)
         trainer = Trainer(wide, on_groups, **STEADY)
         kernels, splats = trainer._work._kernels, trainer._work.store()
         splats.values["log_scales"] -= np.float32(2.5)
@@ -164,7 +170,7 @@ def test_an_interrupt_while_the_step_is_compiled_counts_nobody_twice(renderer, d
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(OpenCLGradients, "prepare_step", interrupted)
+        patch.setattr(OpenCLGradients, "compile_step", interrupted)
         with pytest.raises(KeyboardInterrupt):
             stopped.step()
     stopped.step()

@@ -14,7 +14,7 @@ import pytest
 from training_scene import QUICK, scene
 
 import fidsplat as fs
-from fidsplat.backends.gradients import TooLittleRoom
+from fidsplat.backends.gradients import CapacityExceeded
 from fidsplat.train import Trainer, TrainingError, TrainSettings, splats_of, splats_within
 
 ITERATIONS = 26
@@ -101,7 +101,7 @@ def test_a_picture_that_had_too_little_room_is_drawn_again(whole, dataset, tmp_p
         def backward(self, images, gradients):
             if trainer.iteration % 3 == 0 and not self.waits:
                 refused.append(trainer.iteration)
-                raise TooLittleRoom
+                raise CapacityExceeded
             return self.own.backward(images, gradients)
 
     trainer._differentiate = Narrow

@@ -75,6 +75,8 @@ class CommandList:
         self._used: dict[str, int] = {}
         """launches of each kernel in this recording"""
         self._named: dict[str, _NamedArgument] = {}
+        self.key: Any = None
+        """what the recording is valid for, set by its owner when it is complete; `clear` resets it"""
 
     @property
     def stages(self) -> list[str]:
@@ -88,6 +90,7 @@ class CommandList:
 
     def clear(self) -> None:
         """Start another recording."""
+        self.key = None
         self._commands, self._used, self._named = [], {}, {}
 
     def record(

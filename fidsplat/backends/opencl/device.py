@@ -166,7 +166,7 @@ class OpenCLBackend(Workspace, Backend):
     def compile_ahead(self, features: FeatureSet) -> None:
         """Start to compile `differentiate` in the background."""
         if self._own[1].get(features) not in self._gradients:
-            self._ahead.begin(features, lambda: self.differentiate(features).prepare_step())
+            self._ahead.begin(features, lambda: self.differentiate(features).compile_step())
 
     def training(self) -> OpenCLTraining:
         """Compiled training kernels, without splats."""

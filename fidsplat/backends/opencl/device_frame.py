@@ -104,8 +104,7 @@ class DeviceFrame:
             stack: the views of a batch; `view` then has what they have in common.
             replay_queue: the queue of a frame that is recorded for replay: the host does not wait for its
                 counts.
-            pair_limit: pairs for which a frame with derivatives reserves buffers without waiting for its
-                counts; 0 to wait.
+            pair_limit: largest capacity of the lists of a recorded frame; 0 for no limit.
         """
         self.workspace, self.commands, self.shape = workspace, commands, shape
         self.resident, self.view, self.plan = resident, view, plan

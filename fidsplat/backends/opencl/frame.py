@@ -86,7 +86,7 @@ def render_tiled(frame: DeviceFrame) -> None:
         tiling.list_and_sort(frame, every, capacity, first_band=True)
         blend(frame, every)
         resolve(frame)
-    if frame.recorded or (frame.pair_limit and capacity):
+    if frame.recorded:
         frame.counted, frame.pairs = counted, capacity
     else:
         complete_tiled(frame, counted, capacity)

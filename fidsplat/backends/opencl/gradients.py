@@ -14,8 +14,8 @@ from pyopencl.array import Array
 
 from fidsplat.backends.gradients import (
     NOT_THE_LAST,
+    CapacityExceeded,
     DifferentiableImages,
-    TooLittleRoom,
     check_shape,
     gradient_shape,
 )
@@ -28,11 +28,11 @@ from fidsplat.backends.opencl.assemble import (
 )
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.device_frame import DeviceFrame
-from fidsplat.backends.opencl.gradients_again import Again
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.uniforms import scalars_of
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
@@ -50,130 +50,157 @@ class OpenCLDifferentiable(DifferentiableImages):
     images: OpenCLImages
 
     def device_array(self, name: str) -> Array:
-        """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
+        """The image as a pyopencl array, (h, w) or (h, w, channels), without a copy."""
         buffer, shape = self.device_buffer(name)
         return Array(self.picture.queue, shape, np.dtype(IMAGES[name].dtype), data=buffer)
 
     def device_buffer(self, name: str) -> tuple[cl.Buffer, tuple[int, ...]]:
-        """The image's buffer and shape: an array takes the host longer to make than a kernel to launch."""
+        """The buffer of an image, and its shape; faster than an array."""
         return self.picture.named[f"{name}_out"], gradient_shape(name, self.picture.view)
 
 
 @contextmanager
-def _failing(picture: DeviceFrame) -> Iterator[None]:
-    """Takes the device for oneself, and says what it fails at."""
+def _differentiating(frame: DeviceFrame) -> Iterator[None]:
+    """Use the device exclusively, and raise its failures as DeviceError."""
     try:
-        with picture.workspace.lock:
+        with frame.workspace.lock:
             yield
     except cl.Error as error:
-        title = picture.workspace.info.title
+        title = frame.workspace.info.title
         raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
 
 
-class TakenBack:
-    """A frame whose gradients are summed per tile, until the device renders another one."""
+class TileGradients:
+    """Gradients of a frame summed per tile, until the device renders another frame."""
 
-    def __init__(self, of: OpenCLGradients, images: OpenCLDifferentiable, picture: DeviceFrame) -> None:
-        self._of, self._images, self._picture = of, images, picture
+    def __init__(self, of: OpenCLGradients, images: OpenCLDifferentiable, frame: DeviceFrame) -> None:
+        self._of, self._images, self._frame = of, images, frame
 
     def gradients(self) -> dict[str, Any]:
-        """The result of `GradientPipeline.backward`."""
+        """The result of `OpenCLGradients.backward`."""
         with self._last():
-            return self._of.sum_up(self._picture)
+            return self._of.sum_tiles(self._frame)
 
-    def prepare_step(self) -> None:
-        """Before `step`: compiles what it launches."""
-        self._of.prepare_step()
+    def compile_step(self) -> None:
+        """Compile the kernel of `step`."""
+        self._of.compile_step()
 
     def step(self, given: Mapping[str, Any]) -> None:
-        """Launches kernels/opencl/project_step.cl. given: its arguments but for the picture's."""
+        """Submit kernels/opencl/project_step.cl. given: its arguments other than those of the frame."""
         with self._last():
-            self._of.step(self._picture, given)
+            self._of.step(self._frame, given)
 
     def _last(self) -> AbstractContextManager[None]:
         if not self._images.last:
             raise InputError(NOT_THE_LAST)
-        return _failing(self._picture)
+        return _differentiating(self._frame)
 
 
 class OpenCLGradients(GradientPipeline):
-    """Compiled stages and their derivatives."""
+    """Compiled stages with their derivatives.
+
+    A training run renders thousands of frames that differ in numbers only. So frames are replayed
+    (`OpenCLPipeline.replay_complete`), and so are the kernels of the backward pass while their buffers stay
+    the same.
+    """
 
     def __init__(self, pipeline: OpenCLPipeline) -> None:
         self._pipeline = pipeline
         self.source = assemble_gradients(pipeline.features, pipeline.shape)
         self.program = Program(pipeline.workspace, self.source)
         arguments = self.source.arguments
-        self._wanted = {one.name for one in arguments["blend_backward"]}
+        self._by_outputs = [
+            name
+            for name in GRADIENT_OUTPUTS
+            if any(one.name == f"by_{name}" for one in arguments["blend_backward"])
+        ]
+        """outputs whose gradients the kernels read"""
         self._cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
-        self._pairs = 0
-        """for which there is room"""
-        self._commands = CommandList(self.program)
-        """of `sum_up`"""
-        self._again = Again(pipeline.workspace, pipeline.program, self.program)
-        self._step: tuple[int, CommandList] | None = None
-        """number of splats, and what was launched for so many"""
+        self._pair_limit = 0
+        """capacity of the lists of frames whose counts the host does not wait for"""
+        self._tile_commands, self._sum_commands = CommandList(self.program), CommandList(self.program)
+        self._step_commands: CommandList | None = None
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
-        """Render one view; GPUs need not wait where frames were differentiated before."""
-        pipeline, again = self._pipeline, self._again
-        with pipeline.workspace.rendering():
-            if waits or not self._pairs:
+        """Render one frame. waits: for its counts, as GPUs need not after the first differentiated frame."""
+        pipeline = self._pipeline
+        with pipeline.workspace.lock:
+            if waits or not self._pair_limit:
                 frame = pipeline.render_complete(resident, view)
-            elif (frame := again.draw(resident, view, self._pairs)) is None:
-                frame = pipeline.render_complete(resident, view, self._pairs, again.record())
-                again.keep(frame)
+            else:
+                frame = pipeline.replay_complete(resident, view, self._pair_limit)
             return OpenCLDifferentiable(frame, pipeline.images_of(frame))
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """Gradients as pyopencl arrays."""
         with images.picture.workspace.lock:
-            return self.take_back(images, gradients).gradients()
+            return self.backward_to_tiles(images, gradients).gradients()
 
-    def take_back(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TakenBack:
-        """`backward` up to the sums over tiles."""
+    def backward_to_tiles(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TileGradients:
+        """The first part of `backward`, up to the sums over tiles."""
         check_gradients(self._pipeline.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)
-        picture = images.picture
-        with _failing(picture):
-            return TakenBack(self, images, self._backward(picture, gradients))
+        with _differentiating(images.picture):
+            frame = self._backward_frame(images.picture)
+            self._submit_to_tiles(frame, gradients)
+            return TileGradients(self, images, frame)
 
-    def _backward(self, drawn: DeviceFrame, gradients: Mapping[str, Any]) -> DeviceFrame:
-        if drawn.counted is not None and self._again.take_back(drawn, gradients, lambda: self._ask(drawn)):
-            return self._with_slots(drawn)
-        picture = self._with_slots(drawn)
-        picture.commands = self._again.record_back()
-        view, shape, count = picture.view, self._pipeline.shape, picture.resident.count
-        self._take_gradients(picture, gradients)
-        tile = shape.tile_width * shape.tile_height
-        features, in_groups = self._pipeline.features, shape.schedule == "group"
-        chunks = picture.pairs // backward_chunk(features, shape) + picture.tiles
-        picture.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
-        reserved = picture.take("reserved", 8)
+    def _backward_frame(self, forward: DeviceFrame) -> DeviceFrame:
+        """The frame with the buffers of gradients, and with launches of the program `gradients`."""
+        frame = copy(forward)
+        frame.commands = self._tile_commands
+        frame.take("splat_slots", 4 * frame.resident.count)
+        frame.take("moments", self.source.records["Moments"].itemsize * frame.pairs)
+        frame.take("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * frame.tiles)
+        return frame
+
+    def _submit_to_tiles(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
+        """Submit the kernels up to the sums over tiles: again, if only numbers and some buffers differ."""
+        self._bind_gradients(frame, gradients)
+        reserved = frame.take("reserved", 8)
+        cl.enqueue_fill_buffer(frame.queue, reserved, _ZERO, 0, 8)
+        ceiling = math.log(frame.view.ceiling)
+        commands, key = self._tile_commands, self._key(frame)
+        if key is not None and commands.key == key:
+            leased = {name: buffer for name, buffer in frame.leased}
+            given = {f"by_{name}": frame.buffer(f"by_{name}") for name in self._by_outputs}
+            commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **leased, **given})
+            frame.events += zip(commands.stages, commands.submit(frame.queue), strict=True)
+            self._check_capacity(frame)
+            return
+        commands.clear()
+        self._record_to_tiles(frame, ceiling)
+        self._check_capacity(frame)
+        commands.key = self._key(frame)
+
+    def _key(self, frame: DeviceFrame) -> Any:
+        """Equal if two backward passes use the same buffers; None if the host waited for the counts."""
+        if frame.counted is None:
+            return None
+        count, size = frame.resident.count, (frame.view.width, frame.view.height)
+        return frame.pool.state, count, frame.capacity, size
+
+    def _record_to_tiles(self, frame: DeviceFrame, log_ceiling: float) -> None:
+        features, shape = self._pipeline.features, self._pipeline.shape
+        in_groups, tile = shape.schedule == "group", shape.tile_width * shape.tile_height
+        chunks = frame.pairs // backward_chunk(features, shape) + frame.tiles
+        frame.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
         if not in_groups:
-            rows = -(-view.height // shape.tile_height)
-            picture.take("big_rows", 4 * picture.numbers["big_capacity"] * rows)
-
-        cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 8)
-        if count:
-            picture.launch("reserve", "reserve_slots", count, _GROUP, count=count)
-        ceiling = math.log(view.ceiling)
-        groups = chunks if in_groups else min(picture.tiles, picture.workspace.info.compute_units)
+            rows = -(-frame.view.height // shape.tile_height)
+            frame.take("big_rows", 4 * frame.numbers["big_capacity"] * rows)
+        if count := frame.resident.count:
+            frame.launch("reserve", "reserve_slots", count, _GROUP, count=count)
+        groups = chunks if in_groups else min(frame.tiles, frame.workspace.info.compute_units)
         if in_groups:
-            picture.take("reached", 4 * picture.tiles)
-            picture.take("chunk_tiles", 4 * chunks)
-            items = shape.blend_items
-            picture.launch("blend backward", "blend_light", picture.tiles * items, items, log_ceiling=ceiling)
+            frame.take("reached", 4 * frame.tiles)
+            frame.take("chunk_tiles", 4 * chunks)
+            size = frame.tiles * shape.blend_items
+            frame.launch("blend backward", "blend_light", size, shape.blend_items, log_ceiling=log_ceiling)
         else:
-            picture.take("tapes", self._tape_bytes() * groups)
+            frame.take("tapes", self._tape_bytes() * groups)
         items = backward_items(features, shape)
-        picture.launch("blend backward", "blend_backward", groups * items, items, log_ceiling=ceiling)
-        self._ask(drawn)
-        if drawn.counted is not None:
-            wanted = {f"by_{name}" for name in GRADIENT_OUTPUTS} & self._wanted
-            self._again.keep_back(picture, gradients, wanted)
-        return picture
+        frame.launch("blend backward", "blend_backward", groups * items, items, log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
         """Size of the record `Tape` (schedule/lanes_backward.cl): light and opacity of each pixel for a
@@ -183,88 +210,78 @@ class OpenCLGradients(GradientPipeline):
         words = 2 * 8 * chunk + 1
         return 8 * chunk * shape.tile_width * shape.tile_height + -(-4 * words // vector) * vector
 
-    def _with_slots(self, drawn: DeviceFrame) -> DeviceFrame:
-        """The picture with the kernels of the way back, and what those leave that go through tiles."""
-        picture = copy(drawn)
-        picture.commands = self._commands
-        picture.take("splat_slots", 4 * picture.resident.count)
-        picture.take("moments", self.source.records["Moments"].itemsize * picture.pairs)
-        picture.take("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * picture.tiles)
-        return picture
-
-    def sum_up(self, picture: DeviceFrame) -> dict[str, Any]:
-        """The derivatives of a picture that was taken back."""
-        picture = copy(picture)
-        picture.commands = self._commands
-        self._commands.clear()
-        count, real = picture.resident.count, self.source.scalars.dtype("real").itemsize
-        posed = -(-count // _GROUP)  # work-groups that sum up the pose
-        picture.take("group_sums", 6 * real * posed)
-        found = self._room_for_results(picture)
+    def sum_tiles(self, frame: DeviceFrame) -> dict[str, Any]:
+        """The gradients of a frame from the sums over tiles."""
+        frame = copy(frame)
+        frame.commands = self._sum_commands
+        self._sum_commands.clear()
+        count, real = frame.resident.count, self.source.scalars.dtype("real").itemsize
+        groups = -(-count // _GROUP)  # of the sums for the pose
+        frame.take("group_sums", 6 * real * groups)
+        found = self._allocate_results(frame)
         if count:
             arrays: dict[str, Any] = {
-                name: picture.resident.part(name, 0, count) for name in self._cloud_arrays
+                name: frame.resident.part(name, 0, count) for name in self._cloud_arrays
             }
-            picture.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
+            frame.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
         given: dict[str, Any] = {name: found[name].data for name in ("background", "pose")}
-        given |= {"tiles": picture.tiles, "groups": posed}
-        picture.launch("project backward", "add_up", (3 + 6) * _GROUP, _GROUP, **given)
+        given |= {"tiles": frame.tiles, "groups": groups}
+        frame.launch("project backward", "add_up", (3 + 6) * _GROUP, _GROUP, **given)
         return found
 
-    def prepare_step(self) -> None:
-        """Compiles what `step` launches, which those do not need who only ask for derivatives."""
-        if self._step is None:
+    def compile_step(self) -> None:
+        """Compile the kernel of `step`, which is not needed for gradients alone."""
+        if self._step_commands is None:
             source = assemble_step(self._pipeline.features, self._pipeline.shape)
-            self._step = 0, CommandList(Program(self._pipeline.workspace, source))
+            self._step_commands = CommandList(Program(self._pipeline.workspace, source))
 
-    def step(self, picture: DeviceFrame, given: Mapping[str, Any]) -> None:
-        """The step of a training by a picture that was taken back, with arguments that are its own."""
-        assert self._step is not None  # `prepare_step`
-        known, commands = self._step
-        count = picture.resident.count
+    def step(self, frame: DeviceFrame, given: Mapping[str, Any]) -> None:
+        """One step of Adam from the sums over tiles. given: arguments that are not those of the frame."""
+        commands, count = self._step_commands, frame.resident.count
+        assert commands is not None  # `compile_step`
+        given = {**given, "count": count}
         arguments = commands.program.source.arguments["project_step"]
-        every = {**given, "count": count}
-        values = {one.name: every[one.name] if one.name in every else picture.value(one) for one in arguments}
-        if known != count:
-            self._step = 0, commands  # an interrupt on the way leaves none
+        values = {one.name: given[one.name] if one.name in given else frame.value(one) for one in arguments}
+        if commands.key != count:
             commands.clear()
             size = (max(1, -(-count // _GROUP)) * _GROUP,)
             commands.record("project_step", size, (_GROUP,), list(values.values()))
-            self._step = count, commands
+            commands.key = count
         commands.set(values)
-        (event,) = commands.submit(picture.queue)
-        picture.events.append(("project backward", event))
+        (event,) = commands.submit(frame.queue)
+        frame.events.append(("project backward", event))
 
-    def _ask(self, drawn: DeviceFrame) -> None:
-        """Whether there was room for all pairs: with too little of it lists were left empty, and splats have
-        slots beyond the end. The device is busy meanwhile."""
-        if (pairs := drawn.count_pairs()) is None:
-            raise TooLittleRoom
-        if self._pairs < pairs * 9 // 8:  # seldom: with another number nothing is launched as before
-            self._pairs = pairs * 5 // 4
+    def _check_capacity(self, frame: DeviceFrame) -> None:
+        """Raise CapacityExceeded if the lists were too small: they are empty then, and gradient buffer
+        offsets exceed the buffers. The device is busy meanwhile."""
+        if (pairs := frame.count_pairs()) is None:
+            raise CapacityExceeded
+        if self._pair_limit < pairs * 9 // 8:  # seldom: frames with another limit are recorded again
+            self._pair_limit = pairs * 5 // 4
 
-    def _take_gradients(self, picture: DeviceFrame, gradients: Mapping[str, Any]) -> None:
-        """The derivatives by the images, as arguments of the kernels."""
-        for name in GRADIENT_OUTPUTS:
-            if f"by_{name}" not in self._wanted:
-                continue
-            shape, given = gradient_shape(name, picture.view), gradients.get(name)
+    def _bind_gradients(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
+        """Bind the gradients by the outputs as arguments of the kernels."""
+        for name in self._by_outputs:
+            shape, given = gradient_shape(name, frame.view), gradients.get(name)
             if given is None:
                 size = 4 * math.prod(shape)
-                buffer = picture.take(f"by_{name}", size)
-                cl.enqueue_fill_buffer(picture.queue, buffer, _ZERO, 0, size)
+                buffer = frame.take(f"by_{name}", size)
+                cl.enqueue_fill_buffer(frame.queue, buffer, _ZERO, 0, size)
                 continue
-            check_shape(name, given.shape, picture.view)
+            check_shape(name, given.shape, frame.view)
             if isinstance(given, Array):
                 if given.dtype != _F32 or not given.flags.c_contiguous or given.offset:
-                    raise InputError(f"the gradient of {name} must be a whole, contiguous float32 array")
-                picture.bind(f"by_{name}", given.data)  # pyright: ignore[reportArgumentType]
+                    raise InputError(
+                        f"the gradient of {name} must be a complete, contiguous float32 array, got "
+                        f"{given.dtype} at offset {given.offset}; copy it first"
+                    )
+                frame.bind(f"by_{name}", given.data)  # pyright: ignore[reportArgumentType]
             else:
-                picture.put(f"by_{name}", np.ascontiguousarray(given, np.float32))
+                frame.put(f"by_{name}", np.ascontiguousarray(given, np.float32))
 
-    def _room_for_results(self, picture: DeviceFrame) -> dict[str, Array]:
-        """Arrays for the results, the same from call to call."""
-        count, features = picture.resident.count, self._pipeline.features
+    def _allocate_results(self, frame: DeviceFrame) -> dict[str, Array]:
+        """Arrays for the gradients, the same in every call."""
+        count, features = frame.resident.count, self._pipeline.features
         shapes: dict[str, tuple[int, ...]] = {
             **{"means": (count, 3), "quats": (count, 4), "scales": (count, 2), "opacities": (count,)},
             **{"screen": (count,), "background": (3,), "pose": (6,)},
@@ -276,6 +293,6 @@ class OpenCLGradients(GradientPipeline):
         found = {}
         for name, shape in shapes.items():
             argument = name if name == "screen" else f"by_{name}"
-            found[name] = picture.pool.array(picture.queue, argument, shape)
-            picture.named[argument] = found[name].data  # pyright: ignore[reportArgumentType]
+            found[name] = frame.pool.array(frame.queue, argument, shape)
+            frame.named[argument] = found[name].data  # pyright: ignore[reportArgumentType]
         return found

@@ -98,15 +98,8 @@ class OpenCLPipeline(Pipeline):
         except DeviceError:  # too little memory for any part of it
             return False
 
-    def render_complete(
-        self, resident: Resident, view: View, pair_limit: int = 0, commands: CommandList | None = None
-    ) -> DeviceFrame:
+    def render_complete(self, resident: Resident, view: View) -> DeviceFrame:
         """One frame with all that its stages leave on the device until the next frame.
-
-        Args:
-            pair_limit: pairs for which buffers are reserved without waiting for the counts
-                (`DeviceFrame.count_pairs` tells whether they sufficed); 0 to wait.
-            commands: records the launches for replay.
 
         Raises:
             DeviceError: as `render`; or the frame does not fit the memory budget at once.
@@ -114,12 +107,41 @@ class OpenCLPipeline(Pipeline):
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
             if not plan.chunk:
-                frame = self._render_planned(resident, view, plan, pair_limit, commands)
+                frame = self._render_planned(resident, view, plan)
             if frame is None or frame.pairs > self.workspace.pair_budget:
                 raise DeviceError(
                     "frames with derivatives must fit the memory budget at once, got chunks or bands of "
                     f"{resident.count:,} splats; raise memory_budget, or use fewer splats or smaller frames"
                 )
+            return frame
+
+    def replay_complete(self, resident: Resident, view: View, pair_limit: int) -> DeviceFrame:
+        """`render_complete` without waiting for the counts: `DeviceFrame.count_pairs` returns whether the
+        buffers sufficed. A frame of a kind that was rendered before is replayed.
+
+        pair_limit: largest capacity of the lists.
+        """
+        if self.shape.lists == "ordered" or not resident.count:
+            return self.render_complete(resident, view)
+        workspace, key = self.workspace, (*self._key(view), pair_limit)
+        with workspace.rendering():
+            cached, queue = resident.cached_frames.get(key), workspace.switch_to(workspace.queue)
+            recorded = None if cached is None else cached.recorded
+            if cached is not None and recorded is not None and self._ready(recorded, resident, view, queue):
+                frame = self._frame(resident, view, cached.plan, recorded.commands, queue, pair_limit)
+                recorded.render(frame)
+                return frame
+            plan = self._planner.frame(resident, view)
+            kind = self._buffer_kind(resident, view, plan)
+            workspace.pool.make_way(kind, workspace.memory_budget - plan.held, resident.capacity)
+            if plan.chunk or not tiling.pair_capacity(workspace):
+                return self.render_complete(resident, view)
+            resident.cached_frames.pop(key, None)  # an interrupt leaves a part of a recording
+            commands = CommandList(self.program) if recorded is None else recorded.commands
+            frame = self._frame(resident, view, plan, commands, queue, pair_limit)
+            frame.lease_images(self.features.images)
+            render(frame)
+            resident.cached_frames[key] = CachedFrame(plan, kind, None, RecordedFrame(frame))
             return frame
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:
@@ -202,15 +224,12 @@ class OpenCLPipeline(Pipeline):
         resident: Resident,
         view: View,
         plan: MemoryPlan,
-        pair_limit: int = 0,
-        commands: CommandList | None = None,
     ) -> DeviceFrame:
         """A frame with the buffers that it requires."""
         # buffers of other kinds of frames are released; those of its own kind are part of the plan
         free = self.workspace.memory_budget - plan.held
         self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.capacity)
-        commands = self._commands if commands is None else commands
-        frame = self._frame(resident, view, plan, commands, pair_limit=pair_limit)
+        frame = self._frame(resident, view, plan, self._commands)
         frame.lease_images(self.features.images)
         render(frame)
         return frame

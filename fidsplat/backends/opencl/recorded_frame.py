@@ -8,11 +8,13 @@ the device.
 from __future__ import annotations
 
 from collections import deque
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.opencl.counts import read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.view import View
 
@@ -44,6 +46,7 @@ class RecordedFrame:
         self._tallies = frame.pool.size("tallies")
         self._uploads: deque[cl.Event] = deque(frame.uploads, maxlen=_UPLOADS)
         self._leases = [(name, buffer.size) for name, buffer in frame.leased]
+        self._scratch = [name for name in frame.bound if name not in dict(frame.leased)]
 
     @property
     def valid(self) -> bool:
@@ -91,6 +94,21 @@ class RecordedFrame:
         events = self.commands.submit(queue)
         queue.flush()
         return leased, events
+
+    def render(self, frame: DeviceFrame) -> None:
+        """Replay as a frame of the view that is bound, with the buffers that its stages leave for
+        derivatives."""
+        frame.leased, events = self.submit(frame.queue)
+        for name in self._scratch:
+            if (buffer := self._pool.known(name)) is not None:
+                frame.bind(name, buffer)
+        for name, buffer in frame.leased:
+            frame.bind(name, buffer)
+        frame.numbers["big_capacity"], frame.pairs = self.capacity.big, self.capacity.pairs
+        frame.events = list(zip(self.commands.stages, events, strict=True))
+        frame.counted = events[self.commands.kernels.index("tile_starts")]
+        reader, count = frame.workspace.read_queue, frame.resident.count
+        frame.stats = partial(read_stats, reader, frame.buffers.counts, events[-1], count)
 
     def _numbers_of(self, frame: DeviceFrame) -> dict[str, Any]:
         """The numbers of a frame's view, by the names of the kernel arguments."""

@@ -15,7 +15,7 @@ from pyopencl.array import Array
 from fidsplat.backends.interface import ResidentData, TrainingKernels
 from fidsplat.backends.opencl.assemble import assemble_training
 from fidsplat.backends.opencl.command_list import CommandList
-from fidsplat.backends.opencl.loss_sums import LATE, LossSums
+from fidsplat.backends.opencl.loss_readback import SLOTS, LossReadback
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras import Camera
@@ -87,7 +87,7 @@ class ResidentArrays(ResidentData):
 class OpenCLTraining(TrainingKernels):
     """Training kernels of an OpenCL device."""
 
-    late = LATE // 2 - 1  # a picture may be compared twice
+    late = SLOTS // 2 - 1  # a picture may be compared twice
 
     def __init__(self, workspace: Workspace, lanes: int = 0) -> None:
         """lanes: of vectors, in place of the device's own (tests)."""
@@ -104,12 +104,12 @@ class OpenCLTraining(TrainingKernels):
         self._drawn: tuple[int, ResidentArrays] | None = None
         self._truths: list[_Truth] = []
         self._loss_images: tuple[tuple[int, int], cl.Buffer] | None = None
-        self._sums: dict[int, LossSums] = {}
+        self._sums: dict[int, LossReadback] = {}
         """by numbers of work-groups"""
         self._version = object()
         """another one whenever splats are held in other buffers"""
-        self._kept: dict[str, tuple[tuple[Any, ...], CommandList, Any]] = {}
-        """launches of a step that are made again, with what they hold for"""
+        self._replayed: dict[str, CommandList] = {}
+        """command lists of a step, by name"""
         self._sights: WeakKeyDictionary[Camera, tuple[np.ndarray, dict[str, float]]] = WeakKeyDictionary()
         """numbers by which kernels know what a camera sees, each with the origin that they are of"""
 
@@ -198,30 +198,30 @@ class OpenCLTraining(TrainingKernels):
         grid = (-(-3 * columns // _PANEL), -(-height // _STRIP)) if strided else (_SUMS,)
         sums = self._sums_of(math.prod(grid))
         slot, room = sums.take()
+        slope = self._array("by_rgb", (height, columns, 3))
         given = {
             **{"rgb": rgb, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
-            **{"l1_share": (1 - dssim_weight) / number, "sums": room},
+            **{"l1_share": (1 - dssim_weight) / number, "sums": room, "by_rgb": slope.data},
         }
 
-        def plan() -> tuple[list[Launch], Array]:
-            slope = self._array("by_rgb", (height, columns, 3))
+        def launches() -> list[Launch]:
             every = given | {
-                **{"by_rgb": slope.data, "ssim_share": dssim_weight / size},
+                "ssim_share": dssim_weight / size,
                 **{"width": 3 * columns, "height": height, "stride": stride},
                 **{"images": self._room_for_images(height, columns)},
                 "image_stride": stride * (height + 2 * _MARGIN_ROWS),
             }
             if strided:
                 kernels = "loss_strips", "loss_strips_backward"
-                return [self._one(kernel, grid, (1, 1), every) for kernel in kernels], slope
+                return [self._one(kernel, grid, (1, 1), every) for kernel in kernels]
             row = [self._of_rows("loss_take", 3 * columns, height, every)]
             for kernel in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
                 each = _EACH_ROWS if "columns" in kernel else 1
                 row.append(self._of_rows(kernel, 3 * columns, -(-height // each), every))
-            return [*row, self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), every)], slope
+            return [*row, self._one("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), every)]
 
-        events, slope = self._again("loss", (height, columns, dssim_weight), given, plan)
-        sums.added(slot, events[0 if strided else -1])
+        events = self._replay("loss", (height, columns, dssim_weight), given, launches)
+        sums.submitted(slot, events[0 if strided else -1])
 
         def value() -> tuple[float, float]:
             self._queue.flush()
@@ -269,7 +269,7 @@ class OpenCLTraining(TrainingKernels):
         self._step(taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin)
 
     def _step(self, taken: Any, given: Mapping[str, Any], camera: Camera | None, origin: np.ndarray) -> None:
-        taken.prepare_step()  # takes seconds once: an interrupt there finds nobody counted
+        taken.compile_step()  # takes seconds once: an interrupt there finds nobody counted
         if camera is not None:
             self._seen(camera, origin)
         taken.step({**self._held, **given, "counted": int(camera is not None)})
@@ -279,7 +279,7 @@ class OpenCLTraining(TrainingKernels):
         if (known := self._sights.get(camera)) is None or known[0] is not origin:
             known = self._sights[camera] = origin, _sight(camera, origin)
         given = known[1]
-        self._again("count", (), given, lambda: ([self._items("count_seen", self._count, given)], None))
+        self._replay("count", (), given, lambda: [self._items("count_seen", self._count, given)])
 
     def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
         """As `TrainingKernels`."""
@@ -316,31 +316,27 @@ class OpenCLTraining(TrainingKernels):
             self._commands.clear()
             self._commands.launch(self._queue, *launch)
 
-    def _again(
+    def _replay(
         self,
         name: str,
-        kind: tuple[Any, ...],
+        key: tuple[Any, ...],
         given: Mapping[str, Any],
-        plan: Callable[[], tuple[list[Launch], Any]],
-    ) -> tuple[list[cl.Event], Any]:
-        """Launches a part of a step: what the last step launched, where only `given` differs.
+        launches: Callable[[], list[Launch]],
+    ) -> list[cl.Event]:
+        """Submit a part of a step: replayed, if it differs from that of the last step in `given` only.
 
-        plan: gives the launches for all else, and what comes of them; `kind` tells what they depend on
-            beside the splats and the pool.
+        launches: called to record them, if the key, the splats or the buffers have changed.
         """
-        known = self._kept.pop(name, None)  # an interrupt on the way leaves none
+        commands = self._replayed.setdefault(name, CommandList(self._program))
+        key = (*key, self._version, self._workspace.pool.state)
         with self._workspace.failing("training"):
-            if known is None or known[0] != (kind, self._version, self._workspace.pool.state):
-                commands = CommandList(self._program) if known is None else known[1]
-                row, made = plan()
+            if commands.key != key:
                 commands.clear()
-                for launch in row:
+                for launch in launches():
                     commands.record(*launch)
-                known = (kind, self._version, self._workspace.pool.state), commands, made
-            known[1].set(given)
-            events = known[1].submit(self._queue)
-        self._kept[name] = known
-        return events, known[2]
+                commands.key = key
+            commands.set(given)
+            return commands.submit(self._queue)
 
     def _put(self, what: str, array: np.ndarray) -> cl.Buffer:
         array = np.ascontiguousarray(array)
@@ -355,9 +351,9 @@ class OpenCLTraining(TrainingKernels):
     def _array(self, name: str, shape: tuple[int, ...]) -> Array:
         return self._workspace.pool.array(self._queue, f"training: {name}", shape)
 
-    def _sums_of(self, groups: int) -> LossSums:
+    def _sums_of(self, groups: int) -> LossReadback:
         if groups not in self._sums:
-            self._sums[groups] = LossSums(self._workspace, groups)
+            self._sums[groups] = LossReadback(self._workspace, groups)
         return self._sums[groups]
 
     def _stride(self, columns: int) -> int:
