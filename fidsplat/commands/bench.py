@@ -62,7 +62,7 @@ class Bench:
     scene: UserScenes = ()
     cameras: Cameras = None
     device: Devices = ()
-    repeats: Annotated[int, option("N", "timed frames of each scene on each device (default: 20)")] = 20
+    repeats: Annotated[int, option("N", "timed frames of each scene on each device")] = 20
     json: Annotated[
         str | None,
         option("FILE", "also write all figures to a file after each scene; - for stdout only"),

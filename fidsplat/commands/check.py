@@ -36,9 +36,7 @@ class Check:
     """
 
     device: Device = None
-    out: Annotated[
-        str, option("DIR", "folder for the image and the fuzzer's state (default: fidsplat-check)", "-o")
-    ] = "fidsplat-check"
+    out: Annotated[str, option("DIR", "folder for the image and the fuzzer's state", "-o")] = "fidsplat-check"
     fuzz: Annotated[int | None, option("N", "render random scenes until they add up to N splats")] = None
     json: Json = False
 

@@ -30,11 +30,9 @@ class DemoViews:
       fidsplat demo views -o yard --views 60 --width 640
     """
 
-    out: Annotated[str, option("DIR", "folder for the data set (default: fidsplat-demo-views)", "-o")] = (
-        "fidsplat-demo-views"
-    )
-    views: Annotated[int, option("N", "training images, 2 to 1000 (default: 30)")] = 30
-    width: Annotated[int, option("PIXELS", "width of an image, 64 to 4096 (default: 320)")] = 320
+    out: Annotated[str, option("DIR", "folder for the data set", "-o")] = "fidsplat-demo-views"
+    views: Annotated[int, option("N", "training images, 2 to 1000")] = 30
+    width: Annotated[int, option("PIXELS", "width of an image, 64 to 4096")] = 320
     device: Device = None
     json: Json = False
 
@@ -67,13 +65,11 @@ class Demo:
 
     PARTS: ClassVar[dict[str, type]] = {"views": DemoViews}
 
-    out: Annotated[
-        str, option("DIR", "folder for images, scene and figures (default: fidsplat-demo)", "-o")
-    ] = "fidsplat-demo"
+    out: Annotated[str, option("DIR", "folder for images, scene and figures", "-o")] = "fidsplat-demo"
     device: Device = None
     mixture: Annotated[
         str,
-        option("NAME", "mixture of the markers: exact, fitted, facets or paper (default: exact)"),
+        option("NAME", "mixture of the markers: exact, fitted, facets or paper"),
     ] = "exact"
     json: Json = False
 

@@ -40,15 +40,11 @@ class Dataset(CountedSettings):
       fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender
     """
 
-    out: Annotated[Path, option("DIR", "folder for the scenes (default: fidsplat-dataset)", "-o")] = Path(
-        "fidsplat-dataset"
-    )
+    out: Annotated[Path, option("DIR", "folder for the scenes", "-o")] = Path("fidsplat-dataset")
     truth: Annotated[
-        str, option("NAME", "renderer: exact, exact-linear, blender-standard or blender-raw (default: exact)")
+        str, option("NAME", "renderer: exact, exact-linear, blender-standard or blender-raw")
     ] = "exact"
-    blender: Annotated[Path, option("DIR", "Blender's images (default: fidsplat-experiments/blender)")] = (
-        Path("fidsplat-experiments/blender")
-    )
+    blender: Annotated[Path, option("DIR", "Blender's images")] = Path("fidsplat-experiments/blender")
     json: Json = False
 
     def run(self) -> int:
@@ -117,9 +113,7 @@ class Blender(CountedSettings):
       fidsplat experiment blender --view raw --category small --markers 1 --samples 16
     """
 
-    out: Annotated[
-        Path, option("DIR", "folder for the images (default: fidsplat-experiments/blender)", "-o")
-    ] = Path("fidsplat-experiments/blender")
+    out: Annotated[Path, option("DIR", "folder for the images", "-o")] = Path("fidsplat-experiments/blender")
     install: Annotated[bool, switch("install Blender instead of rendering")] = False
     environment: BlenderEnvironment = None
     view: tuple[str, ...] = ()
@@ -177,7 +171,7 @@ class Plants:
       fidsplat experiment plants -o sampled --iterations 0
     """
 
-    out: Annotated[str, option("DIR", "folder (default: fidsplat-plants)", "-o")] = "fidsplat-plants"
+    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-plants"
     settings: PlantSettings = field(default_factory=PlantSettings)
     environment: BlenderEnvironment = None
     device: Device = None
@@ -210,9 +204,7 @@ class Merge:
     """
 
     folders: Annotated[Folders, option("DIR", "folders with results of shards")]
-    out: Annotated[
-        str, option("DIR", "folder for the joined results (default: fidsplat-experiments)", "-o")
-    ] = "fidsplat-experiments"
+    out: Annotated[str, option("DIR", "folder for the joined results", "-o")] = "fidsplat-experiments"
     json: Json = False
 
     def run(self) -> int:

@@ -60,13 +60,13 @@ class Fly(RenderInput):
     ] = None
     out: Annotated[
         str,
-        option("DIR|RUN.mcap", f"folder (default: {DEFAULT_FOLDER}), or a log and the folder RUN", "-o"),
+        option("DIR|RUN.mcap", "folder, or a log with its images in the folder RUN", "-o"),
     ] = DEFAULT_FOLDER
-    rate: Annotated[float, option("HZ", "frames per second, also of the video (default: 30)")] = 30.0
+    rate: Annotated[float, option("HZ", "frames per second, also of the video")] = 30.0
     times: Annotated[str | None, option("T,T,...", "seconds on the trajectory's clock instead of --rate")] = (
         None
     )
-    file_rate: Annotated[float, option("HZ", "poses per second of a file without times (default: 10)")] = 10.0
+    file_rate: Annotated[float, option("HZ", "poses per second of a file without times")] = 10.0
     smooth: Annotated[bool, switch("interpolate poses by smooth curves instead of straight lines")] = False
     video: Annotated[
         str | None, option("FILE.mp4", "also write a video of the first output (extra: video)")

@@ -26,7 +26,7 @@ class Greenhouse:
       fidsplat render greenhouse/greenhouse.toml
     """
 
-    out: Annotated[str, option("DIR", "folder (default: greenhouse)", "-o")] = "greenhouse"
+    out: Annotated[str, option("DIR", "folder", "-o")] = "greenhouse"
     settings: GreenhouseSettings = field(default_factory=GreenhouseSettings)
     plants_from: Annotated[
         str | None, option("DIR", "folder of plants KIND-NUMBER.ply (default: plants are grown as disks)")

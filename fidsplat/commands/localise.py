@@ -31,7 +31,7 @@ class Localise:
       fidsplat experiment localise --variant odometry --variant exact -o drive
     """
 
-    out: Annotated[str, option("DIR", "folder (default: fidsplat-localise)", "-o")] = "fidsplat-localise"
+    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-localise"
     quick: Annotated[bool, switch("measure one row of four plants and the first three variants")] = False
     drive: Drive = field(default_factory=Drive)
     variant: Annotated[

@@ -53,7 +53,7 @@ class Marker:
     out: Annotated[str | None, option("FILE.ply", "file for the splats", "-o")] = None
     size: Annotated[
         float,
-        option("M", "edge of the code (width of a board) in metres, without the quiet zone (default: 1)"),
+        option("M", "edge of the code (width of a board) in metres, without the quiet zone"),
     ] = 1.0
     mixture: Annotated[
         str | None,

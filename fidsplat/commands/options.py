@@ -21,9 +21,13 @@ repeatable = tyro.conf.configure(tyro.conf.UseAppendAction)
 
 
 def option(metavar: str, text: str, short: str | None = None):
-    """tyro's description of an option. The text states the default itself."""
+    """tyro's description of an option. The text states a default that is computed; others are appended."""
     aliases = [] if short is None else [short]
-    return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint="")
+    return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint=_default)
+
+
+def _default(value: str) -> str:
+    return "" if value in ("none", "") else f"(default: {value})"
 
 
 def switch(text: str):

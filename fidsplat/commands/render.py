@@ -190,7 +190,7 @@ class Gallery:
     """
 
     sources: Annotated[tyro.conf.Positional[tuple[str, ...]], option("SCENE.toml|FILE.ply...", "scenes")]
-    out: Annotated[str, option("DIR", "folder (default: fidsplat-gallery)", "-o")] = "fidsplat-gallery"
+    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-gallery"
     device: Device = None
     json: Json = False
 

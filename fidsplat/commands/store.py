@@ -36,14 +36,12 @@ class Build:
 
     inputs: Annotated[tyro.conf.Positional[list[str]], option("IN...", "splat files")]
     out: Out
-    chunk: Annotated[int, option("N", "maximum number of splats per chunk (default: 32768)")] = 32768
-    memory: Annotated[str, option("SIZE", "approximate memory while building (default: 2GiB)")] = "2GiB"
+    chunk: Annotated[int, option("N", "maximum number of splats per chunk")] = 32768
+    memory: Annotated[str, option("SIZE", "approximate memory while building")] = "2GiB"
     sh_degree: Annotated[
         int | None, option("N", "highest SH degree to store (default: that of the files)")
     ] = None
-    colors: Annotated[
-        str, option("TYPE", "type of colours and SH: float32 or float16 (default: float32)")
-    ] = "float32"
+    colors: Annotated[str, option("TYPE", "type of colours and SH: float32 or float16")] = "float32"
     no_levels: Annotated[bool, switch("store no levels of detail; every image is then exact")] = False
     overwrite: Overwrite = False
     json: Json = False
@@ -90,7 +88,7 @@ class Place:
     source: StorePath
     out: Out
     grid: Annotated[str | None, option("NX,NY,NZ", "instances along the world's axes")] = None
-    pitch: Annotated[str, option("DX,DY,DZ", "metres between instances (default: 10,10,10)")] = "10,10,10"
+    pitch: Annotated[str, option("DX,DY,DZ", "metres between instances")] = "10,10,10"
     poses: Annotated[str | None, option("FILE", "poses, for example TUM, instead of a grid")] = None
     overwrite: Overwrite = False
     json: Json = False
@@ -229,11 +227,9 @@ class Measure:
     """
 
     store: StorePath
-    views: Annotated[int, option("N", "number of viewpoints (default: 60)")] = 60
-    lowpass: Annotated[str, option("A,B,...", "low-pass filters: pixel, screen, none (default: pixel)")] = (
-        "pixel"
-    )
-    seed: Annotated[int, option("N", "seed of the viewpoints (default: 0)")] = 0
+    views: Annotated[int, option("N", "number of viewpoints")] = 60
+    lowpass: Annotated[str, option("A,B,...", "low-pass filters: pixel, screen, none")] = "pixel"
+    seed: Annotated[int, option("N", "seed of the viewpoints")] = 0
     device: Device = None
     json: Json = False
 
@@ -271,12 +267,12 @@ class StoreDemo:
       fidsplat fly city/city.toml -o flight --rate 2
     """
 
-    out: Annotated[str, option("DIR", "folder (default: fidsplat-city)", "-o")] = "fidsplat-city"
-    splats: Annotated[float, option("N", "number of splats (default: 20e6)")] = 20e6
-    houses: Annotated[int, option("N", "houses along a side (default: 8)")] = 8
-    seed: Annotated[int, option("N", "seed of houses and splats (default: 0)")] = 0
-    markers: Annotated[int, option("N", "markers on the walls, 0 to 1,000 (default: 0)")] = 0
-    views: Annotated[int, option("N", "viewpoints of the measurement, 0 for none (default: 24)")] = 24
+    out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-city"
+    splats: Annotated[float, option("N", "number of splats")] = 20e6
+    houses: Annotated[int, option("N", "houses along a side")] = 8
+    seed: Annotated[int, option("N", "seed of houses and splats")] = 0
+    markers: Annotated[int, option("N", "markers on the walls, 0 to 1,000")] = 0
+    views: Annotated[int, option("N", "viewpoints of the measurement, 0 for none")] = 24
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False

@@ -59,9 +59,7 @@ class Train:
     hold_out: Annotated[
         int | None, option("N", "hold out every Nth view, 0 for none (default: see above)")
     ] = None
-    random_points: Annotated[
-        int, option("N", "start from N random points instead of the data set's (default: 0)")
-    ] = 0
+    random_points: Annotated[int, option("N", "start from N random points instead of the data set's")] = 0
     report: Annotated[
         str | None, option("DIR|FILE.md", "write a page with curves and images of the held-out views")
     ] = None

@@ -54,13 +54,13 @@ class View:
         str | None,
         option("FILE", "poses to show as keyframes (docs/trajectories.md), e.g. a flight's trajectory.tum"),
     ] = None
-    port: Annotated[int, option("N", "port of the page (default: 8080)")] = 8080
-    host: Annotated[
-        str, option("ADDRESS", "address to listen on; 0.0.0.0 opens it to the network (default: 127.0.0.1)")
-    ] = "127.0.0.1"
+    port: Annotated[int, option("N", "port of the page")] = 8080
+    host: Annotated[str, option("ADDRESS", "address to listen on; 0.0.0.0 opens it to the network")] = (
+        "127.0.0.1"
+    )
     device: SceneDevice = None
     quality: SceneQuality = None
-    rate: Annotated[float, option("HZ", "target frame rate while moving (default: 30)")] = 30.0
+    rate: Annotated[float, option("HZ", "target frame rate while moving")] = 30.0
     memory_budget: MemoryBudget = None
 
     def run(self) -> int:

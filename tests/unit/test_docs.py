@@ -217,7 +217,7 @@ def test_the_readme_has_the_install_commands(line):
 
 
 @pytest.mark.parametrize("line", ["fidsplat render scene.toml --no-such", "python benchmarks/no_such.py"])
-def test_a_line_that_would_fail_is_noticed(line):
+def test_invalid_lines_are_detected(line):
     with pytest.raises((fs.InputError, AssertionError)):
         check_commands(line)
 
