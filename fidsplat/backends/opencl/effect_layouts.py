@@ -56,14 +56,15 @@ LAYOUTS: dict[str, Layout] = {
         "slot/lowpass_screen.cl",
         splat=(
             member(
-                "wide dot_x dot_y", "projected centre relative to the anchor's; far away if it is not drawn"
+                "wide disc_x disc_y",
+                "centre of the low-pass disc relative to the anchor; far away if there is none",
             ),
         ),
         bounds=(
             member("float px py pr", "the filter's support: centre and radius [samples]; radius < 0: none"),
         ),
         backward_file="slot/lowpass_screen_backward.cl",
-        moments=(member("float dot_x dot_y", "by the dot's place"),),
+        moments=(member("float disc_x disc_y", "by the position of the low-pass disc"),),
     ),
     "stop_inclusive": Layout(),
     "stop_exclusive": Layout("slot/stop_exclusive.cl", backward_file="slot/stop_exclusive_backward.cl"),

@@ -17,10 +17,10 @@
         reach = fabs(a.z) + fabs(b.z);
 //@@ camera_box_reach
     }
-//@ footprint_dot_bounds
+//@ footprint_disc_bounds
         if (BOX_HERE) bounds.pr = -1.0f;
-//@ footprint_dot
-        if (BOX_HERE) record.dot_x = record.dot_y = 1e18f;
+//@ footprint_disc
+        if (BOX_HERE) record.disc_x = record.disc_y = 1e18f;
 //@ footprint_opacity
     if (IS_BOX(s)) opacity = fmin(exp(s->log_opacity), constants->ceiling) * c.cover;
 //@ footprint_tau

@@ -91,7 +91,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
 //@ blocks_nearest
         vfloat min_depth = s->nearest;
 //@@ camera_blocks_nearest
-//@@ dot_blocks_nearest
+//@@ disc_blocks_nearest
 //@@ coplanar_blocks_nearest
         VSTORE((in_order(VAS_INT(min_depth)) & -CHUNK) | which, keys + first);
 //@ tile_loop

@@ -3,12 +3,12 @@
 //@ geometry
     vfloat d, z;
     vint hit;               // the depth is z_numerator / D
-//@@ dot_geometry
+//@@ disc_geometry
 //@ geometry_make
     g.d = c.d;
     vfloat z_low = s->z_center - s->z_reach, z_high = s->z_center + s->z_reach, depth = s->z_numerator * g.inverse_d;
     vint flat = g.on_plane;                 // the depth is on the plane, if within range
-//@@ dot_geometry_make
+//@@ disc_geometry_make
     g.hit = flat & VMASK(depth >= z_low) & VMASK(depth <= z_high);
     g.z = clamp(depth, z_low, z_high);
 //@ sums
@@ -19,7 +19,7 @@ static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vf
                                vfloat *by_nu, vfloat *by_nv) {
     vfloat by_numerator = VSELECT((vfloat)0.0f, by_z * g->inverse_d, g->hit), by_d = -by_numerator * g->z;
     vfloat by_center = VSELECT(by_z, (vfloat)0.0f, g->hit);
-//@@ dot_add_depth
+//@@ disc_add_depth
     sums->z_numerator += by_numerator;
     sums->z_center += by_center;
     return by_d;

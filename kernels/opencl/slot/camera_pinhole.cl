@@ -9,7 +9,7 @@
         vint hit = VMASK(d > 2.0f * around_d) & VMASK((vfloat)s->z_numerator > 0.0f) & VMASK((vfloat)conic_h == (vfloat)(float)half_r2);
         vfloat depth = fmin((1.0f - BLOCKS_SLACK) * s->z_numerator / d, (vfloat)(s->z_center + s->z_reach));
         min_depth = VSELECT(min_depth, fmax(depth, min_depth), hit);
-//@ camera_dot
+//@ camera_disc
         // The low-pass disc never has the larger weight if the splat is wider than it in all of the disc: there D is at least `min_d`, in
         // front of the near plane, and (n_u^2 + n_v^2) / D^2 at most the squared distance.
         real spread = sqrt((kx.z * kx.z + ky.z * ky.z) * (half_r2 / view->filter));
@@ -18,7 +18,7 @@
         // margin for the rounding of the float32 record
         if (facing != 0 && min_d > 0 && (ahead + spread) * near < REAL(0.999) * fabs(determinant) &&
             steep < REAL(1.99) * view->filter * min_d * min_d)
-            record.dot_x = 1e18f;
+            record.disc_x = 1e18f;
 //@ camera_derivative
         real ahead = 1 / pz;
         real3_ in_x = {a.x, b.x, p.x}, in_y = {a.y, b.y, p.y}, in_z = {a.z, b.z, p.z};

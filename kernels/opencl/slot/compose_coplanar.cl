@@ -33,7 +33,7 @@
             if (before > 0 && !reads) deferred_count += length - before;
             if (before > 0) length = before;
         }
-//@ coplanar_dot_depth
+//@ coplanar_disc_depth
         if (s->plane >= 0) on_plane = -1;           // also in the low-pass disc
 //@ coplanar_attribute_depth
     attributes.z = fmax(attributes.z, (vfloat)s->nearest);

@@ -44,7 +44,7 @@
         if (THICK_HERE) filtered = false;   // EWA has its own low-pass
 //@ camera_steepest
     if (THICK_HERE) steepest = fabs(k0.z);  // makes D equal to 1 at all samples
-//@ footprint_dot_bounds
+//@ footprint_disc_bounds
         if (THICK_HERE) bounds.pr = -1.0f;
-//@ footprint_dot
-        if (THICK_HERE) record.dot_x = record.dot_y = 1e18f;
+//@ footprint_disc
+        if (THICK_HERE) record.disc_x = record.disc_y = 1e18f;

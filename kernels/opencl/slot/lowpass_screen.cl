@@ -1,15 +1,15 @@
 // Screen-space low-pass of 2DGS (Huang et al. 2024, eq. 11, sigma = sqrt(1/2) px): rho = min(rho_3d, 2 d^2) with d the distance in
-// pixels from the projected centre. It adds a disc around the centre (dot_*), rendered if the centre is beyond the near plane,
+// pixels from the projected centre. It adds a disc around the centre (disc_*), rendered if the centre is beyond the near plane,
 // independently of the ray-plane intersection.
 //@ bounds_make
         bounds.px = (float)center_x;
         bounds.py = (float)center_y;
         bounds.pr = pz >= near ? sqrt(half_r2 / (float)view->filter) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD : -1.0f;
-//@@ footprint_dot_bounds
+//@@ footprint_disc_bounds
 //@ bounds_span
-    float dot_low = fmax(y0 - b->py, -b->pr), dot_high = fmin(y1 - b->py, b->pr);
-    if (dot_low <= dot_high) {
-        float at = clamp(0.0f, dot_low, dot_high);
+    float disc_low = fmax(y0 - b->py, -b->pr), disc_high = fmin(y1 - b->py, b->pr);
+    if (disc_low <= disc_high) {
+        float at = clamp(0.0f, disc_low, disc_high);
         float half_chord = sqrt(fmax(b->pr * b->pr - at * at, 0.0f)) + BOUNDS_PAD;
         *x0 = fmin(*x0, b->px - half_chord);
         *x1 = fmax(*x1, b->px + half_chord);
@@ -20,69 +20,69 @@
         high = fmax(high, b->py + b->pr);
     }
 //@ project
-        record.dot_x = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
-        record.dot_y = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
-//@@ camera_dot
-//@@ footprint_dot
+        record.disc_x = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
+        record.disc_y = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
+//@@ camera_disc
+//@@ footprint_disc
 //@ cells_start
-    const float dot_square = s->dot_x < 1e17f ? (float)(half_r2 / filter) * (1.0f + 1e-4f) : -1.0f;   // -1: no disc
-//@ cells_dot
-            float dot_y = clamp((float)s->dot_y, y0, y1) - (float)s->dot_y, dot_rest = dot_square - dot_y * dot_y;
-            if (dot_rest >= 0.0f) {
-                float half_chord = sqrt(dot_rest) + CELLS_PAD;
-                low = fmin(low, (float)s->dot_x - half_chord);
-                high = fmax(high, (float)s->dot_x + half_chord);
+    const float disc_square = s->disc_x < 1e17f ? (float)(half_r2 / filter) * (1.0f + 1e-4f) : -1.0f;   // -1: no disc
+//@ cells_disc
+            float disc_y = clamp((float)s->disc_y, y0, y1) - (float)s->disc_y, disc_rest = disc_square - disc_y * disc_y;
+            if (disc_rest >= 0.0f) {
+                float half_chord = sqrt(disc_rest) + CELLS_PAD;
+                low = fmin(low, (float)s->disc_x - half_chord);
+                high = fmax(high, (float)s->disc_x + half_chord);
             }
-//@ blocks_dot
-        if (HAS_DOT(s)) {
-            vfloat dot_x = fmax(fabs(x - s->dot_x) - half_x - BLOCKS_PAD, (vfloat)0.0f);
-            vfloat dot_y = fmax(fabs(y - s->dot_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
-            outside &= VMASK(FMA(dot_x, dot_x, dot_y * dot_y) * filter > half_r2);
+//@ blocks_disc
+        if (HAS_DISC(s)) {
+            vfloat disc_x = fmax(fabs(x - s->disc_x) - half_x - BLOCKS_PAD, (vfloat)0.0f);
+            vfloat disc_y = fmax(fabs(y - s->disc_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
+            outside &= VMASK(FMA(disc_x, disc_x, disc_y * disc_y) * filter > half_r2);
         }
 //@ fragment_mask
 // A splat without a disc has it far away, or at NaN where the lens does not image the centre. Vectors of pixels skip it; for single
 // pixels the test costs as much as it saves.
-#define HAS_DOT(s) ((s)->dot_x < 1e17f)
+#define HAS_DISC(s) ((s)->disc_x < 1e17f)
 #if LANES > 1
-#define SKIPS_DOT(s) (!HAS_DOT(s))
+#define SKIPS_DISC(s) (!HAS_DISC(s))
 #else
-#define SKIPS_DOT(s) false
+#define SKIPS_DISC(s) false
 #endif
 
 static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y, wide half_r2, wide filter,
                                  vfloat *screen) {
     *screen = 0.0f;
-    if (SKIPS_DOT(s)) return c.inside;
-    vfloat ex = x - s->dot_x;
-    vfloat ey = y - s->dot_y;
+    if (SKIPS_DISC(s)) return c.inside;
+    vfloat ex = x - s->disc_x;
+    vfloat ey = y - s->disc_y;
     *screen = FMA(ex, ex, ey * ey) * filter;
     return c.inside | VMASK(*screen <= half_r2);
 }
 //@ fragment_half_rho
 static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat inverse_d, vfloat screen) {
     vfloat half_rho = (c.q * inverse_d) * inverse_d;
-    return SKIPS_DOT(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
+    return SKIPS_DISC(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
 }
-//@ dot_crossing
+//@ disc_crossing
     vfloat screen;              // rho / 2 of the low-pass disc
-//@ dot_mask
+//@ disc_mask
             c.screen = screen;
-//@ dot_attribute_depth
+//@ disc_attribute_depth
     // In the disc, the ray-plane intersection may be far outside of the splat. Beyond the circle rho = 2 ln 255, inside of which a splat
     // has at least 1/255 of its opacity, depths are reflected at the circle: the difference from the centre's depth is multiplied by
     // 2 ln 255 / rho and tends to 0 at the plane's horizon. Where the disc's rho is larger it defines the circle, which makes depth
     // continuous at the disc's border (docs/correctness.md).
-    if (HAS_DOT(s)) {
+    if (HAS_DISC(s)) {
         vfloat circle = VMAX(c.screen, (vfloat)WIDE(5.5412635451584261));
         vint on_plane = VMASK((c.q * inverse_d) * inverse_d <= circle), beyond_near = VMASK(c.d <= s->d_near);
-//@@ camera_dot_depth
-//@@ coplanar_dot_depth
+//@@ camera_disc_depth
+//@@ coplanar_disc_depth
         hit &= beyond_near;
         depth = VSELECT(FMA(circle * (depth_d - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center), depth, on_plane);
     }
-//@ dot_blocks_nearest
-        if (HAS_DOT(s)) min_depth = fmin(min_depth, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->nearest));
-//@ dot_depth_reach
+//@ disc_blocks_nearest
+        if (HAS_DISC(s)) min_depth = fmin(min_depth, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->nearest));
+//@ disc_depth_reach
 #ifndef BOX_HERE
 #define BOX_HERE false
 #endif
