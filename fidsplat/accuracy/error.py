@@ -55,16 +55,16 @@ def errors(image: ArrayLike, reference: ArrayLike) -> Errors:
     Raises:
         InputError: the shapes differ, there are no values, or one is not finite.
     """
-    found, wanted = np.asarray(image, np.float64), np.asarray(reference, np.float64)
-    if found.shape != wanted.shape:
-        raise InputError(f"image must have the shape {wanted.shape} of the reference, got {found.shape}")
+    found, expected = np.asarray(image, np.float64), np.asarray(reference, np.float64)
+    if found.shape != expected.shape:
+        raise InputError(f"image must have the shape {expected.shape} of the reference, got {found.shape}")
     if found.size == 0:
         raise InputError(f"image must have values to compare, got shape {found.shape}")
-    for name, values in (("image", found), ("reference", wanted)):
+    for name, values in (("image", found), ("reference", expected)):
         bad = values.size - int(np.isfinite(values).sum())
         if bad:
             raise InputError(f"{name} must be finite, got {bad} of {values.size} values that are not")
-    off = np.abs(found - wanted)
+    off = np.abs(found - expected)
     mean_square = float(np.mean(off**2))
     return Errors(
         maximum=float(off.max()),

@@ -213,11 +213,11 @@ def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], start
 
     Raises InputError if the file is missing, truncated or does not match the header.
     """
-    file, wanted = column_file(folder, name), npy_header(kind, shape)
+    file, header = column_file(folder, name), npy_header(kind, shape)
     size = NPY_HEADER + row_bytes(kind, shape[1:]) * shape[0]
     try:
         with open_input(file) as stream:
-            begins, found = stream.read(NPY_HEADER), os.fstat(stream.fileno()).st_size
+            start, found = stream.read(NPY_HEADER), os.fstat(stream.fileno()).st_size
     except InputError as error:
         raise InputError(f"{error}; the store is incomplete") from error
     if found < size:
@@ -227,7 +227,7 @@ def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], start
             f"{file} is truncated: it has {found} bytes of {size}, so that rows from {lost} on are missing, "
             f"from chunk {chunk} on; build the store again"
         )
-    if begins != wanted or found > size:
+    if start != header or found > size:
         raise InputError(
             f"{file} does not belong to this store, or its header is damaged; build the store again"
         )

@@ -126,11 +126,11 @@ def _by_moments(
         spread[:, i, j] = spread[:, j, i] = values - middle[i] * middle[j]
     sizes, vectors = np.linalg.eigh(spread)
     sigma = np.sqrt(np.maximum(sizes[:, ::-1], 1e-24))
-    turns = vectors[:, :, ::-1].copy()
-    turns[:, :, 2] = np.cross(turns[:, :, 0], turns[:, :, 1])
+    rotations = vectors[:, :, ::-1].copy()
+    rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
     opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
     copies = np.maximum(np.ceil(opacities / MAX_OPACITY), 1).astype(np.int64)
-    made = {"means": (base + middle).T, "quats": quaternions_of(turns), "scales": sigma[:, :2]}
+    made = {"means": (base + middle).T, "quats": quaternions_of(rotations), "scales": sigma[:, :2]}
     made["opacities"] = opacities / copies
     for name in {"colors", "sh"} & set(splats):
         flat = splats[name].reshape(count, -1).T.astype(np.float64)

@@ -75,13 +75,13 @@ class Extent:
     """factor on depths"""
 
     @staticmethod
-    def of(view: View, features: FeatureSet, least: float = 0.0) -> Extent | None:
-        """The extent of a view's splats, of at least `least` standard deviations; None if unbounded.
+    def of(view: View, features: FeatureSet, minimum: float = 0.0) -> Extent | None:
+        """The extent of a view's splats, of at least `minimum` standard deviations; None if unbounded.
 
         The low-pass `pixel` has no bound for distorted lenses (a fold stretches without limit), for parallel
         rays (an unbounded footprint) and for cut-offs as low as 1e-13.
         """
-        radius = max(cutoff_radius(view), least)
+        radius = max(cutoff_radius(view), minimum)
         # the dot of the low-pass, or the widening by EWA
         plain = Extent(radius, radius * view.samples + 2.0, radius)
         if not _widened(features):
@@ -238,9 +238,9 @@ def _max_ray_rotation(view: View) -> float:
         return 1.0 / min(view.focal_x, view.focal_y)
     angles = np.linspace(1e-6, lens.limit, 4096)
     slopes = lens.distance(angles + 1e-6) - lens.distance(angles - 1e-6)
-    least = min(float(slopes.min()) / 2e-6, float((lens.distance(angles) / np.sin(angles)).min()))
+    slope = min(float(slopes.min()) / 2e-6, float((lens.distance(angles) / np.sin(angles)).min()))
     # 5 % for the change between sampled angles
-    return math.inf if least < 0.05 else 1.05 / (least * min(view.focal_x, view.focal_y))
+    return math.inf if slope < 0.05 else 1.05 / (slope * min(view.focal_x, view.focal_y))
 
 
 @lru_cache(maxsize=8)

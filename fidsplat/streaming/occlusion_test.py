@@ -42,8 +42,8 @@ def occluded(
 
     boxes, reach: those of `in_frustum`.
     """
-    least, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, ends)
-    return least > _RangeMaximum(ends.depths).within(*spans)
+    keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, ends)
+    return keys > _RangeMaximum(ends.depths).within(*spans)
 
 
 def contributing_tiles(
@@ -54,9 +54,9 @@ def contributing_tiles(
     boxes, reach: those of `in_frustum`.
     """
     made = np.zeros(ends.depths.shape, bool)
-    least, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, ends)
-    for depth, top, bottom, left, right in zip(least, *spans, strict=True):
-        made[top:bottom, left:right] |= ends.depths[top:bottom, left:right] >= depth
+    keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, ends)
+    for key, top, bottom, left, right in zip(keys, *spans, strict=True):
+        made[top:bottom, left:right] |= ends.depths[top:bottom, left:right] >= key
     return made
 
 
@@ -111,12 +111,12 @@ def _projected_extent(
     low, high = _projected(view, *boxes(radius))
     wide = ewa_reach(view, features, radius, reach[:, None])
     if wide is not None:
-        least, most = _projected(view, *boxes(0.0))
+        low_center, high_center = _projected(view, *boxes(0.0))
         if not view.parallel:
             with np.errstate(divide="ignore", invalid="ignore"):
                 nearest = CameraBoxes(view, *boxes(0.0)).nearest(view)[:, None]
                 wide = np.where(nearest > 0, wide / nearest, np.inf)
-        low, high = np.minimum(low, least - wide), np.maximum(high, most + wide)
+        low, high = np.minimum(low, low_center - wide), np.maximum(high, high_center + wide)
     return low - margin, high + margin
 
 
@@ -124,8 +124,8 @@ def _projected(view: View, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
     """Bounds of the projected corners of boxes, (n, 2) samples each."""
     rounding = CameraBoxes(view, low, high).rounding[:, None] * math.sqrt(3.0)
     low, high = low - rounding, high + rounding
-    least = np.full((len(low), 2), np.inf)
-    most, nearest = -least, np.full(len(low), np.inf)
+    lowest = np.full((len(low), 2), np.inf)
+    highest, nearest = -lowest, np.full(len(low), np.inf)
     focal, center = np.array([view.focal_x, view.focal_y]), np.array([view.center_x, view.center_y])
     for corner in range(8):
         which = np.array([corner & 1, corner >> 1 & 1, corner >> 2], bool)
@@ -133,10 +133,10 @@ def _projected(view: View, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
         nearest = np.minimum(nearest, at[:, 2])
         with np.errstate(divide="ignore", invalid="ignore"):
             on = focal * (at[:, :2] if view.parallel else at[:, :2] / at[:, 2:]) + center
-        least, most = np.minimum(least, on), np.maximum(most, on)
+        lowest, highest = np.minimum(lowest, on), np.maximum(highest, on)
     if not view.parallel:
-        least[~(nearest > 0)], most[~(nearest > 0)] = -np.inf, np.inf
-    return least, most
+        lowest[~(nearest > 0)], highest[~(nearest > 0)] = -np.inf, np.inf
+    return lowest, highest
 
 
 class _RangeMaximum:
