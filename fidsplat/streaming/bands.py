@@ -77,37 +77,43 @@ class Band:
             made.__dict__["visible"] = self.visible
         return made
 
-    def without_occluded(self, ends: TerminationDepths) -> Band:
+    def without_occluded(self, termination: TerminationDepths) -> Band:
         """The same rows, without occluded nodes and subchunks."""
-        occluded = self.occluded(ends)
+        occluded = self.occluded(termination)
         nodes = tuple(a & ~b for a, b in zip(self.nodes, occluded, strict=True))
-        return self.with_nodes(nodes).without_occluded_subchunks(ends)
+        return self.with_nodes(nodes).without_occluded_subchunks(termination)
 
-    def without_occluded_subchunks(self, ends: TerminationDepths) -> Band:
+    def without_occluded_subchunks(self, termination: TerminationDepths) -> Band:
         """The same rows, rendered from those subchunks of its nodes that can contribute."""
         every = self.scene.subchunks(self.nodes)
-        masked = tuple((each, self._can_contribute(each, ends)) for each in every)
+        masked = tuple((each, self._can_contribute(each, termination)) for each in every)
         return self._with_cache(replace(self, subchunks=masked))
 
-    def missing_subchunks(self, ends: TerminationDepths, missing: NodeMasks) -> list[Subchunks]:
+    def missing_subchunks(self, termination: TerminationDepths, missing: NodeMasks) -> list[Subchunks]:
         """Subchunks that can contribute but are not rendered: of its own nodes and of missing nodes."""
-        own = [each.only(self._can_contribute(each, ends) & ~used) for each, used in self.subchunks or ()]
-        others = (each.only(self._can_contribute(each, ends)) for each in self.scene.subchunks(missing))
+        own = [
+            each.only(self._can_contribute(each, termination) & ~used) for each, used in self.subchunks or ()
+        ]
+        others = (
+            each.only(self._can_contribute(each, termination)) for each in self.scene.subchunks(missing)
+        )
         return [each for each in (*own, *others) if len(each.nodes)]
 
-    def contributing_tiles(self, subchunks: Sequence[Subchunks], ends: TerminationDepths) -> np.ndarray:
+    def contributing_tiles(
+        self, subchunks: Sequence[Subchunks], termination: TerminationDepths
+    ) -> np.ndarray:
         """(rows, columns) bool: tiles to which subchunks can contribute."""
-        made = np.zeros(ends.depths.shape, bool)
+        made = np.zeros(termination.depths.shape, bool)
         for each in subchunks:
-            made |= contributing_tiles(self.view, self.features, each.boxes, each.reach, ends)
+            made |= contributing_tiles(self.view, self.features, each.boxes, each.reach, termination)
         return made
 
-    def _can_contribute(self, subchunks: Subchunks, ends: TerminationDepths) -> np.ndarray:
+    def _can_contribute(self, subchunks: Subchunks, termination: TerminationDepths) -> np.ndarray:
         """(k,) bool: subchunks that are pinned, or in the frustum and not occluded."""
         if not len(subchunks.nodes):
             return np.zeros(0, bool)
         visible = in_frustum(self.view, self.features, subchunks.boxes, subchunks.reach)
-        visible &= ~occluded(self.view, self.features, subchunks.boxes, subchunks.reach, ends)
+        visible &= ~occluded(self.view, self.features, subchunks.boxes, subchunks.reach, termination)
         return visible | subchunks.pinned
 
     @cached_property
@@ -133,9 +139,9 @@ class Band:
         """Visible nodes from which it is not rendered."""
         return tuple(each & ~own for each, own in zip(self.visible, self.nodes, strict=True))
 
-    def occluded(self, ends: TerminationDepths) -> NodeMasks:
+    def occluded(self, termination: TerminationDepths) -> NodeMasks:
         """Nodes that are occluded, given termination depths."""
-        return occluded_nodes(self.scene, self.view, self.features, ends)
+        return occluded_nodes(self.scene, self.view, self.features, termination)
 
     def minimum_keys(self) -> tuple[np.ndarray, ...]:
         """(instances * nodes,) metres for each store: lower bounds on sort keys."""

@@ -61,10 +61,10 @@ class OcclusionCulling:
     def initial_guess(self, full: Band) -> Band:
         """The view with the chunks from which to render it first."""
         last = self._last
-        ends = None if last is None else _reprojected(*last, full.view)
-        if ends is None:
+        termination = None if last is None else _reprojected(*last, full.view)
+        if termination is None:
             return full.with_nodes(_nearest(full, full.nodes, _INITIAL_SPLATS))
-        return full.without_occluded(ends)
+        return full.without_occluded(termination)
 
     def render(
         self,
@@ -87,31 +87,33 @@ class OcclusionCulling:
             band, first_id = bands[-1], sum(each.count for each in bands[:-1])
             if not fits(band, first_id):
                 break
-            images, ends = render_band(band, first_id)
+            images, termination = render_band(band, first_id)
             if frame is not None:
                 copy_tiles(frame[0], images, tiles)
-                images, ends = frame[0], frame[1].replaced(tiles, ends)
-            self._last = full.view, ends
-            here = ends.within(tiles)
+                images, termination = frame[0], frame[1].replaced(tiles, termination)
+            self._last = full.view, termination
+            here = termination.within(tiles)
             missing = _without(band.missing, band.occluded(here))
             few = full.count_of(missing) <= bands[0].count // _PATCH_RATIO
             subchunks = band.missing_subchunks(here, missing) if few else []
             if few and not subchunks:
                 self._pause = _PAUSE if bands[0].count > _MAX_VISIBLE * full.count else 0
                 return bands, images
-            if few and _pixels_within_tiles(full.view, ends):
+            if few and _pixels_within_tiles(full.view, termination):
                 tiles = band.contributing_tiles(subchunks, here)
-                patch = full.with_rows(*_rows(tiles, full, ends)).without_occluded(ends.within(tiles))
+                patch = full.with_rows(*_rows(tiles, full, termination)).without_occluded(
+                    termination.within(tiles)
+                )
                 if patch.count <= bands[0].count // _PATCH_RATIO:
-                    bands, frame = [*bands, patch], (images, ends)
+                    bands, frame = [*bands, patch], (images, termination)
                     continue
             images = frame = None  # releases its buffers for the next pass
-            tiles, occluded = np.array(True), full.occluded(ends)
+            tiles, occluded = np.array(True), full.occluded(termination)
             missing = _without(bands[0].missing, occluded)
             visible = bands[0].count + full.count_of(missing)
             more = _nearest(full, missing, max(_INITIAL_SPLATS, int(_MAX_GROWTH * bands[0].count)))
             both = zip(_without(bands[0].nodes, occluded), more, strict=True)
-            bands = [full.with_nodes(tuple(a | b for a, b in both)).without_occluded_subchunks(ends)]
+            bands = [full.with_nodes(tuple(a | b for a, b in both)).without_occluded_subchunks(termination)]
             probe = max(full.count // _PROBE_SHARE, _PROBE_SPLATS)
             if visible > _MAX_VISIBLE * full.count and bands[0].count > probe:
                 break
@@ -119,15 +121,15 @@ class OcclusionCulling:
         return None
 
 
-def _rows(tiles: np.ndarray, full: Band, ends: TerminationDepths) -> tuple[int, int]:
+def _rows(tiles: np.ndarray, full: Band, termination: TerminationDepths) -> tuple[int, int]:
     """Rows of pixels [first, end) of a view that contain the selected tiles."""
-    rows, height = np.flatnonzero(tiles.any(axis=1)), ends.tile[0] // full.view.samples
+    rows, height = np.flatnonzero(tiles.any(axis=1)), termination.tile[0] // full.view.samples
     return max(int(rows[0]) * height, full.rows[0]), min((int(rows[-1]) + 1) * height, full.rows[1])
 
 
-def _pixels_within_tiles(view: View, ends: TerminationDepths) -> bool:
+def _pixels_within_tiles(view: View, termination: TerminationDepths) -> bool:
     """Whether all samples of each pixel are in one tile."""
-    return not any(side % view.samples for side in ends.tile)
+    return not any(side % view.samples for side in termination.tile)
 
 
 def _without(nodes: NodeMasks, others: NodeMasks) -> NodeMasks:
@@ -151,29 +153,29 @@ def _nearest(full: Band, nodes: NodeMasks, max_splats: int) -> NodeMasks:
     return tuple(made)
 
 
-def _reprojected(last: View, ends: TerminationDepths, view: View) -> TerminationDepths | None:
+def _reprojected(last: View, termination: TerminationDepths, view: View) -> TerminationDepths | None:
     """Guess of a view's termination depths: those of the previous view in the same directions, plus a
     multiple of the camera's motion. None where the views overlap by less than half."""
     if (last.width, last.height, last.parallel) != (view.width, view.height, view.parallel):
         return None
-    rows, columns = ends.depths.shape
-    depths = ends.depths
+    rows, columns = termination.depths.shape
+    depths = termination.depths
     if view.raster is None and not view.parallel:
         depths, overlaps = np.full_like(depths, -np.inf), []
         within = (np.arange(_SAMPLES_PER_TILE) + 0.5) / _SAMPLES_PER_TILE
         for down, right in product(within, within):
             y, x = np.mgrid[0:rows, 0:columns]
-            y, x = (y + down) * ends.tile[0], (x + right) * ends.tile[1]
+            y, x = (y + down) * termination.tile[0], (x + right) * termination.tile[1]
             ray = (x - view.center_x) / view.focal_x, (y - view.center_y) / view.focal_y, np.ones(x.shape)
             last_ray = np.stack(ray, -1) @ view.rotation @ last.rotation.T
             in_front = last_ray[..., 2] > 0
             z = np.where(in_front, last_ray[..., 2], 1.0)
-            column = (last_ray[..., 0] / z * last.focal_x + last.center_x) // ends.tile[1]
-            row = (last_ray[..., 1] / z * last.focal_y + last.center_y) // ends.tile[0]
+            column = (last_ray[..., 0] / z * last.focal_x + last.center_x) // termination.tile[1]
+            row = (last_ray[..., 1] / z * last.focal_y + last.center_y) // termination.tile[0]
             overlaps.append(in_front & (column >= 0) & (column < columns) & (row >= 0) & (row < rows))
             row, column = np.clip(row, 0, rows - 1).astype(int), np.clip(column, 0, columns - 1).astype(int)
-            depths = np.maximum(depths, np.where(in_front, ends.depths[row, column], np.inf))
+            depths = np.maximum(depths, np.where(in_front, termination.depths[row, column], np.inf))
         if np.mean(overlaps) < 0.5:
             return None
     moved = float(np.linalg.norm(view.rotation.T @ view.translation - last.rotation.T @ last.translation))
-    return replace(ends, depths=(depths + np.float32(_MOTION_SLACK * moved)).astype(np.float32))
+    return replace(termination, depths=(depths + np.float32(_MOTION_SLACK * moved)).astype(np.float32))

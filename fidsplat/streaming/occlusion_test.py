@@ -36,27 +36,27 @@ def minimum_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
 
 
 def occluded(
-    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TerminationDepths
+    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, termination: TerminationDepths
 ) -> np.ndarray:
     """(n,) bool: boxes none of whose splats can contribute to a frame with these termination depths.
 
     boxes, reach: those of `in_frustum`.
     """
-    keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, ends)
-    return keys > _RangeMaximum(ends.depths).within(*spans)
+    keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, termination)
+    return keys > _RangeMaximum(termination.depths).within(*spans)
 
 
 def contributing_tiles(
-    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TerminationDepths
+    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, termination: TerminationDepths
 ) -> np.ndarray:
     """(rows, columns) bool: tiles to which splats of the boxes can contribute, given termination depths.
 
     boxes, reach: those of `in_frustum`.
     """
-    made = np.zeros(ends.depths.shape, bool)
-    keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, ends)
+    made = np.zeros(termination.depths.shape, bool)
+    keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, termination)
     for key, top, bottom, left, right in zip(keys, *spans, strict=True):
-        made[top:bottom, left:right] |= ends.depths[top:bottom, left:right] >= key
+        made[top:bottom, left:right] |= termination.depths[top:bottom, left:right] >= key
     return made
 
 
@@ -67,31 +67,31 @@ def node_keys(scene: ChunkedSplats, view: View, features: FeatureSet) -> tuple[n
 
 
 def occluded_nodes(
-    scene: ChunkedSplats, view: View, features: FeatureSet, ends: TerminationDepths
+    scene: ChunkedSplats, view: View, features: FeatureSet, termination: TerminationDepths
 ) -> NodeMasks:
     """Masks of the nodes that are occluded in a frame with these termination depths, except pinned ones."""
     made = []
     for number, (store, pinned) in enumerate(zip(scene.stores, scene.pinned, strict=True)):
         reach = np.tile(store.nodes["reach"].astype(np.float64), store.instances)
-        made.append(occluded(view, features, partial(scene.boxes, number), reach, ends) & ~pinned)
+        made.append(occluded(view, features, partial(scene.boxes, number), reach, termination) & ~pinned)
     return tuple(made)
 
 
 def _tile_spans(
-    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TerminationDepths
+    view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, termination: TerminationDepths
 ) -> tuple[np.ndarray, ...]:
     """Rows [top, bottom) and columns [left, right) of the tiles that boxes can touch, (n,) int64 each."""
-    columns = ends.depths.shape[1]
+    columns = termination.depths.shape[1]
     first, end = (0, view.height) if view.band is None else view.band
-    band = first // ends.tile[0], -(-end // ends.tile[0])
+    band = first // termination.tile[0], -(-end // termination.tile[0])
     if view.raster is not None:
         return tuple(np.full(len(reach), side, np.int64) for side in (*band, 0, columns))
     low, high = _projected_extent(view, features, boxes, reach)
     with np.errstate(invalid="ignore"):
-        left = np.clip(np.floor((low[:, 0] - 1) / ends.tile[1]), 0, columns)
-        right = np.clip(np.floor(high[:, 0] / ends.tile[1]) + 1, 0, columns)
-        top = np.clip(np.floor((low[:, 1] - 1) / ends.tile[0]), *band)
-        bottom = np.clip(np.floor(high[:, 1] / ends.tile[0]) + 1, *band)
+        left = np.clip(np.floor((low[:, 0] - 1) / termination.tile[1]), 0, columns)
+        right = np.clip(np.floor(high[:, 0] / termination.tile[1]) + 1, 0, columns)
+        top = np.clip(np.floor((low[:, 1] - 1) / termination.tile[0]), *band)
+        bottom = np.clip(np.floor(high[:, 1] / termination.tile[0]) + 1, *band)
     return tuple(each.astype(np.int64) for each in (top, bottom, left, right))
 
 
