@@ -1,8 +1,8 @@
 // Compaction for clouds that are projected in chunks: appends the visible splats of a chunk to those of preceding chunks, in
 // order. The chunk is cut into CHUNKS pieces; the host adds up their counts.
 
-// Index space: one work-item per piece. Reads: keys. Writes: held[0 .. CHUNKS): splats of the piece in this band,
-// held[CHUNKS .. 2 * CHUNKS): splats of the piece in any band.
+// Index space: one work-item per piece. Reads: keys. Writes: piece_counts[0 .. CHUNKS): splats of the piece in this band,
+// piece_counts[CHUNKS .. 2 * CHUNKS): splats of the piece in any band.
 kernel void pack_count(
 //@@ arguments pack_count
 ) {
@@ -14,11 +14,11 @@ kernel void pack_count(
         packed += keys[k] < OUT_OF_BAND;
         visible += keys[k] != CULLED;
     }
-    held[piece] = packed;
-    held[CHUNKS + piece] = visible;
+    piece_counts[piece] = packed;
+    piece_counts[CHUNKS + piece] = visible;
 }
 
-// Index space: one work-item per piece. Reads: places (output index of each piece), splats, keys, windows.
+// Index space: one work-item per piece. Reads: piece_offsets (output index of each piece), splats, keys, windows.
 // Writes: splats_out, keys_out, windows_out.
 kernel void pack_move(
 //@@ arguments pack_move
@@ -26,12 +26,12 @@ kernel void pack_move(
     uint piece = get_global_id(0);
     if (piece >= CHUNKS) return;
     uint each = (count + CHUNKS - 1) / CHUNKS;
-    uint from = min(piece * each, count), to = min(from + each, count), place = places[piece];
+    uint from = min(piece * each, count), to = min(from + each, count), offset = piece_offsets[piece];
     for (uint k = from; k < to; k++)
         if (keys[k] < OUT_OF_BAND) {
-            splats_out[place] = splats[k];
-            keys_out[place] = keys[k];
-            windows_out[place] = windows[k];
-            place++;
+            splats_out[offset] = splats[k];
+            keys_out[offset] = keys[k];
+            windows_out[offset] = windows[k];
+            offset++;
         }
 }

@@ -18,7 +18,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
     uint i = get_global_id(0), item = get_local_id(0), first = get_group_id(0) * STEP_ITEMS;
     if (i < count) {
         const SplatGradient own = splat_gradient(
-            i, view, means, drawn_quats, drawn_scales, drawn_opacities, sh, all, splats, keys, windows, big_capacity, big_bounds, width,
+            i, view, means, activated_quats, activated_scales, activated_opacities, sh, all, splats, keys, windows, big_capacity, big_bounds, width,
             height, splat_slots, moments
         );
         if (counted) gradients[i] += own.screen;
@@ -43,10 +43,10 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         for (uint k = 3 * item, at = 3 * i; k < 3 * item + 48; k += 16, at += 16)
             vstore16(ADAM_16(means, at, vload16(0, by_means + k), (float16)size_means), 0, means + at);
         for (uint k = 2 * item, at = 2 * i; k < 2 * item + 32; k += 16, at += 16) {
-            float16 gradient = (vload16(0, by_scales + k) + scale_penalty) * vload16(0, drawn_scales + at);
+            float16 gradient = (vload16(0, by_scales + k) + scale_penalty) * vload16(0, activated_scales + at);
             float16 value = ADAM_16(log_scales, at, gradient, (float16)size_scales);
             vstore16(value, 0, log_scales + at);
-            vstore16(exp(value), 0, drawn_scales + at);
+            vstore16(exp(value), 0, activated_scales + at);
         }
         for (uint k = 4 * item, at = 4 * i; k < 4 * item + 64; k += 16, at += 16) {
             float16 q = vload16(0, quats + at), by = vload16(0, by_quats + k);
@@ -54,13 +54,13 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
             by = (by - turn * sums_of_4(turn * by)) / length;
             q = ADAM_16(quats, at, by, (float16)size_quats);
             vstore16(q, 0, quats + at);
-            vstore16(units(q), 0, drawn_quats + at);
+            vstore16(units(q), 0, activated_quats + at);
         }
-        float16 opacity = vload16(0, drawn_opacities + i);
+        float16 opacity = vload16(0, activated_opacities + i);
         float16 gradient = (vload16(0, by_opacities + item) + opacity_penalty) * opacity * (1.0f - opacity);
         float16 value = ADAM_16(logits, i, gradient, (float16)size_logits);
         vstore16(value, 0, logits + i);
-        vstore16(sigmoids(value), 0, drawn_opacities + i);
+        vstore16(sigmoids(value), 0, activated_opacities + i);
     }
 #else
     bool vectorized = false;
@@ -69,8 +69,8 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         for (uint k = 0; k < 3; k++) ADAM(means, 3 * i + k, by_means[3 * item + k], size_means);
         for (uint k = 0; k < 2; k++) {
             uint at = 2 * i + k;
-            ADAM(log_scales, at, (by_scales[2 * item + k] + scale_penalty) * drawn_scales[at], size_scales);
-            drawn_scales[at] = EXP(log_scales[at]);
+            ADAM(log_scales, at, (by_scales[2 * item + k] + scale_penalty) * activated_scales[at], size_scales);
+            activated_scales[at] = EXP(log_scales[at]);
         }
         float4 q = vload4(i, quats), by = vload4(item, by_quats);
         float length = sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w);
@@ -80,10 +80,10 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         ADAM(quats, 4 * i + 1, by.y, size_quats);
         ADAM(quats, 4 * i + 2, by.z, size_quats);
         ADAM(quats, 4 * i + 3, by.w, size_quats);
-        vstore4(unit(vload4(i, quats)), i, drawn_quats);
-        float opacity = drawn_opacities[i];
+        vstore4(unit(vload4(i, quats)), i, activated_quats);
+        float opacity = activated_opacities[i];
         ADAM(logits, i, (by_opacities[item] + opacity_penalty) * opacity * (1.0f - opacity), size_logits);
-        drawn_opacities[i] = sigmoid(logits[i]);
+        activated_opacities[i] = sigmoid(logits[i]);
     }
 
     // the rendered colours are the parameters themselves unless a degree is left out or they are plain
@@ -105,13 +105,13 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
             if (k == 0) size.s012 = size_sh;
             float16 value = ADAM_16(sh, row + k, by[k / 16], size);
             vstore16(value, 0, sh + row + k);
-            if (separate) vstore16(value, 0, drawn_sh + out + k);
+            if (separate) vstore16(value, 0, activated_sh + out + k);
         }
         float last[16];
         vstore16(by[k / 16 % 3], 0, last);
         for (; k < VALUES; k++) {
             float value = ADAM(sh, row + k, last[k % 16], k < 3 ? size_sh : size_rest);
-            if (separate) drawn_sh[out + k] = value;
+            if (separate) activated_sh[out + k] = value;
         }
     }
 #else
@@ -123,7 +123,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         float gradient = basis[TERMS_CAPACITY * which + within / 3] * by_colors[3 * which + within % 3];
         if (PLAIN) gradient = SH_C0 * sh[at] + 0.5f > 0.0f ? SH_C0 * gradient : 0.0f;
         float value = ADAM(sh, at, gradient, within < 3 ? size_sh : size_rest);
-        if (separate) drawn_sh[(size_t)first * VALUES + k] = PLAIN ? plain_color(value) : value;
+        if (separate) activated_sh[(size_t)first * VALUES + k] = PLAIN ? plain_color(value) : value;
     }
 #endif
 }

@@ -63,8 +63,8 @@ static inline void count_pairs(const Share *share, const Area *area, global cons
 
 // Index space: for each view a work-group for every GROUP_SPLATS splats.
 // Reads: windows, keys. Adds to: tallies.
-kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_gathered(
-//@@ arguments tally_gathered
+kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_local(
+//@@ arguments tally_local
 ) {
     local uint pair_counts[LOCAL_TILES];
     local int extents[4];
@@ -84,10 +84,10 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tally_gather
         if (pair_counts[place] != 0) atomic_add(tallies + area_tile(&area, place, tiles_x), pair_counts[place]);
 }
 
-// Index space: that of tally_gathered.
+// Index space: that of tally_local.
 // Reads: windows, keys, starts. Consumes: cursors of the band. Writes: pairs; adds to counts' number of visible splats.
-kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_gathered(
-//@@ arguments emit_gathered
+kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
+//@@ arguments emit_local
 ) {
     local uint pair_counts[LOCAL_TILES];
     local uint visible;

@@ -110,7 +110,7 @@ def test_a_picture_with_more_pairs_than_there_is_room_for_is_not_launched_as_the
         for _ in range(6):
             trainer.step()
         large = np.exp(trainer._work.store().values["log_scales"] + np.float32(2.5))
-        cl.enqueue_copy(on_groups.backend.queue, kernels._held["drawn_scales"], large)
+        cl.enqueue_copy(on_groups.backend.queue, kernels._held["activated_scales"], large)
         losses.append([trainer.step().loss for _ in range(3)])
         assert len(refused) == 1
     assert losses[0] == losses[1]

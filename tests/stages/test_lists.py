@@ -45,11 +45,9 @@ def test_no_splat_of_a_complete_image_is_outside_of_its_band(backend):
     assert not (trace["keys"] == CULLED - 1).any()
 
 
-@pytest.mark.parametrize(
-    ("lists", "budget"), [("ordered", 0), ("tiled", 0), ("gathered", 0), ("gathered", 5000)]
-)
+@pytest.mark.parametrize(("lists", "budget"), [("ordered", 0), ("tiled", 0), ("local", 0), ("local", 5000)])
 def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budget):
-    """gathered: few tiles, counted in local memory by groups of 4096 splats; a pair budget makes bands."""
+    """local: few tiles, counted in local memory by groups of 4096 splats; a pair budget makes bands."""
     cloud = random_splats(5000, seed=5, scale=(1e-3, 0.5))
     quality = fs.Quality(lowpass="none")
     captures = [
@@ -57,22 +55,22 @@ def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budge
         for x in (-1.0, 0.5)
     ]
     features, batch = prepare_batch(cloud, views_of(captures))
-    shape = listing(backend, "tiled" if lists == "gathered" else lists)
+    shape = listing(backend, "tiled" if lists == "local" else lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
     alone = [pipeline.render(resident, prepare(cloud, capture)[1]) for capture in captures]
-    gathered = tiling.launch_gathered
+    original = tiling.launch_local
     launched = []
 
-    def gather(self, kernel, **given):
+    def launch(self, kernel, **given):
         launched.append(kernel)
-        gathered(self, kernel, **given)
+        original(self, kernel, **given)
 
-    monkeypatch.setattr(tiling, "launch_gathered", gather)
+    monkeypatch.setattr(tiling, "launch_local", launch)
     if lists == "tiled":
-        monkeypatch.setattr(tiling, "GATHER_TILES", 0)
+        monkeypatch.setattr(tiling, "LOCAL_TILES", 0)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     batch_images = pipeline.render_batch(resident, batch)
-    assert (launched.count("emit_gathered") > (2 if budget else 0)) == (lists == "gathered")
+    assert (launched.count("emit_local") > (2 if budget else 0)) == (lists == "local")
     for name in ("visible", "pairs"):
         assert batch_images.stats[name] == sum(images.stats[name] for images in alone)
     for images, own in zip(batch_images.read("rgb"), alone, strict=True):
@@ -95,13 +93,13 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     pipeline, resident = backend.pipeline(features, listing(backend, "tiled")), backend.upload(cloud)
     expected = pipeline.render(resident, view)
     assert 1000 < expected.stats["visible"] < 2.2 * 4096
-    gathered, launched = tiling.launch_gathered, []
+    original, launched = tiling.launch_local, []
 
-    def gather(self, kernel, **given):
+    def launch(self, kernel, **given):
         launched.append(kernel)
-        gathered(self, kernel, **given)
+        original(self, kernel, **given)
 
-    monkeypatch.setattr(tiling, "launch_gathered", gather)
+    monkeypatch.setattr(tiling, "launch_local", launch)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     resident = backend.upload(cloud)
     resident.coherent = True
@@ -111,13 +109,13 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
         for name in ALL_OUTPUTS:
             assert np.array_equal(images.read(name), expected.read(name)), name
     # in bands each time; else twice, then replayed
-    assert launched.count("tally_gathered") == (3 if budget else 2)
+    assert launched.count("tally_local") == (3 if budget else 2)
     moved = replace(capture, camera=fs.Camera.look_at(641, 549, 1.0, (0.3, 0.0, 0.0), (0.0, 0.0, 3.0)))
     batch_images = pipeline.render_batch(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
     other = pipeline.render(backend.upload(cloud), prepare(cloud, moved)[1])
     for images, own in zip(batch_images.read("rgb"), (other, expected), strict=True):
         assert np.array_equal(images, own.read("rgb"))
-    assert launched.count("tally_gathered") > (3 if budget else 2)
+    assert launched.count("tally_local") > (3 if budget else 2)
 
 
 def test_lists_that_overflow_are_made_again(backend):

@@ -41,7 +41,7 @@ from fidsplat.util.files import kernels_folder
 _LISTS = {
     "ordered": ("scan", "sort", "bin"),
     "tiled": ("tile_lists",),
-    "gathered": ("tile_lists", "tile_lists_local"),
+    "local": ("tile_lists", "tile_lists_local"),
 }
 """stages of the program `lists`, by the way of listing"""
 _DRAWN = (
@@ -74,7 +74,7 @@ _WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
 _WIDE = re.compile(r"wide(?<=\bwide)\b")
 _EFFECT_ARGUMENTS = {
     **{name: name for name in ("project", "blend", "backdrop", "resolve", "project_backward")},
-    **{"blend_light": "blend_backward", "blend_backward": "blend_backward"},
+    **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward"},
 }
 """fields of `Layout` with the arguments that effects add to these kernels"""
 

@@ -115,7 +115,7 @@ class OpenCLBackend(Workspace, Backend):
 
     def termination_depths(self, images: OpenCLImages) -> TerminationDepths:
         """Termination depth per tile of a frame with the effect `termination_depths`."""
-        return images.tile_ends()
+        return images.termination_depths()
 
     def copy_tiles(self, images: OpenCLImages, other: OpenCLImages, tiles: np.ndarray) -> None:
         """Copy tiles of another frame of the same view into a frame."""

@@ -68,7 +68,7 @@ class FrameBuffers:
     """samples (4, s) float32: r, g, b, transmittance"""
     slots: cl.Buffer
     """index of each view in the output images (v) uint32"""
-    tile_ends: cl.Buffer
+    termination_depths: cl.Buffer
     """termination depth of each tile (t) uint32"""
 
 

@@ -143,7 +143,9 @@ LAYOUTS: dict[str, Layout] = {
     "shutter_rows": Layout("slot/shutter_rows.cl"),
     "blend_double": Layout(),
     "termination_depths": Layout(
-        blend=takes("in uint keys", "out uint tile_ends  // of each tile: the key at which it was finished")
+        blend=takes(
+            "in uint keys", "out uint termination_depths  // of each tile: the key at which it was finished"
+        )
     ),
     # what several of them share
     "cull_frustum": Layout("part/cull_frustum.cl"),

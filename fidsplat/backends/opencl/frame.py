@@ -47,8 +47,8 @@ def allocate_samples(frame: DeviceFrame) -> None:
     """Bind buffers for what the blend stage writes."""
     for one in frame.samples:
         frame.take(one.name, 4 * frame.numbers["channel_stride"] * one.channels)
-    if frame.takes("blend", "tile_ends"):
-        ends = frame.lease("tile_ends", 4 * frame.tiles)
+    if frame.takes("blend", "termination_depths"):
+        ends = frame.lease("termination_depths", 4 * frame.tiles)
         if frame.view.band is not None:
             cl.enqueue_fill_buffer(frame.queue, ends, _NEVER, 0, 4 * frame.tiles)
 

@@ -196,7 +196,9 @@ class OpenCLGradients(GradientPipeline):
             frame.take("reached", 4 * frame.tiles)
             frame.take("chunk_tiles", 4 * chunks)
             size = frame.tiles * shape.blend_items
-            frame.launch("blend backward", "blend_light", size, shape.blend_items, log_ceiling=log_ceiling)
+            frame.launch(
+                "blend backward", "blend_checkpoints", size, shape.blend_items, log_ceiling=log_ceiling
+            )
         else:
             frame.take("tapes", self._tape_bytes() * groups)
         items = backward_items(features, shape)

@@ -173,13 +173,13 @@ class OpenCLImages(Images):
             image = rendered.buffer(f"{name}_out")
             return read_uint8(self._workspace, image, self._shape(name), rendered.done())
 
-    def tile_ends(self) -> TerminationDepths:
+    def termination_depths(self) -> TerminationDepths:
         """Termination depths of a frame with that effect. Raises DeviceError as `read`."""
         with self._workspace.failing("rendering"):
             rendered, (grid, tile) = self.settle(), self._tiles
             keys = np.empty(grid, np.uint32)
             queue = self._workspace.read_queue
-            cl.enqueue_copy(queue, keys, rendered.buffer("tile_ends"), wait_for=rendered.done())
+            cl.enqueue_copy(queue, keys, rendered.buffer("termination_depths"), wait_for=rendered.done())
         return TerminationDepths.of_keys(keys, tile)
 
     def take_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:

@@ -116,7 +116,9 @@ _SURFACE = takes(
     _IMAGE_SIZE,
     "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
 )
-_DRAWN_SH = takes("uint count drawn all", "int plain")
+_DRAWN_SH = takes("uint count rendered all", "int plain")
+
+_ROTATION = "float " + " ".join(f"rotation_{row}{column}" for row in range(3) for column in range(3))
 
 KERNELS: dict[str, tuple[Argument, ...]] = {
     "project": takes(
@@ -134,9 +136,9 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out uint big  // splats that touch more than a window",
         "out Bounds big_bounds",
     ),
-    "pack_count": takes("uint count", "in uint keys", "out uint held"),
+    "pack_count": takes("uint count", "in uint keys", "out uint piece_counts"),
     "pack_move": takes(
-        *("uint count", "in uint places", "in Splat splats", "in uint keys", "in uint2 windows"),
+        *("uint count", "in uint piece_offsets", "in Splat splats", "in uint keys", "in uint2 windows"),
         *("out Splat splats_out", "out uint keys_out", "out uint2 windows_out"),
     ),
     "scan_chunks": takes("uint bins", "out uint table totals"),
@@ -162,8 +164,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
         *("out uint counts cursors", "out uint2 pairs"),
     ),
-    "tally_gathered": takes("uint count", _SIZE, "in uint2 windows", "in uint keys", "out uint tallies"),
-    "emit_gathered": takes(
+    "tally_local": takes("uint count", _SIZE, "in uint2 windows", "in uint keys", "out uint tallies"),
+    "emit_local": takes(
         *("uint count first_band", _SIZE, "int band_first band_end", "uint capacity"),
         *("in uint2 windows", "in uint keys starts", "out uint counts cursors", "out uint2 pairs"),
     ),
@@ -181,7 +183,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *(_SIZE, "int stride", "uint channel_stride", RAY_UNIFORMS),
         uniforms(
             "rotation",
-            "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
+            _ROTATION,
             note="world to camera",
         ),
         "out float raw",
@@ -238,14 +240,14 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float quats first_quats second_quats",
         "out float logits first_logits second_logits",
         "out float sh first_sh second_sh",
-        "out float drawn_quats drawn_scales drawn_opacities drawn_sh",
+        "out float activated_quats activated_scales activated_opacities activated_sh",
     ),
     "add_up": takes(
         *("uint tiles groups", "in real tile_sums group_sums  // (tiles, 3), (groups, 6)"),
         "out float background pose",
     ),
     # training
-    "loss_take": takes(_LOSS_SIZE, "in float rgb", "in uchar truth", _MASK, _IMAGES),
+    "loss_take": takes(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),
     "loss_rows": takes(_LOSS_SIZE, _IMAGES),
     "loss_columns": takes(_LOSS_SIZE, _IMAGES),
     "loss_rows_backward": takes(_LOSS_SIZE, _IMAGES),
@@ -254,11 +256,11 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "loss_sums": takes("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
     "loss_strips": takes(
-        *(_LOSS_SIZE, "in float rgb", "in uchar truth", _MASK),
+        *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
         *(_IMAGES, "out float sums  // (work-groups, 3)"),
     ),
     "loss_strips_backward": takes(
-        *(_LOSS_SIZE, "in float rgb", "in uchar truth", _MASK),
+        *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
         *("float l1_share ssim_share", "in float images", "out float by_rgb"),
     ),
     "surface_normals": takes(
@@ -273,27 +275,27 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "activate": takes(
         "uint count",
         "in float quats log_scales logits",
-        "out float drawn_quats drawn_scales drawn_opacities",
+        "out float activated_quats activated_scales activated_opacities",
     ),
-    "activate_sh": takes(_DRAWN_SH, "in float sh", "out float drawn_sh"),
-    "pick": takes(
-        "uint count row kept",
+    "activate_sh": takes(_DRAWN_SH, "in float sh", "out float activated_sh"),
+    "gather_rows": takes(
+        "uint count row copied",
         "in uint rows",
-        "in float before",
-        "out float picked",
+        "in float source",
+        "out float gathered",
     ),
-    "count_seen": takes(
+    "count_visible": takes(
         "uint count",
-        "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
-        "float move_x move_y move_z  // camera-space position of the means' zero [m]",
+        _ROTATION,
+        "float translation_x translation_y translation_z  // camera-space position of the means' zero [m]",
         "float focal_x focal_y center_x center_y near width height",
-        "in float means drawn_scales",
+        "in float means activated_scales",
         "out float seen",
     ),
-    "shake": takes(
+    "add_position_noise": takes(
         "uint count seed_low seed_high iteration purpose",
         "float size  // metres times 1 / m^2 of the steps",
-        "float steep clear  // of the opacity beyond which splats stay where they are",
+        "float slope threshold  // of the opacity above which splats do not move",
         "in float quats log_scales logits",
         "out float means",
     ),
@@ -302,7 +304,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
 
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": _RESERVED,
-    "blend_light": takes(
+    "blend_checkpoints": takes(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
         "out float checkpoints  // of each pixel of CHUNK splats: light in front, its worth behind",
         "out uint reached  // (tiles) chunks that light comes to",

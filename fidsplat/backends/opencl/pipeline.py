@@ -81,7 +81,7 @@ class OpenCLPipeline(Pipeline):
             if cached is not None and (images := self._replay(resident, view, cached)) is not None:
                 return images
             if resident.coherent and self.shape.lists == "tiled":
-                return self._listing("gathered").render(resident, view)
+                return self._listing("local").render(resident, view)
             plan = self._planner.frame(resident, view)
             if plan.chunk and self.shape.lists != "ordered":
                 # chunks are rendered by one strategy only: where memory is short, sorting is fastest
@@ -301,8 +301,8 @@ class OpenCLPipeline(Pipeline):
             return self
         if plan.chunk:
             return self._listing("ordered")  # as `render`
-        few = stack is not None and self._planner.tiles(stack.view) <= tiling.GATHER_TILES
-        return self._listing("gathered") if few or resident.coherent else self
+        few = stack is not None and self._planner.tiles(stack.view) <= tiling.LOCAL_TILES
+        return self._listing("local") if few or resident.coherent else self
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one frame and return what the stages pass on.

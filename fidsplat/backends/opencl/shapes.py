@@ -16,7 +16,7 @@ class DeviceShape:
     """`lanes` (a tile per work-item, vectors across pixels) or `group` (a work-group per tile)."""
     lists: str
     """`ordered` (sort the splats by depth, then list them per tile in that order), `tiled` (list them per
-    tile, then sort each list) or `gathered` (as `tiled`, of many views of few tiles, and of stores)."""
+    tile, then sort each list) or `local` (as `tiled`, of many views of few tiles, and of stores)."""
     lanes: int
     tile_width: int
     tile_height: int

@@ -3,7 +3,7 @@
 On CPUs (`ordered`) all visible splats are sorted by depth, then listed per tile in that order, by counting
 sorts over a few contiguous chunks: long sequential loops and no atomics. On GPUs (`tiled`) the projection
 counts the splats of each tile, pairs of splats and tiles are written in any order, and each tile's list is
-sorted in local memory: few kernels, all of them wide. For many small views and for stores (`gathered`), tiles
+sorted in local memory: few kernels, all of them wide. For many small views and for stores (`local`), tiles
 are counted for thousands of splats at a time in local memory, since atomics of neighbouring splats on one
 tile's counter serialise. devlog/growth.md compares the strategies on both kinds of device.
 """
@@ -24,9 +24,9 @@ from fidsplat.backends.opencl.memory_plan import BIG, KEYS, WINDOWS
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
-GATHER_TILES = 4096
+LOCAL_TILES = 4096
 """most tiles of a view that are counted in local memory (as in tile_lists_local.cl)"""
-_GATHERED = 4096
+_GROUP_SPLATS = 4096
 """splats of a work-group there"""
 _ITEMS = 256
 """BIN_ITEMS and SORT_ITEMS"""
@@ -195,9 +195,9 @@ def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Pack
     for start in range(0, count, chunk):
         stop = min(start + chunk, count)
         project(frame, start, stop)
-        frame.take("held", 8 * chunks)
+        frame.take("piece_counts", 8 * chunks)
         frame.launch("project", "pack_count", chunks, 1, count=stop - start)
-        counts = frame.read("held", np.uint32, (2, chunks)).astype(np.int64)
+        counts = frame.read("piece_counts", np.uint32, (2, chunks)).astype(np.int64)
         visible += int(counts[1].sum())
         places = np.concatenate([[0], np.cumsum(counts[0])]) + total
         total = int(places[-1])
@@ -206,7 +206,7 @@ def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Pack
         big = int(frame.read("tallies", np.uint32, (_TALLIES,))[_BIG])
         if big > frame.numbers["big_capacity"]:
             return Packed(total, visible), big
-        frame.put("places", places[:-1].astype(np.uint32))
+        frame.put("piece_offsets", places[:-1].astype(np.uint32))
         frame.launch("project", "pack_move", chunks, 1, count=stop - start, **out)
     return Packed(total, visible), 0
 
@@ -240,8 +240,8 @@ def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
     allocate_tallies(frame, _TALLIES + frame.tiles, big)
     project(frame, 0, count)
     frame.launch("bin", "tally_big", _big_groups(frame) * _ITEMS, _ITEMS, count=count)
-    if frame.shape.lists == "gathered":
-        launch_gathered(frame, "tally_gathered")
+    if frame.shape.lists == "local":
+        launch_local(frame, "tally_local")
 
 
 def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
@@ -259,9 +259,9 @@ def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band:
     frame.take("lists", 4 * capacity)
     count, views, groups = frame.resident.count, frame.views, _big_groups(frame)
     given = {"band_first": band.first, "band_end": band.end, "capacity": capacity, "first_band": first_band}
-    if frame.shape.lists == "gathered":  # big splats, then all others
+    if frame.shape.lists == "local":  # big splats, then all others
         frame.launch("bin", "emit", groups * _ITEMS, _ITEMS, views, count=count, splat_groups=0, **given)
-        launch_gathered(frame, "emit_gathered", **given)
+        launch_local(frame, "emit_local", **given)
     else:
         splat_groups = -(-count // _ITEMS)
         items = (splat_groups + -(-groups // views)) * _ITEMS
@@ -279,11 +279,11 @@ def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
     return [TileBand(*band) for band in cut(tallies[_TALLIES:], budget)]
 
 
-def launch_gathered(frame: DeviceFrame, kernel: str, **given: Any) -> None:
+def launch_local(frame: DeviceFrame, kernel: str, **given: Any) -> None:
     """Submit a kernel of tile_lists_local.cl."""
     count, items = frame.resident.count, frame.shape.scan_items
     if count:
-        groups = -(-count // _GATHERED)
+        groups = -(-count // _GROUP_SPLATS)
         frame.launch("bin", kernel, groups * items, items, frame.views, count=count, **given)
 
 

@@ -135,8 +135,10 @@ class OpenCLTraining(TrainingKernels):
             made = len(rows), *shape[1:]
             picked = self._workspace.pool.fresh(f"the splats' {name}", 4 * math.prod(made))
             remembered = name.startswith(_REMEMBERED)
-            given = {"row": math.prod(shape[1:]), "kept": kept if remembered else len(rows)}
-            self._launch("pick", math.prod(made), given | {"before": self._held[name], "picked": picked})
+            given = {"row": math.prod(shape[1:]), "copied": kept if remembered else len(rows)}
+            self._launch(
+                "gather_rows", math.prod(made), given | {"source": self._held[name], "gathered": picked}
+            )
             self._held[name], self._shapes[name] = picked, made
         self._begin()
 
@@ -175,16 +177,16 @@ class OpenCLTraining(TrainingKernels):
             sizes = {"quats": 4, "scales": 2, "opacities": 1} | ({} if itself else {"sh": 3 * drawn})
             for name, floats in sizes.items():
                 size = 4 * count * floats
-                self._held[f"drawn_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
-            self._held |= {"drawn": drawn, "all": every, "plain": int(degree == 0)}
+                self._held[f"activated_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
+            self._held |= {"rendered": drawn, "all": every, "plain": int(degree == 0)}
             self._launch("activate", count)
             if itself:
-                self._held["drawn_sh"] = self._held["sh"]
+                self._held["activated_sh"] = self._held["sh"]
             else:
                 self._launch("activate_sh", 3 * count * drawn)
-            buffers = {name: self._held[f"drawn_{name}"] for name in ("quats", "scales", "opacities")}
+            buffers = {name: self._held[f"activated_{name}"] for name in ("quats", "scales", "opacities")}
             buffers["means"] = self._held["means"]
-            buffers["colors" if degree == 0 else "sh"] = self._held["drawn_sh"]
+            buffers["colors" if degree == 0 else "sh"] = self._held["activated_sh"]
             self._drawn, self._version = (degree, ResidentArrays(buffers, count, degree, origin)), object()
         return self._drawn[1]
 
@@ -200,7 +202,7 @@ class OpenCLTraining(TrainingKernels):
         slot, room = sums.take()
         slope = self._array("by_rgb", (height, columns, 3))
         given = {
-            **{"rgb": rgb, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
+            **{"rgb": rgb, "target": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
             **{"l1_share": (1 - dssim_weight) / number, "sums": room, "by_rgb": slope.data},
         }
 
@@ -279,13 +281,13 @@ class OpenCLTraining(TrainingKernels):
         if (known := self._sights.get(camera)) is None or known[0] is not origin:
             known = self._sights[camera] = origin, _sight(camera, origin)
         given = known[1]
-        self._replay("count", (), given, lambda: [self._items("count_seen", self._count, given)])
+        self._replay("count", (), given, lambda: [self._items("count_visible", self._count, given)])
 
     def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
         """As `TrainingKernels`."""
         names = ("seed_low", "seed_high", "iteration", "purpose")
-        given = {"size": size, "steep": steep, "clear": clear, **dict(zip(names, words, strict=True))}
-        self._launch("shake", self._count, given)
+        given = {"size": size, "slope": steep, "threshold": clear, **dict(zip(names, words, strict=True))}
+        self._launch("add_position_noise", self._count, given)
 
     @property
     def _queue(self) -> cl.CommandQueue:
@@ -372,11 +374,11 @@ class OpenCLTraining(TrainingKernels):
 
 
 def _sight(camera: Camera, origin: np.ndarray) -> dict[str, float]:
-    """Arguments of the kernel `count_seen`."""
+    """Arguments of the kernel `count_visible`."""
     turn = camera.world_to_camera[:3, :3]
-    names = [f"turn_{i}{j}" for i in range(3) for j in range(3)]
+    names = [f"rotation_{i}{j}" for i in range(3) for j in range(3)]
     given = dict(zip(names, turn.ravel().tolist(), strict=True))
     move = turn @ (origin - camera.position)
-    given |= dict(zip(("move_x", "move_y", "move_z"), move.tolist(), strict=True))
+    given |= dict(zip(("translation_x", "translation_y", "translation_z"), move.tolist(), strict=True))
     given |= {"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy}
     return given | {"near": camera.near, "width": camera.width, "height": camera.height}

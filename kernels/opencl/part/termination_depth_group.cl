@@ -1,5 +1,5 @@
 // Termination depths of tiles for GPUs (part/termination_depth_lanes.cl), per batch of splats. The last batch is followed by no vote.
 //@ group_start
-    if (item == 0) tile_ends[tile] = UINT_MAX;
+    if (item == 0) termination_depths[tile] = UINT_MAX;
 //@ voted
-        if (!alive && item == 0 && batch > start) tile_ends[tile] = keys[lists[batch - 1]];
+        if (!alive && item == 0 && batch > start) termination_depths[tile] = keys[lists[batch - 1]];

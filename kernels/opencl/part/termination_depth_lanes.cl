@@ -5,4 +5,4 @@
 //@ tile_loop_chunk
         last_read = chunk + length - 1;
 //@ pass_end
-    tile_ends[tile] = !alive && last_read != UINT_MAX ? keys[lists[last_read]] : UINT_MAX;
+    termination_depths[tile] = !alive && last_read != UINT_MAX ? keys[lists[last_read]] : UINT_MAX;

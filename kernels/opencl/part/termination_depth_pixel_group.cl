@@ -7,4 +7,4 @@
         if (px < width && py + row < height)
             atomic_max(&furthest, sortable(convert_float_rtp(pixel_termination(&pixels[row], &constants))));
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) tile_ends[tile] = furthest;
+    if (item == 0) termination_depths[tile] = furthest;

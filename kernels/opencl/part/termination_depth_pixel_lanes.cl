@@ -6,4 +6,4 @@
     float lane_depths[LANES];
     VSTORE(furthest, lane_depths);
     for (int lane = 1; lane < LANES; lane++) lane_depths[0] = fmax(lane_depths[0], lane_depths[lane]);
-    tile_ends[tile] = on_picture ? sortable(lane_depths[0]) : UINT_MAX;
+    termination_depths[tile] = on_picture ? sortable(lane_depths[0]) : UINT_MAX;

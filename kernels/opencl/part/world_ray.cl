@@ -11,9 +11,9 @@ kernel void backdrop(
     float ray_x = ((float)x + 0.5f - ray_center_x) / ray_focal_x;
     float ray_y = ((float)y + 0.5f - ray_center_y) / ray_focal_y, ray_z = 1.0f;
 //@@ backdrop_ray
-    float world_x = FMA(turn_00, ray_x, FMA(turn_10, ray_y, turn_20 * ray_z));
-    float world_y = FMA(turn_01, ray_x, FMA(turn_11, ray_y, turn_21 * ray_z));
-    float world_z = FMA(turn_02, ray_x, FMA(turn_12, ray_y, turn_22 * ray_z));
+    float world_x = FMA(rotation_00, ray_x, FMA(rotation_10, ray_y, rotation_20 * ray_z));
+    float world_y = FMA(rotation_01, ray_x, FMA(rotation_11, ray_y, rotation_21 * ray_z));
+    float world_z = FMA(rotation_02, ray_x, FMA(rotation_12, ray_y, rotation_22 * ray_z));
     float behind[3];
 //@@ backdrop
     float transmittance = raw[3 * (size_t)channel_stride + at];

@@ -1,4 +1,4 @@
-// Backward pass of blending for GPUs, in two kernels. `blend_light` loops over each tile's list once, front to back, and stores a
+// Backward pass of blending for GPUs, in two kernels. `blend_checkpoints` loops over each tile's list once, front to back, and stores a
 // checkpoint per pixel and CHUNK splats: the transmittance in front of them, and the gradient by the light behind them. Chunks are
 // then independent: each work-group of `blend_backward` processes one, so that long lists occupy many groups. Sums over
 // work-items are per splat, in a fixed order and without atomics.
@@ -52,8 +52,8 @@ static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
 // Reads:  splats, lists, starts[tiles + 1], and the gradients of the images.
 // Writes: checkpoints of all pixels and reached chunks; reached, chunk_tiles; tile_sums.
-kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
-//@@ arguments blend_light
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints(
+//@@ arguments blend_checkpoints
 ) {
     local Staged staged[STAGED];
     local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // [row of cells][splat]: a byte of bits, one per cell that the splat overlaps

@@ -6,34 +6,34 @@ kernel void activate(
 ) {
     size_t i = get_global_id(0);
     if (i >= count) return;
-    vstore4(unit(vload4(i, quats)), i, drawn_quats);
-    for (size_t k = 2 * i; k < 2 * i + 2; k++) drawn_scales[k] = EXP(log_scales[k]);
-    drawn_opacities[i] = sigmoid(logits[i]);
+    vstore4(unit(vload4(i, quats)), i, activated_quats);
+    for (size_t k = 2 * i; k < 2 * i + 2; k++) activated_scales[k] = EXP(log_scales[k]);
+    activated_opacities[i] = sigmoid(logits[i]);
 }
 
 // Index space: one work-item per splat and rendered coefficient of a channel. Reads: sh, of `all` coefficients. Writes: the first
-// `drawn` of them, packed; at degree 0, if `plain`, the RGB colours.
+// `rendered` of them, packed; at degree 0, if `plain`, the RGB colours.
 kernel void activate_sh(
 //@@ arguments activate_sh
 ) {
     uint k = get_global_id(0);
-    if (k >= count * 3 * drawn) return;
-    float value = sh[k / (3 * drawn) * 3 * all + k % (3 * drawn)];
-    drawn_sh[k] = plain ? plain_color(value) : value;
+    if (k >= count * 3 * rendered) return;
+    float value = sh[k / (3 * rendered) * 3 * all + k % (3 * rendered)];
+    activated_sh[k] = plain ? plain_color(value) : value;
 }
 
 // Index space: one work-item per splat. Reads: means, scales. Updates: the number of frames in whose frustum the splat was, by a
 // sphere of three standard deviations.
-kernel void count_seen(
-//@@ arguments count_seen
+kernel void count_visible(
+//@@ arguments count_visible
 ) {
     size_t i = get_global_id(0);
     if (i >= count) return;
     float3 p = vload3(i, means);
-    float x = turn_00 * p.x + turn_01 * p.y + turn_02 * p.z + move_x;
-    float y = turn_10 * p.x + turn_11 * p.y + turn_12 * p.z + move_y;
-    float z = turn_20 * p.x + turn_21 * p.y + turn_22 * p.z + move_z;
-    float reach = 3.0f * fmax(drawn_scales[2 * i], drawn_scales[2 * i + 1]);
+    float x = rotation_00 * p.x + rotation_01 * p.y + rotation_02 * p.z + translation_x;
+    float y = rotation_10 * p.x + rotation_11 * p.y + rotation_12 * p.z + translation_y;
+    float z = rotation_20 * p.x + rotation_21 * p.y + rotation_22 * p.z + translation_z;
+    float reach = 3.0f * fmax(activated_scales[2 * i], activated_scales[2 * i + 1]);
     // pixels times depth, so that nothing is divided by a depth of 0
     float u = focal_x * x + center_x * z, v = focal_y * y + center_y * z;
     bool inside = z > near && u + focal_x * reach > 0.0f && u - focal_x * reach < width * z && v + focal_y * reach > 0.0f

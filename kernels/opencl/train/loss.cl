@@ -17,10 +17,10 @@ kernel void loss_take(
     int column = get_global_id(0), row = get_global_id(1);
     if (column >= width || row >= height) return;
     size_t from = (size_t)row * width + column, to = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column;
-    float target = truth[from] * (1.0f / 255);
+    float target_value = target[from] * (1.0f / 255);
     bool counts = !masked || mask[(size_t)row * (width / 3) + column / 3];
-    images[to] = counts ? rgb[from] : target;
-    images[image_stride + to] = target;
+    images[to] = counts ? rgb[from] : target_value;
+    images[image_stride + to] = target_value;
 }
 
 // Index space: (LANES values, rows). Reads: images 0 and 1 (a and b). Writes: images 2 to 6, the row-wise means of a, b, a a, b b,

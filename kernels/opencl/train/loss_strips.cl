@@ -10,22 +10,22 @@
 // Loads a row of the render and of the target from `column` - MARGIN on, zeros outside of the image. Where the mask is 0 the render
 // is replaced by the target.
 static inline void load_row(
-    float *a, float *b, int column, int width, global const float *rgb, global const uchar *truth, int masked,
+    float *a, float *b, int column, int width, global const float *rgb, global const uchar *target, int masked,
     global const uchar *mask
 ) {
     for (int k = 0; k < PANEL + 2 * MARGIN; k += LANES) {
         int from = column - MARGIN + k;
         if (!masked && from >= 0 && from + LANES <= width) {
             VSTORE(VLOAD(rgb + from), a + k);
-            VSTORE(VFLOAT(VLOAD(truth + from)) * (1.0f / 255), b + k);
+            VSTORE(VFLOAT(VLOAD(target + from)) * (1.0f / 255), b + k);
             continue;
         }
         for (int lane = 0; lane < LANES; lane++) {
             int at = from + lane;
             bool inside = at >= 0 && at < width;
-            float target = inside ? truth[at] * (1.0f / 255) : 0.0f;
-            b[k + lane] = target;
-            a[k + lane] = inside && (!masked || mask[at / 3]) ? rgb[at] : target;
+            float target_value = inside ? target[at] * (1.0f / 255) : 0.0f;
+            b[k + lane] = target_value;
+            a[k + lane] = inside && (!masked || mask[at / 3]) ? rgb[at] : target_value;
         }
     }
 }
@@ -50,7 +50,7 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
     for (int row = first - RADIUS; row < end + RADIUS; row++) {
         bool there = row >= 0 && row < height;
         size_t from = there ? (size_t)row * width : 0;
-        load_row(a, b, left, there ? width : 0, rgb + from, truth + from, masked, mask + from / 3);
+        load_row(a, b, left, there ? width : 0, rgb + from, target + from, masked, mask + from / 3);
         vfloat differences = 0, squares = 0;
         for (int vector = 0; vector < VECTORS; vector++) {
             vfloat sum_a = 0, sum_b = 0, sum_aa = 0, sum_bb = 0, sum_ab = 0;
@@ -133,7 +133,7 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips_backward(
         for (int k = 0; k < TAPS; k++) rows[k] = means[(y - RADIUS + k + TAPS) % TAPS];
         float a[PANEL + 2 * MARGIN], b[PANEL + 2 * MARGIN];
         size_t at = (size_t)y * width;
-        load_row(a, b, left, width, rgb + at, truth + at, masked, mask + at / 3);
+        load_row(a, b, left, width, rgb + at, target + at, masked, mask + at / 3);
         for (int vector = 0, column = left; vector < VECTORS && column < width; vector++, column += LANES) {
             vfloat by_mean = 0, by_variance = 0, by_shared = 0;
 #pragma unroll
@@ -144,8 +144,8 @@ kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips_backward(
                 by_variance = FMA(w, terms[1], by_variance);
                 by_shared = FMA(w, terms[2], by_shared);
             }
-            vfloat x = VLOAD(a + MARGIN + vector * LANES), target = VLOAD(b + MARGIN + vector * LANES);
-            vfloat slope = sign(x - target) * l1_share - (by_mean + 2.0f * x * by_variance + target * by_shared) * ssim_share;
+            vfloat x = VLOAD(a + MARGIN + vector * LANES), target_value = VLOAD(b + MARGIN + vector * LANES);
+            vfloat slope = sign(x - target_value) * l1_share - (by_mean + 2.0f * x * by_variance + target_value * by_shared) * ssim_share;
             if (!masked && column + LANES <= width) {
                 VSTORE(slope, by_rgb + at + column);
                 continue;

@@ -12,8 +12,8 @@ static inline uint4 philox(uint4 c, uint k0, uint k1) {
 }
 
 // Index space: one work-item per splat. Reads: the other parameters. Updates: means.
-kernel void shake(
-//@@ arguments shake
+kernel void add_position_noise(
+//@@ arguments add_position_noise
 ) {
     size_t i = get_global_id(0);
     if (i >= count) return;
@@ -27,7 +27,7 @@ kernel void shake(
     float3 along = {1.0f - 2.0f * (y * y + z * z), 2.0f * (x * y + w * z), 2.0f * (x * z - w * y)};
     float3 across = {2.0f * (x * y - w * z), 1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z + w * x)};
     float2 s = exp(vload2(i, log_scales));
-    float fade = 1.0f / (1.0f + exp(steep * (sigmoid(logits[i]) - clear)));
+    float fade = 1.0f / (1.0f + exp(slope * (sigmoid(logits[i]) - threshold)));
     float3 offset = along * (dot(along, sample) * s.x * s.x) + across * (dot(across, sample) * s.y * s.y);
     vstore3(vload3(i, means) + offset * (fade * size), i, means);
 }
