@@ -29,12 +29,12 @@ class DifferentiableImages:
 
     def __init__(self, picture: Any, images: Images) -> None:
         self.picture, self.images = picture, images
-        self._number = picture.workspace.pictures
+        self._number = picture.workspace.frames
 
     @property
     def last(self) -> bool:
         """Whether no other picture has been begun on the device since."""
-        return self.picture.workspace.pictures == self._number
+        return self.picture.workspace.frames == self._number
 
     def read(self, name: str) -> np.ndarray:
         """The image as a NumPy array of its own."""

@@ -26,17 +26,17 @@ def compact(
     drawn: wp.array(dtype=wp.int32),  # (n)
     places: wp.array(dtype=wp.int32),  # (n) inclusive sums of drawn
     totals: wp.array(dtype=wp.int64),  # (2) splats drawn, pairs
-    room: int,  # for so many of those drawn, at most n; the rest is left out
+    capacity: int,  # of the outputs, at most n; further splats are dropped
     sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of those drawn, by index; behind them the last of all
     order: wp.array(dtype=wp.int32),  # out: their indices
 ):
     i = wp.tid() + first
     if drawn[i] != 0:
         k = places[i] - 1
-        if k < room:
+        if k < capacity:
             sorted_keys[k] = keys[i]
             order[k] = i
-    if i < room and wp.int64(i) >= totals[0]:
+    if i < capacity and wp.int64(i) >= totals[0]:
         sorted_keys[i] = CULLED
 
 
@@ -46,13 +46,13 @@ def gather(
     order: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int64),
     totals: wp.array(dtype=wp.int64),  # (2) splats drawn, pairs
-    room: int,  # for so many splats
+    capacity: int,  # in splats
     pairs: int,  # and so many pairs
-    lengths: wp.array(dtype=wp.int64),  # out: counts in depth order; all 0 where the room is too small
+    lengths: wp.array(dtype=wp.int64),  # out: counts in depth order; all 0 where a capacity is too small
 ):
     k = wp.tid() + first
     lengths[k] = wp.int64(0)
-    if wp.int64(k) < totals[0] and totals[0] <= wp.int64(room) and totals[1] <= wp.int64(pairs):
+    if wp.int64(k) < totals[0] and totals[0] <= wp.int64(capacity) and totals[1] <= wp.int64(pairs):
         lengths[k] = counts[order[k]]
 
 
@@ -170,17 +170,17 @@ def make_lists(screen: bool) -> SimpleNamespace:
         bounds: wp.array(dtype=Bounds),
         ends: wp.array(dtype=wp.int64),  # inclusive sums of lengths
         lengths: wp.array(dtype=wp.int64),
-        room: int,  # splats in `ends`
-        pairs: int,  # for which there is room
-        beyond: int,  # behind the last tile
+        capacity: int,  # size of `ends`
+        pairs: int,  # capacity of the outputs
+        end_tile: int,  # number of tiles
         tiles: wp.array(dtype=wp.int32),  # out: pairs in depth order; behind them what lies beyond
         lists: wp.array(dtype=wp.int32),  # out: their splats
     ):
         k = wp.tid() + first
-        rest = int(ends[room - 1]) + k
+        rest = int(ends[capacity - 1]) + k
         while rest < pairs:
-            tiles[rest] = beyond
-            rest += room
+            tiles[rest] = end_tile
+            rest += capacity
         if lengths[k] == wp.int64(0):
             return  # what `order` has here may be nothing
         view = views[0]

@@ -35,7 +35,7 @@ def make_resolve(
     def resolve(
         first_pixel: int,  # of thread 0, of those of the pictures, view after view, row by row
         views: wp.array(dtype=View),
-        slots: wp.array(dtype=wp.int32),  # (views) place of each view's images among all
+        batch_indices: wp.array(dtype=wp.int32),  # (views) place of each view's images among all
         background: wp.vec3,
         rays: Rays,
         samples: Samples,
@@ -49,7 +49,7 @@ def make_resolve(
         view = views[number]
         grid = PixelGrid()
         grid.here = place - number * pixels
-        grid.pixel = slots[number] * pixels + grid.here
+        grid.pixel = batch_indices[number] * pixels + grid.here
         own_row = grid.here / width
         grid.row = number * (view.height / n) + own_row
         grid.splats = view.splats

@@ -23,12 +23,12 @@ def make_sensor(steps: tuple[str, ...]):
         settings: Settings,
         width: int,  # of a picture
         pixels: int,  # of a picture
-        slots: wp.array(dtype=wp.int32),  # (views) place of each view's images among all
+        batch_indices: wp.array(dtype=wp.int32),  # (views) place of each view's images among all
         rgb: wp.array(dtype=wp.float32),  # (images h w 3) in and out
     ):
         place = wp.tid() + first
         here = place % pixels
-        at = slots[place / pixels] * pixels + here
+        at = batch_indices[place / pixels] * pixels + here
         for channel in range(3):
             v = rgb[3 * at + channel]
             for k in range(wp.static(len(applied))):

@@ -10,10 +10,9 @@ from derivative_errors import random_picture
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare, prepare_batch
-from fidsplat.backends.warp import batch as batches
-from fidsplat.backends.warp import runtime
-from fidsplat.backends.warp.picture import Picture
-from fidsplat.backends.warp.replay import Replay
+from fidsplat.backends.warp import memory_plan, runtime
+from fidsplat.backends.warp.frame import DeviceFrame
+from fidsplat.backends.warp.recorded_frame import RecordedFrame
 from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.capture.views import views_of
 
@@ -29,24 +28,24 @@ FAR = fs.Camera.look_at(61, 43, 1.1, (0.0, 0.0, -60.0), (0.0, 0.0, 3.0))
 def ahead(renderer):
     """Its backend; what it waits for is restored."""
     backend = renderer.backend
-    before, backend.ahead = backend.ahead, True
+    before, backend.asynchronous = backend.asynchronous, True
     yield backend
-    backend.ahead = before
+    backend.asynchronous = before
 
 
 def pictures(backend, draw):
     """How many pictures are begun while it draws."""
-    before = backend.pictures
+    before = backend.frames
     draw()
-    return backend.pictures - before
+    return backend.frames - before
 
 
 def waiting(renderer, cameras):
     """Their pictures, each drawn when its counts were known."""
     backend = renderer.backend
-    before, backend.ahead = backend.ahead, False
+    before, backend.asynchronous = backend.asynchronous, False
     frames = [renderer.render(CLOUD, CAPTURE.with_(camera=camera)) for camera in cameras]
-    backend.ahead = before
+    backend.asynchronous = before
     return frames
 
 
@@ -127,14 +126,14 @@ def test_images_that_nobody_reads_leave_at_once(ahead):
 @pytest.fixture
 def replayed(ahead, monkeypatch):
     """What graphs have drawn, of its backend, which captures what it launches."""
-    drawn, own = [], Replay.draw
+    drawn, own = [], RecordedFrame.replay
 
     def counted(replay, stack):
         drawn.append(stack)
         own(replay, stack)
 
     monkeypatch.setattr(ahead, "replays", True)
-    monkeypatch.setattr(Replay, "draw", counted)
+    monkeypatch.setattr(RecordedFrame, "replay", counted)
     return drawn
 
 
@@ -188,7 +187,7 @@ def test_what_moves_is_replayed(renderer, replayed):
 
     frames = [renderer.render(resident, capture(place)) for place in places]
     assert len(replayed) == 2
-    renderer.backend.ahead = False
+    renderer.backend.asynchronous = False
     for frame, place in zip(frames, places, strict=True):
         wanted = renderer.render(cloud, capture(place))
         assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
@@ -240,7 +239,7 @@ def test_a_replay_that_fails_half_filled_is_not_launched_again(renderer, replaye
         raise RuntimeError("no copy")
 
     with monkeypatch.context() as failing:
-        failing.setattr(Picture, "_fill_views", refused)
+        failing.setattr(DeviceFrame, "_fill_views", refused)
         with pytest.raises(fs.DeviceError, match="no copy"):
             renderer.render(resident, there)
     assert np.array_equal(renderer.render(resident, there)["rgb"], wanted)
@@ -279,7 +278,7 @@ CROSSING = [fs.Camera.look_at(61, 43, 1.1, (0.02 * k, 0.0, 0.0), (0.0, 0.0, 3.0)
 
 def test_parts_of_a_batch_are_replayed(renderer, replayed, monkeypatch):
     """Two views at a time, each with the bits of itself alone."""
-    monkeypatch.setattr(batches, "_MOST", {False: 1_300_000, True: 1_300_000})
+    monkeypatch.setattr(memory_plan, "_MAX_PART_BYTES", {False: 1_300_000, True: 1_300_000})
     captures, resident = [CAPTURE.with_(camera=camera) for camera in CROSSING], renderer.upload(CLOUD)
     batch = renderer.render_batch(resident, captures)
     assert [len(stack) for stack in replayed] == [2, 2, 2]

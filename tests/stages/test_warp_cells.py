@@ -43,7 +43,7 @@ def marked(picture):
 
     count = picture.resident.count
     found = wp.zeros((count, picture.tiles), dtype=wp.uint32, device="cpu")
-    held, lists = picture.held, wp.array(np.arange(count), dtype=wp.int32, device="cpu")
+    held, lists = picture.named, wp.array(np.arange(count), dtype=wp.int32, device="cpu")
     wp.launch(ask, found.shape, [held["views"], held["lines"], lists, found], device="cpu")
     return (found.numpy()[:, :, None] >> np.arange(32) & 1).astype(bool)
 
@@ -72,10 +72,10 @@ def test_marked_cells_contain_all_fragments_and_few_others(renderer, cloud, qual
         pytest.skip("asked one by one on the CPU; blending itself is compared with the reference")
     resident = backend.upload(CLOUDS[cloud]())
     features, view = prepare(resident, fs.Capture(CAMERA, quality=fs.Quality.of(quality), outputs=("rgb",)))
-    picture = backend.pipeline(features).drawn(resident, view)[0]
-    seen = picture.held["drawn"].numpy()[: resident.count] != 0
+    picture = backend.pipeline(features).render_counted(resident, view)[0]
+    seen = picture.named["drawn"].numpy()[: resident.count] != 0
     found = marked(picture)[seen]
-    lines = picture.held["lines"].numpy()[: resident.count * picture.program.layout.lines]
+    lines = picture.named["lines"].numpy()[: resident.count * picture.program.layout.lines]
     records = lines.reshape(resident.count, -1)[seen]
     wanted = covered(records, picture.program.layout.names, view, *picture.grid)
     assert not (wanted & ~found).any()

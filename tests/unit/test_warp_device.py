@@ -315,9 +315,9 @@ def test_arrays_of_another_device_are_refused():
 
 def test_debug_builds_are_launched_by_one_thread(monkeypatch):
     """What they share among threads they would crash by."""
-    assert fs.Renderer("warp:cpu").backend._commands.threads > 1 or len(os.sched_getaffinity(0)) == 1
+    assert fs.Renderer("warp:cpu").backend._launches.threads > 1 or len(os.sched_getaffinity(0)) == 1
     monkeypatch.setattr(wp.config, "mode", "debug")
-    assert fs.Renderer("warp:cpu").backend._commands.threads == 1
+    assert fs.Renderer("warp:cpu").backend._launches.threads == 1
 
 
 def test_warp_pipelines_share_kernels_that_mean_the_same():

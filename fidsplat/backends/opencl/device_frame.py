@@ -112,7 +112,7 @@ class DeviceFrame:
         self.recorded, self.pair_limit = replay_queue is not None, pair_limit
         self.queue = workspace.switch_to(workspace.queue) if replay_queue is None else replay_queue
         self.pool = workspace.pool
-        workspace.pictures += 1
+        workspace.frames += 1
         self.tiles_x = -(-view.width // shape.tile_width)
         self.tiles_y = -(-view.height // shape.tile_height)
         self.tiles = self.views * self.tiles_x * self.tiles_y

@@ -31,7 +31,7 @@ class Workspace:
         self.replay_queue = cl.CommandQueue(self.context)
         """for replayed frames: without profiling, a launch takes the host a third less time"""
         self._last, self._idle = self.queue, True
-        self.pictures = 0
+        self.frames = 0
         """frames that were begun: each overwrites the scratch buffers of the last"""
         self.lock = threading.RLock()
         """held while a frame is submitted: scratch buffers and kernel arguments belong to one at a time"""

@@ -10,8 +10,8 @@ import numpy as np
 
 from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.command_list import LaunchCache
 from fidsplat.backends.warp.gradients import WarpGradients
-from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.probe import WarpProbe
 from fidsplat.backends.warp.program import Program, unsupported
@@ -65,20 +65,20 @@ class WarpBackend(Workspace, Backend):
         self.shape = shape_for(device)
         # debug builds of Warp's CPU kernels share a pointer among threads, and crash (warp/native/tile.h)
         alone = device.is_cuda or runtime.load().config.mode == "debug"
-        self._commands = Commands(device, 1 if alone else self.info.compute_units)
+        self._launches = LaunchCache(device, 1 if alone else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
         self._gradients: dict[tuple[FeatureSet, WarpShape], WarpGradients] = {}
 
     def limit_memory(self, budget: int) -> None:
-        """Let a picture and its cloud take at most `budget` bytes of the device.
+        """Limit the device memory of a frame and its cloud to `budget` bytes.
 
-        Pictures that need more for their lists are drawn in bands of tiles, with the same bits; a cloud that
-        does not fit is an error.
+        A frame with longer lists is rendered in bands of tiles, bit-identically; a cloud that does not fit is
+        an error.
         """
         self.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:
-        """The cloud in arrays on the device."""
+        """Copy a cloud to the device."""
         return Resident.of(cloud, self.pool)
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
@@ -86,19 +86,19 @@ class WarpBackend(Workspace, Backend):
         return Resident.around(arrays, origin, self.pool)
 
     def unsupported(self, features: FeatureSet) -> str:
-        """The effects that the Warp kernels have not; empty if they have all."""
+        """Error message naming the effects without Warp kernels; empty if all have them."""
         return unsupported(features, self.info.name)
 
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
 
         Raises:
-            DeviceError: what is `unsupported`, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler fails.
         """
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)
-            self._pipelines[key] = WarpPipeline(program, self, self._commands)
+            self._pipelines[key] = WarpPipeline(program, self, self._launches)
         return self._pipelines[key]
 
     def differentiate(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpGradients:
@@ -110,7 +110,7 @@ class WarpBackend(Workspace, Backend):
         return self._gradients[key]
 
     def probe(self) -> WarpProbe:
-        """What tests look into the device with."""
+        """Access to the device for tests."""
         return WarpProbe(self)
 
     def shapes(self, kind: str) -> dict[str, WarpShape]:

@@ -1,5 +1,4 @@
-"""Pictures with their derivatives: the stages of picture.py, and the kernels that go back through what they
-have left (kernels/warp/*_backward.py)."""
+"""Gradients of a frame: the backward kernels (kernels/warp/*_backward.py) on the arrays of its stages."""
 
 from __future__ import annotations
 
@@ -17,9 +16,9 @@ from fidsplat.backends.gradients import (
 )
 from fidsplat.backends.interface import GradientPipeline
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.command_list import Launcher
+from fidsplat.backends.warp.frame import DeviceFrame
 from fidsplat.backends.warp.images import WarpImages
-from fidsplat.backends.warp.launch import Launcher
-from fidsplat.backends.warp.picture import Picture
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.program import GradientKernels
 from fidsplat.backends.warp.resident import Resident
@@ -28,21 +27,21 @@ from fidsplat.effects.differentiable import check_gradients
 from fidsplat.util.errors import DeviceError, InputError
 
 _SHARES = 2048
-"""threads that share a sum over the whole picture or cloud; the order of additions is theirs"""
+"""threads of a sum over all pixels or splats; the order of additions depends on it"""
 
 
 class WarpDifferentiable(DifferentiableImages):
     """Output images of `WarpGradients.forward`."""
 
-    picture: Picture
+    picture: DeviceFrame
     images: WarpImages
 
     def device_array(self, name: str) -> Any:
-        """The image as a wp.array of the device; no copy."""
+        """The image as a wp.array; no copy."""
         return self.images.device_array(name)
 
     def wait(self) -> None:
-        """Until the device has drawn it."""
+        """Wait until the device has rendered it."""
         self.images.wait()
 
 
@@ -54,43 +53,43 @@ class WarpGradients(GradientPipeline):
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> WarpDifferentiable:
         """Render one view; always waits."""
-        picture, images = self._pipeline.drawn(resident, view)
-        if picture.bands > 1:
+        frame, images = self._pipeline.render_counted(resident, view)
+        if frame.bands > 1:
             raise DeviceError(
-                f"{resident.count:,} splats are drawn in bands within the memory budget, and such pictures "
-                "have no gradient; raise memory_budget, or use fewer splats or smaller pictures"
+                f"{resident.count:,} splats are rendered in bands within the memory budget, and such frames "
+                "have no gradient; raise memory_budget, or use fewer splats or smaller images"
             )
-        return WarpDifferentiable(picture, images)
+        return WarpDifferentiable(frame, images)
 
     def backward(self, images: WarpDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """Gradients as wp.arrays."""
-        picture = images.picture
-        check_gradients(picture.program.features, gradients)
+        frame = images.picture
+        check_gradients(frame.program.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)
-        with picture.workspace.working("while taking derivatives"):
-            return _Backward(picture, self._kernels, gradients).results()
+        with frame.workspace.working("in the backward pass"):
+            return _Backward(frame, self._kernels, gradients).results()
 
 
 class _Backward:
-    """The derivatives of one picture: the stages in order, each a method."""
+    """The backward pass of a frame: the stages in order, each a method."""
 
-    def __init__(self, picture: Picture, made: GradientKernels, gradients: Mapping[str, Any]) -> None:
-        self._picture, self._made, self._wp = picture, made, load()
-        self._launcher: Launcher = picture.launcher
-        self._count, self._pairs = picture.resident.count, picture.stats["pairs"]
-        self._given = dict(picture.held) | picture.resident.arrays | {"by": self._by(gradients)}
+    def __init__(self, frame: DeviceFrame, made: GradientKernels, gradients: Mapping[str, Any]) -> None:
+        self._frame, self._made, self._wp = frame, made, load()
+        self._launcher: Launcher = frame.launcher
+        self._count, self._pairs = frame.resident.count, frame.stats["pairs"]
+        self._given = dict(frame.named) | frame.resident.arrays | {"by": self._by(gradients)}
         self._given |= {
-            "samples": picture.samples,
-            "color": picture.samples.color,
-            "background": self._wp.vec3(*picture.view.background),
-            "log_ceiling": math.log(picture.view.ceiling),
+            "samples": frame.samples,
+            "color": frame.samples.color,
+            "background": self._wp.vec3(*frame.view.background),
+            "log_ceiling": math.log(frame.view.ceiling),
             "by_rgb": self._given["by"].rgb,
         }
 
     def results(self) -> dict[str, Any]:
-        """All stages; the arrays of `GradientPipeline.backward`."""
-        found = self._room_for_results()
+        """Run all stages; returns the arrays of `GradientPipeline.backward`."""
+        found = self._allocate_results()
         self._launcher.stage("blend backward")
         self._blend()
         self._launcher.stage("project backward")
@@ -99,44 +98,44 @@ class _Backward:
         else:  # no splat is visible: there are no moments
             for array in (*found.values(), self._given["by_poses"]):
                 array.zero_()
-        view = self._picture.view
+        view = self._frame.view
         pixels = view.width * view.height
         parts = self._take("background parts", 3 * _SHARES, self._wp.float64)
-        sizes = {"pixels": pixels, "width": view.width, "stride": self._picture.grid[1], "threads": _SHARES}
+        sizes = {"pixels": pixels, "width": view.width, "stride": self._frame.grid[1], "threads": _SHARES}
         given = self._given | sizes | {"parts": parts}
         self._launcher.launch(self._made.sums.background_parts, _SHARES, given)
-        self._add_up(parts, _SHARES, 3, found["background"])
-        self._add_up(flat_of(self._given["by_poses"]), self._count, 6, found["pose"])
+        self._sum_rows(parts, _SHARES, 3, found["background"])
+        self._sum_rows(flat_of(self._given["by_poses"]), self._count, 6, found["pose"])
         self._launcher.stage(None)
         return found
 
     def _blend(self) -> None:
-        """Sums over samples, by slots."""
-        wp, picture, made, pairs = self._wp, self._picture, self._made, self._pairs
+        """Sum moments over the samples of each pair of a splat and a tile."""
+        wp, frame, made, pairs = self._wp, self._frame, self._made, self._pairs
         if not pairs:
             return
         self._given["slots"] = self._take("slots", pairs, wp.int32)
         self._launcher.launch(made.slots, pairs, self._given)
-        self._given["moments"] = moments = picture.pool.exact("moments", pairs, made.blend.Moments)
+        self._given["moments"] = moments = frame.pool.exact("moments", pairs, made.blend.Moments)
         moments.zero_()
-        shape = picture.program.shape
+        shape = frame.program.shape
         area = shape.tile_width * shape.tile_height
         chunk = kernels("blend_backward").CHUNK
-        checkpoints = area * (pairs // chunk + picture.tiles + 1)
+        checkpoints = area * (pairs // chunk + frame.tiles + 1)
         self._given["checkpoints"] = self._take("checkpoints", checkpoints, wp.float32)
-        kernel, tiles = made.blend.kernel, picture.tiles
+        kernel, tiles = made.blend.kernel, frame.tiles
         if shape.schedule == "group":
             given = self._given | {"band_first": 0}
-            self._launcher.once(kernel, tiles * area, given, area)
+            self._launcher.launch_whole(kernel, tiles * area, given, area)
             return
-        room = self._launcher.pieces * area
-        self._given["lights"] = self._take("lights", room, wp.float32)
-        self._given["losses"] = self._take("losses", room, made.blend.Loss)
-        self._given["fragments"] = self._take("fragments", room * chunk, wp.vec2)
-        self._launcher.tiles(kernel, 0, tiles, area, self._given)
+        states = self._launcher.pieces * area
+        self._given["lights"] = self._take("lights", states, wp.float32)
+        self._given["losses"] = self._take("losses", states, made.blend.Loss)
+        self._given["fragments"] = self._take("fragments", states * chunk, wp.vec2)
+        self._launcher.launch_tiles(kernel, 0, tiles, area, self._given)
 
-    def _add_up(self, parts: Any, rows: int, columns: int, result: Any) -> None:
-        """The sum of all rows, in a fixed order."""
+    def _sum_rows(self, parts: Any, rows: int, columns: int, result: Any) -> None:
+        """Sum all rows in a fixed order."""
         sums = self._take("sums", columns * _SHARES, self._wp.float64)
         total = self._take("total", columns, self._wp.float64)
         made = self._made.sums
@@ -146,35 +145,35 @@ class _Backward:
         self._launcher.launch(made.as_single, columns, {"sums": total, "singles": result})
 
     def _by(self, gradients: Mapping[str, Any]) -> Any:
-        """The derivatives by the images as the kernels' struct; 0 where none are given."""
+        """The gradients of the images as the kernels' struct; missing ones are 0."""
         by = self._made.blend.By()
         for name in self._made.losses:
-            view, given = self._picture.view, gradients.get(name)
+            view, given = self._frame.view, gradients.get(name)
             size = math.prod(gradient_shape(name, view))
             if given is None:
-                array = self._picture.pool.exact(f"by {name}", size, self._wp.float32)
+                array = self._frame.pool.exact(f"by {name}", size, self._wp.float32)
                 array.zero_()
             else:
                 check_shape(name, _shape_of(given), view)
-                array = self._taken(name, given)
+                array = self._device_gradient(name, given)
             setattr(by, name, array)
         return by
 
-    def _taken(self, name: str, given: Any) -> Any:
-        """A derivative on the device, flat; no copy of one that is there."""
-        wp, pool = self._wp, self._picture.pool
+    def _device_gradient(self, name: str, given: Any) -> Any:
+        """A gradient as a flat device array; no copy if it is on the device."""
+        wp, pool = self._wp, self._frame.pool
         if not isinstance(given, wp.array):
             return pool.filled(f"by {name}", np.ascontiguousarray(given, np.float32).ravel(), wp.float32)
         scalar = getattr(given.dtype, "_wp_scalar_type_", given.dtype)
         if scalar is not wp.float32 or not given.is_contiguous or given.device != pool.device:
             raise InputError(
-                f"the gradient of {name} must be a contiguous float32 array on {pool.device}, not "
+                f"the gradient of {name} must be a contiguous float32 array on {pool.device}, got "
                 f"{wp.types.type_repr(given.dtype)} on {given.device}"
             )
         return flat_of(given)
 
-    def _room_for_results(self) -> dict[str, Any]:
-        """Arrays for the results, the same from call to call."""
+    def _allocate_results(self) -> dict[str, Any]:
+        """Allocate the results, which each call overwrites."""
         wp, count, terms = self._wp, self._count, max(self._made.sh_terms, 1)
         kinds = {
             "by_means": wp.vec3,
@@ -195,29 +194,29 @@ class _Backward:
         return found
 
     def _take(self, name: str, size: int, dtype: Any) -> Any:
-        self._given[name] = array = self._picture.pool.exact(name, size, dtype)
+        self._given[name] = array = self._frame.pool.exact(name, size, dtype)
         return array
 
 
 def flat_of(array: Any) -> Any:
-    """The numbers of a contiguous array of numbers or vectors, on its memory."""
+    """View a contiguous array of numbers or vectors as flat numbers."""
     wp = load()
     scalar = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     size = math.prod(_shape_of(array))
     flat = wp.array(ptr=array.ptr, dtype=scalar, shape=(size,), device=array.device)
-    flat._ref = array  # which it must not outlive
+    flat._ref = array  # keeps the memory alive
     return flat
 
 
 def add_to(sums: Any, values: Any) -> None:
-    """Adds flat float32 arrays, as long, on their device."""
+    """Add flat float32 arrays of equal length on their device."""
     given = {"device": sums.device, "record_tape": False}
     with quiet():
         load().launch(kernels("column_sums").add_to, sums.size, [sums, values], **given)
 
 
 def _shape_of(array: Any) -> tuple[int, ...]:
-    """Of an array of numbers or of vectors."""
+    """Shape of an array in numbers, with an axis for vectors."""
     wp = load()
     shape = tuple(array.shape)
     if isinstance(array, wp.array) and wp.types.type_is_vector(array.dtype):

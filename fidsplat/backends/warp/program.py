@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fidsplat.backends.view import View
-from fidsplat.backends.warp.launch import BLOCK
+from fidsplat.backends.warp.command_list import BLOCK
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool

@@ -1,5 +1,4 @@
-"""What a device's pictures share: scratch arrays, arrays of lenses and panoramas, and the memory they may
-take."""
+"""Shared by all frames of a device: scratch arrays, arrays of lenses and panoramas, and the memory budget."""
 
 from __future__ import annotations
 
@@ -26,9 +25,9 @@ class ArrayPool:
         self._hosts: dict[str, Any] = {}
         self._spare: dict[str, list[Any]] = {}
         self.state = object()
-        """another one whenever a scratch array has been replaced"""
+        """another object whenever a scratch array is replaced"""
         self.holders: WeakSet[Any] = WeakSet()
-        """what holds scratch arrays from picture to picture: told to `forget` them when one is replaced"""
+        """caches of scratch arrays, whose `release_arrays` is called when one is replaced"""
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         """An array of at least `size` elements whose content is undefined."""
@@ -39,7 +38,7 @@ class ArrayPool:
                 self._parts.pop((name, dtype), None)
                 self.state = object()
                 for holder in list(self.holders):
-                    holder.forget()
+                    holder.release_arrays()
             held = self._arrays[name, dtype] = self.fresh(name, size, dtype)
         return held
 
@@ -52,7 +51,7 @@ class ArrayPool:
         return part
 
     def filled(self, name: str, values: Any, dtype: Any) -> Any:
-        """A scratch array that holds these values of the host, as long as they are."""
+        """A scratch array of the size of `values`, with these values of the host."""
         wp = load()
         given = wp.array(values, dtype=dtype, device="cpu")
         held = self.exact(name, given.size, dtype)
@@ -60,13 +59,13 @@ class ArrayPool:
         return held
 
     def host(self, name: str, size: int, dtype: Any) -> Any:
-        """An array of the host that the device can write to without a detour."""
+        """A page-locked array of the host."""
         if name not in self._hosts:
             self._hosts[name] = load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
         return self._hosts[name]
 
     def lend(self, name: str, size: int, dtype: Any) -> Any:
-        """As `host`, of which there are several at a time; `give_back` takes it again."""
+        """One of several page-locked arrays of the host, until `give_back`."""
         spare = self._spare.setdefault(name, [])
         return (
             spare.pop()
@@ -75,14 +74,14 @@ class ArrayPool:
         )
 
     def give_back(self, name: str, array: Any) -> None:
-        """What `lend` gave, which nobody reads or writes any more."""
+        """Return an array of `lend` that is no longer used."""
         self._spare[name].append(array)
 
     def fresh(self, name: str, size: int, dtype: Any) -> Any:
-        """An array that nobody else holds.
+        """A new array.
 
         Raises:
-            DeviceError: the device cannot give that much.
+            DeviceError: the device has too little memory.
         """
         wp = load()
         try:
@@ -95,44 +94,41 @@ class ArrayPool:
 
 
 class Workspace:
-    """Of one open device."""
+    """State of an open device."""
 
     def __init__(self, device: Any, name: str, memory_budget: int) -> None:
         """name: of the device, for errors."""
         self.device, self.name, self._lock = device, name, threading.RLock()
         self.pool = ArrayPool(device)
         self.memory_budget = memory_budget
-        """bytes of the device that a picture and its cloud may take"""
+        """bytes of the device for a frame and its cloud"""
         self.pair_budget = 2**30 - 1
-        """Most pairs of splats and tiles that are listed at once; tests make it small."""
-        self.ahead = device.is_cuda
-        """Whether pictures of a kind that was drawn before are drawn without waiting for what they take."""
+        """maximum number of splat-tile pairs that are listed at once; tests lower it"""
+        self.asynchronous = device.is_cuda
+        """whether frames do not wait for their counts if one of their kind was rendered before"""
         self.replays = device.is_cuda
-        """Whether the launches of such pictures are captured as a graph, and the graph launched."""
-        self.pictures = 0
-        """how many have been begun: what they leave is there until the next"""
+        """whether such frames are recorded as command lists"""
+        self.frames = 0
+        """number of frames that were started; each overwrites the arrays of the last"""
         self.lenses: WeakKeyDictionary[RayRaster, dict[str, Any]] = WeakKeyDictionary()
-        """arrays of the whole rasters that are in use, by name"""
+        """arrays of complete rasters, by name"""
         self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
-        """on the device, each as long as it is somewhere else"""
+        """on the device, as long as the host refers to them"""
 
     @cached_property
-    def first_slot(self) -> Any:
-        """Where the images of a view stand that is no part of a batch: an array of a 0."""
+    def first_index(self) -> Any:
+        """Batch index of a single view: an array of one 0."""
         return load().zeros(1, dtype=load().int32, device=self.device)
 
     @cached_property
-    def _side(self) -> Any:
-        return load().Stream(self.device)
-
-    def capturing(self) -> Any:
-        """The stream on which launches are captured; None where there are no streams."""
-        return self._side if self.device.is_cuda else None
+    def capture_stream(self) -> Any:
+        """The stream on which launches are captured; None on the CPU."""
+        return load().Stream(self.device) if self.device.is_cuda else None
 
     @contextmanager
     def working(self, doing: str) -> Iterator[None]:
-        """On the device, which is one thread's at a time: pictures that were drawn ahead may have to be drawn
-        again by who reads them.
+        """A context with exclusive use of the device: a thread that reads images may have to render them
+        again.
 
         Raises:
             DeviceError: as `failing`.
@@ -142,7 +138,7 @@ class Workspace:
 
     @contextmanager
     def failing(self, doing: str) -> Iterator[None]:
-        """Failures of the device are those of what is done there.
+        """A context that raises failures of the device as DeviceError. doing: for the message.
 
         Raises:
             DeviceError: the device fails.

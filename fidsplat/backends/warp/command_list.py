@@ -1,0 +1,189 @@
+"""Launches of kernels: timed by stage, divided over threads on the CPU, and captured for replay on CUDA."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from typing import Any
+
+from fidsplat.backends.warp.runtime import load
+from fidsplat.backends.warp.workspace import Workspace
+
+BLOCK = 256
+"""default threads per block on a GPU"""
+_MIN_PIECE = 2048
+"""minimum threads of a piece of a CPU launch, below which the call costs more than it saves"""
+
+
+@cache
+def _parameters(kernel: Any) -> tuple[str, ...]:
+    return tuple(argument.label for argument in kernel.adj.args)
+
+
+def _arguments(kernel: Any, given: Mapping[str, Any], first: int = 0) -> list[Any]:
+    """The kernel's arguments from `first` on, by the names of its parameters."""
+    return [given[name] for name in _parameters(kernel)[first:]]
+
+
+class LaunchCache:
+    """The last launch of each kernel of a device, of which only changed arguments are packed again."""
+
+    def __init__(self, device: Any, threads: int) -> None:
+        """threads: of the host, over which launches on the CPU are divided."""
+        self.device, self.threads = device, threads
+        # a CPU launch runs on the calling thread, without the interpreter's lock
+        self.workers = None if device.is_cuda else ThreadPoolExecutor(threads, "fidsplat-warp")
+        self._wp = load()
+        self._launches: dict[tuple[Any, int], tuple[Any, list[Any], list[int]]] = {}
+
+    def release_arrays(self) -> None:
+        """Release the launches, and with them their arrays."""
+        self._launches.clear()
+
+    def launch(self, kernel: Any, count: int, args: list[Any], block: int = BLOCK) -> None:
+        """Launch `count` threads of a kernel, in blocks of `block` on a GPU."""
+        cached = self._launches.get((kernel, block))
+        if cached is None:
+            options = {"device": self.device, "block_dim": block, "record_tape": False, "record_cmd": True}
+            command = self._wp.launch(kernel, count, args, **options)
+            self._launches[kernel, block] = command, list(args), [count]
+        else:
+            command, before, dim = cached
+            for index, value in enumerate(args):
+                if value is not before[index]:
+                    command.set_param_at_index(index, value)
+                    before[index] = value  # kept alive: the command has its address only
+            if dim[0] != count:
+                command.set_dim(count)
+                dim[0] = count
+        command.launch()
+
+
+class Launcher:
+    """Launches of one frame, with arguments by the names of the kernels' parameters."""
+
+    def __init__(self, cache: LaunchCache, timed: bool = True, divided: bool = True) -> None:
+        """timed: measure the stages. divided: divide CPU launches over threads; a capture needs one."""
+        self._wp, self.timed = load(), timed
+        self._device, self._workers, self._cache = cache.device, cache.workers, cache
+        self.pieces = 8 * cache.threads if divided else 1
+        """of a CPU launch, several per thread since work is uneven"""
+        self._stream = None if self._workers else self._device.stream  # the caller may switch it later
+        self._marks: list[tuple[str | None, Any]] = []
+
+    def launch(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
+        """Launch `count` threads of a kernel whose first parameter is the number of thread 0."""
+        args = _arguments(kernel, given, 1)
+        if self._workers is None:
+            self._cache.launch(kernel, count, [0, *args], block)
+            return
+        pieces = min(self.pieces, -(-count // _MIN_PIECE))
+        cuts = [count * k // pieces for k in range(pieces + 1)]
+        self._run(kernel, [(first, end - first, [first, *args]) for first, end in pairwise(cuts)])
+
+    def launch_whole(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
+        """Launch `count` threads in one piece on every device, with all arguments given."""
+        self._cache.launch(kernel, count, _arguments(kernel, given), block)
+
+    def launch_tiles(self, kernel: Any, first: int, end: int, area: int, given: Mapping[str, Any]) -> None:
+        """Launch a CPU thread per tile; the kernel's first parameter is the first tile of a piece, its last
+        the offset of the piece's `area` samples of state.
+        """
+        pieces = min(self.pieces, end - first)
+        cuts = [first + (end - first) * k // pieces for k in range(pieces + 1)]
+        args = _arguments(kernel, {**given, "state_first": 0}, 1)[:-1]
+        spans = enumerate(pairwise(cuts))
+        self._run(kernel, [(k, b - a, [a, *args, k * area]) for k, (a, b) in spans])
+
+    def _run(self, kernel: Any, pieces: list[tuple[int, int, list[Any]]]) -> None:
+        wp, device = self._wp, self._device
+
+        def run(piece: tuple[int, int, list[Any]]) -> None:
+            wp.launch(kernel, piece[1], piece[2], device=device, record_tape=False)
+
+        if len(pieces) == 1:
+            self._cache.launch(kernel, *pieces[0][1:])
+        elif self._workers is not None:
+            list(self._workers.map(run, pieces))  # raises the exception of a piece
+
+    def read_back(self, totals: Any, host: Any) -> list[int]:
+        """Copy a few integers from the device through the array `host` of the same length, and wait."""
+        self._wp.copy(host, totals)
+        self.finish()
+        return host.numpy().tolist()
+
+    def finish(self) -> None:
+        """Wait for all launches."""
+        if self._stream is not None:
+            self._wp.synchronize_stream(self._stream)
+
+    def stage(self, name: str | None) -> None:
+        """Start the stage `name`; None ends the last."""
+        if not self.timed:
+            return
+        if self._workers is None:
+            mark = self._wp.Event(self._device, enable_timing=True)
+            self._wp.record_event(mark)
+        else:
+            mark = time.perf_counter()
+        self._marks.append((name, mark))
+
+    def timings(self) -> dict[str, float]:
+        """Milliseconds by stage, in the order in which they first ran."""
+        timings: dict[str, float] = {}
+        for (name, begin), (_, end) in pairwise(self._marks):
+            if name is None:  # between a frame and its derivatives
+                continue
+            if self._workers is None:
+                took = self._wp.get_event_elapsed_time(begin, end)
+            else:
+                took = (end - begin) * 1e3
+            timings[name] = timings.get(name, 0.0) + took
+        return timings
+
+
+class CommandList:
+    """A CUDA graph of launches, captured once and replayed; on the CPU, for tests, Warp's own list."""
+
+    def __init__(self, graph: Any) -> None:
+        self._graph = graph
+
+    @staticmethod
+    def record(workspace: Workspace, launch: Callable[[], object]) -> CommandList | None:
+        """Capture what `launch` submits from one thread and without times; nothing runs. None where the
+        device cannot capture, after a warning; later frames are not captured either."""
+        wp, device = load(), workspace.device
+        try:
+            # a stream of its own: the user's current one may be one that cannot be captured
+            with wp.ScopedStream(workspace.capture_stream, sync_enter=False):
+                wp.capture_begin(device=device)
+                try:
+                    launch()
+                except BaseException:
+                    _abort_capture(wp, device)
+                    raise
+                return CommandList(wp.capture_end(device=device))
+        except RuntimeError as error:
+            workspace.replays = False
+            warnings.warn(
+                f"{workspace.name} captures no graphs ({str(error).strip()}); each frame's kernels are "
+                "launched one by one, with bit-identical images",
+                stacklevel=2,
+            )
+            return None
+
+    def submit(self) -> None:
+        """Replay the launches."""
+        load().capture_launch(self._graph)
+
+
+def _abort_capture(wp: Any, device: Any) -> None:
+    """End a capture that failed."""
+    try:
+        wp.capture_end(device=device)
+    except RuntimeError:
+        return

@@ -1,0 +1,79 @@
+"""What a frame takes of the memory budget: how many pairs it may list at once, and which views are rendered
+together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.view import View
+from fidsplat.backends.warp.program import Program
+from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.runtime import load
+from fidsplat.backends.warp.structs import memory_bytes
+from fidsplat.backends.warp.workspace import Workspace
+from fidsplat.util.errors import DeviceError, bytes_words
+
+# bytes: of a splat's bounds; of its window, key, counts and sums; of a visible splat in the sort and the
+# lists; of a pair with the scratch of its sort
+_BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
+_MAX_PART_BYTES = {True: 1 << 31, False: 1 << 28}
+"""of the views of a part, on CUDA and on the CPU: more is no faster"""
+_MAX_NUMBERED = 1 << 30
+"""samples, and lines of records, of all views of a part: kernels number them in 32 bits"""
+
+
+class MemoryPlanner:
+    """Plans frames of one program."""
+
+    def __init__(self, program: Program, workspace: Workspace) -> None:
+        self._workspace, shape = workspace, program.shape
+        self._tile_width, self._tile_height = shape.tile_width, shape.tile_height
+        sizes = map(load().types.type_size_in_bytes, program.sample_fields.values())
+        self._sample_bytes = sum(sizes)
+        self._lines = program.layout.lines
+        self._splat_bytes = 16 * self._lines + _BOUNDS + _PROJECTED
+        self._same_settings = program.sensor is not None
+        """whether the views of a part must have the same numbers"""
+
+    def sample_bytes(self, view: View) -> int:
+        """Bytes of the sample buffers of a view, of complete tiles."""
+        return self._samples(view) * self._sample_bytes
+
+    def _samples(self, view: View) -> int:
+        columns, rows = -(-view.width // self._tile_width), -(-view.height // self._tile_height)
+        return rows * columns * self._tile_width * self._tile_height
+
+    def max_pairs(self, resident: Resident, stack: ViewStack, visible: int, reserved: int) -> int:
+        """Number of pairs that may be listed at once. reserved: bytes of other arrays.
+
+        Raises:
+            DeviceError: the rest of the frame exceeds the memory budget.
+        """
+        workspace = self._workspace
+        fixed = resident.memory_bytes + self._splat_bytes * len(stack) * resident.count + _VISIBLE * visible
+        fixed += len(stack) * self.sample_bytes(stack.view) + reserved + memory_bytes(stack.view, workspace)
+        pairs = (workspace.memory_budget - fixed) // _PAIR
+        if pairs < 1:
+            raise DeviceError(
+                f"a memory budget of {bytes_words(workspace.memory_budget)} is too small for "
+                f"{resident.count} splats in this picture, which take {bytes_words(fixed)} before their "
+                "lists; raise memory_budget, or use an OpenCL device, which draws a cloud in chunks"
+            )
+        return min(workspace.pair_budget, pairs)
+
+    def parts(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[tuple[int, int]]:
+        """Ranges [first, end) of views that are rendered together. reserved: bytes of all their images."""
+        count, views, workspace = len(batch.slots), batch.views, self._workspace
+        if not count or not isinstance(views, ViewStack) or (self._same_settings and views.numbers):
+            return iter([(k, k + 1) for k in range(count)])
+        each = resident.count * (self._splat_bytes + _VISIBLE) + self.sample_bytes(views.view)
+        free = workspace.memory_budget - resident.memory_bytes - reserved
+        # half is for the lists
+        fitting = min(free // 2, _MAX_PART_BYTES[workspace.device.is_cuda]) // each
+        numbered = _MAX_NUMBERED // max(self._samples(views.view), resident.count * self._lines)
+        together = max(1, min(fitting, numbered))
+        # of equal size, so that parts have the same launches
+        parts = -(-count // together)
+        return pairwise([count * k // parts for k in range(parts + 1)])
