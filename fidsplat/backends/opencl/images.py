@@ -90,7 +90,7 @@ class Replay:
         self, pipeline: ReplayingPipeline, resident: Resident, view: View, recorded: RecordedFrame
     ) -> None:
         self._pipeline, self._view, self._recorded = pipeline, view, recorded
-        self._number = pipeline.workspace.pictures
+        self._number = pipeline.workspace.frames
         self._resident: Resident | None = resident
         self._timed = weakref.ref(resident)
 
@@ -100,7 +100,7 @@ class Replay:
         if resident is None:
             return None
         queue, after = rendered.queue, None  # faster than a queue that waits for another
-        if workspace.pictures != self._number:  # without waiting for frames that were submitted since
+        if workspace.frames != self._number:  # without waiting for frames that were submitted since
             queue, after = workspace.read_queue, rendered.done()
         counts = Counts.read(queue, rendered.buffer("counts"), after)
         complete = self._recorded.capacity.holds(counts)

@@ -158,7 +158,7 @@ class OpenCLPipeline(Pipeline):
         workspace = self.workspace
         with workspace.rendering():
             queue = workspace.switch_to(workspace.queue)
-            workspace.pictures += 1
+            workspace.frames += 1
             if self._ready(recorded, resident, view, queue):
                 leased, events = recorded.submit(queue)
                 named = list(zip(recorded.commands.stages, events, strict=True))
@@ -176,7 +176,7 @@ class OpenCLPipeline(Pipeline):
         if not tiling.pair_capacity(workspace):
             return None
         queue = workspace.switch_to(workspace.replay_queue)
-        workspace.pictures += 1
+        workspace.frames += 1
         if recorded is not None and self._ready(recorded, resident, view, queue):
             leased, events = recorded.submit(queue)
             stats = partial(
