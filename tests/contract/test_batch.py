@@ -208,7 +208,7 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
     [
         ({"captures": []}, "captures is empty"),
         ({"captures": 5}, "captures is 5; it must be a list"),
-        ({"captures": [CAMERA, "front"]}, "camera is 'front'"),
+        ({"captures": [CAMERA, "front"]}, "camera must be .* got 'front'"),
         ({"captures": [CAMERA, fs.Camera.pinhole(51, 40, 9, 9, 9, 9)]}, "same size.* view 1 has 51 x 40"),
         ({"captures": [CAMERA, fs.Capture(CAMERA, "alpha")]}, "same outputs"),
         (

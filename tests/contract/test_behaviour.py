@@ -113,9 +113,9 @@ def test_timings_and_stats_name_the_work(renderer):
         ({"outputs": ("rgb", "dept")}, ["'dept'", "'depth'"]),
         ({"quality": "standrad"}, ["'standrad'", "'standard'"]),
         ({"background": (0, 1)}, ["background", "three"]),
-        ({"shutter": 0.01}, ["shutter is 0.01", "a Shutter"]),
-        ({"motion": np.eye(4)}, ["motion is", "a Motion"]),
-        ({"fog": 0.0}, ["fog is 0.0", "a Fog"]),
+        ({"shutter": 0.01}, ["shutter must be", "a Shutter", "0.01"]),
+        ({"motion": np.eye(4)}, ["motion must be", "a Motion"]),
+        ({"fog": 0.0}, ["fog must be", "a Fog", "0.0"]),
         (
             {"quality": fs.Quality(samples=8), "camera": fs.Camera.pinhole(9000, 10, 1, 1, 1, 1)},
             ["9000", "32767"],

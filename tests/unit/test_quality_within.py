@@ -387,7 +387,7 @@ def test_an_impossible_error(renderer, scene, error):
             {"error": 1e-3, "scene": 7, "capture": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)},
             "scene must be .* got a int",
         ),
-        ({"error": 1e-3, "capture": "best"}, "camera is 'best'"),
+        ({"error": 1e-3, "capture": "best"}, "camera must .* got 'best'"),
     ],
 )
 def test_invalid_bounds(words, message):
