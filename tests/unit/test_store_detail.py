@@ -251,7 +251,7 @@ def test_stores_without_detail_are_refused(store, renderer, tmp_path):
     with pytest.raises(fs.InputError, match="no levels of detail"):
         measure_detail(flat, renderer)
     assert flat.cell_sizes(QUALITY.with_(detail_error=0.1)) == (0.0,)  # beside others it stays exact
-    with pytest.raises(fs.InputError, match="detail_error must .* got 1"):
+    with pytest.raises(fs.InputError, match=r"detail_error must .* got 1"):
         fs.Quality(detail_error=1.0)
 
 
