@@ -172,7 +172,7 @@ class Plants:
     """
 
     out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-plants"
-    settings: PlantSettings = field(default_factory=PlantSettings)
+    plants: PlantSettings = field(default_factory=PlantSettings)
     environment: BlenderEnvironment = None
     device: Device = None
     json: Json = False
@@ -184,7 +184,7 @@ class Plants:
         environment = self.environment or default_environment()
         with delayed_progress(console(True)) as progress:
             made = list(
-                plants.write_plants(self.settings, Path(self.out), environment, self.device, progress)
+                plants.write_plants(self.plants, Path(self.out), environment, self.device, progress)
             )
         facts = {"plants": [{"file": str(file), "psnr": score} for file, score in made]}
         rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in made]

@@ -27,7 +27,7 @@ class Greenhouse:
     """
 
     out: Annotated[str, option("DIR", "folder", "-o")] = "greenhouse"
-    settings: GreenhouseSettings = field(default_factory=GreenhouseSettings)
+    layout: GreenhouseSettings = field(default_factory=GreenhouseSettings)
     plants_from: Annotated[
         str | None, option("DIR", "folder of plants KIND-NUMBER.ply (default: plants are grown as disks)")
     ] = None
@@ -38,7 +38,7 @@ class Greenhouse:
         from fidsplat.worlds.plants import load_plants
 
         stock = None if self.plants_from is None else load_plants(self.plants_from)
-        settings = self.settings
+        settings = self.layout
         made = World(**vars(settings), stock=stock)
         folder = path_of(self.out)
         scene_file, model = folder / "greenhouse.toml", folder / "greenhouse.xml"

@@ -16,6 +16,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import ordinary_file, path_of, writable_folder
 
+_UNSET = "unset"
 repeatable = tyro.conf.configure(tyro.conf.UseAppendAction)
 """Decorator of a command whose options with several values are repeated, one value each time."""
 
@@ -27,7 +28,7 @@ def option(metavar: str, text: str, short: str | None = None):
 
 
 def _default(value: str) -> str:
-    return "" if value in ("none", "") else f"(default: {value})"
+    return "" if value in (_UNSET, "") else f"(default: {value})"
 
 
 def switch(text: str):
@@ -36,7 +37,8 @@ def switch(text: str):
 
 
 value_rules = ConstructorRegistry()
-"""tyro's rules for values, with one for optional values: help shows `INT` instead of `{None}|INT`."""
+"""tyro's rules for values, with one for optional values: help shows `INT (default: unset)` instead of
+`{None}|INT (default: None)`."""
 
 
 @value_rules.primitive_rule
@@ -50,7 +52,7 @@ def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     return replace(
         inner,
         is_instance=lambda value: value is None or inner.is_instance(value),
-        str_from_instance=lambda value: ["none"] if value is None else inner.str_from_instance(value),
+        str_from_instance=lambda value: [_UNSET] if value is None else inner.str_from_instance(value),
     )
 
 

@@ -88,7 +88,7 @@ class Tradeoff:
         ),
     ] = None
     device: Devices = ()
-    settings: TradeoffSettings = field(default_factory=TradeoffSettings)
+    measurement: TradeoffSettings = field(default_factory=TradeoffSettings)
     scene: UserScenes = ()
     cameras: Cameras = None
     plot: Annotated[
@@ -104,14 +104,14 @@ class Tradeoff:
 
         if self.plot is not None:
             check_plot(self.plot, "pandas")
-        folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.settings.quick else ""))
+        folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.measurement.quick else ""))
         devices = tuple(dict.fromkeys(self.device)) or (default_device(),)
-        own = own_pictures(load_user_scenes(self.scene, self.cameras, self.settings.scenes))
+        own = own_pictures(load_user_scenes(self.scene, self.cameras, self.measurement.scenes or ()))
         folders = [folder / name.replace(":", "-") for name in devices] if len(devices) > 1 else [folder]
         with ExitStack() as stack:
             # open all devices first, so that a missing one is reported before another is measured
             sweeps = [
-                stack.enter_context(prepared(self.settings, out, device, own))
+                stack.enter_context(prepared(self.measurement, out, device, own))
                 for out, device in zip(folders, devices, strict=True)
             ]
             measured = run_sweeps(sweeps)

@@ -51,7 +51,7 @@ class Train:
     dataset: Annotated[tyro.conf.Positional[str], option("DATASET", "folder or transforms.json")]
     out: Annotated[str, option("FILE.ply", "file for the splats", "-o")]
     device: Device = None
-    settings: TrainSettings = field(default_factory=TrainSettings)
+    training: TrainSettings = field(default_factory=TrainSettings)
     within_memory: Annotated[
         float | None,
         option("GIB", "memory of splats and images while training; reduces the number of splats"),
@@ -76,7 +76,7 @@ class Train:
             raise InputError(f"-o must be a .ply file, got {self.out}")
         if self.report is not None:
             require_packages()
-        settings = self.settings
+        settings = self.training
         file = writable_file(self.out)
         checkpoint = file.with_suffix(".training.npz")
         if file.exists() and not checkpoint.exists():  # from something else than this training

@@ -35,9 +35,9 @@ _BATCH = 16
 class TradeoffSettings:
     """Scenes, quality settings and length of a trade-off measurement."""
 
-    scenes: tuple[str, ...] = ()
+    scenes: tuple[str, ...] | None = None
     """Scenes to measure. By default all, with --quick four."""
-    knobs: tuple[str, ...] = ()
+    knobs: tuple[str, ...] | None = None
     """Quality settings to vary: names of Quality's fields, or preset, marker, together. By default all."""
     quick: bool = False
     """Measure few values, few frames and four scenes."""
@@ -57,9 +57,9 @@ def prepared(
     """
     own = own or {}
     keys = (
-        own_points(own, options.knobs, options.quick)
+        own_points(own, options.knobs or (), options.quick)
         if own
-        else all_points(options.scenes, options.knobs, options.quick)
+        else all_points(options.scenes or (), options.knobs or (), options.quick)
     )
     renderer = Renderer(device)
     info = renderer.device
