@@ -183,9 +183,7 @@ class Plants:
 
         environment = self.environment or default_environment()
         with delayed_progress(console(True)) as progress:
-            made = list(
-                plants.write_plants(self.plants, Path(self.out), environment, self.device, progress)
-            )
+            made = list(plants.write_plants(self.plants, Path(self.out), environment, self.device, progress))
         facts = {"plants": [{"file": str(file), "psnr": score} for file, score in made]}
         rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in made]
         return report(self.json, facts, table=("plants", ("file", "PSNR of test views [dB]"), rows))

@@ -172,7 +172,7 @@ def test_scenes_for_trainers(capsys, tmp_path):
         (["report", "nowhere"], "no results in nowhere"),
     ],
 )
-def test_wrong_words_are_one_line(capsys, tmp_path, monkeypatch, words, message):
+def test_wrong_arguments_are_one_line(capsys, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     status, out, err = run(capsys, *words)
     assert (status, out) == (2, "")
@@ -226,7 +226,7 @@ def test_merge_names_shards_that_are_missing(capsys, tmp_path):
 
 
 def test_pictures_of_another_seed_are_not_the_truth(capsys, tmp_path):
-    """Blender's pictures are looked for by their names, which do not say their seed."""
+    """Blender's images are found by their names, which do not include the seed."""
     note_pictures(tmp_path / "b", "raw", 0, 16)
     for words in (
         ("views", "--quick", *SMALL, "--blender", tmp_path / "b", "--seed", "1", "-o", tmp_path / "out"),

@@ -72,7 +72,7 @@ def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, mon
     for view in views:
         assert found[view, "truth", None]["maximum"] < 1e-5
         assert 1e-4 < found[view, "point", "base"]["maximum"] < 0.05
-    # pictures differ, so do their errors; the ceiling lets light through
+    # images differ, so do their errors; the ceiling lets light through
     assert found[views[0], "point", "base"]["rmse"] != found[views[1], "point", "base"]["rmse"]
     assert found[views[0], "point", "0.99"]["maximum"] >= found[views[0], "point", "base"]["maximum"]
     capsys.readouterr()
@@ -114,9 +114,9 @@ def test_several_devices_measure_into_folders_of_their_names(capsys, tmp_path, m
     assert said["points"] == len(begun) == sum(map(len, records))
     assert begun == ["opencl:pocl"] * len(records[0]) + ["warp:cpu"] * len(records[1])
     titles = [device.title for device in load([tmp_path / "opencl-pocl", tmp_path / "warp-cpu"])]
-    drawn = (tmp_path / "both.svg").read_text()
+    chart = (tmp_path / "both.svg").read_text()
     assert len(set(titles)) == 2
-    assert all(f"<!-- hard on {title} -->" in drawn for title in titles)
+    assert all(f"<!-- hard on {title} -->" in chart for title in titles)
 
 
 def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
@@ -149,7 +149,7 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
         (["report", "nowhere"], "no results in nowhere"),
     ],
 )
-def test_wrong_words_are_one_line(capsys, tmp_path, monkeypatch, words, message):
+def test_wrong_arguments_are_one_line(capsys, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     assert main(["tradeoff", *words]) == 2
     out, err = capsys.readouterr()

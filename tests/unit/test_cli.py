@@ -1,5 +1,5 @@
-"""The command line: exit statuses, one line for an error, --json alone on stdout, the words of the
-contract."""
+"""The command line: exit statuses, one line for an error, --json alone on stdout, the commands of
+the contract."""
 
 import io
 import os
@@ -25,13 +25,13 @@ CAMERA = fs.Camera.pinhole(320, 240, 400, 400, 160, 120)
 
 
 @pytest.fixture
-def picture(tmp_path):
+def image_file(tmp_path):
     """A PNG with an AprilTag and a QR code side by side."""
-    pictures = [
+    images = [
         draw(bits, 0.2, pose(turned(20), [0, 0, 0.6]), CAMERA, quiet)[0]
         for bits, quiet in ((dictionary_bits("apriltag", "36h11", 5), 1), (qr_bits("hello"), 4))
     ]
-    return write_png(tmp_path / "codes.png", photographed(np.hstack(pictures)))
+    return write_png(tmp_path / "codes.png", photographed(np.hstack(images)))
 
 
 # --- words
@@ -78,7 +78,7 @@ def test_help_loads_nothing_heavy():
         (["detect", "--json"], "IMAGE"),
     ],
 )
-def test_words_that_make_no_command(words, says, capsys):
+def test_invalid_arguments(words, says, capsys):
     status, line = fails(capsys, *words)
     assert status == 2
     assert says in line
@@ -110,7 +110,7 @@ def test_words_that_make_no_command(words, says, capsys):
         (["demo", "--out", "/proc/nowhere"], "/proc/nowhere"),
     ],
 )
-def test_input_that_cannot_be_used(words, says, capsys, tmp_path, monkeypatch):
+def test_unusable_input(words, says, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     status, line = fails(capsys, *words)
     assert status == 2
@@ -118,12 +118,12 @@ def test_input_that_cannot_be_used(words, says, capsys, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_detect_refuses_families_and_pictures_that_it_does_not_know(capsys, picture, tmp_path):
-    status, line = fails(capsys, "detect", picture, "--family", "36h12")
+def test_detect_refuses_unknown_families_and_damaged_images(capsys, image_file, tmp_path):
+    status, line = fails(capsys, "detect", image_file, "--family", "36h12")
     assert status == 2
     assert "36h11" in line
     broken = tmp_path / "broken.png"
-    broken.write_bytes(picture.read_bytes()[:400])
+    broken.write_bytes(image_file.read_bytes()[:400])
     assert fails(capsys, "detect", broken)[0] == 2
 
 
@@ -149,7 +149,7 @@ def test_version(capsys):
 # --- statuses
 
 
-def test_a_failed_run_is_1_and_a_fault_of_ours_says_so(capsys, monkeypatch):
+def test_a_failed_run_is_status_1_and_an_unexpected_error_is_named(capsys, monkeypatch):
     def broken(self):
         raise fs.DeviceError("the device\ngave up")
 
@@ -189,9 +189,9 @@ def test_debug_anywhere_shows_the_traceback(words, capsys):
     assert err.splitlines()[-1].startswith("fidsplat: ")
 
 
-def test_output_that_nobody_reads_any_more_is_no_traceback(picture):
+def test_a_closed_output_pipe_prints_no_traceback(image_file):
     # the reader is gone before the first word is written
-    words = ["detect", str(picture)]
+    words = ["detect", str(image_file)]
     code = f"import sys; sys.stdin.read(); from fidsplat.cli import main; sys.exit(main({words}))"
     pipe = subprocess.PIPE
     done = subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=pipe, text=True)
@@ -276,34 +276,34 @@ def test_info(capsys, tmp_path):
     assert main(["info", str(tmp_path / "empty.ply")]) == 0
 
 
-def test_detect(capsys, picture):
-    result = prints_json(capsys, "detect", picture)
+def test_detect(capsys, image_file):
+    result = prints_json(capsys, "detect", image_file)
     assert [code["name"] for code in result["detections"]] == ["apriltag:36h11:5", "qr:hello"]
     assert np.array(result["detections"][0]["corners"]).shape == (4, 2)
-    assert main(["detect", str(picture)]) == 0
+    assert main(["detect", str(image_file)]) == 0
     assert "apriltag:36h11:5" in capsys.readouterr().out
     assert (
-        prints_json(capsys, "detect", picture, "--family", "4x4_50", "--family", "25h9")["detections"][0][
+        prints_json(capsys, "detect", image_file, "--family", "4x4_50", "--family", "25h9")["detections"][0][
             "id"
         ]
         is None
     )
 
 
-def test_detect_in_folders_and_videos(capsys, picture, tmp_path):
+def test_detect_in_folders_and_videos(capsys, image_file, tmp_path):
     folder = tmp_path / "stills"
     folder.mkdir()
     for name in ("b.png", "a.png"):
-        write_png(folder / name, read_image(picture))
-    (folder / "notes.txt").write_text("no picture")
+        write_png(folder / name, read_image(image_file))
+    (folder / "notes.txt").write_text("not an image")
     result = prints_json(capsys, "detect", folder)
     assert [one["image"] for one in result["pictures"]] == [str(folder / "a.png"), str(folder / "b.png")]
-    assert main(["detect", str(folder), str(picture)]) == 0
+    assert main(["detect", str(folder), str(image_file)]) == 0
     out = capsys.readouterr().out
     assert "3 images" in out
     assert out.count("apriltag:36h11:5") == 3
 
-    image = read_image(picture)
+    image = read_image(image_file)
     film = tmp_path / "film.avi"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, image.shape[1::-1])
     assert writer.isOpened()

@@ -174,7 +174,7 @@ def test_a_bare_splat_file_is_framed(scene, tmp_path, capsys):
     rows = np.flatnonzero(image.max((1, 2)) > 128)
     assert rows[0] > 5
     assert rows[-1] < 714
-    assert rows[-1] - rows[0] > 400, "it fills the picture"
+    assert rows[-1] - rows[0] > 400, "it fills the image"
     assert main(["detect", "tag.png", "--json"]) == 0
     assert [code["name"] for code in said(capsys)["detections"]] == ["apriltag:36h11:5"]
 
@@ -278,7 +278,7 @@ def test_the_frame_holds_a_cloud_that_is_long_along_one_axis(axis):
     inside = camera.project(ends)
     assert ((inside > 0) & (inside < (camera.width, camera.height))).all()
     spread = np.ptp(inside, axis=0) / (camera.width, camera.height)
-    assert spread.max() > 0.75  # and not from much further away than that takes
+    assert spread.max() > 0.75  # and from no larger distance than necessary
 
 
 def test_every_eighth_pixel_of_the_reference(scene, tmp_path, capsys):

@@ -229,6 +229,6 @@ def test_the_files_of_the_examples_are_made_by_their_script(tmp_path, monkeypatc
         np.abs(read_image(tmp_path / "sky.png").astype(int) - read_image(EXAMPLES / "data/sky.png")).max()
         <= 1
     )
-    again, kept = (fs.load_ply(folder / "globe.ply") for folder in (tmp_path, EXAMPLES / "data"))
-    assert np.allclose(again.sh, kept.sh, atol=1e-6)
-    assert np.allclose(again.means, kept.means, atol=1e-6)
+    made, stored = (fs.load_ply(folder / "globe.ply") for folder in (tmp_path, EXAMPLES / "data"))
+    assert np.allclose(made.sh, stored.sh, atol=1e-6)
+    assert np.allclose(made.means, stored.means, atol=1e-6)

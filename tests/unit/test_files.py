@@ -172,8 +172,8 @@ INPUTS = {
     "scene": lambda folder, pipe: fs.Scene.load(pipe),
     "splats of a scene": lambda folder, pipe: put_scene(folder, pipe.rename(folder / "pipe.ply"), "splats"),
     "panorama": lambda folder, pipe: put_scene(folder, pipe, "panorama"),
-    "picture": lambda folder, pipe: read_image(pipe),
-    "picture of a folder": lambda folder, pipe: next(pictures(pipe.rename(folder / "pipe.png").parent)),
+    "image": lambda folder, pipe: read_image(pipe),
+    "image of a folder": lambda folder, pipe: next(pictures(pipe.rename(folder / "pipe.png").parent)),
     "video": renamed(".mp4", lambda pipe: next(pictures(pipe))),
     "marker image": lambda folder, pipe: fs.marker(f"image:{pipe}", size=0.1),
     "drawing": lambda folder, pipe: fs.marker(f"svg:{pipe}", size=0.1),
@@ -181,7 +181,7 @@ INPUTS = {
     "COLMAP trajectory": renamed(".bin", fs.load_trajectory),
     "points of transforms.json": lambda folder, pipe: put_transforms(folder, pipe, ply_file_path="pipe"),
     "mask": lambda folder, pipe: put_transforms(folder, pipe, frame={"mask_path": "pipe"}),
-    "picture of a data set": lambda folder, pipe: put_transforms(folder, pipe, frame={"file_path": "pipe"}),
+    "image of a data set": lambda folder, pipe: put_transforms(folder, pipe, frame={"file_path": "pipe"}),
     **{
         f"COLMAP {name}": lambda folder, pipe, name=name: put_colmap(folder, pipe, name)
         for name in ("sparse/0/images.bin", "sparse/0/points3D.bin", "images/a.png", "dataset.json")
@@ -205,15 +205,15 @@ INPUTS = {
 
 @pytest.fixture
 def pipe(tmp_path):
-    """A pipe that a thread writes nothing into, as often as somebody opens it: to read it ends, at once."""
+    """A pipe that a thread writes nothing into, whenever it is opened, so that reading ends immediately."""
     path = tmp_path / "pipe"
     os.mkfifo(path)
-    kept = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # later names lead to the same pipe
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # later names lead to the same pipe
     done = threading.Event()
 
     def write():
         while not done.is_set():
-            os.close(os.open(f"/proc/self/fd/{kept}", os.O_WRONLY))
+            os.close(os.open(f"/proc/self/fd/{descriptor}", os.O_WRONLY))
             done.wait(0.01)
 
     writer = threading.Thread(target=write, daemon=True)
@@ -221,7 +221,7 @@ def pipe(tmp_path):
     yield path
     done.set()
     writer.join()
-    os.close(kept)
+    os.close(descriptor)
 
 
 @pytest.mark.parametrize("name", INPUTS)
@@ -230,7 +230,7 @@ def test_a_pipe_in_place_of_an_input_is_refused_and_not_waited_for(name, tmp_pat
         INPUTS[name](tmp_path, pipe)
 
 
-ODD = "a\udcff$x$"  # a byte that is not UTF-8, and what matplotlib takes for mathematics
+ODD = "a\udcff$x$"  # a byte that is not UTF-8, and matplotlib's marks of mathematics
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".spz", ".glb", ".gltf", ".usda", ".usdc", ".fss"])

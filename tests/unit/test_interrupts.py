@@ -176,14 +176,14 @@ def test_what_is_lost_is_seen(trial):
     folder = trial.work / "damaged"
     shutil.copytree(trial.work / "second", folder)
     (folder / ".picture.png.x.part").touch()
-    pictures = sorted(name for name in interrupt.files_below(folder) if name.endswith(".png"))
-    (folder / pictures[0]).write_bytes((folder / pictures[1]).read_bytes())
-    (folder / pictures[-1]).write_bytes((folder / pictures[-1]).read_bytes()[:-9])
+    images = sorted(name for name in interrupt.files_below(folder) if name.endswith(".png"))
+    (folder / images[0]).write_bytes((folder / images[1]).read_bytes())
+    (folder / images[-1]).write_bytes((folder / images[-1]).read_bytes()[:-9])
     assert [words.partition(":")[0] for words in trial.lost(folder, 1, "Traceback")] == [
         "ended with 1",
         "left .picture.png.x.part",
-        f"{pictures[0]} differs",
-        f"{pictures[-1]} is not whole",
+        f"{images[0]} differs",
+        f"{images[-1]} is not whole",
     ]
 
 

@@ -135,13 +135,13 @@ def test_detect_reads_logs(tmp_path, capsys, tag_picture, name, compress):
             log.image(time, "front", tag_picture, compress=compress)
             log.image(time, "front", DEPTH, "depth")
     assert main(["detect", str(tmp_path / name), "--json"]) == 0
-    pictures = json.loads(capsys.readouterr().out)["pictures"]
-    assert [p["image"] for p in pictures] == [
+    results = json.loads(capsys.readouterr().out)["pictures"]
+    assert [p["image"] for p in results] == [
         f"/front/image_raw{'/compressed' if compress else ''} {time} s" for time in ("0.000", "0.100")
     ]
-    assert all(p["detections"][0]["name"] == "apriltag:36h11:5" for p in pictures)
+    assert all(p["detections"][0]["name"] == "apriltag:36h11:5" for p in results)
     (there,) = detect(to_uint8(tag_picture))
-    np.testing.assert_allclose(pictures[0]["detections"][0]["corners"], there.corners, atol=0.1)
+    np.testing.assert_allclose(results[0]["detections"][0]["corners"], there.corners, atol=0.1)
     assert main(["detect", str(tmp_path / name), "--topic", "/rear"]) == 2
     assert "must have colour images on /rear" in capsys.readouterr().err
 
@@ -224,7 +224,7 @@ def test_damaged_logs(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["run.mcap", "bag"])
 def test_times_up_to_the_last_that_a_stamp_holds(tmp_path, name):
-    from fidsplat.logs import RobotLog, log_pictures
+    from fidsplat.logs import RobotLog, log_images
 
     last = 2**31 - 1
     with RobotLog(tmp_path / name) as log:
@@ -233,4 +233,4 @@ def test_times_up_to_the_last_that_a_stamp_holds(tmp_path, name):
         for late in (last + 0.5, np.nextafter(last, np.inf), 2.0**31):
             with pytest.raises(fs.InputError, match="must be seconds from 0"):
                 log.image(late, "front", RGB)
-    assert [one.stamp for one in log_pictures(tmp_path / name)] == [0, last * 10**9]
+    assert [one.stamp for one in log_images(tmp_path / name)] == [0, last * 10**9]

@@ -1,4 +1,4 @@
-"""Work for other processes: the queue by itself, and flights whose pictures come back as bytes."""
+"""Work for other processes: the queue, and flights whose images return as bytes."""
 
 import pickle
 from collections import Counter
@@ -16,7 +16,7 @@ from fidsplat.scenes import PlacedMarker
 
 
 class Here:
-    """An engine of this process, whose workers die where they are told to: at their n-th item."""
+    """An engine of this process, whose workers die at a given item."""
 
     def __init__(self, work=lambda item: item, dies=()):
         self.work, self.dies = work, list(dies)
@@ -89,19 +89,19 @@ def flight(**parts) -> Flight:
     return Flight(scene, path, np.linspace(0, 1, 5), scene.capture)
 
 
-def test_pictures_come_back_as_the_files_that_one_process_writes(tmp_path):
+def test_workers_return_the_files_that_one_process_writes(tmp_path):
     flown = flight(sensor=fs.Sensor(bits=16))
     renderer = fs.Renderer("reference")
-    alone = FlightFolder(tmp_path / "alone", flown, renderer.device.title)
-    list(alone.draw(renderer))
+    single = FlightFolder(tmp_path / "single", flown, renderer.device.title)
+    list(single.draw(renderer))
     work = pickle.loads(pickle.dumps(FlightWork(flown, "reference")))()
     assert work.title == renderer.device.title
     folder = FlightFolder(tmp_path / "many", flown, work.title)
-    folder.file(3, "rgb", ".png").write_bytes(alone.file(3, "rgb", ".png").read_bytes())
-    drawn = list(render_flight(folder, Here(work, dies=[(1, 2), (3, 1)]), 2))
-    assert sorted(drawn) == [0, 1, 2, 3, 4]  # of picture 3 the depth was missing
-    files = {file.relative_to(alone.folder): file.read_bytes() for file in alone.folder.glob("*/*")}
-    assert len(files) == 5 * 4  # rgb, and of depth an array and two pictures
+    folder.file(3, "rgb", ".png").write_bytes(single.file(3, "rgb", ".png").read_bytes())
+    rendered = list(render_flight(folder, Here(work, dies=[(1, 2), (3, 1)]), 2))
+    assert sorted(rendered) == [0, 1, 2, 3, 4]  # the depth of frame 3 was missing
+    files = {file.relative_to(single.folder): file.read_bytes() for file in single.folder.glob("*/*")}
+    assert len(files) == 5 * 4  # rgb, and an array and two images of depth
     assert {file.relative_to(folder.folder): file.read_bytes() for file in folder.folder.glob("*/*")} == files
     assert list(render_flight(folder, Here(work), 2)) == []
 
@@ -140,7 +140,7 @@ def test_replies_that_are_no_results(tmp_path, reply):
     assert not results.file.exists()
 
 
-def test_workers_read_stores_where_they_are_here(tmp_path):
+def test_workers_read_stores_at_the_same_path(tmp_path):
     cloud = fs.marker("aruco:4x4_50:7", size=0.4, mixture="fitted").cloud
     fs.save_ply(cloud, tmp_path / "a.ply")
     store = fs.Store(fs.build_store([tmp_path / "a.ply"], tmp_path / "a.fss"))
@@ -157,7 +157,7 @@ def test_workers_read_stores_where_they_are_here(tmp_path):
         pickle.loads(sent)()
 
 
-def test_words_that_cannot_be_used(tmp_path, capsys, monkeypatch):
+def test_unusable_options(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words in (("--workers", "2"), ("--ray", "local", "--workers", "0")):
         assert main(["fly", "none.toml", *words]) == 2

@@ -47,7 +47,7 @@ def cluster(monkeypatch):
     """Two machines with three processors."""
     ray, errors = ModuleType("ray"), ModuleType("ray.exceptions")
     errors.RayError, errors.RayTaskError = GoneError, TaskError
-    kept = SimpleNamespace(options=[], killed=[], actors=[], address="none", shut=0)
+    record = SimpleNamespace(options=[], killed=[], actors=[], address="none", shut=0)
 
     def get(ticket):
         if isinstance(ticket.error, GoneError):
@@ -57,27 +57,27 @@ def cluster(monkeypatch):
         return ticket.value
 
     def start(worker):
-        kept.actors.append(Actor(worker()))
-        return kept.actors[-1]
+        record.actors.append(Actor(worker()))
+        return record.actors[-1]
 
     def remote(worker):
         def options(**given):
-            kept.options.append(given)
+            record.options.append(given)
             return SimpleNamespace(remote=lambda: start(worker))
 
         return SimpleNamespace(options=options)
 
     ray.exceptions, ray.get, ray.remote = errors, get, remote
-    ray.put, ray.kill = lambda value: value, kept.killed.append
+    ray.put, ray.kill = lambda value: value, record.killed.append
     ray.wait = lambda tickets, **_: ([tickets[-1]], tickets[:-1])
     ray.cluster_resources = lambda: {"CPU": 3.0}
     ray.nodes = lambda: [{"Alive": True}, {"Alive": True}, {"Alive": False}]
     ray.is_initialized = lambda: False
-    ray.init = lambda address, **_: setattr(kept, "address", address)
-    ray.shutdown = lambda: setattr(kept, "shut", kept.shut + 1)
+    ray.init = lambda address, **_: setattr(record, "address", address)
+    ray.shutdown = lambda: setattr(record, "shut", record.shut + 1)
     monkeypatch.setitem(sys.modules, "ray", ray)
     monkeypatch.setitem(sys.modules, "ray.exceptions", errors)
-    return kept
+    return record
 
 
 def work(do, titles=("a device",)):
@@ -143,15 +143,15 @@ def test_workers_with_another_device_are_refused(cluster):
     with ray_engine("local", work(str, ("a device", "another"))) as engine:
         first, second = engine.start(), engine.start()
         assert engine.result(engine.submit(first, 1)) == "1"
-        with pytest.raises(fs.InputError, match="draws with another, another with a device"):
+        with pytest.raises(fs.InputError, match=r"must render with a device, .* got another"):
             engine.result(engine.submit(second, 1))
 
 
 def test_workers_with_other_code_are_refused(cluster, monkeypatch):
-    seen = iter([("1", "here"), ("1", "there")])
-    monkeypatch.setattr("fidsplat.remote.ray_engine.identity", lambda: next(seen))
+    identities = iter([("1", "here"), ("1", "there")])
+    monkeypatch.setattr("fidsplat.remote.ray_engine.identity", lambda: next(identities))
     with (
-        pytest.raises(fs.InputError, match="has fidsplat 1, code there, and this is 1, code here"),
+        pytest.raises(fs.InputError, match="must have fidsplat 1, code here, got 1, code there"),
         ray_engine("local", work(str)),
     ):
         pass

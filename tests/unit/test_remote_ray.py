@@ -38,18 +38,18 @@ def test_a_worker_that_is_killed_costs_no_picture_and_none_is_drawn_twice(tmp_pa
     flown = flight()
     with ray_engine("local", FlightWork(flown, "reference"), workers=3) as engine:  # of two cores
         folder = FlightFolder(tmp_path / "many", flown, engine.title)
-        drawn = []
+        rendered = []
         for k in render_flight(folder, engine, engine.workers):
-            drawn.append(k)
-            if len(drawn) == 3:
+            rendered.append(k)
+            if len(rendered) == 3:
                 ray.kill(engine._actors[0])
         assert len(engine._actors) == 4
-    assert sorted(drawn) == list(range(VIEWS))
+    assert sorted(rendered) == list(range(VIEWS))
     assert folder.left() == []
-    alone = FlightFolder(tmp_path / "alone", flown, engine.title)
-    list(alone.draw(fs.Renderer("reference")))
+    single = FlightFolder(tmp_path / "single", flown, engine.title)
+    list(single.draw(fs.Renderer("reference")))
     for k in range(VIEWS):
-        assert folder.file(k, "rgb", ".png").read_bytes() == alone.file(k, "rgb", ".png").read_bytes()
+        assert folder.file(k, "rgb", ".png").read_bytes() == single.file(k, "rgb", ".png").read_bytes()
 
 
 def test_a_worker_with_another_fidsplat_is_refused(monkeypatch):
@@ -80,11 +80,11 @@ def test_the_command_draws_by_workers(tmp_path, monkeypatch, capsys):
     (tmp_path / "poses.tum").write_text("0 0 0 -1 0 0 0 1\n1 0.3 0 -1 0 0 0 1\n")
     words = ["fly", "scene.toml", "--trajectory", "poses.tum", "--rate", "3", "--device", "reference"]
     assert main([*words, "-o", "many", "--ray", "local", "--workers", "1"]) == 0
-    assert "4 pictures" in capsys.readouterr().out
+    assert "4 frames" in capsys.readouterr().out
     assert main([*words, "-o", "one"]) == 0
     for name in ("rgb/000003.png", "contact-sheet.png", "trajectory.tum"):
         assert (tmp_path / "many" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
-    assert main([*words, "-o", "many"]) == 0  # the same flight, whoever draws it
+    assert main([*words, "-o", "many"]) == 0  # the same flight, whatever renders it
     assert "4 were there already" in capsys.readouterr().out
 
 

@@ -51,7 +51,7 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
         (["--random-points", "-1"], "--random-points must be"),
         (["--random-points", "99999999999"], "--random-points must be"),
         (["--within-memory", "0"], "--within-memory must be above 0 GiB, got 0"),
-        (["--within-memory", "1e-6"], "alone take 0.0001 GiB of the 1e-06 GiB"),
+        (["--within-memory", "1e-6"], "must be more than the 0.0001 GiB of the images"),
     ):
         assert main([*words, *wrong]) == 2
         assert said in capsys.readouterr().err
@@ -60,7 +60,7 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert main(words) == 0
     printed = capsys.readouterr().out
     assert "PSNR" not in printed
-    assert "no view was held out: --hold-out 8" in " ".join(printed.split())
+    assert "no view was held out; --hold-out 8" in " ".join(printed.split())
 
 
 def test_a_run_that_is_interrupted_keeps_what_it_has_done(folder, tmp_path, capsys, monkeypatch):
@@ -78,7 +78,7 @@ def test_a_run_that_is_interrupted_keeps_what_it_has_done(folder, tmp_path, caps
     file = tmp_path / "a.ply"
     assert main([*words, str(file)]) == 130
     said = capsys.readouterr().err
-    assert "the same command goes on after iteration 4" in said
+    assert "the same command resumes after iteration 4" in said
     assert not file.exists()
     assert main([*words, str(file)]) == 0
     assert file.read_bytes() == (tmp_path / "whole.ply").read_bytes()

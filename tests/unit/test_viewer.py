@@ -1,4 +1,4 @@
-"""The viewer without a browser: what is drawn by which settings."""
+"""The viewer without a browser: images of given settings."""
 
 import math
 import threading
@@ -74,12 +74,12 @@ def test_a_moving_picture_has_coarser_constants_and_its_colours_alone():
     assert moving.outputs == ("rgb",)
     assert moving.quality == fs.Quality.named("fast")
     assert (rest.outputs, rest.quality) == (AT_REST, fs.Quality())
-    asked = (
+    quality = (
         "reference,samples=3,transmittance_stop=0.01,lowpass=none"  # coarser in one, a definition in another
     )
-    fine = replace(settings, quality=asked).moving(scene(), camera).quality
-    wanted = fs.Quality.of("fast,transmittance_stop=0.01,lowpass=none")
-    assert fine == wanted.with_(order=fine.order, marker=fine.marker)
+    fine = replace(settings, quality=quality).moving(scene(), camera).quality
+    expected = fs.Quality.of("fast,transmittance_stop=0.01,lowpass=none")
+    assert fine == expected.with_(order=fine.order, marker=fine.marker)
 
 
 def test_a_picture_is_that_of_the_renderer(session):
@@ -96,36 +96,36 @@ def test_a_picture_is_that_of_the_renderer(session):
 
 
 def test_settings_and_scenes_are_exchanged(session):
-    told = []
+    messages = []
     before = session.render(HERE).frame["rgb"]
-    session.request(settings=replace(session.state.settings, fog=1.0), done=told.append)
+    session.request(settings=replace(session.state.settings, fog=1.0), done=messages.append)
     assert session.settle()
     foggy = session.render(HERE).frame["rgb"]
     assert np.abs(foggy - before).max() > 0.1
     _, settings = session.requested()
     moved = replace(session.state.scene, markers=[PlacedMarker(TAG, rigid_matrix((0.2, 0, 0)))])
-    session.request(scene=moved, done=told.append)
+    session.request(scene=moved, done=messages.append)
     assert session.settle()
     assert session.render(HERE).pick(0.05, 0.5)["label"] == -1
     assert session.state.settings == settings  # a new scene keeps the controls
     assert session.state.version == 2
-    assert told == [None, None]
+    assert messages == [None, None]
 
 
 def test_what_cannot_be_drawn_changes_nothing(session):
-    told = []
-    drawn = session.state
+    messages = []
+    state = session.state
     for wrong in ({"device": "opencl:nowhere"}, {"quality": "best"}, {"fog": -1.0, "exposure": -1.0}):
-        session.request(settings=replace(drawn.settings, **wrong), done=told.append)
+        session.request(settings=replace(state.settings, **wrong), done=messages.append)
         assert session.settle()
-    assert session.state is drawn
-    assert "nowhere" in told[0]
-    assert "unknown quality 'best'" in told[1]
-    assert "exposure" in told[2]
+    assert session.state is state
+    assert "nowhere" in messages[0]
+    assert "unknown quality 'best'" in messages[1]
+    assert "exposure" in messages[2]
 
 
 def test_a_switch_never_blocks(session, monkeypatch):
-    """While the new renderer is made, the old one draws."""
+    """The old renderer renders while the new one is opened."""
     compiling, go_on = threading.Event(), threading.Event()
     made = session_module.Renderer
 

@@ -1,5 +1,5 @@
-"""The viewer in a headless Chromium: the page loads, a picture arrives, a drag changes it, a slider changes
-it, a click answers. Skipped where there is no Chromium (Debian: apt-get install chromium)."""
+"""The viewer in a headless Chromium: the page loads, an image arrives, a drag changes it, a slider changes
+it, a click reports a pixel. Skipped where there is no Chromium (Debian: apt-get install chromium)."""
 
 import time
 
@@ -25,14 +25,14 @@ def until(condition, seconds=120.0):
 
 
 def shown(viewer, page):
-    """How far the page's pixels are from those of the last picture at rest: 0 to 255, in the mean."""
+    """Mean difference of the page's pixels from the last exact image, 0 to 255."""
     (view,) = viewer._views.values()
     rgb = to_uint8(view.frame["rgb"])
     wide, tall = page.evaluate(f"{CANVAS}.width"), page.evaluate(f"{CANVAS}.height")
     rows = ((np.arange(HEIGHT) + 0.5) * rgb.shape[0] / tall).astype(int).clip(0, rgb.shape[0] - 1)
     columns = ((np.arange(int(wide)) + 0.5) * rgb.shape[1] / wide).astype(int).clip(0, rgb.shape[1] - 1)
     page_shows = page.picture()[:, : int(wide)]
-    # a notice of the page, that it has no GPU, lies above, the panel beside
+    # a notice about the missing GPU is above, the panel next to it
     part = (slice(HEIGHT // 2, HEIGHT), slice(0, int(wide) - 10))
     return float(np.abs(rgb[rows][:, columns][part].astype(int) - page_shows[part]).mean())
 
@@ -51,7 +51,7 @@ def test_a_browser_sees_drags_asks_and_changes(tmp_path):
     try:
         viewer.overlay(False)
         with chromium.Page(viewer.address, WIDTH, HEIGHT) as page:
-            # the page loads and looks from the scene's camera, and our picture arrives
+            # the page loads and looks from the scene's camera, and the image arrives
             until(lambda: any(abs(v.viewpoint.position[2] + 1) < 1e-6 for v in viewer._views.values()))
             until(lambda: shown(viewer, page) < 6)
             first = next(iter(viewer._views.values()))

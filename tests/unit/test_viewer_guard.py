@@ -64,7 +64,7 @@ def test_a_port_in_use_is_said():
 
 
 def test_a_port_that_another_takes_meanwhile_is_said(monkeypatch):
-    """Between our look and viser's, which takes the next port without a word."""
+    """Between the check and viser, which would silently use the next port."""
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     from fidsplat.viewer import server
 

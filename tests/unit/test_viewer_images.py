@@ -91,9 +91,9 @@ def test_a_moved_camera_shows_the_scene_from_there(viewer, client):
     assert shows(client, rendered(scene, camera_of(ASIDE)))
     other = rigid_matrix((-0.5, 0.4, -0.9), (0.9, -0.2, 0.3, 0.1))
     put(client, other, 50, 62, 1.2)
-    wanted = rendered(scene, camera_of(other, 50, 62, 1.2))
-    assert wanted.std() > 5
-    assert shows(client, wanted)
+    expected = rendered(scene, camera_of(other, 50, 62, 1.2))
+    assert expected.std() > 5
+    assert shows(client, expected)
 
 
 @pytest.mark.parametrize(
@@ -113,9 +113,9 @@ def test_sliders_change_the_image(viewer, client, slider, value, parts):
     before = rendered(scene, camera_of(ASIDE))
     assert shows(client, before)
     viewer._controls._sliders[slider].value = value
-    wanted = rendered(scene, camera_of(ASIDE), **parts)
-    assert (np.abs(wanted.astype(int) - before) > 5).mean() > 0.3
-    assert shows(client, wanted)
+    expected = rendered(scene, camera_of(ASIDE), **parts)
+    assert (np.abs(expected.astype(int) - before) > 5).mean() > 0.3
+    assert shows(client, expected)
     viewer._controls._sliders[slider].value = float(getattr(type(viewer.session.state.settings)(), slider))
     assert shows(client, before)
 
@@ -145,9 +145,9 @@ def test_gizmos_move_what_the_image_shows(viewer, client):
     viewer._move(pose, False)
     one, other = scene.markers
     moved = replace(scene, markers=(one, replace(other, pose=pose)))
-    wanted = rendered(moved, camera_of(ASIDE))
-    assert (wanted != before).any(axis=2).mean() > 0.05
-    assert shows(client, wanted)
+    expected = rendered(moved, camera_of(ASIDE))
+    assert (expected != before).any(axis=2).mean() > 0.05
+    assert shows(client, expected)
 
 
 def test_clicks_name_what_is_at_their_pixel(viewer, client):
@@ -193,7 +193,7 @@ class Page:
 
 
 def corners_of(node):
-    """World positions of the far corners of a frustum at distance 1 along its axis, as viser draws it."""
+    """World positions of the far corners of a frustum at distance 1 along its axis, as viser renders it."""
     tall = np.tan(node.fov / 2)
     wide = tall * node.aspect
     ends = np.array([[x * wide, y * tall, 1.0] for x in (-1, 1) for y in (-1, 1)])
@@ -213,8 +213,8 @@ def test_corners_of_a_frustum_are_those_of_the_image(kind):
     else:
         Nodes(page).show_keyframes(camera, [np.eye(4), ASIDE])
         node = page.added["/keyframes/1"]
-    seen = camera.project(corners_of(node))
-    np.testing.assert_allclose(seen, [[0, 0], [0, 36], [48, 0], [48, 36]], atol=1e-9)
+    projected = camera.project(corners_of(node))
+    np.testing.assert_allclose(projected, [[0, 0], [0, 36], [48, 0], [48, 36]], atol=1e-9)
 
 
 def test_outlines_are_where_the_image_has_the_markers(tmp_path):

@@ -1,4 +1,4 @@
-"""The viewer's page, with a client that is no browser."""
+"""The viewer's page, with a client instead of a browser."""
 
 import base64
 import hashlib
@@ -68,11 +68,11 @@ def test_a_marker_that_moves_is_read_where_it_is_at_the_time_of_the_image(viewer
 
     (still,) = scene().markers
     moving = fs.Scene(markers=[replace(still, motion=slide)], background=(0.2, 0.3, 0.4))
-    drawn = replace(viewer.session.state, scene=moving, settings=replace(Settings.of(moving), time=1.0))
-    capture = drawn.settings.capture(moving, replace(HERE, width=320, height=240).camera(moving, "scene"))
+    state = replace(viewer.session.state, scene=moving, settings=replace(Settings.of(moving), time=1.0))
+    capture = state.settings.capture(moving, replace(HERE, width=320, height=240).camera(moving, "scene"))
     client = Client()
     viewer._messages[1] = client.said
-    viewer._views[1] = StillImage(drawn.renderer.render(moving, capture), drawn, HERE)
+    viewer._views[1] = StillImage(state.renderer.render(moving, capture), state, HERE)
     viewer.detect_markers(client)
     assert "| aruco:4x4_50:7 | 0." in client.said.content  # millimetres, not 100 of them
 
@@ -83,13 +83,13 @@ def test_texts_of_a_scene_are_no_markup(viewer, monkeypatch):
     hostile = "qr:<iframe srcdoc='<script>x</script>'>![a](/etc/passwd)[b](javascript:x) | &lt;\n\n<b>"
     shown = " ".join(hostile.split())
     client, box = Client(), viewer.session
-    drawn = box.state
-    marker = replace(drawn.scene.markers[0].marker, spec=hostile)
-    placed = replace(drawn.scene.markers[0], marker=marker)
+    state = box.state
+    marker = replace(state.scene.markers[0].marker, spec=hostile)
+    placed = replace(state.scene.markers[0], marker=marker)
     viewer._enter(client)
     assert until(lambda: 1 in viewer._views)
     view = viewer._views[1]
-    scene = replace(drawn.scene, markers=(placed,))
+    scene = replace(state.scene, markers=(placed,))
     viewer._views[1] = replace(view, state=replace(view.state, scene=scene))
 
     def is_text(content, text):
@@ -207,7 +207,7 @@ def test_a_gizmo_moves_a_splat_file(viewer, tmp_path):
         "{time = 1, position = [0, 0, 6]}]\n"
     )
     viewer = type(viewer)(fs.Scene.load(path), path, "reference", port=0)
-    viewer._closed.set()  # nobody looks at the file meanwhile
+    viewer._closed.set()  # the file is not polled
     try:
         assert viewer._controls._targets.options[2:] == (
             "file 1: box.ply",
@@ -339,7 +339,7 @@ def test_a_marker_is_not_written_into_a_file_that_cannot_be_shown(viewer, tmp_pa
     file.write_text(edited.replace("-1", "0.4"))
     assert until(lambda: len(viewer._controls._targets.options) == 3)
     assert viewer._controls._targets.options[2] == "2: aruco:4x4_50:7"
-    viewer._move(np.eye(4), True)  # nothing is held any more
+    viewer._move(np.eye(4), True)  # no target is selected
     assert "position" not in file.read_text()
     viewer.select_target("2: aruco:4x4_50:7")
     viewer._move(rigid_matrix((0.1, 0.0, 0.2)), True)

@@ -1,4 +1,4 @@
-"""`fidsplat view RUN`: a flight's folder, and a training that goes on while one looks."""
+"""`fidsplat view RUN`: a flight's folder, and a running training."""
 
 import os
 from dataclasses import replace
@@ -20,7 +20,7 @@ SCENE = (
 
 @pytest.fixture
 def flight(tmp_path, monkeypatch):
-    """A folder of one picture."""
+    """A flight of one frame."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "poses.tum").write_text("0 0 0 -1 0 0 0 1\n")
@@ -30,7 +30,7 @@ def flight(tmp_path, monkeypatch):
 
 
 def test_a_flight_is_its_scene_and_its_poses(flight, monkeypatch):
-    monkeypatch.chdir(flight.parent)  # the scene is found from wherever one stands
+    monkeypatch.chdir(flight.parent)  # the scene is found from any folder
     shown = View("one")._target()
     assert shown.training is None
     assert os.path.samefile(shown.source, "../scene.toml")
@@ -106,9 +106,9 @@ def trainer(tmp_path_factory):
 def test_a_checkpoint_holds_what_is_drawn(trainer):
     cloud, background = splats_of(trainer.checkpoint)
     assert background == BACKGROUND
-    wanted = trainer.cloud()
+    expected = trainer.cloud()
     for name in ("means", "quats", "scales", "opacities", "sh", "origin"):
-        np.testing.assert_array_equal(getattr(cloud, name), getattr(wanted, name))
+        np.testing.assert_array_equal(getattr(cloud, name), getattr(expected, name))
 
 
 def test_a_training_is_shown_as_it_grows(trainer):
@@ -128,13 +128,13 @@ def test_a_training_is_shown_as_it_grows(trainer):
     assert second.camera is first.camera
     assert not np.array_equal(second.cloud().means, first.cloud().means)
     assert run.reload() is None
-    kept = run.file.read_bytes()
+    content = run.file.read_bytes()
     run.file.unlink()
-    assert run.reload() is None  # as while another takes its place
-    run.file.write_bytes(kept[:-9])
+    assert run.reload() is None  # the checkpoint is being replaced
+    run.file.write_bytes(content[:-9])
     with pytest.raises(fs.InputError, match="as a checkpoint of `fidsplat train`"):
         run.reload()
-    run.file.write_bytes(kept)
+    run.file.write_bytes(content)
 
 
 def test_the_page_shows_the_newest_splats(trainer):

@@ -1,4 +1,4 @@
-"""Pacing: which pictures the viewer draws, how large and when."""
+"""Pacing: number, size and time of the viewer's images."""
 
 import threading
 from dataclasses import replace
@@ -21,15 +21,15 @@ class Clock:
 
 def looked_at(moving_takes=lambda scale: 0.0):
     """A stream with a clock of its own, and what it drew."""
-    clock, drawn = Clock(), []
+    clock, rendered = Clock(), []
 
     def moving(viewpoint, scale):
-        drawn.append((viewpoint.position[0], scale))
+        rendered.append((viewpoint.position[0], scale))
         clock.now += moving_takes(scale)
         return lambda: None
 
-    stream = Stream(moving, lambda viewpoint: drawn.append((viewpoint.position[0], "exact")), clock=clock)
-    return stream, clock, drawn
+    stream = Stream(moving, lambda viewpoint: rendered.append((viewpoint.position[0], "exact")), clock=clock)
+    return stream, clock, rendered
 
 
 def at(x) -> Viewpoint:
@@ -37,36 +37,36 @@ def at(x) -> Viewpoint:
 
 
 def test_the_newest_viewpoint_then_one_exact_picture_then_nothing():
-    stream, clock, drawn = looked_at()
-    assert stream.step() is None  # nobody looks yet
+    stream, clock, rendered = looked_at()
+    assert stream.step() is None  # no viewpoint yet
     for x in (1.0, 2.0, 3.0):
         stream.set_viewpoint(at(x))
     assert stream.step() == 0.0
-    assert drawn == [(3.0, 0.5)]
+    assert rendered == [(3.0, 0.5)]
     assert stream.step() == pytest.approx(REST_DELAY)
-    assert len(drawn) == 1
+    assert len(rendered) == 1
     clock.now += REST_DELAY
     assert stream.step() == 0.0
-    assert drawn[1:] == [(3.0, "exact")]
+    assert rendered[1:] == [(3.0, "exact")]
     for _ in range(3):
         clock.now += 60
         assert stream.step() is None
-    stream.set_viewpoint(at(3.0))  # the same again is no news
+    stream.set_viewpoint(at(3.0))  # the same viewpoint
     assert stream.step() is None
     stream.refresh()
     assert stream.step() == 0.0
-    assert drawn[2][0] == 3.0
-    assert len(drawn) == 3
+    assert rendered[2][0] == 3.0
+    assert len(rendered) == 3
 
 
 @pytest.mark.parametrize("full", [0.01, 0.05, 0.2])
 def test_the_scale_holds_the_rate(full):
-    """Of a machine that takes so long for a picture of the page's size."""
-    stream, _, drawn = looked_at(lambda scale: full * scale**2)
+    """A machine that needs this time for an image of the page's size."""
+    stream, _, rendered = looked_at(lambda scale: full * scale**2)
     for k in range(40):
         stream.set_viewpoint(at(float(k)))
         stream.step()
-    last = drawn[-1][1]
+    last = rendered[-1][1]
     assert last == stream.pace.step_scale
     if full < 0.03:
         assert last == 1.0
@@ -85,37 +85,37 @@ def test_the_scale_has_an_end():
 
 
 def test_a_picture_that_fails_is_told_and_the_stream_goes_on():
-    told = []
+    messages = []
 
     def refused(*_):
         raise fs.InputError("too large")
 
-    stream = Stream(refused, refused, told.append, clock=Clock())
+    stream = Stream(refused, refused, messages.append, clock=Clock())
     stream.set_viewpoint(HERE)
     assert stream.step() == 0.0
-    assert told == ["too large"]
+    assert messages == ["too large"]
     assert stream.step() is not None
 
 
 def test_a_picture_that_is_too_large_for_the_memory_is_told():
-    told: list[str] = []
+    messages: list[str] = []
 
-    def draw(*_):
+    def fail(*_):
         raise MemoryError
 
-    stream = Stream(draw, draw, told.append, clock=lambda: 0.0)
+    stream = Stream(fail, fail, messages.append, clock=lambda: 0.0)
     stream.set_viewpoint(HERE)
     stream.step()
-    assert told == ["not enough memory for this image"]
+    assert messages == ["not enough memory for this image"]
 
 
 def test_a_picture_is_sent_while_the_next_is_drawn_and_before_the_exact_one():
-    done, drawn, clock = [], [], Clock()
+    done, rendered, clock = [], [], Clock()
     next_is_drawn = threading.Event()
 
     def moving(viewpoint, scale):
-        number = len(drawn)
-        drawn.append(number)
+        number = len(rendered)
+        rendered.append(number)
         if number == 1:
             next_is_drawn.set()
 
@@ -135,25 +135,25 @@ def test_a_picture_is_sent_while_the_next_is_drawn_and_before_the_exact_one():
 
 
 def test_what_goes_wrong_while_a_picture_is_sent_is_told():
-    told = []
+    messages = []
 
     def send():
-        raise fs.InputError("nobody takes it")
+        raise fs.InputError("the browser left")
 
-    stream = Stream(lambda *_: send, lambda *_: None, told.append, clock=Clock())
+    stream = Stream(lambda *_: send, lambda *_: None, messages.append, clock=Clock())
     for x in (1.0, 2.0):
         stream.set_viewpoint(at(x))
         stream.step()
-    assert told == ["nobody takes it"]
+    assert messages == ["the browser left"]
 
 
 def test_a_stream_runs_in_a_thread_until_it_is_closed():
-    seen = threading.Event()
-    stream = Stream(lambda *_: lambda: None, lambda *_: seen.set())
+    rested = threading.Event()
+    stream = Stream(lambda *_: lambda: None, lambda *_: rested.set())
     thread = threading.Thread(target=stream.run)
     thread.start()
     stream.set_viewpoint(HERE)
-    assert seen.wait(20)
+    assert rested.wait(20)
     stream.close()
     thread.join(20)
     assert not thread.is_alive()
