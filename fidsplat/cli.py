@@ -83,6 +83,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             or (isinstance(error, ImportError) and "failed to map segment" in str(error))
         ):
             return _fail("not enough memory; use a smaller image or fewer splats", 1)
+        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+            return _fail(
+                f"the name of a file must have at most 255 bytes, got {str(error.filename)[:100]}...", 2
+            )
         if isinstance(error, OSError) and error.errno in _SHORTAGES:
             streams.discard_stdout()
             where = f" ({error.filename})" if error.filename else ""

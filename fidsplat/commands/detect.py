@@ -113,7 +113,7 @@ class Detect:
         from fidsplat.images.files import is_video, pictures
         from fidsplat.render.flight import RECORD, seen_in_flight
 
-        if path.endswith(".mcap") or (Path(path) / "metadata.yaml").is_file():
+        if path.endswith(".mcap") or (path_of(path) / "metadata.yaml").is_file():
             yield from self._log_images(path, scene)
             return
         if scene is not None and is_video(path):

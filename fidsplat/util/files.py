@@ -102,7 +102,7 @@ def read_input(path: str | os.PathLike[str], most: int | None = None, first: int
         if first is None:
             check_expansion(path_of(path), size, "its length")
         try:
-            return stream.read(-1 if first is None else first)
+            return stream.read(-1 if first is None else min(first, size))
         except OSError as error:
             raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 

@@ -83,5 +83,6 @@ def _found_at(width: int, height: int, fx: float, fy: float, cx: float, cy: floa
     rays = np.stack([(np.arange(width) + 0.5 - cx) / fx, np.empty(width), np.ones(width)], axis=1)
     for row in range(height):  # not at once: photographs have millions of pixels
         rays[:, 1] = (row + 0.5 - cy) / fy
-        at[:, row] = (lens.image(rays) * (fx, fy) + (cx - 0.5, cy - 0.5)).T
-    return np.nan_to_num(at, nan=_NOWHERE)
+        with np.errstate(over="ignore"):
+            at[:, row] = (lens.image(rays) * (fx, fy) + (cx - 0.5, cy - 0.5)).T
+    return np.nan_to_num(at, nan=_NOWHERE, posinf=_NOWHERE, neginf=_NOWHERE)

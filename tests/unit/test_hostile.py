@@ -414,6 +414,25 @@ def test_damaged_files_are_used_or_refused(kind, good, tmp_path):
     check()
 
 
+def test_a_gltf_buffer_view_of_more_bytes_than_there_are(tmp_path):
+    gltf(tmp_path)
+    said = json.loads((tmp_path / "a.gltf").read_text())
+    for length in (2**53, 2**62, 10**300):
+        said["bufferViews"][0]["byteLength"] = length
+        (tmp_path / "a.gltf").write_text(json.dumps(said))
+        with limits():
+            fs.load_splats(tmp_path / "a.gltf")
+
+
+def test_a_lens_whose_center_is_far_beyond_float32(tmp_path):
+    colmap_text(tmp_path)
+    for center in ("2147483648", "1e30", "-1e300"):
+        text = COLMAP["cameras"].replace("11 6 4", f"11 {center} 4")
+        (tmp_path / "sparse/0/cameras.txt").write_text(text)
+        with limits():
+            use_views(tmp_path)
+
+
 # --- Python
 
 
@@ -503,6 +522,49 @@ SLOW = [
 ]
 """commands that would work for minutes, were their words good after all"""
 OPTIONS = ["--size", "--debugg", "--jsno", "-o", "--outputs", "--quality", "--seed"]
+
+
+NAMED = [
+    "info NAME",
+    "info NAME.ply",
+    "convert NAME.ply a.spz",
+    "convert good.ply NAME.spz",
+    "detect NAME",
+    "detect NAME.mcap",
+    "detect good.png --scene NAME",
+    "render NAME -o a",
+    "render a.toml -o NAME",
+    "render NAME.toml -o a",
+    "source NAME",
+    "marker image:NAME",
+    "marker qr:a -o NAME.ply",
+    "train NAME -o a.ply",
+    "view NAME",
+    "store info NAME",
+    "store verify NAME",
+    "store build NAME.ply -o a.fss",
+    "store build good.ply -o NAME",
+    "fly a.toml NAME",
+    "gallery NAME -o a",
+    "experiment report NAME -o a",
+    "tradeoff report NAME -o a",
+]
+
+
+@pytest.mark.parametrize("length", [251, 300, 5000])
+def test_names_that_no_file_can_have(tmp_path, capsys, monkeypatch, length):
+    """In place of each word of a command line that names a file."""
+    monkeypatch.chdir(tmp_path)
+    scene(tmp_path)
+    long = "x" * length
+    for line in NAMED:
+        capsys.readouterr()
+        with limits():
+            status = cli.main(line.replace("NAME", long).split())
+        errors = capsys.readouterr().err
+        assert status in ((1, 2) if length > 255 else (0, 1, 2)), line
+        assert "a fault of fidsplat" not in errors, (line, errors[-300:])
+        assert "Traceback" not in errors, line
 
 
 @st.composite
