@@ -69,9 +69,12 @@ def test_a_budget_is_measured_and_told(scene, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [(["--max-error", "nan"], "error is nan"), (["--max-error", "1e-12"], "the least is")],
+    [
+        (["--max-error", "nan"], "error must be a finite number, got nan"),
+        (["--max-error", "1e-12"], "error must be at least"),
+    ],
 )
-def test_a_budget_that_cannot_be(scene, tmp_path, capsys, monkeypatch, words, message):
+def test_impossible_bounds(scene, tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.setattr("fidsplat.accuracy.cache.folder", lambda: tmp_path / "cache")
     assert main(["render", scene, *words]) == 2
     assert message in capsys.readouterr().err

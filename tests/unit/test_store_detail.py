@@ -324,7 +324,7 @@ def test_a_time_bound_allows_levels_of_detail(store, renderer, monkeypatch, tmp_
         base = search.measurement.base
         tried.append(base.detail_error)
         if errors[base.detail_error] is None:
-            raise fs.InputError("no quality draws this scene in 1 ms")
+            raise fs.InputError("ms must be at least 2 in 1 ms")
         candidate = load_candidates(renderer.device.kind)[0]
         own = candidate.quality(base)
         return Choice(own, errors[base.detail_error], 1.0, 1.0, "measured", "here", candidate.settings)
