@@ -44,8 +44,9 @@ class Fly(RenderInput):
     Moving parts of the scene follow the trajectory's clock, and a shutter of the scene includes the motion of
     the camera.
 
-    Trajectory files hold camera-to-world poses (docs/trajectories.md): TUM, KITTI, COLMAP's images.txt or
-    folder, nerfstudio's transforms.json. Without --trajectory the scene's [[camera.motion]] is used.
+    Trajectory files hold camera-to-world poses (docs/formats.md#trajectories): TUM, KITTI, COLMAP's
+    images.txt or folder, nerfstudio's transforms.json. Without --trajectory the scene's [[camera.motion]] is
+    used.
 
     Examples:
       fidsplat fly scene.toml --trajectory flight.tum -o flight --video flight.mp4

@@ -144,7 +144,9 @@ UserScenes = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     option("SCENE.toml|FILE.ply", "your own scene instead of --scenes; repeat for several"),
 ]
-Cameras = Annotated[str | None, option("FILE", "camera-to-world poses for --scene (docs/trajectories.md)")]
+Cameras = Annotated[
+    str | None, option("FILE", "camera-to-world poses for --scene (docs/formats.md#trajectories)")
+]
 
 
 def load_user_scenes(

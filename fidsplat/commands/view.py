@@ -52,7 +52,10 @@ class View:
     ] = None
     trajectory: Annotated[
         str | None,
-        option("FILE", "poses to show as keyframes (docs/trajectories.md), e.g. a flight's trajectory.tum"),
+        option(
+            "FILE",
+            "poses to show as keyframes (docs/formats.md#trajectories), e.g. a flight's trajectory.tum",
+        ),
     ] = None
     port: Annotated[int, option("N", "port of the page")] = 8080
     host: Annotated[str, option("ADDRESS", "address to listen on; 0.0.0.0 opens it to the network")] = (
