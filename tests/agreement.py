@@ -26,7 +26,7 @@ _TRUTHS: dict[bytes, dict[str, np.ndarray]] = {}
 
 
 def reference_images(picture, pixels=None):
-    """The reference's images. They are drawn once for all devices: they take longer than on any of them."""
+    """Images of the reference, cached for all devices."""
     key = hashlib.sha256(pickle.dumps((picture, pixels))).digest()
     if key not in _TRUTHS:
         _TRUTHS[key] = render_reference(picture, pixels)
@@ -34,17 +34,17 @@ def reference_images(picture, pixels=None):
 
 
 def against_reference(renderer, picture):
-    """Draw a picture on a device and compare every output with the reference."""
+    """Render a frame on a device and compare every output with the reference."""
     return compare(render(renderer, picture), reference_images(picture), picture.outputs)
 
 
 def reference_pixels(cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0), pixels=None):
-    """Reference images with the certificate: whole, or at `pixels` = (rows, columns)."""
+    """Reference images with the certificate: all pixels, or at `pixels` = (rows, columns)."""
     return reference_images(FrameSpec(cloud, camera, Quality.of(quality), tuple(outputs), background), pixels)
 
 
 def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, background=(0.1, 0.2, 0.3)):
-    """Draw with a device and with the reference and compare every output; returns the frame."""
+    """Render with a device and with the reference, and compare every output; returns the frame."""
     picture = FrameSpec(cloud, camera, Quality.of(quality), tuple(outputs), background)
     frame = renderer.render(cloud, camera, outputs, picture.quality, background=background)
     truth = reference_images(picture)

@@ -92,8 +92,8 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             "a capture with external_depth must have a shutter with exposure_time=0 and readout=0"
         )
     # boxes and EWA have a filter of their own
-    alone = cloud.ellipsoids == "all" and ellipsoid != "exact"
-    filtered = cloud.footprint == "box" or alone
+    ewa_only = cloud.ellipsoids == "all" and ellipsoid != "exact"
+    filtered = cloud.footprint == "box" or ewa_only
     lowpass = "none" if filtered else quality.lowpass
     double = quality.blend_precision == "float64"
     if double:
@@ -107,12 +107,12 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             f"camera_{lens.kind if lens else 'pinhole'}",
             "color_sh" if sh_degree else "color_rgb",
             *((f"ellipsoid_{ellipsoid}",) if ellipsoid else ()),
-            *(("ellipsoids_only",) if alone else ()),
+            *(("ellipsoids_only",) if ewa_only else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
             # before compositing, whose fragments it occludes
             *(("external_depth",) if capture.external_depth is not None else ()),
-            _composing(cloud, quality.order, one_depth_each=alone and not double),
+            _composing(cloud, quality.order, one_depth_each=ewa_only and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
             # the fast functions are float32
@@ -163,6 +163,6 @@ def _refuse_float64(lens: Lens | None, foggy: bool) -> None:
     if foggy or not (lens is None or isinstance(lens, Orthographic)):
         what = "the fog's" if foggy or lens is None else f"a {lens.kind} lens's"
         raise InputError(
-            f"blend_precision='float64' would promise too much: {what} rays are held in float32; take "
+            f"blend_precision='float64' must have rays in float64, got {what} rays in float32; use "
             "blend_precision='float32', or a pinhole without fog"
         )

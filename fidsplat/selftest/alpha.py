@@ -205,10 +205,10 @@ def d5(renderer: Renderer) -> Found:
     for marked in (False, True):
         both = SplatCloud.concatenate([cloud, fire])
         both = both.with_coplanar_groups(0) if marked else both
-        alone = cloud.with_coplanar_groups(0) if marked else cloud
+        without_fire = cloud.with_coplanar_groups(0) if marked else cloud
         frame = renderer.render(both, camera(), names)
         footprint = renderer.render(fire, camera(), names)["alpha"] > 0
-        without = renderer.render(alone, camera(), names)
+        without = renderer.render(without_fire, camera(), names)
         name = "coplanar" if marked else "ordered"
         yield Finding(
             f"{name}: non-finite pixels next to a colour of 1e15",

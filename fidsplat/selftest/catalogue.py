@@ -7,8 +7,8 @@ from fidsplat.selftest import (  # noqa: F401  registers its cases
     arithmetic,
     bounds,
     ellipsoids,
-    homography,
     inputs,
+    intersection,
     order,
 )
 from fidsplat.selftest.case import CASES, Case

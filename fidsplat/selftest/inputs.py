@@ -243,4 +243,4 @@ def e5(renderer: Renderer) -> Found:
                     frame = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, quality)
                     poisoned = {name: frame[name] for name in ALL_OUTPUTS}
                 different += not all(np.array_equal(poisoned[name], clean[name]) for name in ALL_OUTPUTS)
-    yield Finding("frames that change when their buffers held NaN", different, 0)
+    yield Finding("frames that change after their buffers contained NaN", different, 0)

@@ -100,9 +100,9 @@ def composited_parts(
     # with a cut-off above 1/255 every rendered pixel has a depth
     quality = Quality(alpha_cutoff=1 / 250, transmittance_stop=0.0, order=order)
     # all outputs, since kernels for them are compiled by other tests
-    alone = [render(renderer, FrameSpec(part, camera, quality, ALL_OUTPUTS, (0, 0, 0))) for part in parts]
+    frames = [render(renderer, FrameSpec(part, camera, quality, ALL_OUTPUTS, (0, 0, 0))) for part in parts]
     whole = FrameSpec(SplatCloud.concatenate(parts), camera, quality, ALL_OUTPUTS, (0, 0, 0))
-    rgb, alpha, depth = (np.stack([frame[name] for frame in alone]) for name in ("rgb", "alpha", "depth"))
+    rgb, alpha, depth = (np.stack([frame[name] for frame in frames]) for name in ("rgb", "alpha", "depth"))
     ranks = np.argsort(np.where(alpha > 0, depth, np.inf), axis=0)
     light, expected = np.ones(alpha.shape[1:]), np.zeros(rgb.shape[1:])
     for k in ranks:

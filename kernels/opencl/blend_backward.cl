@@ -141,7 +141,8 @@ static inline float lane_sum(vfloat v) {
 #define FOLD_TWOS(a, b) ((vfloat)((a).s014589cd, (b).s014589cd) + (vfloat)((a).s2367abef, (b).s2367abef))
 #define FOLD_ONES(a, b) ((vfloat)((a).even, (b).even) + (vfloat)((a).odd, (b).odd))
 static inline vfloat lane_sums_of_8(const vfloat *v) {
-    vfloat a = FOLD_FOURS(FOLD_HALVES(v[0], v[1]), FOLD_HALVES(v[2], v[3])), b = FOLD_FOURS(FOLD_HALVES(v[4], v[5]), FOLD_HALVES(v[6], v[7]));
+    vfloat a = FOLD_FOURS(FOLD_HALVES(v[0], v[1]), FOLD_HALVES(v[2], v[3])),
+           b = FOLD_FOURS(FOLD_HALVES(v[4], v[5]), FOLD_HALVES(v[6], v[7]));
     return FOLD_TWOS(a, b);
 }
 static inline vfloat lane_sums(const vfloat *v) { return FOLD_ONES(lane_sums_of_8(v), lane_sums_of_8(v + 8)); }

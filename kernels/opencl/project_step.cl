@@ -18,8 +18,8 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
     uint i = get_global_id(0), item = get_local_id(0), first = get_group_id(0) * STEP_ITEMS;
     if (i < count) {
         const SplatGradient own = splat_gradient(
-            i, view, means, activated_quats, activated_scales, activated_opacities, sh, all, splats, keys, windows, big_capacity, big_bounds, width,
-            height, splat_slots, moments
+            i, view, means, activated_quats, activated_scales, activated_opacities, sh, all, splats, keys, windows, big_capacity,
+            big_bounds, width, height, splat_slots, moments
         );
         if (counted) gradients[i] += own.screen;
         for (int k = 0; k < 3; k++) by_means[3 * item + k] = own.mean[k];

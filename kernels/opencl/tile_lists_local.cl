@@ -44,7 +44,9 @@ static inline Area area_of(const Share *share, int tiles, int tiles_x, global co
 }
 
 // Index of a window's tile in the area, and the inverse: the tile of an index.
-static inline int area_index(const Area *area, uint2 window) { return window_tile((uint2)(window.x - area->corner, window.y), area->columns); }
+static inline int area_index(const Area *area, uint2 window) {
+    return window_tile((uint2)(window.x - area->corner, window.y), area->columns);
+}
 static inline int area_tile(const Area *area, int place, int tiles_x) {
     return ((int)(area->corner >> 16) + place / area->columns) * tiles_x + (int)(area->corner & 0xFFFFu) + place % area->columns;
 }

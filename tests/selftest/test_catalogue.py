@@ -5,7 +5,7 @@ from agreement import reference_images
 
 from fidsplat.selftest import check
 from fidsplat.selftest.catalogue import GROUPS, all_cases
-from fidsplat.selftest.homography import QUALITY, grazing_errors
+from fidsplat.selftest.intersection import QUALITY, grazing_errors
 
 SIZES = {"A": 7, "B": 8, "C": 4, "D": 5, "E": 5, "F": 6, "G": 5}
 

@@ -77,7 +77,8 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         sorted[before] = batch[k];
     }
     int old = count - 1, own = taken - 1;
-    for (int to = count + taken - 1; own >= 0; to--) deferred[to] = old >= 0 && deferred[old] < sorted[own] ? deferred[old--] : sorted[own--];
+    for (int to = count + taken - 1; own >= 0; to--)
+        deferred[to] = old >= 0 && deferred[old] < sorted[own] ? deferred[old--] : sorted[own--];
     return count + taken;
 }
 //@ lanes_start
@@ -102,7 +103,8 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         uint places[CHUNK], listed[CHUNK], length = 0;      // positions in the list, and splat indices
         // read a chunk, unless a full chunk of deferred splats is in front of all unread splats
         const bool reads = read < end && deferred_count <= DEFERRED_CAPACITY - CHUNK
-                           && (deferred_count < CHUNK || deferred[deferred_count - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
+                           && (deferred_count < CHUNK
+                               || deferred[deferred_count - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
         if (reads)
             for (; length < CHUNK && read < end; length++) places[length] = read++;
         else
@@ -210,9 +212,9 @@ static inline void k_buffer_flush(Pixel *pixel, vfloat nearest, const BlendConst
 }
 
 static inline void swap_lanes(vfloat *one, vfloat *other, vint mask) {
-    vfloat kept = *one;
-    *one = VSELECT(kept, *other, mask);
-    *other = VSELECT(*other, kept, mask);
+    vfloat copy = *one;
+    *one = VSELECT(copy, *other, mask);
+    *other = VSELECT(*other, copy, mask);
 }
 
 static inline void swap_entries(Entry *one, Entry *other, vint mask) {
@@ -253,8 +255,9 @@ static inline void k_buffer_enqueue(KBuffer *k_buffer, Entry *own) {
 }
 
 // Inserts a fragment of the splat at `place` in the list; no later fragment is nearer than `nearest`.
-static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloat opacity, const Attributes *attributes, uint splat, uint place,
-                                vint mask, global const Splat *splats, const BlendConstants *constants) {
+static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloat opacity, const Attributes *attributes,
+                                   uint splat, uint place, vint mask, global const Splat *splats,
+                                   const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     vint here = (vint)(int)place;
     Queue *queue = k_buffer->queue;
@@ -302,7 +305,8 @@ static inline vint k_buffer_finish(Pixel *pixel, global const Splat *splats, con
                 continue;
             }
 //@ blend_arguments
-                        , splats, listed[which], places[which], VMIN(VAS_FLOAT(in_order((vint)sorted[next] & -CHUNK)), (vfloat)rest_nearest), next_nearest
+                        , splats, listed[which], places[which]
+                        , VMIN(VAS_FLOAT(in_order((vint)sorted[next] & -CHUNK)), (vfloat)rest_nearest), next_nearest
 //@ pass
     do {
 //@ pass_end

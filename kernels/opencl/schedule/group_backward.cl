@@ -137,7 +137,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
                     }
                 if (k + next >= listed) break;
                 for (int row = 0; row < ROWS; row++) {
-                    wide transmittance = pixels[row].t, composited = attenuate(&pixels[row], terms[next][row].opacity, terms[next][row].mask, &constants);
+                    wide transmittance = pixels[row].t;
+                    wide composited = attenuate(&pixels[row], terms[next][row].opacity, terms[next][row].mask, &constants);
                     by_weights[row] = FMA(transmittance * composited, terms[next][row].by_weight, by_weights[row]);
                 }
             }

@@ -74,7 +74,8 @@ static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels
 }
 
 // Backward pass of a splat's fragments, which are the last on the tape; removes them.
-static inline void backward_splat(const Splat *s, const Tile *tile, global Tape *tape, uint place, PixelGradient *gradients, global float *slot) {
+static inline void backward_splat(const Splat *s, const Tile *tile, global Tape *tape, uint place, PixelGradient *gradients,
+                                  global float *slot) {
     const BlendConstants *constants = tile->constants;
     Sums sums = {0};
     uint blocks = tape->blocks[place], at = tape->length -= popcount(blocks);
@@ -156,7 +157,8 @@ kernel void blend_backward(
                 chunk += position != start;
                 first = position;
                 tape->length = 0;
-                for (int block = 0; block < BLOCKS; block++) VSTORE(pixel_transmittance(&pixels[block]), own + (size_t)chunk * CHECKPOINT_FLOATS + block * LANES);
+                for (int block = 0; block < BLOCKS; block++)
+                    VSTORE(pixel_transmittance(&pixels[block]), own + (size_t)chunk * CHECKPOINT_FLOATS + block * LANES);
                 ((global uint *)own)[(size_t)chunk * CHECKPOINT_FLOATS + TILE_W * TILE_H] = first;
             }
             PREFETCH_SPLAT(min(position + PREFETCH_SPLATS, end - 1));

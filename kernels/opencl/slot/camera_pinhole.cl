@@ -5,7 +5,7 @@
     real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
     real determinant = view->focal_x * view->focal_y * su * sv * offset;   // of M: exact where tw . k0 cancels
 //@ camera_blocks_nearest
-        // depth is z_numerator / D, clamped to the splat's range, with D <= `d`; not valid where D may be 0, nor for other shapes than disks
+        // depth is z_numerator / D, clamped to the splat's range, with D <= `d`; valid for disks where D > 0
         vint hit = VMASK(d > 2.0f * around_d) & VMASK((vfloat)s->z_numerator > 0.0f) & VMASK((vfloat)conic_h == (vfloat)(float)half_r2);
         vfloat depth = fmin((1.0f - BLOCKS_SLACK) * s->z_numerator / d, (vfloat)(s->z_center + s->z_reach));
         min_depth = VSELECT(min_depth, fmax(depth, min_depth), hit);
@@ -38,10 +38,10 @@
         // beyond the near plane projects into the contour's section at `near`.
         real3_ along_x = {a.x, b.x, third.x}, along_y = {a.y, b.y, third.y}, along_z = {a.z, b.z, third.z};
         real zz = dot3(along_z, along_z), ahead = near - pz * REAL(0.5);
-        real room = REAL(0.25) / inverse_m2 * (1 + (SETUP_FP64 ? REAL(1e-12) : REAL(1e-4))) - ahead * ahead / zz;
-        if (!(room > 0)) return;
+        real extent2 = REAL(0.25) / inverse_m2 * (1 + (SETUP_FP64 ? REAL(1e-12) : REAL(1e-4))) - ahead * ahead / zz;
+        if (!(extent2 > 0)) return;
         real3_ across_x = cross3(along_x, along_z), across_y = cross3(along_y, along_z);
-        real half_x = sqrt(room * dot3(across_x, across_x) / zz), half_y = sqrt(room * dot3(across_y, across_y) / zz);
+        real half_x = sqrt(extent2 * dot3(across_x, across_x) / zz), half_y = sqrt(extent2 * dot3(across_y, across_y) / zz);
         real middle_x = p.x * REAL(0.5) + dot3(along_x, along_z) / zz * ahead;
         real middle_y = p.y * REAL(0.5) + dot3(along_y, along_z) / zz * ahead;
         bounds = box_bounds(fmax((real)(bounds.ex - bounds.hx), view->focal_x * (middle_x - half_x) / near + view->center_x),

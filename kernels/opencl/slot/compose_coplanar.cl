@@ -109,7 +109,8 @@ static inline void layer_close(Pixel *pixel, vfloat nearest, global const Splat 
     const Layer *open_layer = &pixel->open_layer;
     if (open_layer->plane < 0) return;
     vfloat z = fmax(FMA(fabs(open_layer->mean.z), (vfloat)-0x1p-16f, open_layer->mean.z), (vfloat)open_layer->nearest);
-    k_buffer_insert(pixel, nearest, z, open_layer->opacity, &open_layer->mean, LAYER_FLAG, open_layer->place, open_layer->lanes, splats, constants);
+    k_buffer_insert(pixel, nearest, z, open_layer->opacity, &open_layer->mean, LAYER_FLAG, open_layer->place, open_layer->lanes,
+                    splats, constants);
     pixel->open_layer = no_layer();
 }
 

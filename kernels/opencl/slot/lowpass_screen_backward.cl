@@ -14,12 +14,14 @@ static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho
     vfloat disc_depth = FMA(g.circle * (s->z_numerator - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center);
     depth = VSELECT(VSELECT((vfloat)s->z_center, disc_depth, g.disc), depth, flat);
 //@ disc_add_depth
-    vfloat per_q = 1.0f / FMA(g->nu, g->nu, g->nv * g->nv), by_disc = VSELECT((vfloat)0.0f, by_z * per_q, g->disc), taken = g->circle * g->d;
-    vfloat beyond = s->z_numerator - s->z_center * g->d, by_screen = VSELECT((vfloat)0.0f, by_disc * beyond * g->d, VMASK(g->circle == screen));
-    by_numerator = FMA(by_disc, taken, by_numerator);
-    by_center = FMA(-by_disc * taken, g->d, by_center);
+    vfloat per_q = 1.0f / FMA(g->nu, g->nu, g->nv * g->nv), by_disc = VSELECT((vfloat)0.0f, by_z * per_q, g->disc);
+    vfloat scaled_d = g->circle * g->d;
+    vfloat beyond = s->z_numerator - s->z_center * g->d;
+    vfloat by_screen = VSELECT((vfloat)0.0f, by_disc * beyond * g->d, VMASK(g->circle == screen));
+    by_numerator = FMA(by_disc, scaled_d, by_numerator);
+    by_center = FMA(-by_disc * scaled_d, g->d, by_center);
     by_d = FMA(by_disc * g->circle, beyond - s->z_center * g->d, by_d);
-    by_disc = -2.0f * VSELECT((vfloat)0.0f, by_disc * taken * beyond * per_q, g->disc);        // by n_u over n_u, by n_v over n_v
+    by_disc = -2.0f * VSELECT((vfloat)0.0f, by_disc * scaled_d * beyond * per_q, g->disc);        // by n_u over n_u, by n_v over n_v
     *by_nu = FMA(by_disc, g->nu, *by_nu);
     *by_nv = FMA(by_disc, g->nv, *by_nv);
     sums->disc_x = FMA(-by_screen, x - s->disc_x, sums->disc_x);

@@ -67,10 +67,11 @@ kernel void loss_columns(
 //@@ arguments loss_columns
 ) {
     LOCATE(EACH_ROWS);
-    vfloat sums_of_rows[EACH_ROWS][5];
-    columns_of(images + 2 * image_stride + at, 5, stride, image_stride, sums_of_rows);
+    vfloat column_means[EACH_ROWS][5];
+    columns_of(images + 2 * image_stride + at, 5, stride, image_stride, column_means);
     for (int each = 0; each < EACH_ROWS && row + each < height; each++, at += stride) {
-        vfloat a = sums_of_rows[each][0], b = sums_of_rows[each][1], aa = sums_of_rows[each][2], bb = sums_of_rows[each][3], ab = sums_of_rows[each][4];
+        vfloat a = column_means[each][0], b = column_means[each][1], aa = column_means[each][2];
+        vfloat bb = column_means[each][3], ab = column_means[each][4];
         const Ssim here = ssim_of(a, b, aa, bb, ab);
         VSTORE(INSIDE(here.by_mean), images + 7 * image_stride + at);
         VSTORE(INSIDE(here.by_variance), images + 8 * image_stride + at);
@@ -102,10 +103,10 @@ kernel void loss_columns_backward(
 //@@ arguments loss_columns_backward
 ) {
     LOCATE(EACH_ROWS);
-    vfloat sums_of_rows[EACH_ROWS][5];
-    columns_of(images + 2 * image_stride + at, 3, stride, image_stride, sums_of_rows);
+    vfloat column_means[EACH_ROWS][5];
+    columns_of(images + 2 * image_stride + at, 3, stride, image_stride, column_means);
     for (int each = 0; each < EACH_ROWS && row < height; each++, row++, at += stride) {
-        vfloat by_mean = sums_of_rows[each][0], by_variance = sums_of_rows[each][1], by_shared = sums_of_rows[each][2];
+        vfloat by_mean = column_means[each][0], by_variance = column_means[each][1], by_shared = column_means[each][2];
         vfloat a = VLOAD(images + at), b = VLOAD(images + image_stride + at);
         vfloat slope = sign(a - b) * l1_share - (by_mean + 2.0f * a * by_variance + b * by_shared) * ssim_share;
         float values[LANES];
