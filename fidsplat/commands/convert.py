@@ -46,7 +46,7 @@ class Convert:
         if source.exists() and target.exists() and source.samefile(target):
             raise InputError(f"B must be another file than A, got {self.target}")
         new_file(self.target, self.overwrite)
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             cloud = fs.load_splats(self.source, progress)
         lost = losses(cloud, self.target)
         save_splats(cloud, self.target)

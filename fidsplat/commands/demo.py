@@ -41,7 +41,7 @@ class DemoViews:
 
         check_range("--views", self.views, 2, 1000)
         check_range("--width", self.width, 64, 4096, " pixels")
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             folder = write_demo_views(
                 self.out, self.views, width=self.width, device=self.device, progress=progress
             )

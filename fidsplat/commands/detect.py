@@ -174,7 +174,7 @@ class Detect:
 def _load_scene(path: str) -> "Scene":
     import fidsplat as fs
 
-    with delayed_progress(console(True)) as progress:
+    with delayed_progress() as progress:
         scene = fs.Scene.load(path, progress=progress)
     if scene.camera is None:
         raise InputError(f"{path} must have a [camera] table, which the poses of its markers need")

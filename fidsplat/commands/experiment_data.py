@@ -182,7 +182,7 @@ class Plants:
         from fidsplat.experiments.blender import default_environment
 
         environment = self.environment or default_environment()
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             made = list(plants.write_plants(self.plants, Path(self.out), environment, self.device, progress))
         facts = {"plants": [{"file": str(file), "psnr": score} for file, score in made]}
         rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in made]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from fidsplat.commands.options import Json, option
-from fidsplat.commands.output import console, delayed_progress, report
+from fidsplat.commands.output import delayed_progress, report
 
 if TYPE_CHECKING:
     from fidsplat.splats.cloud import SplatCloud
@@ -47,7 +47,7 @@ class Info:
 
         if Path(self.file).suffix.lower() == SUFFIX:
             return report_store(self.file, self.json)
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             cloud = fs.load_splats(self.file, progress)
         facts = {"file": self.file, "bytes": Path(self.file).stat().st_size, **describe(cloud)}
         return report(self.json, facts, table=(self.file, ("", ""), _rows(facts)))

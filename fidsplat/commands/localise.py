@@ -75,7 +75,7 @@ class Localise:
 
         folder = Path(self.out)
         sweep = drive_sweep(folder, drive, names, renderer, step, self.overwrite)
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             done = len(names) - len(sweep.left)
             for record in sweep.run():
                 done += 1

@@ -83,12 +83,15 @@ def progress_bar(where: Console, *columns: Any) -> Any:
 
 
 @contextmanager
-def delayed_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str, float], None]]:
-    """A progress callback (description, share done) whose bar appears after some seconds.
+def delayed_progress(
+    where: Console | None = None, after: float = 1.0
+) -> Iterator[Callable[[str, float], None]]:
+    """A progress callback (description, share done) whose bar appears after some seconds, by default on
+    stderr.
 
     A thread watches the time, so that long work between two calls also shows the bar.
     """
-    bar = progress_bar(where)
+    bar = progress_bar(where or console(True))
     task = bar.add_task("", total=1.0)
     timer = threading.Timer(after, bar.start)
     timer.daemon = True

@@ -134,7 +134,7 @@ class Render(RenderInput):
     def _render(self, renderer: Renderer, scene: Scene, quality: Quality | str | None) -> Frame:
         """The frame; the slow reference device shows its progress."""
         if renderer.device.always_float64 or self.every is not None:
-            with delayed_progress(console(True)) as progress:
+            with delayed_progress() as progress:
                 step = 1 if self.every is None else self.every
                 return renderer.render_every(
                     step, scene, None, self.names, quality, lambda share: progress("rendering", share)
@@ -201,7 +201,7 @@ class Gallery:
             raise InputError(
                 "a gallery needs at least one scene file (.toml) or splat file, e.g. examples/*.toml"
             )
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             total, pieces = len(self.sources), []
             for k, source in enumerate(self.sources):
                 progress(f"reading {source}", 0.5 * k / total)

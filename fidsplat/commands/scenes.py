@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from fidsplat.commands.options import MemoryBudget, check_request, option, parse_bytes, parse_outputs
-from fidsplat.commands.output import console, delayed_progress
+from fidsplat.commands.output import delayed_progress
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class SceneInput:
 
     def load(self) -> Scene:
         """The scene, with a progress bar when loading takes long. Raises InputError."""
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             return load_source(self.source, self.quality, progress)
 
 
@@ -167,6 +167,6 @@ def load_user_scenes(
     path = None if cameras is None else load_trajectory(cameras)
     found: dict[str, BenchScene] = {}
     for name in files:
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             found |= own_scenes(name, load_source(name, None, progress), path)
     return found

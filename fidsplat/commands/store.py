@@ -52,7 +52,7 @@ class Build:
 
         memory, begun = parse_bytes("--memory", self.memory), time.perf_counter()
         assert memory is not None
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             folder = build_store(
                 self.inputs,
                 self.out,
@@ -238,7 +238,7 @@ class Measure:
         from fidsplat.accuracy.detail_errors import measure_detail
 
         store, names = fs.Store(self.store), [name.strip() for name in self.lowpass.split(",")]
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             renderer = fs.Renderer(self.device)
             made = measure_detail(store, renderer, self.views, names, self.seed, progress)
         if self.json:
@@ -289,7 +289,7 @@ class StoreDemo:
         check_range("--markers", self.markers, 0, 1000)
         city, folder = City(int(self.splats), self.houses, self.seed), writable_folder(self.out)
         begun = time.perf_counter()
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             path = fs.build_store(
                 [city.source], folder / "city.fss", overwrite=self.overwrite, progress=progress
             )
@@ -334,7 +334,7 @@ class Verify:
         from fidsplat.store.store import Store
 
         store = Store(self.store)
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             wrong = store.verify(progress)
         facts = {"store": self.store, "nodes": len(store.nodes), "damaged": wrong}
         report(

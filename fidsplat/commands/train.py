@@ -82,7 +82,7 @@ class Train:
         if file.exists() and not checkpoint.exists():  # from something else than this training
             new_file(file, self.overwrite)
         where = console(self.json)
-        with delayed_progress(console(True)) as progress:
+        with delayed_progress() as progress:
             dataset = load_dataset(self.dataset, self.hold_out, self.random_points, settings.seed, progress)
         if self.within_memory is not None:
             settings = splats_within(settings, _bytes(self.within_memory), dataset)

@@ -77,7 +77,7 @@ class View:
         target = self._target()
         path = None if target.trajectory is None else load_trajectory(target.trajectory)
         where = console(True)
-        with delayed_progress(where) as progress:
+        with delayed_progress() as progress:
             scene = target.scene(self.quality, progress)
         file = Path(target.source) if target.source.lower().endswith(".toml") else None
         reload = None if target.training is None else target.training.reload

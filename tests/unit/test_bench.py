@@ -323,7 +323,7 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
     assert "more with --scenes" not in out
     for wrong, why in (
         (("--scene", "own.toml", "--scenes", "small"), "exclude each other"),
-        (("--cameras", "poses.tum"), "give that as well"),
+        (("--cameras", "poses.tum"), "--cameras needs --scene FILE"),
     ):
         assert bench(*wrong) == 2
         assert why in capsys.readouterr().err
