@@ -68,7 +68,7 @@ class Build:
         facts = {"store": str(folder), "splats": len(store), "chunks": store.chunks, "bytes": store.nbytes}
         facts |= {"left_out": store.header.dropped, "seconds": seconds}
         words = f"{_splats(store)}, {store.nbytes / 2**20:.1f} MiB, "
-        left = (f"left out: {count:,}: {why}" for why, count in store.header.dropped.items())
+        left = (f"dropped: {count:,}: {why}" for why, count in store.header.dropped.items())
         rate = len(store) / seconds / 1e6
         return report(self.json, facts, words + f"in {seconds:.1f} s ({rate:.2f} M/s): {folder}", *left)
 

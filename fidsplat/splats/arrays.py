@@ -96,9 +96,9 @@ def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 
 def check_scale(colors: np.ndarray) -> np.ndarray:
-    """Colours, which are no bytes: white would be 255 times as light as the brightest paper."""
+    """Refuse bytes as colours: 1 is white."""
     if colors.dtype == np.uint8 and colors.size and colors.max() > 1:
-        raise InputError("colors are bytes up to 255, but 1 is white: give colors / 255")
+        raise InputError("colors must have 1 as white, got bytes up to 255; give colors / 255")
     return colors
 
 
@@ -130,7 +130,7 @@ def _is_frozen(array) -> bool:
 
 
 def as_single(array: np.ndarray) -> np.ndarray:
-    """As C-ordered float32 that nobody else can write to; what float32 cannot hold becomes inf."""
+    """C-ordered, unshared float32 array; an overflow becomes inf."""
     if array.dtype == F32 and array.flags.c_contiguous and _is_frozen(array):
         return array
     with np.errstate(over="ignore"):
@@ -159,10 +159,10 @@ def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> 
 
 
 def unit_quaternions(quats: np.ndarray) -> np.ndarray:
-    """Quaternions of length 1. Those that are so to float32 rounding keep their bits: twice is the same as
-    once."""
-    unit = quats  # only a cloud's own array can be written to
-    for start in range(0, len(quats), 4096):  # so that millions of them need no copy in float64
+    """Normalised quaternions. Those already normalised to float32 rounding are unchanged, so it is
+    idempotent."""
+    unit = quats  # only arrays of the cloud are writable
+    for start in range(0, len(quats), 4096):  # bounds the float64 copy
         part = slice(start, start + 4096)
         square = square_of(quats[part])
         off = np.abs(square - 1.0) > 2.4e-7
@@ -173,7 +173,7 @@ def unit_quaternions(quats: np.ndarray) -> np.ndarray:
 
 
 def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same 3D Gaussians in frames whose third axis is the thinnest; the third wins ties.
+    """Rotate 3D Gaussians so that their third axis is the thinnest; the third wins ties.
 
     quats (n, 4) wxyz, scales (n, 3), none of them NaN -> both new.
     """
@@ -198,7 +198,7 @@ def check_one_footprint(groups: np.ndarray | None, boxes: np.ndarray | None) -> 
 
 
 def joined_arrays(clouds: Sequence[Any], name: str, kind) -> np.ndarray | None:
-    """The arrays of this name of several clouds as one: 0 where a cloud has None; None if all have None."""
+    """Concatenated array of several clouds: 0 where a cloud has None, None if all have None."""
     arrays = [getattr(cloud, name) for cloud in clouds]
     if all(array is None for array in arrays):
         return None

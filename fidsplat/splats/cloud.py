@@ -1,4 +1,4 @@
-"""SplatCloud: the Gaussian splats of a scene as a structure of arrays, checked once and then frozen."""
+"""SplatCloud: validated, read-only arrays of the splats of a scene."""
 
 import warnings
 from collections import Counter
@@ -41,8 +41,8 @@ __all__ = ["SplatCloud", "sh_basis"]
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class SplatCloud(PickledByFields, Summarised):
-    """2D Gaussian splats (disks), and 3D ones (ellipsoids) where they have a thickness. Every array is
-    read-only; make a new cloud to change one."""
+    """2D Gaussian splats (disks), and 3D ones (ellipsoids) where the thickness is above 0. Arrays are
+    read-only."""
 
     means: np.ndarray
     """(n, 3) float32, metres, centres relative to ``origin``"""
@@ -53,43 +53,42 @@ class SplatCloud(PickledByFields, Summarised):
     opacities: np.ndarray
     """(n,) float32 in [0, 1]"""
     colors: np.ndarray | None
-    """(n, 3) float32 RGB in display space, or None when ``sh`` is set"""
+    """(n, 3) float32 RGB in display space; None if ``sh`` is set"""
     sh: np.ndarray | None
-    """(n, k, 3) float32, k = (degree + 1)^2, or None when ``colors`` is set; convention at ``sh_basis``"""
+    """(n, k, 3) float32, k = (degree + 1)^2, in the convention of ``sh_basis``; None if ``colors`` is set"""
     labels: np.ndarray
     """(n,) int32"""
     origin: np.ndarray
-    """(3,) float64, metres, world position of the means' zero"""
+    """(3,) float64, metres, world position of means 0"""
     coplanar_groups: np.ndarray | None = None
     """(n,) int32, or None: splats with the same id >= 0 are coplanar and composited without an order
     (`with_coplanar_groups`); -1 for splats in no group"""
     boxes: np.ndarray | None = None
-    """(n,) bool, or None if all are False: True for a box, whose opacity is the same all over |u|, |v| <= 1
-    and whose ``scales`` are half sides (`with_boxes`); False for a Gaussian"""
+    """(n,) bool, or None if all are False: True for a box with uniform opacity in |u|, |v| <= 1 and
+    ``scales`` as half sides (`with_boxes`), False for a Gaussian"""
     thickness: np.ndarray | None = None
     """(n,) float32, metres, or None if all are 0: standard deviation along the normal, above 0 for a 3D
     Gaussian, 0 for a disk or a box"""
     dropped: dict[str, int] = field(default_factory=dict)
-    """reason -> number of splats left out when this cloud was made; empty when nothing was"""
+    """reason -> number of splats dropped by the constructor"""
 
     def __init__(
         self, means, quats, scales, opacities, colors=None, sh=None, labels=None, origin=None, *, source=None
     ):
-        """Check and freeze n splats.
+        """Validate and freeze n splats.
 
         means (n, 3) metres; quats (n, 4) wxyz of any length but 0; scales (n, 2) metres, or (n, 3), whose
         third becomes ``thickness``: 0 is a disk; opacities (n,) in [0, 1]; exactly one of colors (n, 3) and
-        sh (n, 1 | 4 | 9 | 16, 3); labels: an int or (n,) ints, else 0.
+        sh (n, 1 | 4 | 9 | 16, 3); labels: an int or (n,) ints, default 0.
 
-        origin None: means are world coordinates; float32 means keep their bits, with origin 0; float64
-        means get an origin when float32 would blur them. origin (3,): means are relative to it, as the
-        attribute is.
+        origin None: means are world coordinates; float32 means are stored unchanged with origin 0; float64
+        means get an origin if float32 would lose precision. origin (3,): means are relative to it.
 
-        A splat that cannot be drawn (a value that is not finite or, quaternions apart, beyond 1e15,
-        |q|^2 < 1e-30, a scale <= 0 or a thickness < 0, an opacity outside [0, 1]) is left out and counted in
-        ``dropped`` under its first such reason; one warning reports the counts, naming ``source`` (a file,
-        say). Arrays are copied, except float32 arrays that are read-only down to the memory they stand on.
-        Raises InputError, naming the array, for a wrong shape or type.
+        A splat that cannot be rendered (a value that is not finite or, except in quaternions, beyond 1e15,
+        |q|^2 < 1e-30, a scale <= 0 or a thickness < 0, an opacity outside [0, 1]) is dropped and counted in
+        ``dropped`` by its first reason; one warning reports the counts and names ``source``, e.g. a file.
+        Arrays are copied unless they are float32 and read-only, including their base. Raises InputError,
+        naming the array, for a wrong shape or type.
         """
         given = real_numbers("means", means)
         n = given.shape[0] if given.ndim else -1
@@ -142,10 +141,10 @@ class SplatCloud(PickledByFields, Summarised):
         origin,
         dropped,
     ) -> "SplatCloud":
-        """A cloud that takes over arrays of splats that can all be drawn, as their maker knows.
+        """A cloud of validated arrays, without a copy.
 
-        means (n, 3) float32 or float64, all else as the attributes are, but quats of any length above 0; one
-        of sh and colors is None. dropped: what a reader left out.
+        means (n, 3) float32 or float64; quats of any length above 0; one of sh and colors is None; the rest
+        like the attributes. dropped: counts of a reader.
         """
         cloud = object.__new__(cls)
         single = {"quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "sh": sh}
@@ -158,13 +157,13 @@ class SplatCloud(PickledByFields, Summarised):
         return cloud
 
     def _finish(self, given, single: dict[str, np.ndarray], labels, origin, dropped: dict[str, int]) -> None:
-        """Freeze splats that can be drawn; given: the means in the type that they came in."""
+        """Freeze validated splats; given: the means in their original type."""
         single["quats"] = unit_quaternions(single["quats"])
         if "thickness" in single and not single["thickness"].any():
             del single["thickness"]
         if origin is not None:
             new_origin = check_origin(origin)
-        else:  # after the defects, so that a splat that is left out has no say in it
+        else:  # after dropping, so dropped splats do not affect it
             single["means"], new_origin = choose_origin(given, single["means"], single["scales"])
         self._set(
             **{
@@ -187,7 +186,7 @@ class SplatCloud(PickledByFields, Summarised):
             object.__setattr__(self, name, value)
 
     def _replaced(self, **values) -> "SplatCloud":
-        """A copy with some arrays exchanged; the values are known to be good."""
+        """A copy with some arrays replaced by validated values."""
         cloud = object.__new__(SplatCloud)
         old = {name: getattr(self, name) for name in self.__dataclass_fields__}
         cloud._set(**old | {"dropped": dict(self.dropped)} | values)
@@ -201,14 +200,14 @@ class SplatCloud(PickledByFields, Summarised):
         return f"SplatCloud({len(self)} splats, {color}, origin {tuple(self.origin.tolist())})"
 
     def summary(self) -> dict[str, str]:
-        """What it holds, in words."""
+        """Readable summary of the contents."""
         kinds = {"none": "2D", "all": "3D", "some": "2D and 3D"}
         rows = {"splats": f"{len(self):,}, {kinds[self.ellipsoids]}"}
         rows["colours"] = "plain" if self.sh is None else f"SH of degree {self.sh_degree}"
         if len(self):
             rows["bounds"] = " to ".join(map(point, self.bounds())) + " m"
             rows["labels"] = f"{len(np.unique(self.labels)):,} different"
-        return rows | {f"left out: {why}": f"{count:,}" for why, count in self.dropped.items()}
+        return rows | {f"dropped: {why}": f"{count:,}" for why, count in self.dropped.items()}
 
     @property
     def sh_degree(self) -> int:
@@ -217,8 +216,8 @@ class SplatCloud(PickledByFields, Summarised):
 
     @property
     def plain_colors(self) -> np.ndarray | None:
-        """(n, 3) float32 colours that do not depend on the view: `colors`, or what SH of degree 0 means; None
-        for SH of a higher degree."""
+        """View-independent colours (n, 3) float32: `colors`, or those of SH of degree 0; None for a higher
+        degree."""
         if self.sh is None or self.sh_degree > 0:
             return self.colors
         return np.maximum(np.float32(C0) * self.sh[:, 0, :] + np.float32(0.5), np.float32(0))
@@ -237,14 +236,14 @@ class SplatCloud(PickledByFields, Summarised):
 
     @property
     def footprint(self) -> str:
-        """`gaussian`, `box`, or `mixed` where there are splats of both kinds."""
+        """`gaussian`, `box`, or `mixed` for both kinds."""
         if self.boxes is None:
             return "gaussian"
         return "box" if self.boxes.all() else "mixed"
 
     @staticmethod
     def empty() -> "SplatCloud":
-        """A cloud of no splats, with plain colours and no origin of its own."""
+        """An empty cloud with plain colours and origin 0."""
         zero = np.zeros
         return SplatCloud(zero((0, 3)), zero((0, 4)), zero((0, 2)), zero(0), colors=zero((0, 3)))
 
@@ -253,8 +252,8 @@ class SplatCloud(PickledByFields, Summarised):
         return self.means + self.origin
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest axis-aligned box (min (3,), max (3,)) float64, world, around all splats: the 3 sigma
-        ellipses or ellipsoids of Gaussians, the rectangles of boxes.
+        """World bounding box (min (3,), max (3,)) float64 of Gaussians to 3 sigma and of boxes to their
+        corners.
 
         Raises InputError for an empty cloud.
         """
@@ -264,8 +263,8 @@ class SplatCloud(PickledByFields, Summarised):
         return (self.means - reach).min(axis=0) + self.origin, (self.means + reach).max(axis=0) + self.origin
 
     def reach(self, sigmas: float) -> np.ndarray:
-        """Half extents (n, 3) float64 [m] of splats along the world's axes: of Gaussians to that many
-        standard deviations, of boxes to their corners."""
+        """Half extents (n, 3) float64 [m] along the world axes: Gaussians to a number of standard deviations,
+        boxes to their corners."""
         sigmas = number("sigmas", sigmas, "a number of standard deviations, 0 to 1e6", 0.0, 1e6)
         turns = quaternion_to_matrix(self.quats)
         axes = turns[:, :, :2] * (sigmas * self.scales.astype(np.float64))[:, None, :]
@@ -278,9 +277,9 @@ class SplatCloud(PickledByFields, Summarised):
         return np.where(self.boxes[:, None], corners, np.sqrt(squares))
 
     def flattened(self) -> "SplatCloud":
-        """The cloud with disks in place of its 3D Gaussians: of each, the thinnest axis becomes the normal.
+        """The cloud with its 3D Gaussians flattened to disks; the thinnest axis becomes the normal.
 
-        For renderers of disks alone. Captures of thick splats lose their haze (docs/experiments.md).
+        For renderers of 2D Gaussians. Captures of thick splats lose their haze (docs/experiments.md).
         """
         if self.thickness is None:
             return self
@@ -291,15 +290,14 @@ class SplatCloud(PickledByFields, Summarised):
         return self._replaced(quats=unit_quaternions(quats), scales=scales, thickness=None)
 
     def with_labels(self, labels) -> "SplatCloud":
-        """The same splats with other labels, one int or (n,) ints. Raises InputError for anything else."""
+        """A copy with other labels, one int or (n,) ints. Raises InputError for anything else."""
         return self._replaced(labels=whole_numbers(labels, len(self)))
 
     def transformed(self, matrix) -> "SplatCloud":
-        """The cloud moved by a 4x4 rigid transform with uniform scale (world from world); SH colours turn
-        too.
+        """The cloud transformed by a 4x4 rotation, uniform scale and translation; SH colours rotate too.
 
-        A cloud with an origin keeps its relative means small: the origin moves. Raises InputError for any
-        other matrix, a reflection among them.
+        A cloud with an origin keeps its means small: the origin moves. Raises InputError for any other
+        matrix, such as a reflection.
         """
         rotation, scale, translation = check_similarity(matrix, "the transform")
         local = self.means @ (scale * rotation).T
@@ -344,11 +342,11 @@ class SplatCloud(PickledByFields, Summarised):
         return self._replaced(coplanar_groups=ids if (ids >= 0).any() else None)
 
     def with_boxes(self, boxes: bool | np.ndarray = True) -> "SplatCloud":
-        """The same splats with box footprints where ``boxes``, one bool or (n,) bools, is True.
+        """A copy with box footprints where ``boxes``, one bool or (n,) bools, is True.
 
-        A box is a rectangle of even opacity: its scales are half sides in metres, its edges are filtered by
-        the pixel. In a coplanar group the coverage of boxes adds up, so a partition into boxes with parallel
-        sides has no seams. Raises InputError for anything but bools, and for a group of both kinds.
+        A box is a rectangle of uniform opacity: its scales are half sides in metres, its edges are filtered
+        by the pixel. In a coplanar group the coverage of boxes adds up, so a partition into boxes with
+        parallel sides has no seams. Raises InputError for anything but bools, and for a group of both kinds.
         """
         try:
             mask = np.asarray(boxes)

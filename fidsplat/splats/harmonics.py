@@ -55,25 +55,25 @@ def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
 
 
 def color_range(colors: np.ndarray | None, sh: np.ndarray | None) -> tuple[float, float]:
-    """Lower and upper bound of every channel of colours (n, 3), or of what harmonics (n, k, 3) show from any
-    direction; 0 is always within. What is not finite does not count.
+    """Bounds of all channels of colours (n, 3), or of SH (n, k, 3) over all directions; they contain 0.
+    Values that are not finite are ignored.
 
-    The squares of a band's basis values add up to (2 l + 1) / (4 pi), so that the band is at most the root of
-    that times the length of its coefficients.
+    The squared basis values of band l sum to (2 l + 1) / (4 pi), so the band is at most the square root of
+    that times the norm of its coefficients.
     """
     if sh is None:
         values = np.zeros(0) if colors is None else colors[np.isfinite(colors)]
         return float(values.min(initial=0.0)), float(values.max(initial=0.0))
-    most = np.full((len(sh), 3), 0.5)
+    highest = np.full((len(sh), 3), 0.5)
     for band in range(int(np.sqrt(sh.shape[1]))):
         own = sh[:, band**2 : (band + 1) ** 2]
         squares = np.einsum("nkc,nkc->nc", own, own, dtype=np.float64)
-        most += np.sqrt((2 * band + 1) / (4 * np.pi) * squares)
-    return 0.0, float(most[np.isfinite(most)].max(initial=0.0))
+        highest += np.sqrt((2 * band + 1) / (4 * np.pi) * squares)
+    return 0.0, float(highest[np.isfinite(highest)].max(initial=0.0))
 
 
 def _sample_directions() -> np.ndarray:
-    """32 evenly spread unit directions (Fibonacci lattice), on which every band is well conditioned."""
+    """32 unit directions of a Fibonacci lattice, on which every band is well conditioned."""
     i = np.arange(32)
     z = 1 - (2 * i + 1) / 32
     angle = i * np.pi * (3 - np.sqrt(5))
@@ -82,7 +82,7 @@ def _sample_directions() -> np.ndarray:
 
 
 def rotation_of_coefficients(degree: int, rotation: np.ndarray) -> np.ndarray:
-    """Matrix D (k, k) float64 that turns SH coefficients with a rotation (3, 3): basis(R d) D f = basis(d) f.
+    """Matrix D (k, k) float64 that rotates SH coefficients by R (3, 3): basis(R d) D f = basis(d) f.
 
     Bands do not mix, so D is block diagonal; each block is solved for on fixed directions.
     """

@@ -7,7 +7,7 @@ from fidsplat.util.errors import InputError
 
 
 def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product a b of (..., 4) quaternions: turning by it is turning by b, then by a."""
+    """Hamilton product a b of quaternions (..., 4): rotate by b, then by a."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a, np.float64), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(b, np.float64), -1, 0)
     return np.stack(
@@ -36,7 +36,7 @@ def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
 def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
     """Unit quaternion (4,) float64, w >= 0, of one rotation matrix (3, 3).
 
-    The row of 4 q q^T with the largest diagonal entry is divided by its length, which is never small.
+    Normalises the row of 4 q q^T with the largest diagonal entry, whose norm is never small.
     """
     r = np.asarray(rotation, np.float64)
     xx, yy, zz = r[0, 0], r[1, 1], r[2, 2]
@@ -68,7 +68,7 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{name} must have the last row (0, 0, 0, 1), got {tuple(m[3].tolist())}")
     linear = m[:3, :3]
-    with np.errstate(over="ignore"):  # as of a quaternion
+    with np.errstate(over="ignore"):  # an overflow is refused below
         scale = float(np.linalg.norm(linear)) / np.sqrt(3.0)
     if not scale > 0 or not np.isfinite(scale):
         raise InputError(f"{name} must be a rotation with a positive scale, but its scale is {scale:g}")
@@ -92,16 +92,16 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
 
 
 def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) -> np.ndarray:
-    """4x4 float64 matrix that scales, then turns by a quaternion (w, x, y, z) of any length, then moves.
+    """4x4 float64 matrix: scale, then rotation by a quaternion (w, x, y, z) of any length, then translation.
 
     Raises InputError when position is not three finite numbers, quaternion not four or all 0, or scale not
     above 0.
     """
-    move, turn = real_array("position", position), real_array("quaternion", quaternion)
-    if move.shape != (3,) or not np.isfinite(move).all():
+    translation, rotation = real_array("position", position), real_array("quaternion", quaternion)
+    if translation.shape != (3,) or not np.isfinite(translation).all():
         raise InputError(f"position must be three finite numbers, got {position!r}")
-    with np.errstate(over="ignore"):  # what is too long for a float is infinitely long, and refused
-        length = np.linalg.norm(turn) if turn.shape == (4,) else np.nan
+    with np.errstate(over="ignore"):  # an overflow is refused below
+        length = np.linalg.norm(rotation) if rotation.shape == (4,) else np.nan
     if not (0 < length < np.inf):
         raise InputError(
             f"quaternion must be four finite numbers (w, x, y, z), not all 0, got {quaternion!r}"
@@ -109,6 +109,6 @@ def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) 
     if not (0 < scale < np.inf):
         raise InputError(f"scale must be above 0 and finite, got {scale!r}")
     matrix = np.eye(4)
-    matrix[:3, :3] = scale * quaternion_to_matrix(turn)
-    matrix[:3, 3] = move
+    matrix[:3, :3] = scale * quaternion_to_matrix(rotation)
+    matrix[:3, 3] = translation
     return matrix

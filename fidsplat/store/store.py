@@ -101,7 +101,7 @@ class Store(Summarised):
             rows["instances"] = f"{len(self.poses):,} of {self.header.store}"
         if len(self):
             rows["bounds"] = " to ".join(map(point, self.bounds())) + " m"
-        return rows | {f"left out: {why}": f"{n:,}" for why, n in self.header.dropped.items()}
+        return rows | {f"dropped: {why}": f"{n:,}" for why, n in self.header.dropped.items()}
 
     # traits, like those of a cloud
 

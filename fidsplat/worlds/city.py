@@ -1,5 +1,5 @@
-"""A city of splats that nobody has to download: streets, and houses with windows, as many splats as asked
-for, made block by block so that none is in memory for long. y is down; streets lie at y = 0."""
+"""Procedural city: streets and houses with windows, of any number of splats, generated in blocks for bounded
+memory. y is down; streets are at y = 0."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.store.sources import Source
 from fidsplat.util.errors import InputError
 
-MOST = 2_000_000_000
+MAX_SPLATS = 2_000_000_000
 PITCH = 24.0
-"""metres from house to house"""
+"""metres between houses"""
 SIDE = 14.0
 """metres: edge of a house"""
 WINDOWS = 3.0
-"""metres from window to window"""
+"""metres between windows"""
 BOARD, EYES = 0.1, 1.7
-"""metres: how far before their walls markers hang, and how high"""
+"""metres: distance of markers from their walls, and height above the street"""
 OPACITY = 0.95
 OVERLAP = 0.75
-"""standard deviations of a splat, in the mean distance of two"""
+"""standard deviation of a splat over the mean distance between splats"""
 
 
 @dataclass(frozen=True)
 class City:
-    """Houses on a square grid. The same for the same numbers on every machine. Raises InputError for numbers
-    that make none."""
+    """Houses on a square grid; equal settings make equal cities on every machine. Raises InputError for
+    numbers out of range."""
 
     splats: int
     houses: int = 8
-    """along a side"""
+    """number of houses along a side"""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, most in (("splats", MOST), ("houses", 100), ("seed", 2**32 - 1)):
-            value, least = getattr(self, name), int(name != "seed")
-            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-                raise InputError(f"{name} of a city must be {least} to {most:,}, got {value!r}")
+        for name, highest in (("splats", MAX_SPLATS), ("houses", 100), ("seed", 2**32 - 1)):
+            value, lowest = getattr(self, name), int(name != "seed")
+            if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
+                raise InputError(f"{name} of a city must be {lowest} to {highest:,}, got {value!r}")
 
     @property
     def side(self) -> float:
-        """Metres: edge of the whole; it reaches from 0 along x and z."""
+        """Edge of the city in metres; it extends from 0 along x and z."""
         return PITCH * self.houses
 
     @property
     def source(self) -> Source:
-        """Its splats, for `build_store`."""
+        """Input of `build_store`."""
         columns: dict = {
             "means": ((3,), np.float32),
             "quats": ((4,), np.float32),
@@ -65,7 +65,7 @@ class City:
 
     @cached_property
     def _walls(self) -> dict[str, np.ndarray]:
-        """Rectangles: corner (w, 3), edges (w, 3) each [m], colour (w, 3), storeys' windows (w,) bool."""
+        """Rectangles: corner (w, 3), two edges (w, 3) [m], colour (w, 3), whether they have windows (w,)."""
         generator = np.random.default_rng(self.seed)
         corners, across, up, colors, windows = (
             [[0.0, 0, 0]],
@@ -102,8 +102,8 @@ class City:
         }
 
     def marker_poses(self, count: int) -> np.ndarray:
-        """(count, 4, 4) world from marker, of boards on the houses' walls at the height of a camera, evenly
-        spread and turned to the streets."""
+        """Poses (count, 4, 4), world from marker, on walls at camera height, evenly spread, facing the
+        streets."""
         walls, houses = self._walls, np.flatnonzero(self._walls["windows"])
         poses, rows = np.tile(np.eye(4), (count, 1, 1)), -(-count // len(houses))
         for number, pose in enumerate(poses):
@@ -118,15 +118,15 @@ class City:
 
     @cached_property
     def _frames(self) -> np.ndarray:
-        """(w, 4) quaternions: tangents along the edges."""
+        """Quaternions (w, 4) with tangents along the edges."""
         walls = self._walls
         u = walls["across"] / np.linalg.norm(walls["across"], axis=1, keepdims=True)
         v = walls["up"] / np.linalg.norm(walls["up"], axis=1, keepdims=True)
-        turns = np.stack([u, v, np.cross(u, v)], axis=2)
-        return np.array([matrix_to_quaternion(turn) for turn in turns])
+        rotations = np.stack([u, v, np.cross(u, v)], axis=2)
+        return np.array([matrix_to_quaternion(rotation) for rotation in rotations])
 
     def _fill(self, first: int, arrays: dict[str, np.ndarray]) -> None:
-        """Splats from `first` on; those of a block of `WINDOW` are made together."""
+        """Fill arrays with the splats from `first` on, generated in blocks of `WINDOW`."""
         done, count = 0, len(arrays["means"])
         while done < count:
             block, start = divmod(first + done, WINDOW)
@@ -162,14 +162,15 @@ class City:
 
 
 def flight(city: City) -> tuple[Camera, Trajectory]:
-    """A camera of 1280 x 720, and its way (world to camera) through a street and up over the roofs, 8 s."""
+    """Camera of 1280 x 720, and a trajectory of 8 s (world to camera) through a street and above the
+    roofs."""
     street, side = PITCH * (city.houses // 2), city.side
-    ways = [
+    views = [
         (0.0, (street, -1.7, -4.0), (street, -2.0, 40.0)),
         (3.0, (street, -2.5, side * 0.4), (street, -4.0, side)),
         (5.0, (street - 6.0, -32.0, side * 0.4), (street, -4.0, side)),
         (8.0, (-0.3 * side, -0.6 * side, -0.4 * side), (side / 2, 0.0, side / 2)),
     ]
-    poses = [look_at_matrix(position, target) for _, position, target in ways]
-    camera = Camera.look_at(1280, 720, math.radians(70.0), ways[0][1], ways[0][2])
-    return camera, Trajectory([time for time, _, _ in ways], np.stack(poses))
+    poses = [look_at_matrix(position, target) for _, position, target in views]
+    camera = Camera.look_at(1280, 720, math.radians(70.0), views[0][1], views[0][2])
+    return camera, Trajectory([time for time, _, _ in views], np.stack(poses))

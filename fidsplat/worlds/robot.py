@@ -1,4 +1,4 @@
-"""A small robot with two driven wheels in MuJoCo: what it does along a path, and what its sensors say."""
+"""Differential-drive robot in MuJoCo: drives along a path, with wheel odometry and a gyroscope."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from fidsplat.util.errors import InputError
 try:
     import mujoco as _mujoco  # type: ignore[import-not-found]
 except ImportError as error:
-    raise InputError(f"MuJoCo is not here ({error}); pip install 'fidsplat[sim]'") from None
+    raise InputError(f"the robot needs MuJoCo ({error}); pip install 'fidsplat[sim]'") from None
 
-mujoco: Any = _mujoco  # whose names its types do not tell
+mujoco: Any = _mujoco  # without type information
 
 WHEEL, TRACK = 0.08, 0.3
-"""metres: radius of a wheel, and from wheel to wheel"""
+"""metres: radius of a wheel, distance between the wheels"""
 CAMERA_AT = (0.1, 0.0, 0.32)
-"""metres from the middle of the axle on the floor; the camera looks ahead"""
+"""metres from the middle of the axle on the floor; the camera faces forward"""
 CONTROL = 0.02
-"""seconds between commands, and between readings of the sensors"""
-ACCELERATION = 0.5
-"""metres a second squared, at most"""
-TURNING = 1.2
-"""radians a second, at most"""
+"""seconds between commands, and between sensor readings"""
+MAX_ACCELERATION = 0.5
+"""metres per second squared"""
+MAX_TURN_RATE = 1.2
+"""radians per second"""
 
-# Spheres that do not rub carry the rest: friction between two bodies is the larger of theirs, so that they
-# need condim 1. Wheels are ellipsoids, since flat ones scrub when they turn.
+# Casters are frictionless spheres: MuJoCo uses the larger friction of a contact, so they need condim 1.
+# Wheels are ellipsoids, since flat ones scrub when the robot turns.
 BODY = f"""    <body name="robot" pos="0 0 {WHEEL}">
       <freejoint/>
       <geom type="box" size="0.16 0.1 0.05" pos="0 0 0.06" mass="4"/>
@@ -55,67 +55,67 @@ _DRIVES = """  <actuator><velocity joint="left" kv="5"/><velocity joint="right" 
 
 @dataclass(frozen=True)
 class Errors:
-    """What wheels and gyroscope get wrong."""
+    """Errors of the wheel odometry and the gyroscope."""
 
     wheels: float = 0.01
-    """standard deviation of each wheel's scale, drawn once for a run"""
+    """standard deviation of the scale of each wheel, sampled once per run"""
     slip: float = 0.002
-    """metres, standard deviation of a wheel's distance after one metre"""
+    """standard deviation of the distance of a wheel after one metre, metres"""
     gyro_bias: float = 0.003
-    """radians a second, standard deviation, drawn once for a run"""
+    """standard deviation of the bias, radians per second, sampled once per run"""
     gyro_noise: float = 0.002
-    """radians a second, standard deviation of each reading"""
+    """standard deviation of each reading, radians per second"""
     seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A drive: what happened, and what was measured, every `CONTROL` seconds."""
+    """Ground truth and measurements of a drive, every `CONTROL` seconds."""
 
     times: np.ndarray
     """(n,) seconds"""
     poses: np.ndarray
-    """(n, 4, 4) world from the middle of the axle on the floor: x ahead, z up"""
+    """(n, 4, 4) world from the middle of the axle on the floor: x forward, z up"""
     wheels: np.ndarray
-    """(n, 2) metres that the left and the right wheel have rolled since the last, as measured"""
+    """(n, 2) measured distance of the left and right wheel since the last reading, metres"""
     gyro: np.ndarray
-    """(n,) radians a second about z, as measured"""
+    """(n,) measured rate about z, radians per second"""
 
     @property
     def length(self) -> float:
-        """Metres that were driven."""
+        """Length of the drive in metres."""
         return float(np.linalg.norm(np.diff(self.poses[:, :2, 3], axis=0), axis=1).sum())
 
     @property
     def camera(self) -> Trajectory:
-        """World from camera, OpenCV axes."""
+        """Trajectory of the camera, world from camera, OpenCV axes."""
         return Trajectory(self.times, self.poses @ mount())
 
 
 def mount() -> np.ndarray:
-    """(4, 4) robot from camera, OpenCV axes."""
+    """Pose of the camera on the robot (4, 4), robot from camera, OpenCV axes."""
     return rigid_matrix(CAMERA_AT, (0.5, -0.5, 0.5, -0.5))
 
 
 def camera_at(camera: Camera, robot: np.ndarray) -> Camera:
-    """A camera where it stands when the robot stands there."""
+    """The camera for a pose of the robot."""
     return replace(camera, world_to_camera=np.linalg.inv(robot @ mount()), position=None)
 
 
 def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None = None) -> Run:
-    """Drive along a path on the floor of a model that has `BODY`: turning at its corners, straight between.
+    """Drive along a path in a model with `BODY`: straight segments, turns at the corners.
 
     Args:
-        mjcf: the model's text, as `Greenhouse.mjcf(BODY)` gives it.
-        path: (k, 2) metres, corners of the path; the robot starts at the first and faces the second.
-        speed: metres a second.
+        mjcf: text of the model, e.g. `Greenhouse.mjcf(BODY)`.
+        path: (k, 2) corners in metres; the robot starts at the first and faces the second.
+        speed: metres per second.
 
     Raises:
-        InputError: a path of less than two corners, or the robot does not get on, as against an obstacle.
+        InputError: fewer than two corners, or the robot is stuck.
     """
     corners = np.asarray(path, np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 2:
-        raise InputError(f"a path has two or more corners (k, 2), not {corners.shape}")
+        raise InputError(f"path must be two or more corners (k, 2), got {corners.shape}")
     model = mujoco.MjModel.from_xml_string(mjcf.replace("</mujoco>\n", _DRIVES))
     data = mujoco.MjData(model)
     first = corners[1] - corners[0]
@@ -126,7 +126,7 @@ def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None
     times, poses, rolled, turned = [], [], [], []
 
     def record() -> None:
-        # lower by the wheel's radius is the floor
+        # the floor is one wheel radius below the body
         pose = np.eye(4)
         pose[:3, :3] = data.body("robot").xmat.reshape(3, 3)
         pose[:3, 3] = data.body("robot").xpos - WHEEL * pose[:3, 2]
@@ -141,22 +141,24 @@ def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None
     for start, goal in itertools.pairwise(corners):
         limit = len(times) + round((np.linalg.norm(goal - start) / speed + 20) / CONTROL)
         while (command := _command(poses[-1], start, goal, speed)) is not None:
-            # a robot that starts at once tips over
-            forward = min(command[0], forward + ACCELERATION * CONTROL)
+            # full acceleration would tip the robot over
+            forward = min(command[0], forward + MAX_ACCELERATION * CONTROL)
             around = command[1]
             data.ctrl[:] = (forward + np.array([-1, 1]) * around * TRACK / 2) / WHEEL
             mujoco.mj_step(model, data, steps)
             record()
             if len(times) > limit:
                 at = tuple(np.round(poses[-1][:2, 3], 2).tolist())
-                raise InputError(f"the robot does not get on at {at}; is there something in its path?")
+                raise InputError(
+                    f"the robot must be able to follow its path, but is stuck at {at}; remove obstacles"
+                )
     return _measured(np.array(times), np.array(poses), np.array(rolled), np.array(turned), errors or Errors())
 
 
 def _command(
     pose: np.ndarray, start: np.ndarray, goal: np.ndarray, speed: float
 ) -> tuple[float, float] | None:
-    """Speed and turning towards a corner; None once it is reached."""
+    """Speed and turn rate towards a corner; None once it is reached."""
     along = (goal - start) / np.linalg.norm(goal - start)
     here = pose[:2, 3]
     left = float((goal - here) @ along)
@@ -166,7 +168,7 @@ def _command(
     heading = math.atan2(along[1], along[0]) - math.atan(2 * aside)
     off = heading - math.atan2(pose[1, 0], pose[0, 0])
     off = (off + math.pi) % (2 * math.pi) - math.pi
-    around = max(-TURNING, min(TURNING, 3 * off))
+    around = max(-MAX_TURN_RATE, min(MAX_TURN_RATE, 3 * off))
     return (speed * min(1.0, left / 0.2 + 0.1) if abs(off) < 0.3 else 0.0), around
 
 
