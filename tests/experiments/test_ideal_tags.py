@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments.ideal_tags import tag_depth_image
+from fidsplat.experiments.ideal_tags import _window, tag_depth_image
 from fidsplat.experiments.plane import plane_picture
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
@@ -38,6 +38,22 @@ def test_it_is_where_the_tag_is(tag):
     local = (points - POSE[:3, 3]) @ POSE[:3, :3]
     assert np.abs(local[:, 2]).max() < 1e-6
     assert np.abs(local[:, :2]).max() < tag.grid.shape[0] * tag.module / 2 + 0.02
+
+
+@pytest.mark.parametrize("spec", ["apriltag:36h11:5", "charuco:3x7:4x4_50"])
+def test_the_window_of_a_tag_is_the_bounds_of_its_corners(spec):
+    """No larger, so that a tag costs no more than its pixels; also where pixels are not square, and a board
+    is higher than wide."""
+    made = fs.marker(spec, size=0.25)
+    camera = fs.Camera.pinhole(120, 90, 80, 110, 61, 44)
+    height, width = np.array(made.grid.shape) * made.module
+    corners = np.array([(x * width / 2, y * height / 2, 0) for x in (-1, 1) for y in (-1, 1)])
+    for x in (0.0, 0.25, -0.45):
+        pose = rigid_matrix((x, -0.02, 1.1), (1, 0.2, 0.3, 0.1))
+        pixels = camera.project(corners @ pose[:3, :3].T + pose[:3, 3])
+        left, top = np.maximum(np.floor(pixels.min(axis=0)), 0)
+        right, bottom = np.minimum(np.ceil(pixels.max(axis=0)), (120, 90))
+        assert _window(pose, PlacedMarker(made, pose), camera) == (left, top, right, bottom)
 
 
 def test_the_nearer_of_two_tags_is_seen(tag):
