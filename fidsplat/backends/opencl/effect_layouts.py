@@ -77,7 +77,7 @@ LAYOUTS: dict[str, Layout] = {
     "compose_coplanar": Layout(
         "slot/compose_coplanar.cl",
         parts=("compose_pixel",),
-        splat=(member("int plane"),),
+        splat=(member("int group", "coplanar group, -1: none"),),
         project=takes(
             "cloud int coplanar_groups  // (n) index of the splat's group; -1: none",
             "in float plane_keys  // (groups, views) depth at which its splats are sorted in [m]",

@@ -6,7 +6,7 @@
 // Splats of a group are adjacent in the lists, at the nearest depth of the group (plane_keys). When another splat follows, the
 // layer enters the k-buffer as one fragment (slot/compose_pixel.cl).
 //@ project
-    record.plane = coplanar_groups[i];
+    record.group = coplanar_groups[i];
 //@ functions
 #define COPLANAR_RADIUS REAL(64.0)       // in standard deviations; for boxes in half sides
 //@ coplanar_depth_reach
@@ -16,32 +16,32 @@
 //@ coplanar_nearest
     if (coplanar_groups[i] >= 0) record.nearest = (wide)plane_keys[coplanar_groups[i] * get_global_size(1) + number];
 //@ coplanar_blocks_nearest
-        if (s->plane >= 0) min_depth = s->nearest;      // adjacent in each block
+        if (s->group >= 0) min_depth = s->nearest;      // adjacent in each block
 //@ coplanar_lookahead
-                if (s.plane >= 0) {                 // its layer may be nearer than this fragment, and at other pixels
+                if (s.group >= 0) {                 // its layer may be nearer than this fragment, and at other pixels
                     z = s.nearest;
                     mask = -1;
                 }
 //@ chunk_end
         // in one chunk, unless they fill several: otherwise the next chunk starts with the group's first splat
-        const int plane = splats[lists[places[length - 1]]].plane;
-        if (plane >= 0 && ((read < end && splats[lists[read]].plane == plane)
-                           || (deferred_count > 0 && splats[lists[(uint)deferred[deferred_count - 1]]].plane == plane))) {
+        const int group = splats[lists[places[length - 1]]].group;
+        if (group >= 0 && ((read < end && splats[lists[read]].group == group)
+                           || (deferred_count > 0 && splats[lists[(uint)deferred[deferred_count - 1]]].group == group))) {
             uint before = length;
-            while (before > 0 && splats[lists[places[before - 1]]].plane == plane) before--;
+            while (before > 0 && splats[lists[places[before - 1]]].group == group) before--;
             if (before > 0 && reads) read -= length - before;
             if (before > 0 && !reads) deferred_count += length - before;
             if (before > 0) length = before;
         }
 //@ coplanar_disc_depth
-        if (s->plane >= 0) on_plane = -1;           // also in the low-pass disc
+        if (s->group >= 0) on_plane = -1;           // also in the low-pass disc
 //@ coplanar_attribute_depth
     attributes.z = fmax(attributes.z, (vfloat)s->nearest);
 //@ compose_types
 #define LAYER_FLAG 0x80000000u       // marks an index as that of a layer, not of a splat
 
 typedef struct {
-    int plane;                  // -1: no layer
+    int group;                  // -1: no layer
     wide nearest;               // sort key of its splats
     uint place;                 // position of its first splat in the list
     vint lanes;                 // where it has fragments
@@ -107,7 +107,7 @@ static inline void layer_add(Layer *layer, const Splat *s, const Attributes *att
 // is in front of ungrouped splats in the same plane.
 static inline void layer_close(Pixel *pixel, vfloat nearest, global const Splat *splats, const BlendConstants *constants) {
     const Layer *open_layer = &pixel->open_layer;
-    if (open_layer->plane < 0) return;
+    if (open_layer->group < 0) return;
     vfloat z = fmax(FMA(fabs(open_layer->mean.z), (vfloat)-0x1p-16f, open_layer->mean.z), (vfloat)open_layer->nearest);
     k_buffer_insert(pixel, nearest, z, open_layer->opacity, &open_layer->mean, LAYER_FLAG, open_layer->place, open_layer->lanes,
                     splats, constants);
@@ -117,13 +117,13 @@ static inline void layer_close(Pixel *pixel, vfloat nearest, global const Splat 
 //@ coplanar_finish
     layer_close(pixel, INFINITY, splats, constants);
 //@ compose_coplanar_group
-    if (s->plane != pixel->open_layer.plane) {
+    if (s->group != pixel->open_layer.group) {
         layer_close(pixel, this_nearest, splats, constants);
-        pixel->open_layer.plane = s->plane;
+        pixel->open_layer.group = s->group;
         pixel->open_layer.nearest = s->nearest;
         pixel->open_layer.place = place;
     }
-    if (s->plane >= 0) {
+    if (s->group >= 0) {
         layer_add(&pixel->open_layer, s, &attributes, opacity, mask);
         return;
     }
