@@ -75,7 +75,7 @@ def test_one_pixel_picture(renderer):
 
 
 def test_opaque_splats_hide_what_is_behind(renderer):
-    """numerics D1: with the inclusive stop and ceiling 1 nothing leaks; the parity presets leak 1 %."""
+    """Case D1: with the inclusive stop and ceiling 1 nothing leaks; the parity presets leak 1 %."""
     cloud = fs.SplatCloud(
         [[0, 0, 1], [0, 0, 2]],
         [[1, 0, 0, 0]] * 2,

@@ -89,7 +89,7 @@ UNCHECKED = {
 
 @pytest.mark.parametrize("name", UNCHECKED)
 def test_kernels_cull_what_no_cloud_should_hold(renderer, name):
-    """numerics E1: comparisons are written so that a NaN fails them. The checks are gone round on purpose."""
+    """Case E1: NaN fails every comparison of the kernels; the checks of the cloud are bypassed."""
     cloud = crowd()
     expected = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS)
     for value in UNCHECKED[name]:

@@ -29,7 +29,7 @@ def test_the_catalogue_is_whole():
 
 
 def test_float32_setup_shows_why_float64_is_used(renderer):
-    """The measure of B1 does see a set-up in single precision: ten times and more (numerics B1, table)."""
+    """Case B1 detects a float32 setup: errors are more than ten times larger."""
     single = QUALITY.with_(setup_precision="float32")
     error = grazing_errors(renderer, 85.0, 3, single).max()
     assert error > 1e-4
