@@ -288,6 +288,17 @@ def _tiff_pixels(data: bytes | np.ndarray) -> int:
 
 
 def _admit(data: bytes | np.ndarray, name: str | os.PathLike[str]) -> None:
+    """Raise InputError for an image that declares more pixels than `input_limit` allows, or for a PNG with a
+    chunk longer than the file, for which libpng would take the memory."""
+    at, png = 8, bytes(data[:8]) == b"\x89PNG\r\n\x1a\n"
+    while png and at + 8 <= len(data) and bytes(data[at + 4 : at + 8]) != b"IEND":
+        length = int.from_bytes(bytes(data[at : at + 4]), "big")
+        if length > len(data):
+            raise InputError(
+                f"{name} is not an image that can be read: it must have chunks within its {len(data):,} "
+                f"bytes, got one of {length:,}; give a whole PNG file"
+            )
+        at += 12 + length
     pixels = declared_pixels(data)
     check_expansion(os.fspath(name), _PIXEL * pixels, f"{pixels:,} pixels", len(data))
 

@@ -144,6 +144,19 @@ def test_images_that_small_files_declare(tmp_path, kind, data):
             read()
 
 
+@pytest.mark.parametrize("kind", [b"\x42\xff\xff\xff", b"IDAT", b"tEXt", b"iCCP"])
+def test_a_png_chunk_that_is_longer_than_its_file(tmp_path, kind):
+    """libpng takes the memory of a chunk before it reads it."""
+    whole = cv2.imencode(".png", np.zeros((8, 12, 3), np.uint8))[1].tobytes()
+    path = tmp_path / "a.png"
+    for length in (0x7FFFFFFF, 0xFFFFFF7F, len(whole) + 100):
+        data = whole[:33] + struct.pack(">I", length) + kind + whole[41:]
+        path.write_bytes(data)
+        for read in (lambda: read_image(path), lambda: read_bits(path), lambda data=data: decoded(data)):
+            with pytest.raises(fs.InputError, match=rf"chunks within its \d+ bytes, got one of {length:,}"):
+                read()
+
+
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("compression", ["lz4", "zstd"])
 def test_chunks_of_logs(tmp_path, monkeypatch, indexed, compression):
