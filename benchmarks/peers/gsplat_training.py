@@ -225,7 +225,7 @@ def finished(
 def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[Peer]]) -> dict[str, Any]:
     """Median milliseconds of a step by each, in turn."""
     trainer = trainer_of(name, renderer, 3, TURN * (1 + repeats))
-    splats = trainer._work.store()
+    splats = trainer._model.read()
     backend: Any = renderer.backend
 
     works = {"fidsplat_ms": finished(trainer.step, backend.finish)}
@@ -293,7 +293,7 @@ def trainings(
     ours = Trainer(dataset, renderer, iterations=iterations)
     ours.run()
     seconds = time.perf_counter() - begun
-    drawn = Peer(ours._work.store(), ours.settings, dataset)
+    drawn = Peer(ours._model.read(), ours.settings, dataset)
     found: dict[str, Any] = {
         "dataset": dataset.name,
         "iterations": iterations,

@@ -340,14 +340,14 @@ class TrainingKernels(ABC):
 
     Its state is n splats before their activations, float32: `means` (n, 3), `log_scales` (n, 2), `quats`
     (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's running means of each as `first_NAME` and `second_NAME`;
-    `gradients` (n,) and `seen` (n,), the sums by which densification chooses splats.
+    `gradient_sums` (n,) and `visible_counts` (n,), the statistics of densification.
     """
 
-    late: int
+    max_pending_losses: int
     """number of later frames after which a loss may still be read"""
 
     @abstractmethod
-    def take_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
+    def load_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
         """Set the ground truth: images (h, w, 3) uint8 with their masks (h, w) bool."""
 
     @abstractmethod
@@ -355,12 +355,12 @@ class TrainingKernels(ABC):
         """Set these arrays; missing ones are unchanged."""
 
     @abstractmethod
-    def store(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Copy the arrays of these names to the host, all by default."""
 
     @abstractmethod
-    def pick(self, rows: np.ndarray, kept: int) -> None:
-        """Replace the splats by the rows (m,) uint32 of them; from row `kept` on without optimiser state."""
+    def gather_rows(self, rows: np.ndarray, remaining: int) -> None:
+        """Replace the splats by the rows (m,) uint32 of them; from row `remaining` on without moments."""
 
     @abstractmethod
     def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
@@ -383,12 +383,12 @@ class TrainingKernels(ABC):
         (h, w, 3) as a device array that is valid until the next call."""
 
     @abstractmethod
-    def surface(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
+    def normal_loss_gradients(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
         """Gradients of `fidsplat.train.losses.normal_loss` by `depth` and `normal`, times the weight, as
         device arrays that are valid until the next call."""
 
     @abstractmethod
-    def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
+    def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
         """Add screen gradients and visibility to their sums. taken: from `backward_to_tiles`."""
 
     @abstractmethod
@@ -408,13 +408,13 @@ class TrainingKernels(ABC):
             numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
                 `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
                 not depend are left unchanged.
-            camera: unless None, `count` is applied first.
+            camera: unless None, `accumulate_statistics` comes first.
         """
 
     @abstractmethod
-    def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
+    def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
         """Add noise to the means within their disks, `size` times their variance, less where the opacity is
-        above `clear`. words: the seed's low and high word, the iteration, the purpose."""
+        above `threshold`. words: the seed's low and high word, the iteration, the purpose."""
 
 
 class Backend(ABC):
@@ -501,7 +501,7 @@ class Backend(ABC):
         """Access to the device for tests."""
         raise DeviceError(self.lacks("have a probe", "use an OpenCL or Warp device"))
 
-    def shapes(self, kind: str) -> dict[str, Any]:
+    def geometry(self, kind: str) -> dict[str, Any]:
         """Other build constants, by name, for tests.
 
         kind: `tiles`, other tile sizes, bit-identical; `schedule`, the schedule of a GPU (on a GPU: other

@@ -1,4 +1,4 @@
-"""Trainer: splats that look like a data set's pictures, the same in every bit on every run of a device."""
+"""Trainer: optimise splats to reproduce the images of a data set; bit-identical on every run of a device."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import densify, mcmc
 from fidsplat.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
 from fidsplat.train.dataset import Dataset, TrainingView
-from fidsplat.train.device import DeviceWork
-from fidsplat.train.host import HostWork
+from fidsplat.train.device_model import DeviceModel
+from fidsplat.train.host_model import HostModel
 from fidsplat.train.losses import Loss
 from fidsplat.train.next_features import next_features
 from fidsplat.train.optimiser import learning_rates
@@ -40,27 +40,27 @@ from fidsplat.util.arguments import callback, instance, invalid, items
 from fidsplat.util.errors import DeviceError, InputError
 from fidsplat.util.files import ordinary_file, writable_folder
 
-_SOLID = ("rgb", "alpha", "depth", "normal")
-"""outputs of pictures whose depths and normals are in the loss"""
-_TOLD_SECONDS = 0.1
-"""after which a run asks for losses, however few"""
+_SURFACE = ("rgb", "alpha", "depth", "normal")
+"""outputs of frames with normal consistency in the loss"""
+_READ_SECONDS = 0.1
+"""a run reads pending losses at least this often"""
 CHECKPOINT_SECONDS = 30.0
-"""a run writes a checkpoint when this has passed since the last"""
+"""time between checkpoints of a run"""
 
 
 class Step(NamedTuple):
-    """What one iteration did."""
+    """Result of one iteration."""
 
     iteration: int
-    """1 for the first"""
+    """number of the iteration, from 1"""
     view: str
-    """name of the view that was looked at"""
+    """name of the rendered view"""
     loss: float
-    """of the picture's colours"""
+    """image loss"""
     psnr: float
-    """dB, of that view before the step"""
+    """of the view before the step [dB]"""
     splats: int
-    """after the step"""
+    """number of splats after the step"""
 
 
 class Trainer:
@@ -73,16 +73,15 @@ class Trainer:
 
     Args:
         dataset: views and points.
-        renderer: opens the device that draws; None: the default device.
-        settings: of the run; None: the defaults. `changes` are fields of it, given by name.
-        checkpoint: a file that the run goes on from if it is there, and that `run` writes.
-        restart: begin again though there is a checkpoint, which stays until the first new one replaces it.
-        start: splats to begin with, in place of one at each of the data set's points; SH grow from degree 0
-            all the same.
+        renderer: device to train on; None: the default device.
+        settings: settings of the run; None: the defaults. `changes` are settings by name.
+        checkpoint: file from which the run resumes if it exists, and which `run` writes.
+        restart: start again although a checkpoint exists, which stays until the first new one replaces it.
+        start: initial splats, instead of one at each point of the data set; the SH degree still grows from 0.
 
     Raises:
         DeviceError: the device has no gradients.
-        InputError: a setting that cannot be used, or a checkpoint that is damaged or of another run.
+        InputError: a setting is outside its range, or the checkpoint is damaged or of another run.
     """
 
     def __init__(
@@ -111,102 +110,102 @@ class Trainer:
         if self.renderer.device.kind == "cpu" and "arithmetic" not in self.settings.quality:
             self._quality = self._quality.with_(arithmetic="fast")
         self._captures = [self._capture(view) for view in dataset.views]
-        self._solid = [replace(each, outputs=_SOLID) for each in self._captures]
-        self._work = (
-            DeviceWork(backend.training(), dataset.views, self.settings)
+        self._surface_captures = [replace(each, outputs=_SURFACE) for each in self._captures]
+        self._model = (
+            DeviceModel(backend.training(), dataset.views, self.settings)
             if backend.traits.trains
-            else HostWork(backend, dataset.views, self.settings)
+            else HostModel(backend, dataset.views, self.settings)
         )
-        self._made = self._begin(start, restart)
-        self._work.load(self._made.splats)
-        self._waiting: deque[tuple[int, str, Callable[[], Loss]]] = deque()
-        """iterations and their views whose losses the host has not asked for"""
-        self._found: deque[tuple[int, str, Loss]] = deque()
-        """those of which nobody has been told"""
+        self._state = self._begin(start, restart)
+        self._model.load(self._state.splats)
+        self._pending: deque[tuple[int, str, Callable[[], Loss]]] = deque()
+        """iterations and views whose losses are not read yet"""
+        self._unreported: deque[tuple[int, str, Loss]] = deque()
+        """unreported losses"""
         self._failure: TrainingError | None = None
-        """of an iteration that others have followed"""
+        """of an iteration that others followed before its loss was read"""
         self._features: FeatureSet | None = None
-        """of the last picture"""
+        """of the last frame"""
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     @property
     def iteration(self) -> int:
-        """Iterations that are done."""
-        return self._made.iteration
+        """Number of completed iterations."""
+        return self._state.iteration
 
     @property
     def done(self) -> bool:
-        """Whether all iterations are done."""
+        """Whether all iterations are completed."""
         return self.iteration >= self.settings.iterations
 
     @property
     def history(self) -> dict[str, np.ndarray]:
-        """Of each iteration that is done: `losses`, `psnrs` float32, `counts` int32 of splats; read them, do
-        not write. Raises as `step`."""
-        self._settle()
-        return {name: array[: self.iteration] for name, array in self._made.history.items()}
+        """`losses`, `psnrs` (float32) and numbers of splats `counts` (int32) of completed iterations; do
+        not write to them. Raises as `step`."""
+        self._read_losses()
+        return {name: array[: self.iteration] for name, array in self._state.history.items()}
 
     def step(self) -> Step:
-        """Look at one view, and change the splats so that they look more like it.
+        """Run one iteration: render a view and update the splats.
 
         Raises:
-            InputError: all iterations are done.
-            TrainingError: the loss is not finite, no splat is left, or making splats was stopped before.
+            InputError: all iterations are completed.
+            TrainingError: the loss is not finite, all splats are pruned, or densification was interrupted.
             DeviceError: the device fails or lacks memory.
         """
         self._advance(late=False)
         return list(self._steps())[-1]
 
     def run(self, progress: Callable[[Step], None] | None = None, prompt: bool = True) -> SplatCloud:
-        """Train to the end, and write checkpoints on the way where there is a file for them.
+        """Train to the end, with regular checkpoints if there is a file for them.
 
         progress: called after each iteration.
-        prompt: before the next one begins; False: a few iterations later, so that a GPU does not wait.
+        prompt: call it before the next iteration; False: a few iterations later, so that a GPU does not wait.
 
         Raises:
-            InputError: as `step`; or a checkpoint cannot be written, and the last one is whole.
+            InputError: as `step`; or a checkpoint cannot be written, and the last one stays.
             TrainingError: as `step`.
         """
         callback("progress", progress)
-        last = told = time.monotonic()
+        saved = read = time.monotonic()
         while not self.done:
             self._advance(late=progress is None or not prompt)
-            if self.done or time.monotonic() - told > _TOLD_SECONDS:
-                self._settle()
-                told = time.monotonic()
+            if self.done or time.monotonic() - read > _READ_SECONDS:
+                self._read_losses()
+                read = time.monotonic()
             for step in self._steps():
                 if progress is not None:
                     progress(step)
-            if self.done or time.monotonic() - last > CHECKPOINT_SECONDS:
+            if self.done or time.monotonic() - saved > CHECKPOINT_SECONDS:
                 self.save_checkpoint()
-                last = time.monotonic()
+                saved = time.monotonic()
         return self.cloud()
 
     def cloud(self) -> SplatCloud:
-        """The splats as they are now. Raises TrainingError where a value is not finite."""
-        return self._stored().cloud(self.settings.sh_degree, self.dataset.origin)
+        """The current splats. Raises TrainingError if a value is not finite."""
+        return self._checked_splats().cloud(self.settings.sh_degree, self.dataset.origin)
 
     def save(self, path: str | Path) -> None:
-        """Write the splats as they are now to a PLY file. Raises InputError when it cannot be written,
-        TrainingError where a value is not finite."""
+        """Write the current splats to a PLY file. Raises InputError if it cannot be written, TrainingError
+        if a value is not finite."""
         save_ply(self.cloud(), path)
 
     def save_checkpoint(self) -> None:
         """Write the checkpoint, if there is a file for it.
 
         Raises:
-            InputError: it cannot be written; an older one then stays.
+            InputError: it cannot be written; the last one stays.
             TrainingError: a value of the splats is not finite.
         """
         if self.checkpoint is None:
             return
-        self._made.splats = self._stored()
-        kept = TrainingState(self.iteration, self._made.splats, self.history)
+        self._state.splats = self._checked_splats()
+        state = TrainingState(self.iteration, self._state.splats, self.history)
         title = self.renderer.device.title
-        save_checkpoint(self.checkpoint, kept, self.settings, self.dataset, title)
+        save_checkpoint(self.checkpoint, state, self.settings, self.dataset, title)
 
     def evaluate(self, views: tuple[TrainingView, ...] | None = None) -> list[ViewScore]:
-        """Compare the splats with views: those that were held out, unless others are given."""
+        """Metrics of views, by default of the held-out views."""
         views = self.dataset.held_out if views is None else views
         views = items("views", views, TrainingView, "a list of TrainingView")
         captures = [self._capture(view) for view in views]
@@ -214,95 +213,99 @@ class Trainer:
         return [score_view(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
 
     def _advance(self, late: bool) -> None:
-        """An iteration. late: its loss may be asked for when others have followed."""
+        """Run one iteration. late: its loss may be read after later iterations."""
         interrupts.check()
-        made, settings = self._made, self.settings
+        state, settings = self._state, self.settings
         if self._failure is not None:
             raise self._failure
         if self.done:
-            raise InputError(f"all {settings.iterations} iterations are done; give a trainer more of them")
-        while self._waiting and self._waiting[-1][0] > made.iteration:  # of one that was interrupted
-            self._waiting.pop()
-        self._make_splats()
-        iteration = made.iteration + 1
+            raise InputError(
+                f"iterations must be more than the completed {self.iteration}, got {settings.iterations}"
+            )
+        while self._pending and self._pending[-1][0] > state.iteration:  # of an interrupted iteration
+            self._pending.pop()
+        self._densify()
+        iteration = state.iteration + 1
         number = self._view_at(iteration)
         view = self.dataset.views[number]
         try:
-            value, taken = self._compared(iteration, number, waits=False)
+            loss, gradients = self._differentiated(iteration, number, waits=False)
         except CapacityExceeded:
-            value, taken = self._compared(iteration, number, waits=True)
-        self._waiting.append((iteration, view.name, value))
-        if not late or len(self._waiting) > self._work.late or settings.densifies_after(iteration):
-            self._settle()  # not before: the device goes on meanwhile
-        self._change(taken, iteration, view)
-        made.iteration = iteration
-        made.history["counts"][iteration - 1] = len(self._work)
+            loss, gradients = self._differentiated(iteration, number, waits=True)
+        self._pending.append((iteration, view.name, loss))
+        full = len(self._pending) > self._model.max_pending_losses
+        if not late or full or settings.densifies_after(iteration):
+            self._read_losses()  # not before, since the device is busy meanwhile
+        self._update(gradients, iteration, view)
+        state.iteration = iteration
+        state.history["counts"][iteration - 1] = len(self._model)
 
-    def _settle(self) -> None:
-        """Asks for the losses that are waited for.
+    def _read_losses(self) -> None:
+        """Read pending losses into the history.
 
         Raises:
-            TrainingError: one is not finite, and it or one that others have followed was not before.
+            TrainingError: one is not finite, now or in an earlier call.
         """
-        while self._failure is None and self._waiting:
-            iteration, view, value = self._waiting[0]
-            loss = value()
+        while self._failure is None and self._pending:
+            iteration, view, read = self._pending[0]
+            loss = read()
             if not math.isfinite(loss.value):
                 failure = TrainingError(
                     f"the loss is {loss.value} at iteration {iteration}, in the view {view}; "
-                    + self._what_is_kept()
+                    + self._checkpoint_state()
                 )
-                self._waiting.clear()
-                if iteration > self.iteration:  # the splats are those before it
+                self._pending.clear()
+                if iteration > self.iteration:  # the splats are not updated yet
                     raise failure
                 self._failure = failure
             else:
-                history = self._made.history
+                history = self._state.history
                 history["losses"][iteration - 1], history["psnrs"][iteration - 1] = loss.value, loss.psnr
-                self._found.append((iteration, view, loss))
-                self._waiting.popleft()
+                self._unreported.append((iteration, view, loss))
+                self._pending.popleft()
         if self._failure is not None:
             raise self._failure
 
     def _steps(self) -> Iterator[Step]:
-        """Those that nobody has been told of."""
-        while self._found:
-            iteration, view, loss = self._found.popleft()
-            count = int(self._made.history["counts"][iteration - 1])
+        """Unreported steps."""
+        while self._unreported:
+            iteration, view, loss = self._unreported.popleft()
+            count = int(self._state.history["counts"][iteration - 1])
             yield Step(iteration, view, loss.value, loss.psnr, count)
 
-    def _compared(self, iteration: int, number: int, waits: bool) -> tuple[Callable[[], Loss], Any]:
-        """Draws a view: what waits for its loss, and the picture taken back, from which splats learn.
+    def _differentiated(self, iteration: int, number: int, waits: bool) -> tuple[Callable[[], Loss], Any]:
+        """Render a view and differentiate its loss. Returns a function that reads the loss, and the gradients
+        for `_update`.
 
         waits: as `GradientPipeline.forward`.
         """
-        resident = self._work.resident(self.settings.degree_at(iteration), self.dataset.origin)
+        resident = self._model.resident(self.settings.degree_at(iteration), self.dataset.origin)
         by_normals, by_distortions = self.settings.surface_weights_at(iteration)
-        plain, solid = self._captures[number], self._solid[number]
-        features, seen = prepare(resident, solid if by_normals else plain)
+        plain, surface = self._captures[number], self._surface_captures[number]
+        features, prepared = prepare(resident, surface if by_normals else plain)
         if by_distortions:
             features = with_distortion(features)
         if features != self._features:
             self._features = features
-            later = next_features(self.settings, iteration, plain, solid)
-            if later is not None:
-                self.renderer.backend.compile_ahead(later)
+            upcoming = next_features(self.settings, iteration, plain, surface)
+            if upcoming is not None:
+                self.renderer.backend.compile_ahead(upcoming)
         pipeline = self._differentiate(features)
-        images = pipeline.forward(resident, seen, waits)
-        value, slope = self._work.loss(images, number)
-        slopes = {"rgb": slope}
+        images = pipeline.forward(resident, prepared, waits)
+        loss, by_rgb = self._model.loss(images, number)
+        by_images = {"rgb": by_rgb}
         if by_normals:
-            slopes |= self._work.surface(images, number, by_normals)
+            by_images |= self._model.normal_loss_gradients(images, number, by_normals)
         if by_distortions:
             view = self.dataset.views[number]
-            counts = np.ones(view.image.shape[:2], np.float32) if view.mask is None else view.mask
-            slopes["distortion"] = counts * np.float32(by_distortions / counts.size)
-        return value, self._work.backward_to_tiles(pipeline, images, slopes)
+            mask = np.ones(view.image.shape[:2], np.float32) if view.mask is None else view.mask
+            by_images["distortion"] = mask * np.float32(by_distortions / mask.size)
+        return loss, self._model.backward_to_tiles(pipeline, images, by_images)
 
-    def _stored(self) -> Splats:
-        self._settle()
-        splats = self._work.store()
-        splats.check(f"after iteration {self.iteration}; {self._what_is_kept()}")
+    def _checked_splats(self) -> Splats:
+        self._read_losses()
+        splats = self._model.read()
+        splats.check(f"after iteration {self.iteration}; {self._checkpoint_state()}")
         return splats
 
     def _capture(self, view: TrainingView) -> Capture:
@@ -312,11 +315,11 @@ class Trainer:
         settings = self.settings
         if self.checkpoint is not None and self.checkpoint.exists() and not restart:
             title = self.renderer.device.title
-            made, others = load_checkpoint(self.checkpoint, settings, self.dataset.digest, title)
+            state, others = load_checkpoint(self.checkpoint, settings, self.dataset.digest, title)
             if others:
                 warnings.warn(
-                    f"{self.checkpoint} was made by {' and '.join(others)}; the run goes on, but its "
-                    "bits will not be those of a run that was made by one: --overwrite begins again",
+                    f"{self.checkpoint} was made by {' and '.join(others)}; the run resumes, but its results "
+                    "differ from those of an uninterrupted run; --overwrite starts again",
                     stacklevel=3,
                 )
         else:
@@ -326,70 +329,72 @@ class Trainer:
                 if start is None
                 else splats_from_cloud(start, settings, dataset.origin)
             )
-            made = TrainingState.initial(splats)
-        left = settings.iterations - made.iteration
-        made.history = {name: np.append(a, np.zeros(left, a.dtype)) for name, a in made.history.items()}
-        return made
+            state = TrainingState.initial(splats)
+        remaining = settings.iterations - state.iteration
+        state.history = {
+            name: np.append(a, np.zeros(remaining, a.dtype)) for name, a in state.history.items()
+        }
+        return state
 
     def _view_at(self, iteration: int) -> int:
-        """The number of a view: all of them in a random order, then all in another."""
+        """The index of a view: a new random order in every epoch."""
         count = len(self.dataset.views)
-        round_, place = divmod(iteration - 1, count)
-        if self._order[0] != round_:
-            self._order = round_, permutation(self.settings.seed, Purpose.VIEWS, round_, count)
-        return int(self._order[1][place])
+        epoch, index = divmod(iteration - 1, count)
+        if self._order[0] != epoch:
+            self._order = epoch, permutation(self.settings.seed, Purpose.VIEWS, epoch, count)
+        return int(self._order[1][index])
 
-    def _make_splats(self) -> None:
-        """By the default rule, after the last iteration that was done. It comes before the next one: a run
-        that ends here keeps splats that were fitted, and opacities that were not reset, as the authors'
-        trainer, which saves them first."""
+    def _densify(self) -> None:
+        """Densify by the default strategy, before the next iteration: a run that ends here returns optimised
+        splats and opacities before a reset, as the authors' trainer saves them."""
         settings, iteration = self.settings, self.iteration
         if settings.strategy == "mcmc" or not settings.densifies_after(iteration):
             return
-        self._settle()
-        made = densify.densification(self._work.shapes(), settings, iteration, self.dataset.extent)
-        with self._not_half():
-            self._work.make(made)
+        self._read_losses()
+        change = densify.densification(self._model.geometry(), settings, iteration, self.dataset.extent)
+        with self._all_or_failed():
+            self._model.densify(change)
             if iteration % settings.reset_every == 0:
-                self._work.reset()
+                self._model.reset_opacities()
 
-    def _change(self, taken: Any, iteration: int, view: TrainingView) -> None:
-        """The optimiser's step; none where the default rule makes splats next, as in the authors' trainer, in
-        which new splats have no gradient yet."""
+    def _update(self, gradients: Any, iteration: int, view: TrainingView) -> None:
+        """Update the splats by Adam, unless densification by the default strategy follows: in the authors'
+        trainer new splats have no gradient yet."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
         origin = self.dataset.origin
         if not mcmc_runs and settings.densifies_after(iteration):
-            self._work.count(taken, view.camera, origin)
+            self._model.accumulate_statistics(gradients, view.camera, origin)
             return
         camera = view.camera if not mcmc_runs and iteration < settings.densify_until else None
         rate = learning_rates(settings, iteration, self.dataset.extent)
-        self._work.step(taken, rate, settings.adam_steps(iteration), camera, origin)
+        self._model.step(gradients, rate, settings.adam_steps(iteration), camera, origin)
         if mcmc_runs:
-            with self._not_half():
+            with self._all_or_failed():
                 if settings.densifies_after(iteration):
-                    self._work.load(mcmc.relocate_and_grow(self._work.store(), settings, iteration))
-                self._work.shake(iteration, rate["means"])
+                    self._model.load(mcmc.relocate_and_grow(self._model.read(), settings, iteration))
+                self._model.add_noise(iteration, rate["means"])
 
     @contextmanager
-    def _not_half(self) -> Iterator[None]:
-        """Splats are made and taken away: if that ends on the way (no memory, an interrupt), nobody draws or
-        keeps what is there, arrays of two lengths maybe."""
+    def _all_or_failed(self) -> Iterator[None]:
+        """Refuse further steps if densification does not finish (no memory, an interrupt): arrays may have
+        different lengths then."""
         try:
             yield
         except BaseException:
             self._failure = TrainingError(
-                f"making splats was stopped after iteration {self.iteration}; {self._what_is_kept('')}"
+                f"densification was interrupted after iteration {self.iteration}; "
+                + self._checkpoint_state("")
             )
             raise
 
-    def _what_is_kept(self, advice: str = "; lower the rates, or check the data set's cameras") -> str:
+    def _checkpoint_state(self, advice: str = "; lower the rates, or check the data set's cameras") -> str:
         if self.checkpoint is None or not self.checkpoint.exists():
-            return f"nothing was kept{advice}"
-        return f"the checkpoint {self.checkpoint} is whole, as it was written last"
+            return f"there is no checkpoint{advice}"
+        return f"the last checkpoint {self.checkpoint} is complete"
 
 
 def _writable(checkpoint: str | Path) -> Path:
-    """The path, after a proof that a file can be written beside it: before the work, not half a minute in."""
+    """The path of the checkpoint, if its folder is writable."""
     file = ordinary_file(checkpoint)
     writable_folder(file.parent)
     return file

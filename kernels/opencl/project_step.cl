@@ -21,7 +21,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
             i, view, means, activated_quats, activated_scales, activated_opacities, sh, all, splats, keys, windows, big_capacity,
             big_bounds, width, height, splat_slots, moments
         );
-        if (counted) gradients[i] += own.screen;
+        if (counted) gradient_sums[i] += own.screen;
         for (int k = 0; k < 3; k++) by_means[3 * item + k] = own.mean[k];
         for (int k = 0; k < 2; k++) by_scales[2 * item + k] = own.scale[k];
         for (int k = 0; k < 4; k++) by_quats[4 * item + k] = own.quat[k];

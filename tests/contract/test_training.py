@@ -12,7 +12,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.train import Trainer, TrainSettings, densify
-from fidsplat.train.host import HostWork
+from fidsplat.train.host_model import HostModel
 from fidsplat.train.losses import normal_loss
 
 BACKEND = "opencl"
@@ -39,7 +39,7 @@ def test_kernels_and_numpy_train_alike(renderer, dataset, monkeypatch, losses):
         trainer = Trainer(dataset, renderer, iterations=10, sh_degree=0, **settings)
         trainer.run()
         steps[name] = trainer.history["losses"]
-        assert type(trainer._work).__name__ == {"kernels": "DeviceWork", "numpy": "HostWork"}[name]
+        assert type(trainer._model).__name__ == {"kernels": "DeviceModel", "numpy": "HostModel"}[name]
     np.testing.assert_allclose(steps["kernels"], steps["numpy"], rtol=1e-4)
 
 
@@ -49,19 +49,19 @@ def test_splats_are_made_by_kernels_as_by_numpy(renderer, dataset):
     trainer = Trainer(dataset, renderer, settings)
     for _ in range(17):  # harmonics too have moved
         trainer.step()
-    work = trainer._work
-    made = densify.densification(work.shapes(), settings, 8, dataset.extent)
+    work = trainer._model
+    made = densify.densification(work.geometry(), settings, 8, dataset.extent)
     assert 0 < made.remaining < 16 < len(made.rows)
-    expected = HostWork(renderer.backend, dataset.views, settings)
-    expected.load(work.store())
+    expected = HostModel(renderer.backend, dataset.views, settings)
+    expected.load(work.read())
     for each in (work, expected):
-        each.make(made)
-        each.reset()
+        each.densify(made)
+        each.reset_opacities()
     assert len(work) == len(made.rows)
     for group in ("values", "first", "second"):
-        for name, array in getattr(expected.store(), group).items():
-            assert np.array_equal(getattr(work.store(), group)[name], array), (group, name)
-    found = work.store()
+        for name, array in getattr(expected.read(), group).items():
+            assert np.array_equal(getattr(work.read(), group)[name], array), (group, name)
+    found = work.read()
     assert found.first["sh"][:, 1:].any()
     assert found.opacities.max() <= 0.5 + 1e-6
     assert all(

@@ -16,8 +16,8 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.train import TrainSettings
-from fidsplat.train.device import DeviceWork
-from fidsplat.train.host import HostWork
+from fidsplat.train.device_model import DeviceModel
+from fidsplat.train.host_model import HostModel
 from fidsplat.train.losses import image_loss
 from fidsplat.train.optimiser import contributing, learning_rates
 from fidsplat.train.parameters import NAMES, Splats
@@ -46,8 +46,8 @@ def works(renderer, views):
     def make(lanes=0, **changes):
         settings = TrainSettings(iterations=5, **changes)
         found = (
-            DeviceWork(training.OpenCLTraining(renderer.backend, lanes), views, settings),
-            HostWork(renderer.backend, views, settings),
+            DeviceModel(training.OpenCLTraining(renderer.backend, lanes), views, settings),
+            HostModel(renderer.backend, views, settings),
         )
         for work in found:
             work.load(splats())
@@ -78,7 +78,7 @@ def drawn(renderer, image):
 
 
 def agree(device, host, rtol=2e-5, atol=2e-6):
-    device, host = device.store(), host.store()
+    device, host = device.read(), host.read()
     for group in ("values", "first", "second"):
         for name in NAMES:
             a, b = (getattr(each, group)[name] for each in (device, host))
@@ -146,7 +146,7 @@ def test_loss_of_normals(renderer, views, works):
             device_array=lambda name, shown=shown: on_device(renderer, shown[name]),
             read=lambda name, shown=shown: shown[name],
         )
-        found, wanted = (work.surface(images, number, 0.3) for work in (device, host))
+        found, wanted = (work.normal_loss_gradients(images, number, 0.3) for work in (device, host))
         for name, array in wanted.items():
             assert np.abs(array).max() > 0
             np.testing.assert_allclose(found[name].get(), array, rtol=1e-4, atol=1e-5 * np.abs(array).max())
@@ -182,7 +182,7 @@ def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lane
         capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
         features, seen = prepare(shown, capture)
         loss = random_loss(features, seen)
-        cloud = host.store().cloud(degree, ORIGIN)
+        cloud = host.read().cloud(degree, ORIGIN)
         expected = derivatives(ReferenceBackend(), cloud, capture, {name: loss[name] for name in by}, False)
         off = [one for one in differences(gradients, expected) if one.norm > NORM or one.turned > COSINE]
         assert not off, (step, off)
@@ -192,12 +192,12 @@ def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lane
         if step < 3:
             by = {name: bool(gradients[name][1].any()) for name in ("opacities", "colors", "means")}
             assert by == {"opacities": False, "colors": step == 1, "means": step == 2}
-        before = host.store().select(np.flatnonzero(idle))
+        before = host.read().select(np.flatnonzero(idle))
         device.step(taken, rate, step, counted, ORIGIN)
         host.step(gradients, rate, step, counted, ORIGIN)
         agree(device, host)
         drawn_alike(renderer, device, host, degree, f"after step {step}", ORIGIN)
-        rested = device.store().select(np.flatnonzero(idle))
+        rested = device.read().select(np.flatnonzero(idle))
         same = [np.array_equal(rested.first[name], before.first[name]) for name in NAMES]
         assert all(same) == (sparse or not idle.any())
 
@@ -255,7 +255,7 @@ def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, views, works, spa
         taken = taken_back(renderer, device, view, device.resident(3, np.zeros(3)), 0)
         device.step(taken, rate, step, None, np.zeros(3))
     went_on = [read(renderer, device.resident(3, np.zeros(3)), name) for name in names]
-    device.load(device.store())
+    device.load(device.read())
     for name, array in zip(names, went_on, strict=True):
         np.testing.assert_array_equal(read(renderer, device.resident(3, np.zeros(3)), name), array, name)
 
@@ -265,12 +265,12 @@ def test_a_step_by_a_picture_that_was_followed_is_refused(renderer, views, works
     device.load(before_a_wall(views[2].camera))
     resident = device.resident(2, np.zeros(3))
     late, last = (taken_back(renderer, device, views[2], resident, 0) for _ in range(2))
-    kept = device.store().values["means"].tobytes()
+    kept = device.read().values["means"].tobytes()
     with pytest.raises(InputError, match="before the next picture"):
         device.step(late, learning_rates(TrainSettings(), 100, 1.5), 1, None, np.zeros(3))
     with pytest.raises(InputError, match="before the next picture"):
         late.gradients()
-    assert device.store().values["means"].tobytes() == kept
+    assert device.read().values["means"].tobytes() == kept
     assert last.gradients()["means"].get().any()
 
 
@@ -289,28 +289,28 @@ def test_who_is_seen(renderer, views, works):
     for view in views:
         taken = taken_back(renderer, device, view, device.resident(0, origin), 0)
         gradients = taken.gradients()
-        device.count(taken, view.camera, origin)
-        host.count(gradients, view.camera, origin)
+        device.accumulate_statistics(taken, view.camera, origin)
+        host.accumulate_statistics(gradients, view.camera, origin)
     agree(device, host)
-    kept = device.store()
+    kept = device.read()
     assert kept.values["means"].tobytes() == splats().values["means"].tobytes()
     assert (kept.gradient_sums > splats().gradient_sums).any()
-    counted = host.store().visible_counts - splats().visible_counts
+    counted = host.read().visible_counts - splats().visible_counts
     assert {0.0, 1.0, 2.0, 3.0} >= set(np.rint(counted).tolist()) > {0.0}
 
 
 def test_shaking(renderer, works):
     device, host = works(strategy="mcmc", seed=2**40 + 7)
-    before = host.store().values["means"].copy()
+    before = host.read().values["means"].copy()
     for work in (device, host):
-        work.shake(17, 1e-4)  # as after splats were made, when nothing of them has been drawn
-    assert np.abs(host.store().values["means"] - before).max() > 0.01
+        work.add_noise(17, 1e-4)  # as after splats were made, when nothing of them has been drawn
+    assert np.abs(host.read().values["means"] - before).max() > 0.01
     agree(device, host, atol=2e-5)
 
 
 def test_what_was_loaded_is_stored(works):
     device, _ = works()
-    kept, wanted = device.store(), splats()
+    kept, wanted = device.read(), splats()
     for name in NAMES:
         np.testing.assert_array_equal(kept.values[name], wanted.values[name])
         np.testing.assert_array_equal(kept.second[name], wanted.second[name])

@@ -39,7 +39,7 @@ def dataset():
 
 
 def splats_of(trainer):
-    return {name: array.tobytes() for name, array in trainer._work.store().values.items()}
+    return {name: array.tobytes() for name, array in trainer._model.read().values.items()}
 
 
 def test_steps_are_launched_again_with_the_same_bits(on_groups, dataset, monkeypatch):
@@ -104,12 +104,12 @@ def test_a_picture_with_more_pairs_than_there_is_room_for_is_not_launched_as_the
         if not kept:
             never_replay(monkeypatch)
         trainer = Trainer(wide, on_groups, **STEADY)
-        kernels, splats = trainer._work._kernels, trainer._work.store()
+        kernels, splats = trainer._model._kernels, trainer._model.read()
         splats.values["log_scales"] -= np.float32(2.5)
-        trainer._work.load(splats)
+        trainer._model.load(splats)
         for _ in range(6):
             trainer.step()
-        large = np.exp(trainer._work.store().values["log_scales"] + np.float32(2.5))
+        large = np.exp(trainer._model.read().values["log_scales"] + np.float32(2.5))
         cl.enqueue_copy(on_groups.backend.queue, kernels._held["activated_scales"], large)
         losses.append([trainer.step().loss for _ in range(3)])
         assert len(refused) == 1
@@ -137,7 +137,7 @@ def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoi
     trainer = Trainer(dataset, renderer, checkpoint=file, **STEADY)
     trainer.step()
     trainer.save_checkpoint()
-    kept, loss, views = file.read_bytes(), trainer._work.loss, []
+    kept, loss, views = file.read_bytes(), trainer._model.loss, []
 
     def failing(images, view):
         value, slope = loss(images, view)
@@ -146,10 +146,10 @@ def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoi
             value = lambda: Loss(math.nan, 0.1)  # noqa: E731
         return value, slope
 
-    monkeypatch.setattr(trainer._work, "loss", failing)
-    monkeypatch.setattr("fidsplat.train.trainer._TOLD_SECONDS", 60.0)
+    monkeypatch.setattr(trainer._model, "loss", failing)
+    monkeypatch.setattr("fidsplat.train.trainer._READ_SECONDS", 60.0)
     with pytest.raises(
-        TrainingError, match=r"the loss is nan at iteration 5, in the view (\S+); .*is whole"
+        TrainingError, match=r"the loss is nan at iteration 5, in the view (\S+); .*is complete"
     ) as seen:
         trainer.run()
     assert f"in the view {views[3]}" in str(seen.value)
@@ -174,7 +174,7 @@ def test_an_interrupt_while_the_step_is_compiled_counts_nobody_twice(renderer, d
         with pytest.raises(KeyboardInterrupt):
             stopped.step()
     stopped.step()
-    ours, theirs = (trainer._work.store() for trainer in (stopped, whole))
+    ours, theirs = (trainer._model.read() for trainer in (stopped, whole))
     assert np.array_equal(ours.visible_counts, theirs.visible_counts)
     assert np.array_equal(ours.gradient_sums, theirs.gradient_sums)
 
@@ -203,7 +203,7 @@ def test_no_memory_while_splats_are_made(renderer, dataset, tmp_path, monkeypatc
         with pytest.raises(fs.DeviceError, match="no memory"):
             trainer.run()
     for after in (trainer.step, trainer.run, trainer.cloud, trainer.save_checkpoint):
-        with pytest.raises(TrainingError, match=r"making splats was stopped .* whole"):
+        with pytest.raises(TrainingError, match=r"densification was interrupted .* is complete"):
             after()
     assert file.read_bytes() == kept
     again = Trainer(dataset, renderer, checkpoint=file, **settings)
@@ -214,8 +214,8 @@ def test_no_memory_while_splats_are_made(renderer, dataset, tmp_path, monkeypatc
 def test_an_interrupt_keeps_the_losses_that_nobody_has_asked_for(renderer, dataset, monkeypatch):
     whole, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
     whole.run()
-    monkeypatch.setattr("fidsplat.train.trainer._TOLD_SECONDS", 60.0)
-    make, calls = stopped._work.step, []
+    monkeypatch.setattr("fidsplat.train.trainer._READ_SECONDS", 60.0)
+    make, calls = stopped._model.step, []
 
     def interrupted(*given):
         make(*given)
@@ -223,7 +223,7 @@ def test_an_interrupt_keeps_the_losses_that_nobody_has_asked_for(renderer, datas
         if len(calls) == 20:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(stopped._work, "step", interrupted)
+    monkeypatch.setattr(stopped._model, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         stopped.run()
     done = stopped.iteration

@@ -117,7 +117,7 @@ def test_a_run_that_ends_where_opacities_fall_keeps_its_own(whole, dataset, tmp_
     renderer = whole[0].renderer
     ended = Trainer(dataset, renderer, iterations=16, checkpoint=checkpoint, **QUICK)
     assert ended.run().opacities.max() > QUICK["reset_opacity"] + 0.1
-    with pytest.raises(fs.InputError, match="all 16 iterations are done"):
+    with pytest.raises(fs.InputError, match="iterations must be more than the completed 16"):
         ended.step()
     again = Trainer(dataset, renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
     again.run()
@@ -181,13 +181,13 @@ def test_a_run_says_that_a_checkpoint_is_of_another_device_or_other_sources(data
         warnings.simplefilter("error")
         assert Trainer(dataset, renderer, **settings).done
     monkeypatch.setattr("fidsplat.train.checkpoint.code_hash", lambda: "f00d")
-    with pytest.warns(UserWarning, match=r"another fidsplat \(.*, not .*f00d\); the run goes on") as seen:
+    with pytest.warns(UserWarning, match=r"another fidsplat \(.*, not .*f00d\); the run resumes") as seen:
         assert Trainer(dataset, renderer, **settings).done
     assert "another device" not in str(seen[0].message)
     file.unlink()
     Trainer(dataset, renderer, **settings).run()
     monkeypatch.setattr(renderer.backend, "info", replace(renderer.device, title="abacus"))
-    with pytest.warns(UserWarning, match=r"another device \(.*, not abacus\); the run goes on"):
+    with pytest.warns(UserWarning, match=r"another device \(.*, not abacus\); the run resumes"):
         assert Trainer(dataset, renderer, **settings).done
 
 
@@ -323,16 +323,16 @@ def test_what_is_not_finite_ends_the_run_and_leaves_the_checkpoint(dataset, tmp_
     trainer.save_checkpoint()
     assert len(synced) == 2  # the file and its folder: a power cut loses neither
     kept = sha(file)
-    splats = trainer._work.store()
+    splats = trainer._model.read()
     splats.values["sh"][:] = np.nan
-    with pytest.raises(TrainingError, match=r"the loss is nan at iteration 2.*is whole"):
+    with pytest.raises(TrainingError, match=r"the loss is nan at iteration 2.*is complete"):
         trainer.run()
     with pytest.raises(TrainingError, match=r"sh of 16 splats .* are not finite after iteration 1"):
         trainer.save_checkpoint()
     assert sha(file) == kept
     alone = Trainer(dataset, renderer, iterations=9, **QUICK)
-    alone._work.store().values["means"][3] = np.nan
-    with pytest.raises(TrainingError, match=r"means of 1 splats \(the first is 3\).*nothing was kept"):
+    alone._model.read().values["means"][3] = np.nan
+    with pytest.raises(TrainingError, match=r"means of 1 splats \(the first is 3\).*there is no checkpoint"):
         alone.save(tmp_path / "scene.ply")
     assert [each.name for each in tmp_path.iterdir()] == [file.name]
 
@@ -365,7 +365,7 @@ def test_memory_that_runs_out_leaves_the_last_checkpoint(whole, dataset, tmp_pat
     def full(*_):
         raise fs.DeviceError("no memory for moments (12 MiB)")
 
-    monkeypatch.setattr(trainer._work, "count", full)
+    monkeypatch.setattr(trainer._model, "accumulate_statistics", full)
     with pytest.raises(fs.DeviceError, match="no memory for moments"):
         trainer.run()
     assert not list(tmp_path.glob("*.tmp*"))

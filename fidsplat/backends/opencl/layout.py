@@ -234,7 +234,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "float size_means size_scales size_quats size_logits  // rates of this step",
         "float size_sh size_rest  // of degree 0 and above",
         "float scale_penalty opacity_penalty",
-        "out float gradients",
+        "out float gradient_sums",
         "out float means first_means second_means",
         "out float log_scales first_log_scales second_log_scales",
         "out float quats first_quats second_quats",
@@ -290,7 +290,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "float translation_x translation_y translation_z  // camera-space position of the means' zero [m]",
         "float focal_x focal_y center_x center_y near width height",
         "in float means activated_scales",
-        "out float seen",
+        "out float visible_counts",
     ),
     "add_position_noise": takes(
         "uint count seed_low seed_high iteration purpose",

@@ -38,5 +38,5 @@ kernel void count_visible(
     float u = focal_x * x + center_x * z, v = focal_y * y + center_y * z;
     bool inside = z > near && u + focal_x * reach > 0.0f && u - focal_x * reach < width * z && v + focal_y * reach > 0.0f
         && v - focal_y * reach < height * z;
-    seen[i] += inside ? 1.0f : 0.0f;
+    visible_counts[i] += inside ? 1.0f : 0.0f;
 }

@@ -1,4 +1,4 @@
-"""The work of a training step around the picture, by a device's kernels."""
+"""Splat model in device memory: parameters, loss and Adam by the training kernels of the device."""
 
 from __future__ import annotations
 
@@ -20,53 +20,55 @@ from fidsplat.train.random_numbers import Purpose
 from fidsplat.train.settings import TrainSettings
 
 _PREFIXES = ("", "first_", "second_")
-_COUNTED = ("gradients", "seen")
+_STATISTICS = ("gradient_sums", "visible_counts")
 
 
-class DeviceWork:
-    """As `fidsplat.train.host.HostWork`, with the splats on the device."""
+class DeviceModel:
+    """Splats in training in device memory, with the images of the data set."""
 
     def __init__(
         self, kernels: TrainingKernels, views: Sequence[TrainingView], settings: TrainSettings
     ) -> None:
         self._kernels, self._settings = kernels, settings
-        self.late = kernels.late
-        kernels.take_views([(view.image, view.mask) for view in views])
+        self.max_pending_losses = kernels.max_pending_losses
+        kernels.load_views([(view.image, view.mask) for view in views])
         self._cameras = [view.camera for view in views]
         self._number = 0
 
     def load(self, splats: Splats) -> None:
-        """Takes over splats."""
+        """Copy splats to the device."""
         groups = (splats.values, splats.first, splats.second)
         arrays = {
             prefix + name: group[name]
             for prefix, group in zip(_PREFIXES, groups, strict=True)
             for name in NAMES
         }
-        self._kernels.load(arrays | {"gradients": splats.gradient_sums, "seen": splats.visible_counts})
+        self._kernels.load(arrays | {name: getattr(splats, name) for name in _STATISTICS})
         self._number = len(splats)
 
-    def store(self) -> Splats:
-        """The splats as they are now, in the host's memory."""
-        arrays = self._kernels.store()
+    def read(self) -> Splats:
+        """A copy of the splats in host memory."""
+        arrays = self._kernels.read()
         values, first, second = ({name: arrays[prefix + name] for name in NAMES} for prefix in _PREFIXES)
-        return Splats(values, first, second, arrays["gradients"], arrays["seen"])
+        return Splats(values, first, second, *(arrays[name] for name in _STATISTICS))
 
-    def shapes(self) -> Splats:
-        """As `store`, without harmonics and what is remembered."""
-        arrays = self._kernels.store((*SHAPES, *_COUNTED))
-        return Splats({name: arrays[name] for name in SHAPES}, {}, {}, *(arrays[name] for name in _COUNTED))
+    def geometry(self) -> Splats:
+        """A copy of the splats without harmonics and moments."""
+        arrays = self._kernels.read((*SHAPES, *_STATISTICS))
+        return Splats(
+            {name: arrays[name] for name in SHAPES}, {}, {}, *(arrays[name] for name in _STATISTICS)
+        )
 
-    def make(self, made: Densification) -> None:
-        """Goes on with the splats of a plan, most of which never leaves the device."""
-        self._kernels.pick(made.rows, made.remaining)
+    def densify(self, made: Densification) -> None:
+        """Clone, split and prune splats; only the new values come from the host."""
+        self._kernels.gather_rows(made.rows, made.remaining)
         self._kernels.write({"means": made.means, "log_scales": made.log_scales}, made.first_split)
-        self._kernels.clear(_COUNTED)
+        self._kernels.clear(_STATISTICS)
         self._number = len(made.rows)
 
-    def reset(self) -> None:
-        """Makes all faint, and forgets how their opacities moved."""
-        logits = limited_logits(self._kernels.store(("logits",))["logits"], self._settings)
+    def reset_opacities(self) -> None:
+        """Limit opacities to `reset_opacity`, and set their moments to 0."""
+        logits = limited_logits(self._kernels.read(("logits",))["logits"], self._settings)
         self._kernels.load({"logits": logits})
         self._kernels.clear(("first_logits", "second_logits"))
 
@@ -74,26 +76,25 @@ class DeviceWork:
         return self._number
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
-        """The splats as the device draws them, with SH of this degree."""
+        """The splats as a cloud to render, with SH of this degree."""
         return self._kernels.resident(degree, origin)
 
     def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], Any]:
-        """What waits for the loss of a picture of a view, by its number; and its derivative (h, w, 3) on the
-        device."""
-        value, slope = self._kernels.loss(images, view, self._settings.dssim_weight)
-        return lambda: Loss(*value()), slope
+        """A function that waits for the loss of a rendered view, and the gradient (h, w, 3) on the device."""
+        value, gradient = self._kernels.loss(images, view, self._settings.dssim_weight)
+        return lambda: Loss(*value()), gradient
 
-    def surface(self, images: Images, view: int, weight: float) -> dict[str, Any]:
-        """Derivatives of the loss of normals by depths and normals, times its weight."""
-        return self._kernels.surface(images, view, self._cameras[view], weight)
+    def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, Any]:
+        """Gradients of the weighted normal loss by `depth` and `normal`."""
+        return self._kernels.normal_loss_gradients(images, view, self._cameras[view], weight)
 
-    def backward_to_tiles(self, pipeline: Any, images: Images, slopes: Mapping[str, Any]) -> Any:
-        """What `count` and `step` take of a picture, from the derivatives by it."""
-        return pipeline.backward_to_tiles(images, slopes)
+    def backward_to_tiles(self, pipeline: Any, images: Images, gradients: Mapping[str, Any]) -> Any:
+        """The backward pass up to the sums over tiles, for `accumulate_statistics` and `step`."""
+        return pipeline.backward_to_tiles(images, gradients)
 
-    def count(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Adds the gradients on the screen to their sums."""
-        self._kernels.count(taken, camera, origin)
+    def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
+        """Add screen gradients and visibility to the densification statistics."""
+        self._kernels.accumulate_statistics(taken, camera, origin)
 
     def step(
         self,
@@ -103,7 +104,7 @@ class DeviceWork:
         camera: Camera | None,
         origin: np.ndarray,
     ) -> None:
-        """One step of Adam; before it, with a camera, what `count` does."""
+        """One step of Adam. camera: unless None, `accumulate_statistics` comes first."""
         settings, count = self._settings, max(1, self._number)
         by_names = {
             "means": "means",
@@ -125,8 +126,8 @@ class DeviceWork:
         }
         self._kernels.step(taken, sizes, numbers, camera, origin)
 
-    def shake(self, iteration: int, rate: float) -> None:
-        """Moves the means at random (`fidsplat.train.mcmc.add_noise`)."""
+    def add_noise(self, iteration: int, rate: float) -> None:
+        """Add MCMC noise to the means. rate: learning rate of the means [m]."""
         seed = self._settings.seed
         words = (seed & 0xFFFFFFFF, seed >> 32, iteration, int(Purpose.NOISE))
-        self._kernels.shake(rate * self._settings.noise, NOISE_SLOPE, 1 - NOISE_CUTOFF, words)
+        self._kernels.add_noise(rate * self._settings.noise, NOISE_SLOPE, 1 - NOISE_CUTOFF, words)

@@ -1,0 +1,132 @@
+"""Splat model in host memory: parameters, loss and Adam in NumPy, for devices without training kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.gradients import on_host
+from fidsplat.backends.interface import Backend, Images, ResidentData
+from fidsplat.cameras import Camera
+from fidsplat.train import mcmc
+from fidsplat.train.dataset import TrainingView
+from fidsplat.train.densify import Densification, limited_logits
+from fidsplat.train.losses import Loss, image_loss, normal_loss
+from fidsplat.train.optimiser import adam_step, contributing, parameter_gradients, sparse_adam_step
+from fidsplat.train.parameters import Splats
+from fidsplat.train.settings import TrainSettings
+
+_REACH = 3.0
+"""radius of a splat's bounding sphere for the visibility statistic, in standard deviations"""
+
+
+class HostModel:
+    """Splats in training in host memory, with the images of the data set."""
+
+    max_pending_losses = 0
+    """number of later frames after which a loss may still be read"""
+
+    def __init__(self, backend: Backend, views: Sequence[TrainingView], settings: TrainSettings) -> None:
+        self._backend, self._views, self._settings = backend, views, settings
+        self._splats: Splats
+
+    def load(self, splats: Splats) -> None:
+        """Use splats, which are updated in place."""
+        self._splats = splats
+
+    def read(self) -> Splats:
+        """The splats."""
+        return self._splats
+
+    def geometry(self) -> Splats:
+        """The splats, to read only; harmonics and moments may be missing on other models."""
+        return self._splats
+
+    def densify(self, made: Densification) -> None:
+        """Clone, split and prune splats."""
+        self._splats = made.apply(self._splats)
+
+    def reset_opacities(self) -> None:
+        """Limit opacities to `reset_opacity`, and set their moments to 0."""
+        splats = self._splats
+        splats.values["logits"] = limited_logits(splats.values["logits"], self._settings)
+        for moments in (splats.first, splats.second):
+            moments["logits"][:] = 0
+
+    def __len__(self) -> int:
+        return len(self._splats)
+
+    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
+        """The splats as a cloud to render, with SH of this degree."""
+        return self._backend.upload(self._splats.cloud(degree, origin, shared=True))
+
+    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], np.ndarray]:
+        """A function that returns the loss of a rendered view, and the gradient (h, w, 3)."""
+        of = self._views[view]
+        target = of.image * np.float32(1 / 255)
+        loss, gradient = image_loss(images.read("rgb"), target, of.mask, self._settings.dssim_weight)
+        return lambda: loss, gradient
+
+    def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
+        """Gradients of the weighted normal loss by `depth` and `normal`."""
+        of = self._views[view]
+        camera, weights = of.camera, np.float32(weight) * images.read("alpha")
+        if of.mask is not None:
+            weights *= of.mask
+        lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        _, by_depth, by_normal = normal_loss(images.read("depth"), images.read("normal"), weights, *lens)
+        return {"depth": by_depth, "normal": by_normal}
+
+    def backward_to_tiles(
+        self, pipeline: Any, images: Images, gradients: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """The gradients for `accumulate_statistics` and `step`."""
+        return pipeline.backward(images, gradients)
+
+    def accumulate_statistics(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
+        """Add screen gradients and visibility to the densification statistics."""
+        splats = self._splats
+        splats.gradient_sums += on_host(gradients["screen"])
+        splats.visible_counts += visible(splats, camera, origin)
+
+    def step(
+        self,
+        gradients: Mapping[str, Any],
+        rate: Mapping[str, float],
+        step: int,
+        camera: Camera | None,
+        origin: np.ndarray,
+    ) -> None:
+        """One step of Adam. camera: unless None, `accumulate_statistics` comes first."""
+        if camera is not None:
+            self.accumulate_statistics(gradients, camera, origin)
+        arrays = {name: on_host(array) for name, array in gradients.items()}
+        raw = parameter_gradients(self._splats, arrays, self._settings)
+        if self._settings.sparse_adam:
+            sparse_adam_step(self._splats, contributing(arrays), raw, rate, self._settings, step)
+        else:
+            adam_step(self._splats, raw, rate, self._settings, step)
+
+    def add_noise(self, iteration: int, rate: float) -> None:
+        """Add MCMC noise to the means. rate: learning rate of the means [m]."""
+        mcmc.add_noise(self._splats, self._settings, iteration, rate)
+
+
+def visible(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the splats whose bounding sphere of three standard deviations intersects the frustum."""
+    rotation = camera.world_to_camera[:3, :3].astype(np.float32)
+    translation = (rotation.astype(np.float64) @ (origin - camera.position)).astype(np.float32)
+    x, y, z = (splats.values["means"] @ rotation.T + translation).T
+    reach = _REACH * splats.scales.max(axis=1)
+    inside = z > camera.near
+    for coordinate, focal, center, size in (
+        (x, camera.fx, camera.cx, camera.width),
+        (y, camera.fy, camera.cy, camera.height),
+    ):
+        # in pixels times depth, to avoid a division by a depth of 0
+        at = np.float32(focal) * coordinate + np.float32(center) * z
+        radius = np.float32(focal) * reach
+        inside &= (at + radius > 0) & (at - radius < np.float32(size) * z)
+    return inside
