@@ -54,7 +54,7 @@ def measure_detail(
         raise InputError(f"views must be a whole number from 1 to 10,000, got {views!r}")
     if unknown := set(lowpass) - set(LOWPASS):
         raise InputError(f"lowpass must be among {', '.join(LOWPASS)}, got {min(unknown)!r}")
-    made, levels = [], range(1, store.levels + 1)
+    measured, levels = [], range(1, store.levels + 1)
     for number, one in enumerate(lowpass):
         worst: dict[int, list[float | None]] = {level: [None] * len(SIZES) for level in levels}
         for done, camera in enumerate(cameras_around(store, views, seed)):
@@ -65,10 +65,12 @@ def measure_detail(
             worst[level] = [_larger(*pair) for pair in zip(worst[level], found, strict=True)]
             progress("measuring levels of detail", (number + (done + 1) / views) / len(lowpass))
         about = -(-views // len(levels)), renderer.device.title, date.today().isoformat()
-        made += [DetailErrors(one, level, SIZES, tuple(errors), *about) for level, errors in worst.items()]
-    save_detail_errors(store.path, store.identity, made)
+        measured += [
+            DetailErrors(one, level, SIZES, tuple(errors), *about) for level, errors in worst.items()
+        ]
+    save_detail_errors(store.path, store.identity, measured)
     store.detail_errors = load_detail_errors(store.path, store.identity)
-    return made
+    return measured
 
 
 def _larger(one: float | None, other: float | None) -> float | None:

@@ -58,13 +58,15 @@ def _changes(given: Quality | MarkerQuality, plain: Quality | MarkerQuality) -> 
     return {name: value for name, (value, before) in pairs.items() if value != before}
 
 
-def marker_settings(made: MarkerQuality, scene: Quality | str | None) -> dict[str, Any]:
+def marker_settings(quality: MarkerQuality, scene: Quality | str | None) -> dict[str, Any]:
     """Settings of a marker that differ from the scene's quality."""
-    changes = _changes(made, Quality.of(scene).marker)
-    if "growth" in changes and made.growth is None:  # the default of the mixture, which a file cannot express
+    changes = _changes(quality, Quality.of(scene).marker)
+    if (
+        "growth" in changes and quality.growth is None
+    ):  # the default of the mixture, which a file cannot express
         from fidsplat.markers.mixture import fitted_growth
 
-        changes["growth"] = fitted_growth() if made.mixture == "fitted" else 0.0
+        changes["growth"] = fitted_growth() if quality.mixture == "fitted" else 0.0
     relevant = {"fitted": ("growth", "template"), "paper": ("levels", "density", "growth"), "facets": ()}
-    names = relevant.get(made.mixture, ("template",))
-    return {"mixture": made.mixture} | {name: changes[name] for name in names if name in changes}
+    names = relevant.get(quality.mixture, ("template",))
+    return {"mixture": quality.mixture} | {name: changes[name] for name in names if name in changes}

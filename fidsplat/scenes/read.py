@@ -198,5 +198,5 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
     known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}
     with table.at():
         spec = with_file(spec, lambda name: str(folder / name))
-        made = marker(spec, size, **known, **own)
-        return PlacedMarker(made, pose, motion=motion, bundle=table.text("bundle", None))
+        built = marker(spec, size, **known, **own)
+        return PlacedMarker(built, pose, motion=motion, bundle=table.text("bundle", None))

@@ -223,14 +223,14 @@ class _Build:
             return np.zeros(0, NODE)
         rows = np.memmap(self._bucket(number), plan.record, "r", 0, (count,)).view(np.ndarray)
         order = np.argsort(rows["code"].copy(), kind="stable")
-        made = []
+        records = []
         for part in np.array_split(order, -(-count // plan.chunk)):
             taken = rows[part]
             splats = {name: np.ascontiguousarray(taken[name]) for name in self.columns.kinds}
-            made.append(node_record(splats, first))
+            records.append(node_record(splats, first))
             self.columns.write(first, splats)
             first += len(part)
-        return np.concatenate(made)
+        return np.concatenate(records)
 
     # chunks to levels of detail
 
@@ -255,12 +255,12 @@ class _Build:
             rows = int(nodes["first"][-1] + nodes["count"][-1])
             most = min(self.workers, max(1, self.plan.memory // self.plan.merge_bytes))
             work = self._in_order(pool, self._merged, (nodes[group] for group in groups[done:]), most)
-            for number, (made, size) in enumerate(work, done + 1):
-                node = node_record(made, rows)
+            for number, (parent, size) in enumerate(work, done + 1):
+                node = node_record(parent, rows)
                 node["level"], node["size"] = level + 1, size
                 _enclose(node, nodes[groups[number - 1]])
-                self.columns.write(rows, made)
-                rows += len(made["means"])
+                self.columns.write(rows, parent)
+                rows += len(parent["means"])
                 self._add_nodes(node)
                 if number % _SAVE_EVERY == 0:
                     self._save(merged=number)

@@ -92,7 +92,7 @@ class BuildPlan:
         """Hexadecimal digest of everything that the store depends on."""
         sha = hashlib.sha256()
         for source in self.sources:
-            sha.update(printable(f"{source.stamp} {source.rows.count} {source.first_plane}\n").encode())
+            sha.update(printable(f"{source.stamp} {source.rows.count} {source.first_group}\n").encode())
         own = (self.chunk, self.memory, self.levels, self.sh_degree, self.columns, self.grid)
         sha.update(repr(own).encode() + self.origin.tobytes() + self.splitters.tobytes())
         return sha.hexdigest()

@@ -160,7 +160,7 @@ class ChunkedSplats:
 
     def ids(self, selection: Selection) -> np.ndarray:
         """Scene indices (n,) int32 of the splats of a selection; -1 for splats of levels of detail."""
-        made, first = [np.empty(0, np.int32)], 0
+        ids, first = [np.empty(0, np.int32)], 0
         for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
             numbers = np.array(nodes, np.int64)
             starts, counts = store.first_of(numbers), store.counts(numbers)
@@ -169,10 +169,10 @@ class ChunkedSplats:
                 starts, counts = np.where(starts < 0, -1, starts + rows[:, 0]), rows[:, 1]
             for start, count in zip(starts, counts, strict=True):
                 own = np.full(count, -1) if start < 0 else np.arange(first + start, first + start + count)
-                made.append(own.astype(np.int32))
+                ids.append(own.astype(np.int32))
             first += len(store)
-        made.append(np.arange(first, first + len(self.in_memory), dtype=np.int32))
-        return np.concatenate(made)
+        ids.append(np.arange(first, first + len(self.in_memory), dtype=np.int32))
+        return np.concatenate(ids)
 
     def prefetch(self, selection: Selection) -> None:
         """Read the nodes of a selection into memory."""
@@ -189,20 +189,22 @@ class ChunkedSplats:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
-        made = self._with_columns(self._relative(store.load(node), store.origin), self._first_planes[number])
-        computed = sum(array.nbytes for array in made.values() if array.base is None)
-        if computed * 4 >= sum(array.nbytes for array in made.values()):
+        arrays = self._with_columns(
+            self._relative(store.load(node), store.origin), self._first_groups[number]
+        )
+        computed = sum(array.nbytes for array in arrays.values() if array.base is None)
+        if computed * 4 >= sum(array.nbytes for array in arrays.values()):
             with self._lock:
                 self._cache_bytes += 0 if key in self._cache else computed
-                self._cache[key] = made
+                self._cache[key] = arrays
                 while self._cache_bytes > HOST_CACHE_BYTES and len(self._cache) > 1:
                     _, evicted = self._cache.popitem(last=False)
                     self._cache_bytes -= sum(a.nbytes for a in evicted.values() if a.base is None)
-        return made
+        return arrays
 
     def unplaced_chunk(self, number: int, node: int) -> dict[str, np.ndarray]:
         """Arrays of a node of a placed store, before its pose is applied."""
-        return self._with_columns(self.stores[number].load(node, placed=False), self._first_planes[number])
+        return self._with_columns(self.stores[number].load(node, placed=False), self._first_groups[number])
 
     @cached_property
     def in_memory_arrays(self) -> dict[str, np.ndarray]:
@@ -213,15 +215,15 @@ class ChunkedSplats:
         optional = {"sh": cloud.sh, "colors": cloud.colors, "coplanar_groups": cloud.coplanar_groups}
         optional |= {"thickness": cloud.thickness, "boxes": cloud.boxes}
         arrays |= {name: array for name, array in optional.items() if array is not None}
-        return self._with_columns(arrays, self._first_planes[-1])
+        return self._with_columns(arrays, self._first_groups[-1])
 
     @cached_property
-    def _first_planes(self) -> list[int]:
+    def _first_groups(self) -> list[int]:
         """Offset added to the group ids of each store, and last of the cloud in memory."""
-        made = [0]
+        offsets = [0]
         for store in self.stores:
-            made.append(made[-1] + store.last_plane() + 1)
-        return made
+            offsets.append(offsets[-1] + store.last_group() + 1)
+        return offsets
 
     def _relative(self, arrays: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
         """Arrays with means relative to this scene's origin instead of another."""
@@ -230,19 +232,19 @@ class ChunkedSplats:
             return arrays
         return arrays | {"means": (arrays["means"] + offset).astype(np.float32)}
 
-    def _with_columns(self, arrays: dict[str, np.ndarray], first_plane: int) -> dict[str, np.ndarray]:
+    def _with_columns(self, arrays: dict[str, np.ndarray], first_group: int) -> dict[str, np.ndarray]:
         """Arrays in the columns of this scene, with defaults for absent ones."""
         count = len(arrays["means"])
-        made = {name: arrays[name] for name in ("means", "quats", "scales", "opacities", "labels")}
-        made |= colors_of_degree(arrays, self.sh_degree)
+        columns = {name: arrays[name] for name in ("means", "quats", "scales", "opacities", "labels")}
+        columns |= colors_of_degree(arrays, self.sh_degree)
         if self.has_coplanar_groups:
             ids = arrays.get("coplanar_groups", np.full(count, -1, np.int32))
-            made["coplanar_groups"] = np.where(ids >= 0, ids + np.int32(first_plane), np.int32(-1))
+            columns["coplanar_groups"] = np.where(ids >= 0, ids + np.int32(first_group), np.int32(-1))
         if self.ellipsoids != "none":
-            made["thickness"] = arrays.get("thickness", np.zeros(count, np.float32))
+            columns["thickness"] = arrays.get("thickness", np.zeros(count, np.float32))
         if self.footprint != "gaussian":
-            made["boxes"] = arrays.get("boxes", np.zeros(count, bool))
-        return made
+            columns["boxes"] = arrays.get("boxes", np.zeros(count, bool))
+        return columns
 
 
 def _pinned(store: Store) -> np.ndarray:

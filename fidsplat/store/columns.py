@@ -38,7 +38,7 @@ class ColumnFiles:
 
     def read(self, first: int, end: int) -> dict[str, np.ndarray]:
         """Read the splats of rows [first, end)."""
-        made = {}
+        splats = {}
         for name, descriptor in self._files.items():
             row = self._row(name)
             array = np.empty((end - first, *self._shapes[name]), self.kinds[name])
@@ -48,8 +48,8 @@ class ColumnFiles:
                 if not got:
                     raise OSError(f"{column_file(self._folder, name)} ends before row {end}")
                 view, at = view[got:], at + got
-            made[name] = array
-        return made
+            splats[name] = array
+        return splats
 
     def finish(self, name: str, header: bytes, rows: int) -> None:
         """Write the header of a column and truncate the file after its rows."""

@@ -80,8 +80,8 @@ def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
         if said["identity"] != identity:
             return []
         rows = [row | {name: tuple(row[name]) for name in ("sizes", "errors")} for row in said["details"]]
-        made = [DetailErrors(**row) for row in rows]
-        for one in made:
+        loaded = [DetailErrors(**row) for row in rows]
+        for one in loaded:
             if len(one.sizes) != len(one.errors) or list(one.sizes) != sorted(map(float, one.sizes)):
                 raise ValueError
             numbers = [*one.sizes, *(error for error in one.errors if error is not None)]
@@ -90,4 +90,4 @@ def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
                 raise ValueError
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{file} is damaged; remove it, and run `fidsplat store measure` again") from None
-    return made
+    return loaded

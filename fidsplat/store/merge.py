@@ -39,8 +39,8 @@ def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndar
     keys = _split_edges(keys, splats)
     order, starts = _runs(keys)
     given = {name: array[order] for name, array in splats.items()}
-    made = _by_moments(given, (u[:, order], v[:, order], normal[:, order]), starts)
-    return made, grid.size(shift)
+    result = _by_moments(given, (u[:, order], v[:, order], normal[:, order]), starts)
+    return result, grid.size(shift)
 
 
 def _runs(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -59,9 +59,9 @@ def _split_edges(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
     mean = np.add.reduceat(light, starts) / lengths
     away = light - np.repeat(mean, lengths)
     edge = np.add.reduceat(away * away, starts) > EDGE**2 * lengths
-    made = np.empty(len(keys), np.int64)
-    made[order] = np.repeat(2 * np.arange(len(starts)), lengths) + ((away > 0) & np.repeat(edge, lengths))
-    return made
+    split = np.empty(len(keys), np.int64)
+    split[order] = np.repeat(2 * np.arange(len(starts)), lengths) + ((away > 0) & np.repeat(edge, lengths))
+    return split
 
 
 def _frames(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,7 +140,7 @@ def _by_moments(
     single, heaviest = lengths == 1, _first_of_largest(weights, starts, lengths)
     result = {}
     for name, array in splats.items():
-        if name not in made:  # labels, planes
+        if name not in made:  # labels, coplanar groups
             result[name] = array[heaviest]
             continue
         result[name] = made[name].astype(array.dtype)

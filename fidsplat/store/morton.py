@@ -13,10 +13,10 @@ BITS = 21
 def _spread(bits: int) -> np.ndarray:
     """(2^bits,) uint64: the bits of an index with two zeros between each."""
     index = np.arange(1 << bits, dtype=np.uint64)
-    made = np.zeros_like(index)
+    spread = np.zeros_like(index)
     for bit in range(bits):
-        made |= ((index >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit)
-    return made
+        spread |= ((index >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit)
+    return spread
 
 
 _LOW_BITS = 11

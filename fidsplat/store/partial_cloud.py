@@ -42,7 +42,7 @@ class PartialCloud(SplatCloud):
         cls, arrays: Mapping[str, np.ndarray], scene: SceneTraits, dropped: Mapping[str, int] | None = None
     ) -> PartialCloud:
         """A cloud of valid arrays, without a copy. dropped: number of omitted splats by the reason."""
-        made = object.__new__(cls)
+        part = object.__new__(cls)
         given: dict[str, Any] = {
             "colors": None,
             "sh": None,
@@ -50,9 +50,9 @@ class PartialCloud(SplatCloud):
             "boxes": None,
             "thickness": None,
         }
-        made._set(**given | dict(arrays), origin=scene.origin, dropped=dict(dropped or {}))
-        object.__setattr__(made, "_scene", scene)
-        return made
+        part._set(**given | dict(arrays), origin=scene.origin, dropped=dict(dropped or {}))
+        object.__setattr__(part, "_scene", scene)
+        return part
 
     def __reduce__(self):
         """Pickled and copied as a plain SplatCloud."""
@@ -125,15 +125,15 @@ def transformed(
         p * b - q * c + r * w + s * a,
         p * c + q * b - r * a + s * w,
     ]
-    made = dict(splats) | {
+    result = dict(splats) | {
         "means": np.stack(means, axis=1).astype(np.float32),
         "quats": np.stack(quats, axis=1).astype(np.float32),
     }
-    if "sh" in made and made["sh"].shape[1] > 1:
-        degree = int(np.sqrt(made["sh"].shape[1])) - 1
+    if "sh" in result and result["sh"].shape[1] > 1:
+        degree = int(np.sqrt(result["sh"].shape[1])) - 1
         matrix = rotation_of_coefficients(degree, rotation).astype(np.float32)
-        rotated = np.zeros_like(made["sh"])
+        rotated = np.zeros_like(result["sh"])
         for i, j in zip(*np.nonzero(matrix), strict=True):
-            rotated[:, i] += matrix[i, j] * made["sh"][:, j]
-        made["sh"] = rotated
-    return made
+            rotated[:, i] += matrix[i, j] * result["sh"][:, j]
+        result["sh"] = rotated
+    return result

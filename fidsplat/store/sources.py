@@ -31,7 +31,7 @@ class Source:
     origin: np.ndarray
     stamp: str
     """path, size and time of the file, to detect a later change"""
-    first_plane: int = 0
+    first_group: int = 0
     """offset added to its coplanar group ids, so that groups of different inputs stay different"""
 
 
@@ -81,15 +81,15 @@ def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
 
 def with_distinct_groups(sources: list[Source]) -> list[Source]:
     """The sources, with distinct coplanar group ids."""
-    made, free = [], 0
+    distinct, free = [], 0
     for source in sources:
-        made.append(Source(source.rows, source.origin, source.stamp, free))
+        distinct.append(Source(source.rows, source.origin, source.stamp, free))
         if "coplanar_groups" in source.rows.columns:
             parts = (
                 window(source.rows, *span)[0]["coplanar_groups"] for span in spans(source.rows.count, WINDOW)
             )
             free += 1 + max((int(ids.max(initial=-1)) for ids in parts), default=-1)
-    return made
+    return distinct
 
 
 def spans(count: int, size: int) -> list[tuple[int, int]]:
@@ -138,14 +138,14 @@ def splats_of(
     means = part["means"]
     if means.dtype != np.float32 or not np.array_equal(source.origin, origin):
         means = (means.astype(np.float64) + (source.origin - origin)).astype(np.float32)
-    made = {"means": means, "quats": unit_quaternions(part["quats"])}
-    made |= {name: part[name] for name in ("scales", "opacities")}
-    made |= colors_of_degree(part, sh_degree)
+    splats = {"means": means, "quats": unit_quaternions(part["quats"])}
+    splats |= {name: part[name] for name in ("scales", "opacities")}
+    splats |= colors_of_degree(part, sh_degree)
     if "thickness" in columns:
-        made["thickness"] = part.get("thickness", np.zeros(count, np.float32))
+        splats["thickness"] = part.get("thickness", np.zeros(count, np.float32))
     if "labels" in columns:
-        made["labels"] = part.get("labels", np.zeros(count, np.int32))
+        splats["labels"] = part.get("labels", np.zeros(count, np.int32))
     if "coplanar_groups" in columns:
         ids = part.get("coplanar_groups", np.full(count, -1, np.int32))
-        made["coplanar_groups"] = np.where(ids >= 0, ids + source.first_plane, -1).astype(np.int32)
-    return {name: made[name].astype(kind, copy=False) for name, kind in columns.items()}, dropped
+        splats["coplanar_groups"] = np.where(ids >= 0, ids + source.first_group, -1).astype(np.int32)
+    return {name: splats[name].astype(kind, copy=False) for name, kind in columns.items()}, dropped

@@ -281,7 +281,7 @@ class Store(Summarised):
             made.update(np.unique(rows).tolist())
         return made
 
-    def last_plane(self) -> int:
+    def last_group(self) -> int:
         """Largest id of its coplanar groups; -1 without."""
         if not self.has_coplanar_groups:
             return -1
@@ -318,14 +318,14 @@ class Store(Summarised):
 
     def _rows(self, first: int, end: int, instance: int | None) -> dict[str, np.ndarray]:
         """Splats of rows [first, end) at the pose of an instance; None: as stored."""
-        made = {name: array[first:end] for name, array in self._columns.items()}
-        for name in {"sh", "colors"} & set(made):
-            made[name] = made[name].astype(np.float32, copy=False)
-        if "labels" not in made:
-            made["labels"] = np.zeros(end - first, np.int32)
+        splats = {name: array[first:end] for name, array in self._columns.items()}
+        for name in {"sh", "colors"} & set(splats):
+            splats[name] = splats[name].astype(np.float32, copy=False)
+        if "labels" not in splats:
+            splats["labels"] = np.zeros(end - first, np.int32)
         if self.poses is None or instance is None:
-            return made
-        return transformed(made, self.poses[instance, :3, :3], self._offsets[instance])
+            return splats
+        return transformed(splats, self.poses[instance, :3, :3], self._offsets[instance])
 
 
 def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:

@@ -72,10 +72,10 @@ class Band:
         """The same rows, rendered from some of the visible nodes."""
         return self._with_cache(replace(self, subset=nodes, subchunks=None))
 
-    def _with_cache(self, made: Band) -> Band:
+    def _with_cache(self, band: Band) -> Band:
         if "visible" in self.__dict__:
-            made.__dict__["visible"] = self.visible
-        return made
+            band.__dict__["visible"] = self.visible
+        return band
 
     def without_occluded(self, termination: TerminationDepths) -> Band:
         """The same rows, without occluded nodes and subchunks."""
@@ -103,10 +103,10 @@ class Band:
         self, subchunks: Sequence[Subchunks], termination: TerminationDepths
     ) -> np.ndarray:
         """(rows, columns) bool: tiles to which subchunks can contribute."""
-        made = np.zeros(termination.depths.shape, bool)
+        tiles = np.zeros(termination.depths.shape, bool)
         for each in subchunks:
-            made |= contributing_tiles(self.view, self.features, each.boxes, each.reach, termination)
-        return made
+            tiles |= contributing_tiles(self.view, self.features, each.boxes, each.reach, termination)
+        return tiles
 
     def _can_contribute(self, subchunks: Subchunks, termination: TerminationDepths) -> np.ndarray:
         """(k,) bool: subchunks that are pinned, or in the frustum and not occluded."""
@@ -172,8 +172,8 @@ class Band:
         middle = (first + end) // 2
         if end - first < 2 * _MIN_ROWS or self.full_view.sub_frames:
             return []
-        made = [self.with_rows(first, middle), self.with_rows(middle, end)]
-        return made if sum(half.count for half in made) <= _MAX_OVERLAP * self.count else []
+        halves = [self.with_rows(first, middle), self.with_rows(middle, end)]
+        return halves if sum(half.count for half in halves) <= _MAX_OVERLAP * self.count else []
 
 
 class BandSplitter:
@@ -189,7 +189,7 @@ class BandSplitter:
         """Bands from the top that fit, or cannot be split further. `fits` is called right before its band is
         yielded."""
         waiting = [full.with_rows(*rows) for rows in pairwise(self._cuts.get(full.rows, full.rows))]
-        made: list[Band] = []
+        bands: list[Band] = []
         while waiting:
             band = waiting.pop(0)
             fitting = fits(band)
@@ -199,8 +199,8 @@ class BandSplitter:
                 continue
             if fitting:
                 self._capacity = max(self._capacity, band.count)
-            made.append(band)
+            bands.append(band)
             yield band
-        counts = np.array([band.count for band in made])
-        firsts = [made[first].rows[0] for first, _, _ in cut(counts, self._capacity)]
-        self._cuts = {full.rows: [*firsts, made[-1].rows[1]]}
+        counts = np.array([band.count for band in bands])
+        firsts = [bands[first].rows[0] for first, _, _ in cut(counts, self._capacity)]
+        self._cuts = {full.rows: [*firsts, bands[-1].rows[1]]}

@@ -31,7 +31,7 @@ class DeviceChunks(ChunkedScene):
 
     def of(self, selection: Selection, applies_poses: bool) -> list[Chunk]:
         """Chunks of a selection. applies_poses: whether the device applies poses of instances."""
-        made = []
+        chunks = []
         for number, (store, nodes) in enumerate(zip(self.scene.stores, selection.nodes, strict=True)):
             posed = applies_poses and self._can_pose(store)
             known = self._chunks.setdefault((number, posed), {})
@@ -41,12 +41,12 @@ class DeviceChunks(ChunkedScene):
                 if selection.rows is not None:
                     first, count = selection.rows[number][index]
                     chunk = replace(chunk, first=first, count=count)
-                made.append(chunk)
+                chunks.append(chunk)
         size, count = self.largest_chunk, len(self.scene.in_memory)
-        for first in range(0, count if made else max(count, 1), size):
+        for first in range(0, count if chunks else max(count, 1), size):
             end = min(first + size, count)
-            made.append(Chunk(("in memory", first), end - first, partial(self._in_memory, first, end)))
-        return made
+            chunks.append(Chunk(("in memory", first), end - first, partial(self._in_memory, first, end)))
+        return chunks
 
     def distinct(self, applies_poses: bool) -> int:
         """Number of different chunk keys. applies_poses: whether the device applies poses of instances."""
@@ -71,7 +71,7 @@ class DeviceChunks(ChunkedScene):
         return self.scene.part(Selection.of(self.scene.pinned))
 
     @cached_property
-    def _plane_ids(self) -> np.ndarray:
+    def _group_ids(self) -> np.ndarray:
         ids = self._pinned_part.coplanar_groups
         assert ids is not None
         return np.unique(ids[ids >= 0])
@@ -98,11 +98,11 @@ class DeviceChunks(ChunkedScene):
 
     def _on_device(self, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Arrays with dense indices of coplanar groups and integers for flags."""
-        made = dict(arrays)
-        if "coplanar_groups" in made:
-            known = np.append(self._plane_ids, np.iinfo(np.int32).max)
-            dense = np.searchsorted(known, made["coplanar_groups"]).astype(np.int32)
-            made["coplanar_groups"] = np.where(made["coplanar_groups"] < 0, np.int32(-1), dense)
-        if "boxes" in made:
-            made["boxes"] = made["boxes"].astype(np.int32)
-        return made
+        result = dict(arrays)
+        if "coplanar_groups" in result:
+            known = np.append(self._group_ids, np.iinfo(np.int32).max)
+            dense = np.searchsorted(known, result["coplanar_groups"]).astype(np.int32)
+            result["coplanar_groups"] = np.where(result["coplanar_groups"] < 0, np.int32(-1), dense)
+        if "boxes" in result:
+            result["boxes"] = result["boxes"].astype(np.int32)
+        return result

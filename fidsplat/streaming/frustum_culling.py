@@ -40,14 +40,14 @@ def in_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray
         reach: (n,) metres: largest standard deviation of a box's splats.
     """
     if view.sub_frames:
-        made = np.zeros(len(reach), bool)
+        visible = np.zeros(len(reach), bool)
         for sub_frame in view.sub_frames:
-            made |= in_frustum(sub_frame.view, features, boxes, reach)
-        return made
-    made = _in_pose_frustum(view, features, boxes, reach)
+            visible |= in_frustum(sub_frame.view, features, boxes, reach)
+        return visible
+    visible = _in_pose_frustum(view, features, boxes, reach)
     for _, own in view.groups:
-        made |= _in_pose_frustum(own, features, boxes, reach)
-    return made
+        visible |= _in_pose_frustum(own, features, boxes, reach)
+    return visible
 
 
 @dataclass(frozen=True)
@@ -132,33 +132,33 @@ def _in_pose_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.n
     radius, margin = extent.radius, extent.margin
     centers = CameraBoxes(view, *boxes(0.0))
     whole = CameraBoxes(view, *boxes(radius))
-    made = whole.furthest(view) >= view.near * (1 - _ROUNDING)
+    visible = whole.furthest(view) >= view.near * (1 - _ROUNDING)
     deep = whole if extent.depths == radius else CameraBoxes(view, *boxes(extent.depths))
-    made &= extent.nearest(view, deep) <= view.far * (1 + _ROUNDING)
+    visible &= extent.nearest(view, deep) <= view.far * (1 + _ROUNDING)
     if view.raster is None:
         wide = ewa_reach(view, features, radius, reach)
         for normal, offset in _pinhole_sides(view, margin):
             inside = whole.beyond(normal) + offset >= 0
             if wide is not None:
                 inside |= centers.beyond(normal) + offset + wide >= 0
-            made &= inside
-        return made
+            visible &= inside
+        return visible
     lens = view.raster.lens
     if isinstance(lens, Equirectangular):
-        return made
+        return visible
     step = view.raster.step * margin
     if isinstance(lens, Fisheye):
         if _widened(features):
             step = _max_ray_rotation(view) * max(margin, extent.depths * _ACROSS + 2.0)
-            return made & centers.within(_max_ray_angle(view.raster), step, extent.depths * reach)
-        return made & whole.within(_max_ray_angle(view.raster) + step)
+            return visible & centers.within(_max_ray_angle(view.raster), step, extent.depths * reach)
+        return visible & whole.within(_max_ray_angle(view.raster) + step)
     low, high = _slopes(view.raster)
     for axis in (0, 1):
         for sign, side in ((1.0, low[axis] - step), (-1.0, high[axis] + step)):
             normal = np.zeros(3)
             normal[axis], normal[2] = sign, -sign * side
-            made &= whole.beyond(normal) >= 0
-    return made
+            visible &= whole.beyond(normal) >= 0
+    return visible
 
 
 class CameraBoxes:
@@ -268,16 +268,16 @@ def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
         return np.max(
             [projected_sizes(sub_frame.view, boxes, edges) for sub_frame in view.sub_frames], axis=0
         )
-    made = np.zeros(len(edges))
+    largest = np.zeros(len(edges))
     for one in (view, *(own for _, own in view.groups)):
         focal = max(one.focal_x, one.focal_y)
         if one.parallel:
-            made = np.maximum(made, edges * focal)
+            largest = np.maximum(largest, edges * focal)
             continue
         placed = CameraBoxes(one, *boxes(0.0))
         panorama = one.raster is not None and isinstance(one.raster.lens, Equirectangular)
         nearest = placed.off_axis() if panorama else placed.nearest(one)
         with np.errstate(divide="ignore", invalid="ignore"):
             size = np.where(nearest > 0, edges * focal / np.maximum(nearest, 1e-300), np.inf)
-        made = np.maximum(made, np.where(edges > 0, size, 0.0))
-    return made
+        largest = np.maximum(largest, np.where(edges > 0, size, 0.0))
+    return largest

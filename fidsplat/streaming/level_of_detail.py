@@ -24,11 +24,11 @@ def visible_nodes(
     scene: ChunkedSplats, views: Sequence[View], features: FeatureSet, cell_sizes: CellSizes = 0.0
 ) -> NodeMasks:
     """Masks of the nodes that views need: visible, and the coarsest that the cell sizes allow."""
-    made = []
+    masks = []
     for number, store in enumerate(scene.stores):
         sizes = cell_sizes[number] if isinstance(cell_sizes, tuple) else (cell_sizes,) * (store.levels + 1)
-        made.append(_visible_nodes(scene, number, views, features, np.array(sizes)))
-    return tuple(made)
+        masks.append(_visible_nodes(scene, number, views, features, np.array(sizes)))
+    return tuple(masks)
 
 
 def _visible_nodes(

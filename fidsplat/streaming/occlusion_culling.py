@@ -144,13 +144,13 @@ def _nearest(full: Band, nodes: NodeMasks, max_splats: int) -> NodeMasks:
     near = np.zeros(len(order), bool)
     before = np.cumsum(np.concatenate(counts)[order], dtype=np.int64) - np.concatenate(counts)[order]
     near[order[before < max_splats]] = True
-    made, first = [], 0
+    masks, first = [], 0
     for mask in nodes:
         chosen, count = mask.copy(), int(np.count_nonzero(mask))
         chosen[mask] = near[first : first + count]
-        made.append(chosen)
+        masks.append(chosen)
         first += count
-    return tuple(made)
+    return tuple(masks)
 
 
 def _reprojected(last: View, termination: TerminationDepths, view: View) -> TerminationDepths | None:

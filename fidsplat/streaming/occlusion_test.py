@@ -53,11 +53,11 @@ def contributing_tiles(
 
     boxes, reach: those of `in_frustum`.
     """
-    made = np.zeros(termination.depths.shape, bool)
+    tiles = np.zeros(termination.depths.shape, bool)
     keys, spans = minimum_keys(view, features, boxes), _tile_spans(view, features, boxes, reach, termination)
     for key, top, bottom, left, right in zip(keys, *spans, strict=True):
-        made[top:bottom, left:right] |= termination.depths[top:bottom, left:right] >= key
-    return made
+        tiles[top:bottom, left:right] |= termination.depths[top:bottom, left:right] >= key
+    return tiles
 
 
 def node_keys(scene: ChunkedSplats, view: View, features: FeatureSet) -> tuple[np.ndarray, ...]:
@@ -70,11 +70,11 @@ def occluded_nodes(
     scene: ChunkedSplats, view: View, features: FeatureSet, termination: TerminationDepths
 ) -> NodeMasks:
     """Masks of the nodes that are occluded in a frame with these termination depths, except pinned ones."""
-    made = []
+    masks = []
     for number, (store, pinned) in enumerate(zip(scene.stores, scene.pinned, strict=True)):
         reach = np.tile(store.nodes["reach"].astype(np.float64), store.instances)
-        made.append(occluded(view, features, partial(scene.boxes, number), reach, termination) & ~pinned)
-    return tuple(made)
+        masks.append(occluded(view, features, partial(scene.boxes, number), reach, termination) & ~pinned)
+    return tuple(masks)
 
 
 def _tile_spans(
@@ -150,21 +150,21 @@ class _RangeMaximum:
         if (down, across) not in self._tables:
             if across:
                 table, step = self._table(down, across - 1), 1 << (across - 1)
-                made = np.maximum(table[:, :-step], table[:, step:])
+                maxima = np.maximum(table[:, :-step], table[:, step:])
             else:
                 table, step = self._table(down - 1, 0), 1 << (down - 1)
-                made = np.maximum(table[:-step], table[step:])
-            self._tables[down, across] = made
+                maxima = np.maximum(table[:-step], table[step:])
+            self._tables[down, across] = maxima
         return self._tables[down, across]
 
     def within(self, top: np.ndarray, bottom: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """(n,) maximum over rows [top, bottom) and columns [left, right); -inf for an empty rectangle."""
-        made = np.full(len(top), -np.inf)
+        maxima = np.full(len(top), -np.inf)
         some = np.flatnonzero((bottom > top) & (right > left))
         tall, wide = (np.frexp(size[some])[1] - 1 for size in (bottom - top, right - left))
         for down, across in {*zip(tall.tolist(), wide.tolist(), strict=True)}:
             at = some[(tall == down) & (wide == across)]
             table, low, far = self._table(down, across), bottom[at] - (1 << down), right[at] - (1 << across)
             first = np.maximum(table[top[at], left[at]], table[top[at], far])
-            made[at] = np.maximum(first, np.maximum(table[low, left[at]], table[low, far]))
-        return made
+            maxima[at] = np.maximum(first, np.maximum(table[low, left[at]], table[low, far]))
+        return maxima

@@ -285,7 +285,7 @@ def test_a_city_does_not_depend_on_how_it_is_read():
     assert (whole["means"][:, 1] <= 1e-3).all()
     assert len(sample([source])[0])
     for bad in ({"splats": 0}, {"splats": 10, "houses": 101}, {"splats": 10, "seed": -1}):
-        with pytest.raises(fs.InputError, match="of a city is"):
+        with pytest.raises(fs.InputError, match="of a city must be"):
             City(**bad)
     camera, path = flight(city)
     assert camera.width == 1280
