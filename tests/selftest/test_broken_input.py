@@ -1,6 +1,4 @@
-"""Broken values: left out and counted when a cloud is made, culled when they reach a kernel all the same, and
-never a trace in the spec.
-"""
+"""Broken values: splats are dropped and counted when a cloud is made, and culled if they reach a kernel."""
 
 import warnings
 
@@ -45,7 +43,7 @@ def test_each_broken_value_is_counted_under_its_reason(name):
 
 
 def test_all_broken_values_at_once(renderer):
-    """One copy of the victim for each broken value, among valid splats: the image of the valid ones."""
+    """A cloud with all broken values has the image of its valid splats."""
     cloud = crowd()
     bad = [arrays for _, arrays in broken_fields(cloud)]
     arrays = {name: getattr(cloud, name) for name in BROKEN}
@@ -88,7 +86,7 @@ UNCHECKED = {
 
 
 @pytest.mark.parametrize("name", UNCHECKED)
-def test_kernels_cull_what_no_cloud_should_hold(renderer, name):
+def test_kernels_cull_invalid_splats(renderer, name):
     """Case E1: NaN fails every comparison of the kernels; the checks of the cloud are bypassed."""
     cloud = crowd()
     expected = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS)
@@ -118,8 +116,8 @@ def test_minus_zero_is_zero(renderer):
     assert same_bits(*frames)
 
 
-def test_splats_that_cannot_be_seen_leave_no_trace(renderer):
-    """Opacity 0, -0, denormal, and below the cut-off: good splats that are not drawn."""
+def test_invisible_splats_change_nothing(renderer):
+    """Opacity 0, -0, denormal, and below the cut-off: valid invisible splats."""
     cloud = crowd()
     expected = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS, CATALOGUED)
     for opacity in (0.0, -0.0, 1e-45, 1e-30, 0.0039):
@@ -138,8 +136,8 @@ def write_rows(path, rows):
     return path
 
 
-def test_all_zero_rows_of_a_file_are_left_out_and_counted(tmp_path, renderer):
-    """A row of zeros reads as a scale of e^0 = 1 m and an opacity of 1/2: it would fill the image."""
+def test_all_zero_rows_of_a_file_are_dropped_and_counted(tmp_path, renderer):
+    """A row of zeros has a scale of e^0 = 1 m and opacity 1/2, and would fill the image."""
     cloud = crowd()
     fs.save_ply(cloud, tmp_path / "good.ply")
     with warnings.catch_warnings():

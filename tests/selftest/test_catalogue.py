@@ -1,4 +1,4 @@
-"""Every entry of the catalogue (docs/correctness.md) on every device, and that none is missing."""
+"""All cases of docs/correctness.md on every device."""
 
 import pytest
 from agreement import reference_images
@@ -12,13 +12,13 @@ SIZES = {"A": 7, "B": 8, "C": 4, "D": 5, "E": 5, "F": 6, "G": 5}
 
 @pytest.mark.parametrize("case", all_cases(), ids=lambda case: case.name)
 def test_case(renderer, case, monkeypatch):
-    """All its specs agree with the reference, and all its findings hold."""
+    """All frames agree with the reference, and all findings hold."""
     monkeypatch.setattr(check, "reference_images", reference_images)  # each drawn once for all devices
     result, _ = check.run_case(renderer, case)
     assert result.wrong == []
 
 
-def test_the_catalogue_is_whole():
+def test_the_catalogue_is_complete():
     """A1 to G5, each once."""
     cases = all_cases()
     names = [f"{letter}{n}" for letter, count in SIZES.items() for n in range(1, count + 1)]
@@ -28,8 +28,8 @@ def test_the_catalogue_is_whole():
     assert all(case.title and case.trigger for case in cases)
 
 
-def test_float32_setup_shows_why_float64_is_used(renderer):
-    """Case B1 detects a float32 setup: errors are more than ten times larger."""
+def test_case_b1_detects_a_float32_setup(renderer):
+    """Errors are more than ten times larger."""
     single = QUALITY.with_(setup_precision="float32")
     error = grazing_errors(renderer, 85.0, 3, single).max()
     assert error > 1e-4

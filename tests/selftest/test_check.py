@@ -1,4 +1,4 @@
-"""`fidsplat check`: what it says when a device is right, and when it is not."""
+"""`fidsplat check`: reports of correct and of faulty devices."""
 
 import json
 
@@ -33,7 +33,7 @@ GOOD = Case("A1", "a good case", "nothing", good)
 
 
 class Broken:
-    """A renderer that draws something else."""
+    """A renderer with faulty images."""
 
     def __init__(self, renderer, spoil):
         self.device, self.backend, self._renderer, self._spoil = (
@@ -99,7 +99,7 @@ def test_a_device_that_fails_fails_its_case_only(renderer):
 
 
 def test_certificates_are_small_where_nothing_is_hard():
-    """They are no loose tolerance: below it in every pixel of an ordinary scene, where nothing may flip."""
+    """In an ordinary scene certificates are below the tolerance in every pixel, and nothing may flip."""
     cloud = random_splats(300, seed=20, depth=(1.0, 6.0), scale=(0.01, 0.3))
     truth = check.reference_images(FrameSpec(cloud, camera(), outputs=ALL_OUTPUTS))
     assert truth["alpha"].max() > 0.9
@@ -113,7 +113,7 @@ def test_certificates_are_small_where_nothing_is_hard():
     assert truth["depth_median_may_flip"].mean() < 5e-4
 
 
-def test_certificates_name_what_single_precision_cannot_decide():
+def test_certificates_cover_decisions_within_float32_rounding():
     # a needle 1e-4 px wide across the image, through pixel centres; a splat at the cut-off; a tie
     needle = splats([[0.00625, 0.00625, 1]], rotation((0, 0, 1), 45), (0.4, 1.25e-6))
     faint = splats([[0.00625, 0.00625, 1]], (1, 0, 0, 0), 0.2, np.float32(1 / 255) * (1 + 1e-6))
@@ -153,7 +153,7 @@ def test_the_reference_agrees_with_itself(reference):
 
 
 @pytest.mark.parametrize("found", [inputs.e2, inputs.e4])
-def test_the_reference_culls_nothing_and_holds(found, reference):
+def test_the_reference_passes_its_own_cases(found, reference):
     findings = [each for each in found(reference) if isinstance(each, Finding)]
     assert findings
     assert all(each.holds for each in findings), findings

@@ -1,4 +1,4 @@
-"""Random hard scenes: what they hold, a short run, and a long one that is stopped and goes on."""
+"""Fuzzing: distribution of the scenes, short runs, and stopped runs that resume."""
 
 import json
 
@@ -11,7 +11,7 @@ from fidsplat.splats.rotations import quaternion_to_matrix
 
 
 @pytest.mark.parametrize("splats", [2000, pytest.param(50_000, marks=pytest.mark.exhaustive)])
-def test_so_many_splats(renderer, splats):
+def test_a_number_of_splats(renderer, splats):
     *_, state = fuzz.fuzz_run(renderer, splats)
     assert state.failing == []
     assert state.passed
@@ -22,7 +22,7 @@ def test_so_many_splats(renderer, splats):
 
 @pytest.mark.parametrize("seed", [12, 45, 68, 94, 174, 194, 223, 229, 248])
 def test_seeds_that_failed_once(renderer, seed):
-    """Tiny splats called edge-on; opacities at the cut-off in depth and labels; optical depth near 1."""
+    """Tiny splats misjudged as edge-on; opacities at the cut-off in depth and labels; high optical depth."""
     state = fuzz.FuzzState("")
     state.add(seed, renderer)
     assert state.failing == []
@@ -30,13 +30,13 @@ def test_seeds_that_failed_once(renderer, seed):
 
 @pytest.mark.parametrize("seed", [56, 107, 739])
 def test_seeds_with_ties(renderer, seed):
-    """Of splats of one plane: cut off by the stop in one order; turned; face to face with the camera."""
+    """Coplanar splats: terminated in one order only; tilted; fronto-parallel."""
     state = fuzz.FuzzState("")
     state.add(seed, renderer)
     assert state.passed
 
 
-def test_a_scene_is_its_seed():
+def test_a_scene_is_determined_by_its_seed():
     one, other = fuzz.scene_of(7), fuzz.scene_of(7)
     assert np.array_equal(one.cloud.means, other.cloud.means)
     assert one.quality == other.quality
@@ -81,7 +81,7 @@ def test_the_scenes_are_hard():
 
 
 @in_turn()
-def test_a_stopped_run_goes_on(renderer, tmp_path, monkeypatch):
+def test_a_stopped_run_resumes(renderer, tmp_path, monkeypatch):
     monkeypatch.setattr(fuzz, "_SAVE_EVERY", 0.0)
     file = tmp_path / "fuzz.json"
     whole = list(fuzz.fuzz_run(renderer, 300))[-1]
@@ -100,16 +100,16 @@ def test_a_stopped_run_goes_on(renderer, tmp_path, monkeypatch):
 
 @in_turn()
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 3}', '{"key": "%s", "scenes": "a", "new": 1}'])
-def test_a_file_of_something_else_is_no_hindrance(renderer, tmp_path, content):
+def test_an_invalid_state_file_is_replaced(renderer, tmp_path, content):
     file = tmp_path / "fuzz.json"
     file.write_text(content.replace("%s", fuzz._key(renderer)))
     assert next(fuzz.fuzz_run(renderer, 50, file)).scenes == 1
 
 
 @in_turn(1)
-def test_a_failing_seed_is_named(renderer, monkeypatch):
+def test_a_failing_seed_is_reported(renderer, monkeypatch):
     class Wrong(dict):
-        """Images of a device that is off by a little where it is sure."""
+        """Images with a small error where the certificate is small."""
 
     def wrong(one, spec):
         frame = render(one, spec)

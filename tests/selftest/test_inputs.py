@@ -1,4 +1,4 @@
-"""Group E: inputs, sizes, integers."""
+"""Cases of group E: inputs, sizes, integers."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from fidsplat.selftest.agreement import COLOR_TOLERANCE, FrameSpec, reference_im
 
 @pytest.mark.parametrize(("width", "height"), [(32767, 3), (3, 32767), (4001, 1003)])
 def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
-    """E4: tens of thousands of tiles; compared with the reference in 200 pixels."""
+    """Case E4: tens of thousands of tiles, compared with the reference in 200 pixels."""
     cloud = random_splats(60, seed=45, depth=(1.0, 4.0), scale=(0.01, 0.3))
     camera = inputs.sized(width, height)
     generator = np.random.default_rng(0)
@@ -31,9 +31,9 @@ def opencl(renderer):
 
 
 @pytest.mark.parametrize("budget", [None, 40])
-def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, budget):
-    """E3: a frame of more than 2^32 pairs has list offsets modulo 2^32. The offsets of a small one are moved
-    up until they wrap amid its tiles.
+def test_list_offsets_wrap_at_2_to_the_32(renderer, monkeypatch, budget):
+    """Case E3: a frame of more than 2^32 pairs has list offsets modulo 2^32. The offsets of a small one are
+    increased until they wrap within its tiles.
     """
     from fidsplat.backends.opencl import probe, tiling
 
@@ -57,16 +57,16 @@ def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, bud
     assert all(np.array_equal(frame[name], expected[name]) for name in frame)
 
 
-def test_a_buffer_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer):
-    """E3: nothing is allocated beyond the device's limit, and the message says what to do."""
+def test_a_buffer_above_the_device_limit_is_an_error_with_a_remedy(renderer):
+    """Case E3: nothing beyond the device's limit is allocated, and the error has a remedy."""
     backend = opencl(renderer)
     limit = renderer.device.largest_allocation_bytes
     with pytest.raises(fs.DeviceError, match=r"lists must be at most .* use fewer splats or a smaller frame"):
         backend.pool.fresh("lists", limit + 1)
 
 
-def test_poison_reaches_every_buffer(renderer):
-    """E5 would prove nothing if the buffers were clean."""
+def test_all_buffers_are_poisoned(renderer):
+    """Case E5 requires that all buffers are filled."""
     from fidsplat.backends.opencl import probe
 
     backend = opencl(renderer)

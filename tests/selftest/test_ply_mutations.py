@@ -15,9 +15,9 @@ import pytest
 import fidsplat as fs
 
 SIZES = [270] * 400 + [20000] * 8
-"""splats in the files of each kind before they are mutated; the large ones are there for the memory"""
+"""splats in the files of each kind before mutation; large ones test memory"""
 SECONDS = 2.0
-"""limit for one file; a small one takes about a millisecond"""
+"""time limit per file; a small one takes about a millisecond"""
 CONSTANT = 300_000
 """bytes: the header's buffer (64 KiB, as bytes and as text), blocks of rows, and Python's own"""
 
@@ -37,7 +37,7 @@ LINES += [b"property int plane", b"property float label", b"comment fidsplat ori
 
 
 def compressed(n, generator, rest=0):
-    """A compressed file of random words: every pattern of bits is a legal splat."""
+    """A compressed file of random words: every bit pattern is a valid splat."""
     limits = [f"{end}_{part}{axis}" for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
     limits += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
     chunks = -(-n // 256)
@@ -69,7 +69,7 @@ def plain(n, generator, folder, degree, native, marked=False):
 
 
 def thick(n, generator, folder):
-    """A 3DGS file as training leaves it: three scales that differ, quaternions of any length."""
+    """A 3DGS file as from training: three different scales, unnormalised quaternions."""
     head, data = plain(n, generator, folder, 0, native=False).split(b"end_header\n", 1)
     rows = np.frombuffer(data, "<f4").reshape(n, -1).copy()
     rows[:, -7:] = generator.normal(size=(n, 7))
@@ -113,13 +113,13 @@ def extend(content, generator):
 
 
 def splice(content, generator):
-    """A piece of the file is lost, or stands twice."""
+    """Remove or duplicate a piece of the file."""
     a, b = np.sort(generator.integers(0, len(content), 2))
     return content[:a] + content[b:] if generator.random() < 0.5 else content[:b] + content[a:]
 
 
 def special_values(content, generator):
-    """Words of the data become NaN, infinities, zeros, denormals, huge numbers; at times whole stretches."""
+    """Replace words of the data, or stretches of them, by NaN, infinities, zeros, denormals, huge numbers."""
     start = data_start(content)
     words = np.frombuffer(content[start : start + (len(content) - start) // 4 * 4], "<u4").copy()
     if not len(words):
@@ -134,7 +134,7 @@ def special_values(content, generator):
 
 
 def edit_header(content, generator):
-    """Lines deleted, doubled, swapped, put in; numbers, types and names replaced."""
+    """Delete, duplicate, swap and insert lines; replace numbers, types and names."""
     start = data_start(content)
     lines = content[:start].split(b"\n")
     for _ in range(generator.integers(1, 4)):
@@ -159,7 +159,7 @@ def edit_header(content, generator):
 
 
 def swap_counts(content, generator):
-    """Counts move from element to element, or become others."""
+    """Exchange or replace the counts of elements."""
     start = data_start(content)
     counts = re.findall(rb"element \w+ (\d+)", content[:start])
     shuffled = iter(generator.permutation(np.array([*counts, b"0", b"2"])))
@@ -171,12 +171,12 @@ MUTATIONS = [flip_bytes, cut, extend, splice, special_values, edit_header, edit_
 
 
 class TooSlowError(Exception):
-    """One file took longer than its limit."""
+    """A file exceeded its time limit."""
 
 
 @pytest.fixture
 def alarm():
-    """Raises TooSlowError after the seconds that it is given; 0 calls it off."""
+    """Raise TooSlowError after some seconds; 0 cancels."""
 
     def ring(*_):
         raise TooSlowError
@@ -188,7 +188,7 @@ def alarm():
 
 
 def load(path, alarm):
-    """The cloud, or the error; and the most memory (bytes) that was in use at once."""
+    """The cloud or the error, and the peak memory in bytes."""
     before = tracemalloc.get_traced_memory()[0]
     tracemalloc.reset_peak()
     alarm(SECONDS)
@@ -204,7 +204,7 @@ def load(path, alarm):
 
 
 def assert_good(cloud):
-    """Every splat that is kept can be drawn."""
+    """Check that every loaded splat is valid."""
     for name in ("means", "quats", "scales", "opacities", "sh"):
         array = getattr(cloud, name)
         assert len(array) == len(cloud) == len(cloud.labels)
