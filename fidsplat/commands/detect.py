@@ -75,37 +75,17 @@ class Detect:
                 results.append(result)
                 readings += read
                 bundles += bundled
-        single = len(results) == 1
         mean = {} if scene is None else {"means": means(readings)}
         if self.json:
-            print_json((results[0] if single else {"pictures": results}) | mean)
+            print_json((results[0] if len(results) == 1 else {"pictures": results}) | mean)
             return 0
-        where = console(False)
-        rows = [
-            (*(() if single else (result["image"],)), code["name"], _corners(code["corners"]))
-            for result in results
-            for code in result["detections"]
-        ]
-        title = results[0]["image"] if single else f"{len(results)} images"
-        if not rows:
-            where.print(f"no code found in {title}; --family selects other tags", markup=False)
-        else:
-            heads = ("code", "corners [px]") if single else ("image", "code", "corners [px]")
-            print_table(where, title, heads, rows)
+        _print_codes(results)
         if scene is not None:
-            heads = (
-                "marker",
-                "found",
-                "distance [m]",
-                "position [mm]",
-                "angle [deg]",
-                "corners [px]",
-            )
-            against = [reading_row(reading) for reading in readings]
-            if len(readings) > 1:
-                against.append(_mean_row(mean["means"]))
-            against += map(_bundle_row, bundles)
-            print_table(where, f"Against {self.scene}: distance, and errors", heads, against)
+            rows = [reading_row(reading) for reading in readings]
+            rows += [_mean_row(mean["means"])] if len(readings) > 1 else []
+            rows += map(_bundle_row, bundles)
+            heads = ("marker", "found", "distance [m]", "position [mm]", "angle [deg]", "corners [px]")
+            print_table(console(False), f"Distances and errors, {self.scene}", heads, rows)
         return 0
 
     def _images(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
@@ -179,6 +159,22 @@ def _load_scene(path: str) -> "Scene":
     if scene.camera is None:
         raise InputError(f"{path} must have a [camera] table, which the poses of its markers need")
     return scene
+
+
+def _print_codes(results: list[dict[str, Any]]) -> None:
+    """Print the codes of all images, with a column for the image if there are several."""
+    single = len(results) == 1
+    title = results[0]["image"] if single else f"{len(results)} images"
+    rows = [
+        (*(() if single else (result["image"],)), code["name"], _corners(code["corners"]))
+        for result in results
+        for code in result["detections"]
+    ]
+    if not rows:
+        console(False).print(f"no code found in {title}; --family selects other tags", markup=False)
+        return
+    heads = ("code", "corners [px]") if single else ("image", "code", "corners [px]")
+    print_table(console(False), title, heads, rows)
 
 
 def _describe(code) -> dict[str, Any]:

@@ -99,7 +99,7 @@ def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
     assert facts["not_in_scene"] == []
     assert main(["detect", "scene.png", "--scene", scene]) == 0
     out = capsys.readouterr().out
-    assert "Against scene.toml" in out
+    assert "Distances and errors, scene.toml" in out
     assert "position [mm]" in out
 
 
