@@ -1,5 +1,7 @@
-"""Pictures with more pairs of splats and tiles than there is room for are drawn in bands of tiles, with the
-same bits."""
+"""Splitting of a frame into bands by cost: tiles by their splat lists, rows by their splats.
+
+A frame that exceeds the memory budget is rendered band by band, with the same image.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +10,17 @@ from collections.abc import Iterator
 import numpy as np
 
 
-def cut(totals: np.ndarray, most: int, start: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Ranges of tiles (first, end, pairs), of at most so many pairs together; at least one tile, whatever its
-    list.
+def split_by_cost(costs: np.ndarray, capacity: int, start: int = 0) -> Iterator[tuple[int, int, int]]:
+    """Ranges (first, end, cost) of consecutive items with a total cost of at most `capacity` each.
 
-    totals (k,): lengths of the lists of the tiles from `start` on.
+    A range has at least one item, whatever its cost.
+
+    Args:
+        costs: (k,) costs of the items from number `start` on.
     """
-    ends = np.cumsum(totals, dtype=np.int64)
+    ends = np.cumsum(costs, dtype=np.int64)
     first, done = 0, 0
     while first < len(ends):
-        end = max(int(np.searchsorted(ends, done + most, side="right")), first + 1)
+        end = max(int(np.searchsorted(ends, done + capacity, side="right")), first + 1)
         yield start + first, start + end, int(ends[end - 1]) - done
         first, done = end, int(ends[end - 1])

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fidsplat.backends.bands import cut
+from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.interface import Images, ResidentData
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
@@ -202,5 +202,5 @@ class BandSplitter:
             bands.append(band)
             yield band
         counts = np.array([band.count for band in bands])
-        firsts = [bands[first].rows[0] for first, _, _ in cut(counts, self._capacity)]
+        firsts = [bands[first].rows[0] for first, _, _ in split_by_cost(counts, self._capacity)]
         self._cuts = {full.rows: [*firsts, bands[-1].rows[1]]}

@@ -11,7 +11,7 @@ from agreement import ALL_OUTPUTS, random_splats, some_thick
 from sampling import alternate
 
 import fidsplat as fs
-from fidsplat.backends.bands import cut
+from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
@@ -82,7 +82,7 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
     bands = []
 
     def noted(*asked):
-        bands.extend(cut(*asked))
+        bands.extend(split_by_cost(*asked))
         return bands
 
     monkeypatch.setattr(opencl.backend, "pair_budget", budget)

@@ -1,9 +1,9 @@
-"""Bands of tiles: where they are cut."""
+"""Splitting of frames into bands."""
 
 import numpy as np
 import pytest
 
-from fidsplat.backends.bands import cut
+from fidsplat.backends.bands import split_by_cost
 
 
 @pytest.mark.parametrize(
@@ -14,11 +14,11 @@ from fidsplat.backends.bands import cut
         (1, [(10, 11, 3), (11, 12, 4), (12, 13, 5), (13, 14, 1), (14, 15, 3)]),
     ],
 )
-def test_no_band_has_more_pairs_than_there_is_room_for(most, bands):
-    """Unless one tile alone has more."""
-    assert list(cut(np.array([3, 4, 5, 1, 3], np.uint32), most, start=10)) == bands
+def test_bands_keep_the_capacity(most, bands):
+    """Except a single tile with more."""
+    assert list(split_by_cost(np.array([3, 4, 5, 1, 3], np.uint32), most, start=10)) == bands
 
 
 def test_many_bands_of_several_tiles_each():
-    """The room is that of each band, not of the first alone."""
-    assert [end - first for first, end, _ in cut(np.ones(100, np.uint32), 8)] == [8] * 12 + [4]
+    """The capacity applies to each band."""
+    assert [end - first for first, end, _ in split_by_cost(np.ones(100, np.uint32), 8)] == [8] * 12 + [4]

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.bands import cut
+from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.opencl.counts import Counts
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.memory_plan import BIG, KEYS, WINDOWS
@@ -121,7 +121,7 @@ def sorted_bands(frame: DeviceFrame, first: int, end: int, pairs: int) -> Iterab
     budget = frame.workspace.pair_budget
     if pairs <= budget:
         return [TileBand(first, end, pairs)]
-    return [TileBand(*band) for band in cut(tile_pairs(frame)[first:end], budget, first)]
+    return [TileBand(*band) for band in split_by_cost(tile_pairs(frame)[first:end], budget, first)]
 
 
 def tile_pairs(frame: DeviceFrame) -> np.ndarray:
@@ -276,7 +276,7 @@ def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
         return [TileBand(0, frame.tiles, pairs)]
     frame.in_bands = True
     tallies = frame.read("tallies", np.uint32, (_TALLIES + frame.tiles,))
-    return [TileBand(*band) for band in cut(tallies[_TALLIES:], budget)]
+    return [TileBand(*band) for band in split_by_cost(tallies[_TALLIES:], budget)]
 
 
 def launch_local(frame: DeviceFrame, kernel: str, **given: Any) -> None:

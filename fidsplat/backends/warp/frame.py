@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fidsplat.backends.bands import cut
+from fidsplat.backends.bands import split_by_cost
 from fidsplat.backends.batched_views import ViewStack
 from fidsplat.backends.view import SubFrame
 from fidsplat.backends.warp.command_list import BLOCK, Launcher
@@ -229,7 +229,7 @@ class DeviceFrame:
         self.program.load_banding()
         # in one piece: on the CPU its atomic additions are plain ones
         self.launcher.launch_whole(self.program.lists.histogram, visible, {**self.named, "first": 0})
-        return cut(totals.numpy()[: self.tiles], limit)
+        return split_by_cost(totals.numpy()[: self.tiles], limit)
 
     def fits(self, capacity: Capacity) -> bool:
         """Whether a frame of this capacity keeps to the budgets in one band."""
