@@ -1,4 +1,4 @@
-"""Lenses: how directions of the camera frame fall on the picture where that is not a pinhole's way.
+"""Lens models: projection of directions in the camera frame to image coordinates, and its inverse.
 
 A lens maps a point (X, Y, Z) of the camera frame to image coordinates (a, b) without unit or in radians or
 metres; the pixel is x = fx a + cx, y = fy b + cy. Conventions and coefficients are OpenCV's.
@@ -27,10 +27,10 @@ _NOTHING = 1e-200  # a leading coefficient that would overflow when roots are fo
 
 @dataclass(frozen=True)
 class BrownConrady:
-    """Radial (k1 to k6), tangential (p1, p2) and thin-prism (s1 to s4) distortion of a perspective picture,
+    """Radial (k1 to k6), tangential (p1, p2) and thin-prism (s1 to s4) distortion of a perspective image,
     as `cv2.projectPoints` has them. All 0 is a pinhole.
 
-    Directions beyond the first fold of the radial part are not seen. Raises InputError for a coefficient
+    Directions beyond the first fold of the radial part are outside the field of view. Raises InputError for a coefficient
     that is not finite.
     """
 
@@ -82,7 +82,7 @@ class BrownConrady:
 
     @cached_property
     def fold(self) -> float:
-        """tan of the angle from the axis at which the radial part turns back; inf if it never does."""
+        """tan of the angle from the axis at which the radial part folds back; inf if it never does."""
         above = np.polynomial.Polynomial([1, self.k1, self.k2, self.k3])
         below = np.polynomial.Polynomial([1, self.k4, self.k5, self.k6])
         q = np.polynomial.Polynomial([0, 2])
@@ -112,11 +112,11 @@ class BrownConrady:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
             a, b = self._distorted(x, y)[:2]
-            seen = (points[:, 2] > 0) & (np.hypot(x, y) < self.fold) & np.isfinite(a) & np.isfinite(b)
-        return np.where(seen[:, None], np.stack([a, b], 1), np.nan)
+            visible = (points[:, 2] > 0) & (np.hypot(x, y) < self.fold) & np.isfinite(a) & np.isfinite(b)
+        return np.where(visible[:, None], np.stack([a, b], 1), np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3) that are seen."""
+        """Jacobian of the image coordinates by X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
         z = points[:, 2]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = points[:, 0] / z, points[:, 1] / z
@@ -124,7 +124,7 @@ class BrownConrady:
             return np.moveaxis(np.stack([by_x, by_y, -(x * by_x + y * by_y)]), (0, 1, 2), (2, 1, 0))
 
     def rays(self, image: np.ndarray) -> np.ndarray:
-        """Directions (n, 3) = (X / Z, Y / Z, 1) of image coordinates (n, 2); NaN where nothing is seen."""
+        """Directions (n, 3) = (X / Z, Y / Z, 1) of image coordinates (n, 2); NaN outside the field of view."""
         a, b = image.T
         distance = np.hypot(a, b)
         x, y = _scaled(a, b, distance, self._undistorted(distance))
@@ -137,12 +137,12 @@ class BrownConrady:
                 if not np.nanmax(np.abs(off_a) + np.abs(off_b), initial=0.0) > 1e-13:
                     break
             here_a, here_b, a_x, a_y, b_x, b_y = self._distorted(x, y)
-            seen = (np.abs(here_a - a) + np.abs(here_b - b) < 1e-9 * (1 + distance)) & (a_x * b_y > a_y * b_x)
-            seen &= np.hypot(x, y) < self.fold
-        return np.where(seen[:, None], np.stack([x, y, np.ones_like(x)], 1), np.nan)
+            visible = (np.abs(here_a - a) + np.abs(here_b - b) < 1e-9 * (1 + distance)) & (a_x * b_y > a_y * b_x)
+            visible &= np.hypot(x, y) < self.fold
+        return np.where(visible[:, None], np.stack([x, y, np.ones_like(x)], 1), np.nan)
 
     def _undistorted(self, distance: np.ndarray) -> np.ndarray:
-        """tan of the angles at which the radial part alone has these distances from the middle."""
+        """tan of the angles at which the radial part, without the others, has these distances from the centre."""
         symmetric = BrownConrady(self.k1, self.k2, self.k3, self.k4, self.k5, self.k6)
 
         def radial(tangent: np.ndarray) -> np.ndarray:
@@ -166,7 +166,7 @@ class Fisheye:
     """Kannala-Brandt fisheye as `cv2.fisheye` has it: a ray at the angle t from the axis falls at the
     distance t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle. All 0 is the equidistant lens.
 
-    Sees up to 100 degrees from the axis, or less where that polynomial turns back. Raises InputError for a
+    The field of view reaches 100 degrees from the axis, or less where that polynomial folds back. Raises InputError for a
     coefficient that is not finite.
     """
 
@@ -184,7 +184,7 @@ class Fisheye:
 
     @cached_property
     def limit(self) -> float:
-        """Largest angle from the axis that is seen, radians."""
+        """Largest visible angle from the axis, radians."""
         slope = np.polynomial.Polynomial([1, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4])
         return min(math.sqrt(_first_root(slope)), FISHEYE_LIMIT)
 
@@ -199,7 +199,7 @@ class Fisheye:
         return 1 + q * (3 * self.k1 + q * (5 * self.k2 + q * (7 * self.k3 + q * 9 * self.k4)))
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3) that are seen."""
+        """Jacobian of the image coordinates by X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
         x, y, z = points.T
         across = np.hypot(x, y)
         angle = np.arctan2(across, z)
@@ -212,15 +212,15 @@ class Fisheye:
         return np.moveaxis(np.stack([cos * by_radius - sin * by_turn, sin * by_radius + cos * by_turn]), 2, 0)
 
     def image(self, points: np.ndarray) -> np.ndarray:
-        """Image coordinates (n, 2) of points (n, 3); NaN where they are not seen."""
+        """Image coordinates (n, 2) of points (n, 3); NaN outside the field of view."""
         across = np.hypot(points[:, 0], points[:, 1])
         angle = np.arctan2(across, points[:, 2])
-        seen = np.asarray(angle <= self.limit) & np.asarray((across > 0) | (points[:, 2] > 0))
+        visible = np.asarray(angle <= self.limit) & np.asarray((across > 0) | (points[:, 2] > 0))
         a, b = _scaled(points[:, 0], points[:, 1], across, self.distance(angle))
-        return np.where(seen[:, None], np.stack([a, b], 1), np.nan)
+        return np.where(visible[:, None], np.stack([a, b], 1), np.nan)
 
     def rays(self, image: np.ndarray) -> np.ndarray:
-        """Unit directions (n, 3) of image coordinates (n, 2); NaN where nothing is seen."""
+        """Unit directions (n, 3) of image coordinates (n, 2); NaN outside the field of view."""
         a, b = image.T
         distance = np.hypot(a, b)
         angles = np.linspace(0, self.limit, _STEPS)
@@ -234,8 +234,8 @@ class Fisheye:
             if not np.abs(step).max(initial=0.0) > 1e-14:
                 break
         x, y = _scaled(a, b, distance, np.sin(angle))
-        seen = distance <= self.distance(self.limit)
-        return np.where(seen[:, None], np.stack([x, y, np.cos(angle)], 1), np.nan)
+        visible = distance <= self.distance(self.limit)
+        return np.where(visible[:, None], np.stack([x, y, np.cos(angle)], 1), np.nan)
 
     @property
     def uniforms(self) -> tuple[float, ...]:
@@ -274,9 +274,9 @@ class Equirectangular:
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) of image coordinates (n, 2); NaN beyond the sphere."""
         a, b = image.T
-        seen = (np.abs(a) <= math.pi) & (np.abs(b) <= math.pi / 2)
+        visible = (np.abs(a) <= math.pi) & (np.abs(b) <= math.pi / 2)
         rays = np.stack([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)], 1)
-        return np.where(seen[:, None], rays, np.nan)
+        return np.where(visible[:, None], rays, np.nan)
 
 
 @dataclass(frozen=True)
@@ -320,14 +320,14 @@ def _check(lens) -> None:
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     """Smallest root above 0; inf if there is none."""
     coefficients = polynomial.trim(_NOTHING).coef
-    # a root that overflows lies beyond all pictures
+    # a root that overflows is beyond all images
     with np.errstate(over="ignore"):
         roots = np.polynomial.Polynomial(coefficients).roots() if len(coefficients) > 1 else np.empty(0)
     real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
     return float(real.min()) if len(real) else math.inf
 
 
-def _scaled(a: np.ndarray, b: np.ndarray, length: np.ndarray, wanted: np.ndarray):
+def _scaled(a: np.ndarray, b: np.ndarray, length: np.ndarray, target: np.ndarray):
     """(a, b) with another length; 0 stays 0."""
-    factor = wanted / np.where(length > 0, length, 1.0)
+    factor = target / np.where(length > 0, length, 1.0)
     return a * factor, b * factor

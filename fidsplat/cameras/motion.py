@@ -24,7 +24,7 @@ Pose: TypeAlias = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Shutter:
-    """When the rows of a picture are exposed. All 0 is the instant global shutter.
+    """Exposure times of the rows of an image. All 0 is the instant global shutter.
 
     The middle of the middle row's exposure time is `time`. Row i of h is exposed
     `readout` * ((i + 1/2) / h - 1/2) seconds later. Raises InputError for a value out of range.
@@ -33,7 +33,7 @@ class Shutter:
     time: float = 0.0
     """seconds, on the clock of the poses"""
     exposure_time: float = 0.0
-    """seconds that each row is exposed; the picture is the mean of `sub_poses` pictures"""
+    """seconds that each row is exposed; the image is the mean of `sub_poses` sub-frames"""
     sub_poses: int = 8
     """n: one pose in the middle of each n-th of the exposure time"""
     readout: float = 0.0
@@ -57,8 +57,8 @@ class Shutter:
                 raise InputError(f"shutter {name} must be a whole number, {limit}, not {value!r}")
 
     def bands(self, height: int) -> list[tuple[int, int, float]]:
-        """(first row, end row, middle of its exposure time) of the bands of a picture of `height` rows."""
-        height = whole_number("the height of a picture", height, 1, 2**24)
+        """(first row, end row, middle of its exposure time) of the bands of an image of `height` rows."""
+        height = whole_number("the height of an image", height, 1, 2**24)
         rows = self.rows_per_band if self.readout > 0 else height
         cuts = [*range(0, height, rows), height]
         return [
@@ -78,7 +78,7 @@ class Motion:
     """What moves: poses as functions of the time in seconds, `Trajectory` or any callable."""
 
     camera: Pose | None = None
-    """world_to_camera; None: it stands where it is"""
+    """world_to_camera; None: the camera does not move"""
     groups: Mapping[int, Pose] = field(default_factory=dict)
     """label of splats: the rigid motion of the world that they make from where their cloud has them"""
 
@@ -92,7 +92,7 @@ class Motion:
         for label in self.groups:
             if isinstance(label, bool) or not isinstance(label, (int, np.integer)):
                 raise InputError(
-                    f"motion of groups: the label {label!r} is no whole number; splats have such "
+                    f"motion of groups: a label must be a whole number, got {label!r}; splats have such "
                     "(SplatCloud.with_labels)"
                 )
         object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))
@@ -111,14 +111,14 @@ class Motion:
         return None if self.camera is None else _checked(self.camera(time), "the camera", time)
 
     def sampled(self, times: Iterable[float]) -> Motion:
-        """A motion that has the poses at these times alone, and pickles even if made of functions."""
+        """A motion restricted to the poses at these times; it pickles even if made of functions."""
         moments = [float(time) for time in times]
         groups = {label: _PoseTable({t: pose(t) for t in moments}) for label, pose in self.groups.items()}
         camera = self.camera and _PoseTable({t: self.camera(t) for t in moments})
         return Motion(camera, groups)
 
     def moved(self, camera: Camera, time: float) -> Camera:
-        """The camera as it stands then."""
+        """The camera at its pose at that time."""
         instance("the camera of a motion", camera, Camera)
         pose = self.camera_at(time)
         # the position follows from the pose

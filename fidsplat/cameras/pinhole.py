@@ -15,16 +15,16 @@ MAX_SIZE = 32767
 """largest width and height in pixels: pixel numbers fit 16 bits on every device"""
 
 FOCAL_LENGTHS = 1e-6, 1e18
-"""least and most, pixels: beyond them the forms of a splat leave the range of float32, and it is lost"""
+"""smallest and largest, pixels: beyond them the quadratic forms of splats leave the range of float32"""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera(PickledByFields):
     """A camera. Without a lens it is a pinhole: a point (X, Y, Z) of the camera frame falls on
-    x = fx X / Z + cx, y = fy Y / Z + cy. A lens says what stands there for X / Z and Y / Z.
+    x = fx X / Z + cx, y = fy Y / Z + cy. A lens replaces X / Z and Y / Z.
 
     Pixel (row i, column j) has its centre at x = j + 0.5, y = i + 0.5. Raises InputError for values that
-    make no camera, among them a distortion that leaves less than half of the picture with a ray.
+    are invalid, among them a distortion that leaves less than half of the image with rays.
     """
 
     width: int
@@ -45,7 +45,7 @@ class Camera(PickledByFields):
     """metres along z (along the ray for a fisheye or panorama), above 0; no part of a splat that is nearer is
     drawn"""
     far: float = math.inf
-    """metres, likewise, above near; a splat that lies wholly beyond it is not drawn"""
+    """metres, likewise, above near; a splat completely beyond it is not rendered"""
 
     position: np.ndarray = None  # type: ignore[assignment]
     """(3,) float64, centre of projection in the world, metres, read-only. By default it follows from
@@ -62,11 +62,11 @@ class Camera(PickledByFields):
             put(self, name, _number(name, getattr(self, name)))
         if not (0 < self.near < math.inf):
             raise InputError(f"camera near must be above 0 and finite, not {self.near!r}")
-        least, most = FOCAL_LENGTHS
+        smallest, largest = FOCAL_LENGTHS
         for name in ("fx", "fy"):
-            if not least <= getattr(self, name) <= most:
+            if not smallest <= getattr(self, name) <= largest:
                 raise InputError(
-                    f"camera {name} must lie between {least:g} and {most:g} pixels, not "
+                    f"camera {name} must be between {smallest:g} and {largest:g} pixels, got "
                     f"{getattr(self, name)!r}; it is half the width / tan(half the field of view)"
                 )
         for name in ("cx", "cy"):
@@ -101,18 +101,18 @@ class Camera(PickledByFields):
             object.__setattr__(self, "lens", None)
         elif not isinstance(lens, Orthographic):
             y, x = np.mgrid[0.5 : self.height : self.height / 24, 0.5 : self.width : self.width / 32]
-            seen = np.isfinite(self.rays(np.stack([x.ravel(), y.ravel()], 1))[:, 0]).mean()
-            if seen < 0.5 and isinstance(lens, BrownConrady):
+            covered = np.isfinite(self.rays(np.stack([x.ravel(), y.ravel()], 1))[:, 0]).mean()
+            if covered < 0.5 and isinstance(lens, BrownConrady):
                 values = [(each.name, getattr(lens, each.name)) for each in fields(lens)]
                 given = ", ".join(f"{name} = {value:g}" for name, value in values if value)
                 raise InputError(
-                    f"camera distortion ({given}) cannot be inverted in {100 * (1 - seen):.0f} % of the "
-                    "picture: it turns back before its edge; check the coefficients and the focal length "
+                    f"camera distortion ({given}) cannot be inverted in {100 * (1 - covered):.0f} % of the "
+                    "image: it folds back before its edge; check the coefficients and the focal length "
                     f"({self.fx:g} pixels)"
                 )
-            if seen == 0:
+            if covered == 0:
                 raise InputError(
-                    f"camera lens: the whole picture lies outside what a {lens.kind} lens sees; check fx, fy "
+                    f"camera lens: the complete image is outside the field of view of a {lens.kind} lens; check fx, fy "
                     f"({self.fx:g}, {self.fy:g} pixels per radian) and cx, cy ({self.cx:g}, {self.cy:g})"
                 )
 
@@ -154,7 +154,7 @@ class Camera(PickledByFields):
 
     @staticmethod
     def orthographic(width, height, metres_wide, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
-        """A camera of parallel rays whose picture is ``metres_wide`` metres across, with square pixels."""
+        """An orthographic camera whose image is ``metres_wide`` metres across, with square pixels."""
         width, height = _size("width", width), _size("height", height)
         across = _number("metres_wide", metres_wide)
         if not 0 < across < math.inf:
@@ -170,7 +170,7 @@ class Camera(PickledByFields):
         """A camera with square pixels at ``position`` whose middle sees ``target`` (3,), metres.
 
         fov_x: horizontal field of view in radians, between 0 and pi. up: the world direction that points up
-        in the picture; by default -y, so that y points down as it does in a marker.
+        in the image; by default -y, so that y points down as it does in a marker.
         """
         width, height = _size("width", width), _size("height", height)
         f = focal_length(width, fov_x)
@@ -183,15 +183,15 @@ class Camera(PickledByFields):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points) -> np.ndarray:
-        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN where they cannot be seen: the depth
+        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN outside the field of view: the depth
         is not above 0, or they lie outside the lens."""
         world = real_array("points", points)
         if world.ndim != 2 or world.shape[1] != 3:
             raise InputError(f"points must have the shape (n, 3), but the shape is {world.shape}")
-        seen = (world - self.position) @ self.world_to_camera[:3, :3].T
+        points = (world - self.position) @ self.world_to_camera[:3, :3].T
         if self.lens is not None:
-            return self.lens.image(seen) * (self.fx, self.fy) + (self.cx, self.cy)
-        x, y, z = seen.T
+            return self.lens.image(points) * (self.fx, self.fy) + (self.cx, self.cy)
+        x, y, z = points.T
         z = np.where(z > 0, z, np.nan)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
 
@@ -262,7 +262,7 @@ def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = -rotation @ eye
-    return matrix + 0.0  # no minus zeros: they would stand in saved scene files
+    return matrix + 0.0  # no minus zeros, which saved scene files would show
 
 
 def _size(name: str, value) -> int:

@@ -1,4 +1,4 @@
-"""The rays of a picture's samples, and where on the picture directions fall: what devices read of a lens."""
+"""Rays of an image's samples and their inverse, the tables of a lens that devices read."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class RayRaster:
     @cached_property
     def rays(self) -> np.ndarray:
         """(h, w, 3) float32: the direction of each sample's ray, with Z = 1 or of unit length; NaN where
-        nothing is seen. The picture is that of these rounded rays, on every device and in the reference."""
+        there is no ray. The image is that of these rounded rays, on every device and in the reference."""
         if self.whole is not None:
             return self.whole.rays[self.top : self.top + self.height]
         rays = np.empty((self.height, self.width, 3), np.float32)
@@ -63,8 +63,8 @@ class RayRaster:
             rays = self.rays[top : top + step].reshape(-1, 3).astype(np.float64)
             by_ray = self.lens.derivative(rays) * np.array([[self.focal_x], [self.focal_y]])
             if not self.lens.along_ray:
-                by_ray[:, :, 2] = 0.0  # rays have Z = 1, and so have those beside them
-            # the inverse among the rays beside this one: J^T (J J^T)^-1
+                by_ray[:, :, 2] = 0.0  # rays have Z = 1, and so have their neighbours
+            # the inverse among neighbouring rays: J^T (J J^T)^-1
             xx, yy, xy = ((by_ray[:, i] * by_ray[:, j]).sum(1)[:, None] for i, j in ((0, 0), (1, 1), (0, 1)))
             with np.errstate(divide="ignore", invalid="ignore"):
                 along_x = (yy * by_ray[:, 0] - xy * by_ray[:, 1]) / (xx * yy - xy * xy)
@@ -75,7 +75,7 @@ class RayRaster:
 
     @cached_property
     def step(self) -> float:
-        """The largest length of a ray's derivative in any direction of the picture, rounded up."""
+        """The largest length of a ray's derivative in any direction of the image, rounded up."""
         if self.whole is not None:
             return self.whole.step
         along_x, along_y = np.moveaxis(self.slopes, 2, 0)
@@ -84,7 +84,7 @@ class RayRaster:
         return float(np.sqrt(np.nanmax(squared))) * 1.00001
 
     def chart(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates in which the kernels enclose a splat: those of the ideal pinhole picture [samples], or,
+        """Coordinates in which the kernels enclose a splat: those of the ideal pinhole image [samples], or,
         for a fisheye, the stereographic ones (X, Y) / (|ray| + Z)."""
         x, y, z = np.moveaxis(rays.astype(np.float64), -1, 0)
         if isinstance(self.lens, Fisheye):
@@ -109,7 +109,7 @@ class RayRaster:
             cells *= 2
         x, y = self.chart(self.rays[rows, columns])
         low = np.array([x.min(), y.min()])
-        # the furthest sample lies in the last cell, not beyond it
+        # the furthest sample is in the last cell, not beyond it
         scale = cells * (1 - 1e-9) / np.maximum(np.array([x.max(), y.max()]) - low, 1e-12)
         cell = np.minimum((y - low[1]) * scale[1], cells - 1).astype(np.int64) * cells
         cell += np.minimum((x - low[0]) * scale[0], cells - 1).astype(np.int64)
@@ -135,7 +135,7 @@ class RayRaster:
             return self.lens.uniforms
         low_x, low_y, *rest = map(float, self.map[1])
         if not isinstance(self.lens, Fisheye):
-            low_y -= self.top  # the chart counts rows as the picture does
+            low_y -= self.top  # the chart counts rows as the image does
         return (*self.lens.uniforms, low_x, low_y, *rest, float(self.top))
 
 
@@ -143,5 +143,5 @@ class RayRaster:
 def raster_of(
     lens: RayLens, width: int, height: int, focal_x: float, focal_y: float, center_x: float, center_y: float
 ) -> RayRaster:
-    """The raster of these numbers; the last few are kept, for pictures from many poses."""
+    """Cached raster of these parameters, for images from many poses."""
     return RayRaster(lens, width, height, focal_x, focal_y, center_x, center_y)

@@ -74,7 +74,7 @@ class Trajectory(PickledByFields):
         return f"Trajectory({len(self)} poses, {first:g} to {last:g} s, {kind})"
 
     def __call__(self, time: float) -> np.ndarray:
-        """(4, 4) float64. Raises InputError for a time that is no finite number."""
+        """(4, 4) float64. Raises InputError for a time that is not finite."""
         time = number("the time of a trajectory", time)
         times = np.asarray(self.times)
         after = int(np.searchsorted(times, time, side="right"))
@@ -99,10 +99,10 @@ class Trajectory(PickledByFields):
         along = np.array([twist(*pair) for pair in itertools.pairwise(self.poses)]) / durations
         before, after = durations[:-1], durations[1:]
         inner = (along[:-1] * after + along[1:] * before) / (before + after)
-        # what turns fast in a short time must not spin through a long one beside it: a third of that one's
+        # a fast rotation in a short interval must not spin through a long neighbouring one: a third of that one's
         # turn, which is what the curve takes, stays below a quarter turn, so that it has one direction
-        turns = np.linalg.norm(inner[:, :3], axis=1, keepdims=True) * np.maximum(before, after) / 3
-        inner *= np.minimum(1.0, math.pi / 2 / np.maximum(turns, 1e-300))
+        rotations = np.linalg.norm(inner[:, :3], axis=1, keepdims=True) * np.maximum(before, after) / 3
+        inner *= np.minimum(1.0, math.pi / 2 / np.maximum(rotations, 1e-300))
         return np.concatenate([along[:1], inner, along[-1:]])
 
     @property

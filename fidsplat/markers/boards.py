@@ -34,9 +34,9 @@ def _parse(text: str, head: str, rest: str) -> BoardSpec:
     if not found:
         raise InputError(f"{text!r} is not COLUMNSxROWS:FAMILY; write for example {kind}:{_EXAMPLES[kind]}")
     columns, rows = int(found[1]), int(found[2])
-    least = 2 if kind == "charuco" else 1
-    if not (least <= columns <= MAX_TAGS and least <= rows <= MAX_TAGS):
-        raise InputError(f"{text!r}: columns and rows must lie from {least} to {MAX_TAGS}")
+    smallest = 2 if kind == "charuco" else 1
+    if not (smallest <= columns <= MAX_TAGS and smallest <= rows <= MAX_TAGS):
+        raise InputError(f"{text!r}: columns and rows must be from {smallest} to {MAX_TAGS}")
     return BoardSpec(text=text, kind=kind, family=found[3].lower(), columns=columns, rows=rows)
 
 

@@ -21,7 +21,7 @@ from fidsplat.markers.mixture import (
     fitted_templates,
     paper_template,
 )
-from fidsplat.markers.partition import least_rectangles, partition_colors
+from fidsplat.markers.partition import minimum_rectangles, partition_colors
 from fidsplat.markers.printing import (
     MAX_SPLATS,
     Printed,
@@ -65,11 +65,11 @@ class Marker(PickledByFields):
     """name of its kind: "apriltag", "aruco", "qr", "image", "svg", "charuco", "gridboard", "aprilgrid", or
     of one that was registered"""
     family: str | None
-    """tag family, of a board too, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for pictures"""
+    """tag family, of a board too, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for images"""
     id: int | None
     """tag id, None for all but tags"""
     payload: str | None
-    """text of a QR code, path of an image or a drawing, None for tags and boards"""
+    """text of a QR code, path of an image or an SVG drawing, None for tags and boards"""
     bits: np.ndarray
     """(h, w) uint8, 1 = dark, the code alone; of a drawing indices into ``palette``"""
     quiet_zone: int
@@ -79,18 +79,18 @@ class Marker(PickledByFields):
     mixture: str
     """"exact", "fitted", "facets", "paper", or "refined" (`fidsplat.train.refine`)"""
     quality: MarkerQuality
-    """all knobs that it was made with; `growth` is None where the mixture's own was taken"""
+    """the quality settings; `growth` is None for the mixture's default"""
     grid: np.ndarray = field(repr=False)
     """(H, W) uint8, the code with its quiet zone"""
     boxes: np.ndarray = field(repr=False)
     """(n, 4) int64 x0, y0, x1, y1: the minimum partition of the grid, in modules; float64 of a drawing that
-    is more than whole modules, which rectangles cover, turned as its edges are"""
+    has slanted or curved edges, before rotation by ``angles``"""
     values: np.ndarray = field(repr=False)
     """(n,) uint8, the value (index into ``palette``) of each rectangle"""
-    turns: np.ndarray | None = field(repr=False)
-    """(n,) radians by which each is turned about its middle, from x to y; None: not at all"""
+    angles: np.ndarray | None = field(repr=False)
+    """(n,) radians, rotation of each about its centre, from x to y; None: no rotation"""
     regions: tuple[MultiPolygon, ...] | None = field(repr=False)
-    """what such a drawing covers with each value, in modules of the grid; None for other markers"""
+    """the region of each value of such a drawing, in modules of the grid; None for other markers"""
     labels: np.ndarray = field(repr=False)
     """(H, W) int32, the 4-connected component of each module of the grid"""
     components: int
@@ -127,7 +127,7 @@ class Marker(PickledByFields):
             return self.cloud
         templates = fitted_templates(self.quality.template)
         printed = without_slivers(
-            Printed(self.grid, self.boxes, self.values, self.turns, self.regions, self.module, self.palette)
+            Printed(self.grid, self.boxes, self.values, self.angles, self.regions, self.module, self.palette)
         )
         count = int(count_gaussians(aspect_of(printed.boxes), templates).sum())
         refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
@@ -136,7 +136,7 @@ class Marker(PickledByFields):
     @cached_property
     def rectangles(self) -> list[Rectangle]:
         """The minimum partition of every component of each colour, in raster order; of a drawing with slanted
-        edges what covers it, before ``turns``."""
+        edges what covers it, before ``angles``."""
         dark = self.is_dark
         return [Rectangle(*row) for row in zip(*self.boxes.T.tolist(), dark.tolist(), strict=True)]
 
@@ -181,9 +181,9 @@ def marker(
 
     Args:
         spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png, svg:FILE.svg,
-            charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11, or of a kind that was registered.
-        size: metres, edge of the code itself, quiet zone not counted (the width of a board or a picture).
-        mixture: "exact" (default), one box for each rectangle, which only this renderer draws
+            charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11, or a registered kind.
+        size: metres, edge of the code itself, without quiet zone (the width of a board or an image).
+        mixture: "exact" (default), one box for each rectangle, which only this renderer supports
             (`SplatCloud.with_boxes`; `Marker.gaussians` are for others and for files); "fitted" or "paper":
             Gaussians; "facets": Gaussians for renderers that composite by depth at each pixel, modules only.
         quiet_zone: modules of white around it; default 1 for tags, 4 for QR, 2 for boards, 0 for images and
@@ -196,7 +196,7 @@ def marker(
             paper.
         quality: what mixture, levels, density, growth and template are where they are left out
             (`Quality.marker`); what does not concern the mixture is let be.
-        max_splats: most splats that it may become; a picture of noise easily becomes tens of millions.
+        max_splats: largest number of splats; an image of noise easily needs tens of millions.
         progress: called with what is being done and the share of it that is done, 0 to 1.
 
     Raises:
@@ -221,12 +221,12 @@ def marker(
     if chosen.mixture == "facets":
         refuse_more(spec, count_facets(grid.shape), max_splats)
     elif len(palette) == 2:
-        refuse_more(spec, least_rectangles(grid) * each, max_splats, "at least ")
+        refuse_more(spec, minimum_rectangles(grid) * each, max_splats, "at least ")
     progress("components", 0.0)
     labels, components = label_components(grid)
     progress("rectangles", 0.0)
     printed = _printed(grid, parsed, quiet, size / bits.shape[1], palette)
-    boxes, values, turns, regions = printed.boxes, printed.values, printed.turns, printed.regions
+    boxes, values, angles, regions = printed.boxes, printed.values, printed.angles, printed.regions
     if regions is not None:
         components = sum(len(region.geoms) for region in regions)
     if chosen.mixture == "facets":
@@ -238,7 +238,7 @@ def marker(
         filled = without_slivers(printed)
         refuse_more(spec, int(count_gaussians(aspect_of(filled.boxes), templates).sum()), max_splats)
         cloud = gaussian_cloud(filled, templates, growth, progress)
-    for array in (bits, grid, boxes, values, turns, labels, palette):
+    for array in (bits, grid, boxes, values, angles, labels, palette):
         if array is not None:
             array.flags.writeable = False
     return Marker(
@@ -255,7 +255,7 @@ def marker(
         grid=grid,
         boxes=boxes,
         values=values,
-        turns=turns,
+        angles=angles,
         regions=regions,
         labels=labels,
         components=components,
@@ -273,12 +273,12 @@ def _quiet_zone(spec: str, parsed: Spec, bits: np.ndarray, modules: int | None) 
         raise InputError(
             f"{spec} has {bits.shape[1]} x {bits.shape[0]} modules; at most {MAX_MODULES} a side are made"
         )
-    wanted = kind_of(parsed).quiet_zone if modules is None else modules
-    return whole_number("the quiet zone", wanted, 0, longest // 2)
+    width = kind_of(parsed).quiet_zone if modules is None else modules
+    return whole_number("the quiet zone", width, 0, longest // 2)
 
 
 def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette: np.ndarray) -> Printed:
-    """The modules cut into rectangles, or what covers a drawing's shapes."""
+    """The modules cut into rectangles, or the rectangles that cover a drawing's shapes."""
     if parsed.regions is None:
         boxes = partition_colors(grid)
         return Printed(grid, boxes, grid[boxes[:, 1], boxes[:, 0]], None, None, module, palette)
@@ -286,18 +286,18 @@ def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette:
     from fidsplat.markers.shapes import with_margin
 
     regions = with_margin(parsed.regions, quiet, grid.shape)
-    boxes, turns, values = cover_all(regions, grid.shape)
-    return Printed(grid, boxes, values, turns, regions, module, palette)
+    boxes, angles, values = cover_all(regions, grid.shape)
+    return Printed(grid, boxes, values, angles, regions, module, palette)
 
 
 def _unseen(words: str, share: float) -> None:
-    """Progress that nobody looks at."""
+    """Progress callback that does nothing."""
 
 
 def _chosen(
     quality: MarkerQuality, mixture: str | None, duplicates: bool | None, given: dict[str, Any]
 ) -> MarkerQuality:
-    """The knobs, with those that are given (not None) in place of the others."""
+    """Quality settings, with the given ones (not None) replaced."""
     if not isinstance(quality, MarkerQuality):
         raise InputError(
             f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"

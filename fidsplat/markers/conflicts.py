@@ -1,6 +1,6 @@
 """Maximum independent set of the chords' conflict graph: a maximum matching, then Koenig's theorem.
 
-Pictures of noise have a million chords, nearly all in small groups that hang together like trees. A vertex
+Images of noise have a million chords, nearly all in small tree-like components. A vertex
 with one neighbour left is matched to it, which some maximum matching does too; whole rounds of them at once
 solve the trees. What is left holds cycles, and networkx's Hopcroft-Karp matches it.
 """
@@ -45,12 +45,12 @@ def _matching(
     of_left, of_right = np.full(n_left, -1), np.full(n_right, -1)
     for _ in range(ROUNDS):
         alone_left = np.bincount(left, minlength=n_left)[left] == 1
-        alone = np.flatnonzero(alone_left | (np.bincount(right, minlength=n_right)[right] == 1))
-        if not len(alone):
+        single = np.flatnonzero(alone_left | (np.bincount(right, minlength=n_right)[right] == 1))
+        if not len(single):
             break
         # of those that hang on one vertex, one is matched to it
-        shared = np.where(alone_left, right + n_left, left)[alone]
-        matched = alone[np.unique(shared, return_index=True)[1]]
+        shared = np.where(alone_left, right + n_left, left)[single]
+        matched = single[np.unique(shared, return_index=True)[1]]
         of_left[left[matched]], of_right[right[matched]] = right[matched], left[matched]
         free = (of_left[left] < 0) & (of_right[right] < 0)
         left, right = left[free], right[free]
@@ -100,7 +100,7 @@ def _hopcroft_karp(left: np.ndarray, right: np.ndarray) -> list[tuple[int, int]]
 
 @contextmanager
 def _recursion(depth: int) -> Iterator[None]:
-    """Room for that many more nested calls. One thread at a time: the limit is the interpreter's."""
+    """Raise the recursion limit by that many calls. One thread at a time: the limit is the interpreter's."""
     with _limit:
         before = sys.getrecursionlimit()
         sys.setrecursionlimit(before + depth)

@@ -1,8 +1,8 @@
-"""Rectangles that cover regions with slanted and curved edges: bands along the edges, turned as they are, and
-whole modules in what the bands leave.
+"""Cover of regions with slanted and curved edges by rectangles: rotated bands along the edges, and whole
+modules inside.
 
-The bands of two colours meet at the edge between them, so it is drawn as sharply as a box's own. A band is as
-wide as the points are far to which the edge is nearest (the medial axis), `BAND` at most. Rectangles of one
+The bands of two colours meet at the edge between them, so it is as sharp as the edge of a box. A band is as
+wide as the distance to the medial axis, at most `BAND`. Rectangles of one
 colour overlap within it; at its edges only at corners.
 """
 
@@ -19,49 +19,49 @@ from fidsplat.util import interrupts
 BAND = 2.5
 """Modules, the widest. A whole module that reaches out of such bands is a module or more from any edge."""
 
-LEAST = 1 / 64
+SHORTEST = 1 / 64
 """Modules: edges are not cut into shorter pieces."""
 
 SHARP = np.radians(10)
-"""Smaller turns around a corner are left to one rectangle."""
+"""Corners with a smaller angle get no extra rectangles."""
 
 SLACK = 1e-6
-"""Modules by which a rectangle may stand out of its region."""
+"""Modules by which a rectangle may exceed its region."""
 
 
 class _Sides(NamedTuple):
-    """Pieces of edges, and around corners that stand into a region the turns from one edge to the next."""
+    """Pieces of edges, and at concave corners the rotation from one edge to the next."""
 
     start: np.ndarray
     """(n, 2) modules"""
     stop: np.ndarray
-    """(n, 2); the same as ``start`` for a turn alone"""
+    """(n, 2); the same as ``start`` at a corner"""
     inward: np.ndarray
     """(n,) radians, direction of the normal into the region, which lies to the left from start to stop"""
     turn: np.ndarray
-    """(n,) radians that the normal turns to the right at ``stop``, up to a quarter turn"""
+    """(n,) radians, clockwise rotation of the normal at ``stop``, up to a quarter turn"""
 
 
 def cover_all(
     regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `cover` returns for several regions, and (n,) uint8, the number of each rectangle's region."""
-    seen = {value: cover(region, shape) for value, region in enumerate(regions) if not region.is_empty}
-    boxes, turns = (np.concatenate(parts) for parts in zip(*seen.values(), strict=True))
-    values = np.repeat(np.array(list(seen), np.uint8), [len(own) for _, own in seen.values()])
-    return boxes, turns, values
+    """Rectangles and angles as from `cover` for several regions, and (n,) uint8, the region of each."""
+    covers = {value: cover(region, shape) for value, region in enumerate(regions) if not region.is_empty}
+    boxes, angles = (np.concatenate(parts) for parts in zip(*covers.values(), strict=True))
+    values = np.repeat(np.array(list(covers), np.uint8), [len(own) for _, own in covers.values()])
+    return boxes, angles, values
 
 
 def cover(region: shapely.MultiPolygon, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Rectangles whose union is a region, a polygon or several, of a grid of (h, w) modules.
 
-    Returns (n, 4) float64 x0, y0, x1, y1 in modules, each as it lies before it is turned about its middle,
-    and (n,) the turns in radians, from x to y.
+    Returns (n, 4) float64 x0, y0, x1, y1 in modules, each before its rotation about its centre,
+    and (n,) the angles in radians, from x to y.
     """
     corners = np.concatenate([_bands(region), _modules(region, shape)])
     # the tips of corners, for which edges would be cut ever shorter
     left = shapely.get_parts(region - shapely.union_all(shapely.polygons(corners)))
-    left = shapely.oriented_envelope(left[shapely.area(left) > LEAST**3])
+    left = shapely.oriented_envelope(left[shapely.area(left) > SHORTEST**3])
     rest = [shapely.get_coordinates(part)[:4] for part in left if isinstance(part, shapely.Polygon)]
     corners = np.concatenate([corners, np.reshape(rest, (-1, 4, 2))])
     along, across = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
@@ -71,10 +71,10 @@ def cover(region: shapely.MultiPolygon, shape: tuple[int, int]) -> tuple[np.ndar
 
 
 def _modules(region: shapely.MultiPolygon, shape: tuple[int, int]) -> np.ndarray:
-    """Whole modules over what lies further inside than bands reach, in rectangles: (n, 4, 2) corners."""
-    wanted = _met(shapely.buffer(region, -BAND), shape)
-    boxes = partition(wanted)
-    x0, y0, x1, y1 = boxes[wanted[boxes[:, 1], boxes[:, 0]] == 1].T.astype(np.float64)
+    """Rectangles of whole modules over the interior beyond the bands: (n, 4, 2) corners."""
+    interior = _met(shapely.buffer(region, -BAND), shape)
+    boxes = partition(interior)
+    x0, y0, x1, y1 = boxes[interior[boxes[:, 1], boxes[:, 0]] == 1].T.astype(np.float64)
     return np.stack([x0, y0, x1, y0, x1, y1, x0, y1], 1).reshape(-1, 4, 2)
 
 
@@ -98,7 +98,7 @@ def _met(region: shapely.Geometry, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _bands(region: shapely.MultiPolygon) -> np.ndarray:
-    """Rectangles over what lies within BAND of the edges: (n, 4, 2) corners."""
+    """Rectangles over the bands along the edges: (n, 4, 2) corners."""
     edges, sides = _sides(region)
     tree = shapely.STRtree(list(shapely.get_parts(shapely.linestrings(edges))))
     within = shapely.buffer(region, SLACK, join_style="mitre")
@@ -106,7 +106,7 @@ def _bands(region: shapely.MultiPolygon) -> np.ndarray:
     found = []
     while len(sides.start):
         rectangles = _rectangles(sides, _widths(sides, edges, tree))
-        long = np.linalg.norm(sides.stop - sides.start, axis=1) > LEAST
+        long = np.linalg.norm(sides.stop - sides.start, axis=1) > SHORTEST
         done = shapely.covers(within, shapely.polygons(rectangles))
         found.append(rectangles[done])
         rest = ~done & (long | (sides.turn > SHARP))
@@ -116,7 +116,7 @@ def _bands(region: shapely.MultiPolygon) -> np.ndarray:
 
 def _sides(region: shapely.MultiPolygon) -> tuple[np.ndarray, _Sides]:
     """A region's edges, (n, 2, 2), and what bands are laid along."""
-    starts, stops, inward, turns = [], [], [], []
+    starts, stops, inward, angles = [], [], [], []
     for polygon in region.geoms:
         rings = [polygon.exterior, *polygon.interiors]
         for number, ring in enumerate(rings):
@@ -128,8 +128,8 @@ def _sides(region: shapely.MultiPolygon) -> tuple[np.ndarray, _Sides]:
             starts.append(points)
             stops.append(np.roll(points, -1, 0))
             inward.append(angle + np.pi / 2)
-            turns.append((angle - np.roll(angle, -1) + np.pi) % (2 * np.pi) - np.pi)
-    start, stop, normal, turn = (np.concatenate(parts) for parts in (starts, stops, inward, turns))
+            angles.append((angle - np.roll(angle, -1) + np.pi) % (2 * np.pi) - np.pi)
+    start, stop, normal, turn = (np.concatenate(parts) for parts in (starts, stops, inward, angles))
     turn = np.maximum(turn, 0)
     gentle = turn <= SHARP
     sides = [_Sides(start, stop, normal, np.where(gentle, turn, 0))]
@@ -176,7 +176,7 @@ def _rectangles(sides: _Sides, width: np.ndarray) -> np.ndarray:
 
 
 def _halves(sides: _Sides, long: np.ndarray) -> _Sides:
-    """Edges cut in two, and of those that are short their turns."""
+    """Edges cut in two; short ones keep only their corner."""
     start, stop, inward, turn = sides
     middle = np.where(long[:, None], (start + stop) / 2, stop)
     bend = np.where(long, 0, turn / 2)
@@ -189,7 +189,7 @@ def grow_turned(
     regions: tuple[shapely.MultiPolygon, ...],
     values: np.ndarray,
     boxes: np.ndarray,
-    turns: np.ndarray,
+    angles: np.ndarray,
     growth: float,
 ) -> np.ndarray:
     """Rectangles of `cover_all` that reach further across sides where that stays in their region: by growth
@@ -202,14 +202,14 @@ def grow_turned(
         for side in range(4):
             tried = grown[own]
             tried[:, side] += np.where(side < 2, -reach, reach)
-            free = shapely.covers(region, shapely.polygons(turned(tried, boxes[own], turns[own])))
+            free = shapely.covers(region, shapely.polygons(rotated(tried, boxes[own], angles[own])))
             grown[own[free]] = tried[free]
     return grown
 
 
-def turned(boxes: np.ndarray, about: np.ndarray, turns: np.ndarray) -> np.ndarray:
+def rotated(boxes: np.ndarray, about: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Corners (n, 4, 2) of boxes, each turned about the middle of another."""
     middle = (about[:, None, :2] + about[:, None, 2:]) / 2
     x, y = np.moveaxis(boxes[:, [[0, 1], [2, 1], [2, 3], [0, 3]]] - middle, -1, 0)
-    c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
+    c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
     return middle + np.stack([c * x - s * y, s * x + c * y], -1)

@@ -1,6 +1,6 @@
 """`facets`: Gaussians that are opaque and end in straight lines, because they lie in the planes of a dish.
 
-By the depth of each point, of two opaque splats that cross the nearer one is seen on either side of the line
+Ordered by depth per pixel, of two opaque splats that cross the nearer one is visible on either side of the line
 in which they do. So each module has a splat much larger than itself, in a plane of its own: the planes are
 those of the facets of a shallow dish, of which at every point the module's own is the nearest. What a
 Gaussian lacks towards the corners of its module its copies make up, and what still comes through shows its
@@ -41,9 +41,9 @@ def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
     before that. Splats of one facet are printed on one plane.
 
     Raises:
-        InputError: a drawing with edges that do not lie along its modules.
+        InputError: a drawing with edges off its module grid.
     """
-    if printed.turns is not None:
+    if printed.angles is not None:
         raise InputError(
             f"{spec} has edges across its modules, which mixture='facets' has no splats for; take 'exact' or "
             "'fitted'"
@@ -59,7 +59,7 @@ def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
     scales = (
         SIGMA * printed.module * np.column_stack([width * np.hypot(1, slope_x), tall * np.hypot(1, slope_y)])
     )
-    # turns (0, 0, 1) to the facet's normal (-slope_x, -slope_y, 1), the short way
+    # shortest rotation of (0, 0, 1) to the facet's normal (-slope_x, -slope_y, 1)
     normal = 1 / np.sqrt(1 + slope_x**2 + slope_y**2)
     quats = np.column_stack([1 + normal, slope_y * normal, -slope_x * normal, np.zeros(len(x))])
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Pictures of two grey levels, one pixel a module."""
+"""Markers from images of two grey levels, one pixel per module."""
 
 from __future__ import annotations
 

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fidsplat.markers import boards, drawing, images, qr, tags
+from fidsplat.markers import boards, images, qr, svg, tags
 from fidsplat.markers.spec import Kind, Spec
 from fidsplat.util.errors import InputError
 
-_kinds = {kind.name: kind for module in (tags, qr, images, drawing, boards) for kind in module.KINDS}
+_kinds = {kind.name: kind for module in (tags, qr, images, svg, boards) for kind in module.KINDS}
 
 
 def register(kind: Kind) -> None:
@@ -40,7 +40,7 @@ def parse_spec(text: str) -> Spec:
     A QR spec may leave out version (the smallest that holds the text) or level (L).
 
     Raises:
-        InputError: not a spec, an unknown version or level, an id that is no number.
+        InputError: not a spec, an unknown version or level, an id that is not a number.
     """
     if not isinstance(text, str):
         raise InputError(f"a marker spec is text ({_forms()}), not {text!r}")
@@ -58,7 +58,7 @@ def bits_of(spec: Spec) -> tuple[Spec, np.ndarray]:
 
     Raises:
         InputError: an unknown family, an id outside it, a text too long for the version, a file that cannot
-            be read as a one-bit picture.
+            be read as a one-bit image.
     """
     return kind_of(spec).bits(spec)
 

@@ -137,7 +137,7 @@ def place(
     n = counts[which]
     start = first[which] + np.where(upright, len(lying), 0)
     row = np.arange(n.sum()) + np.repeat(start - (np.cumsum(n) - n), n)
-    out = np.empty((5, len(row)))  # a column at a time: of a hundred million rows nothing is held twice
+    out = np.empty((5, len(row)))  # column by column, so that a hundred million rows need no temporary copy
     for axis in (0, 1):
         low, high = pieces[:, axis], pieces[:, axis + 2]
         half = np.repeat((high - low) / 2, n)

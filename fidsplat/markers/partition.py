@@ -1,16 +1,16 @@
 """Minimum rectilinear partition of both colours of a grid at once (Ferrari et al. 1984; the paper's
 Algorithm 1).
 
-Every decision is made on integers. A grid line's *unit edge* lies between two neighbouring cells and is
+Every decision is made on integers. A grid line's *unit edge* is between two neighbouring cells and is
 interior to a component when both cells have its colour. At an inner grid vertex the four cells around it say
 everything: three of one colour and one of the other is a concave vertex of the three (outer boundary or hole
-alike); two and two on the diagonal is a checkerboard vertex, convex twice and concave for nobody. Exactly one
+alike); two and two on the diagonal is a checkerboard vertex, convex twice and concave for none. Exactly one
 of a concave vertex's two horizontal unit edges is interior, and exactly one of its two vertical ones.
 
 So the axis-parallel chords of the paper are simply those maximal runs of interior unit edges on a grid line
 whose two end vertices are both concave: all of them come out of one pass over the grid, no pair of vertices
 is ever compared, and a chord between vertices that are not neighbours on their line cannot arise. A vertex
-lies on at most one horizontal and at most one vertical chord, so the pairs that conflict (cross, or share
+is on at most one horizontal and at most one vertical chord, so the pairs that conflict (cross, or share
 an end) are the vertices covered by both.
 """
 
@@ -49,7 +49,7 @@ def concave_vertices(grid: np.ndarray) -> np.ndarray:
 def interior_runs(grid: np.ndarray, concave: np.ndarray, cuts: np.ndarray | None = None) -> Runs:
     """Maximal runs of interior unit edges on the horizontal grid lines of an (h, w) 0/1 grid.
 
-    cuts: (h+1, w+1) bool, vertices at which a run ends because a vertical chord has been drawn through them.
+    cuts: (h+1, w+1) bool, vertices at which a run ends because a vertical chord passes through them.
     """
     h, w = grid.shape
     edge = np.zeros((h + 1, w), np.int8)  # 0: boundary, 1 or 2: interior to a light or a dark component
@@ -98,7 +98,7 @@ def independent_chords(grid: np.ndarray, concave: np.ndarray) -> tuple[np.ndarra
     return across[keep_across], down[keep_down]
 
 
-def least_rectangles(grid: np.ndarray) -> int:
+def minimum_rectangles(grid: np.ndarray) -> int:
     """A number of rectangles below which no partition of an (h, w) uint8 0/1 grid comes, from one look at it.
 
     Of all components' corners, convex and concave, it is a quarter: independent chords end at two concave
@@ -117,13 +117,13 @@ def partition(grid: np.ndarray) -> np.ndarray:
 
     Returns (n, 4) int64 rectangles x0, y0, x1, y1 in cells, half-open, in raster order of their first cell;
     the colour of rectangle i is ``grid[y0, x0]``. Disjoint, exactly covering, and per component of the
-    least possible number: concave vertices - independent chords - holes + 1.
+    minimum number: concave vertices - independent chords - holes + 1.
 
     After the independent chords, each concave vertex that none of them ends at sends one segment into its
-    component until it meets the boundary or something drawn (the paper's greedy completion). Sent
+    component until it meets the boundary or an earlier cut (the paper's greedy completion). Sent
     horizontally, all of them at once: parallel segments cannot cross, and none can join two such vertices,
     because a chord that meets no vertical one of a maximum set would be in the set. The chosen horizontal
-    chords are drawn by the same rule, so only the vertical ones need to be known.
+    chords are cut by the same rule, so only the vertical ones need to be known.
     """
     h, w = grid.shape
     concave = concave_vertices(grid)
@@ -136,12 +136,12 @@ def partition(grid: np.ndarray) -> np.ndarray:
     walls_x[along, line] = True
 
     runs = interior_runs(grid, concave, cut)
-    drawn = (runs.start_concave & ~cut[runs.line, runs.start]) | (
+    cuts = (runs.start_concave & ~cut[runs.line, runs.start]) | (
         runs.stop_concave & ~cut[runs.line, runs.stop]
     )
     walls_y = np.ones((h + 1, w), bool)  # walls_y[y, x]: a wall above cell (y, x)
     walls_y[1:-1] = grid[:-1] != grid[1:]
-    line, along = _unit_edges(runs.line[drawn], runs.start[drawn], runs.stop[drawn])
+    line, along = _unit_edges(runs.line[cuts], runs.start[cuts], runs.stop[cuts])
     walls_y[line, along] = True
 
     y0, x0 = np.nonzero(walls_y[:-1] & walls_x[:, :-1])

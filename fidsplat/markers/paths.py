@@ -14,7 +14,7 @@ PIECES = 64
 """Straight pieces of a curve."""
 
 FARTHEST = 1e9
-"""No number of a drawing is larger."""
+"""Largest magnitude of a number in a drawing."""
 
 _TOKEN = re.compile(r"([MmLlHhVvCcSsQqTtAaZz])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
 _BETWEEN = re.compile(r"[\s,]*")

@@ -20,7 +20,7 @@ MAX_SPLATS = 1_000_000
 """Most splats of a marker unless the caller allows more."""
 
 SLIVER = 1 / 64
-"""Modules: thinner rectangles of a drawing become no Gaussians."""
+"""Modules: thinner rectangles of a drawing have no Gaussians."""
 
 CHUNK = 1 << 18
 """Splats that are placed at a time: intermediate results are in float64 and several."""
@@ -38,7 +38,7 @@ class Printed(NamedTuple):
     """(n, 4) x0, y0, x1, y1 in modules"""
     values: np.ndarray
     """(n,) uint8, the value of each"""
-    turns: np.ndarray | None
+    angles: np.ndarray | None
     """(n,) radians by which each is turned about its middle; None: not at all"""
     regions: tuple[MultiPolygon, ...] | None
     """of each value what it covers, where that is more than whole modules"""
@@ -48,11 +48,11 @@ class Printed(NamedTuple):
     """(k, 3) float32, colours of the values"""
 
 
-def refuse_more(spec: str, least: int, max_splats: int, words: str = "") -> None:
+def refuse_more(spec: str, count: int, max_splats: int, words: str = "") -> None:
     """Raise InputError where a marker becomes more splats than are allowed."""
-    if least > max_splats:
+    if count > max_splats:
         raise InputError(
-            f"{spec} becomes {words}{least:,} splats, more than {max_splats:,}: take a smaller picture or a "
+            f"{spec} must have at most {max_splats:,} splats, got {words}{count:,}; use a smaller image or a "
             "mixture of fewer, or allow them by max_splats (--max-splats N)"
         )
 
@@ -70,15 +70,15 @@ def box_cloud(printed: Printed, progress: Progress) -> SplatCloud:
 
 
 def without_slivers(printed: Printed) -> Printed:
-    """The rectangles that Gaussians are made of: of a drawing not those that nobody sees, between curves that
+    """The rectangles that become Gaussians: without slivers of a drawing, between curves that
     touch, which thousands of Gaussians each would fill."""
-    if printed.turns is None:
+    if printed.angles is None:
         return printed
     sides = printed.boxes[:, 2:] - printed.boxes[:, :2]
-    seen = sides.min(1) >= SLIVER
-    if not seen.any():
+    thick = sides.min(1) >= SLIVER
+    if not thick.any():
         return printed
-    return printed._replace(boxes=printed.boxes[seen], values=printed.values[seen], turns=printed.turns[seen])
+    return printed._replace(boxes=printed.boxes[thick], values=printed.values[thick], angles=printed.angles[thick])
 
 
 def aspect_of(boxes: np.ndarray) -> np.ndarray:
@@ -102,12 +102,12 @@ def gaussian_cloud(
 
 
 def _grown(printed: Printed, growth: float) -> np.ndarray:
-    """`grow`, which knows one colour and another, for each of a drawing's."""
+    """`grow` for each colour of a drawing."""
     grid, boxes, values = printed.grid, printed.boxes, printed.values
-    if printed.regions is not None and printed.turns is not None:
+    if printed.regions is not None and printed.angles is not None:
         from fidsplat.markers.cover import grow_turned  # late, as shapely is
 
-        return grow_turned(printed.regions, values, boxes, printed.turns, growth)
+        return grow_turned(printed.regions, values, boxes, printed.angles, growth)
     if len(printed.palette) <= 2:
         return grow(grid, boxes, growth)
     grown = boxes.astype(np.float64)
@@ -129,7 +129,7 @@ def _cloud(
     another: rows (m, 5) of place and scale in modules and opacity, and (m,) the rectangle of each. They are
     filled in part by part, two at a time, so that memory stays near that of the cloud.
     """
-    module, turns = printed.module, printed.turns
+    module, angles = printed.module, printed.angles
     total = int(ends[-1])
     means, scales = np.zeros((total, 3), np.float32), np.empty((total, 2), np.float32)
     opacities, colors = np.empty(total, np.float32), np.empty((total, 3), np.float32)
@@ -141,8 +141,8 @@ def _cloud(
         rows, owner = make(*part)
         done = int(ends[part[1] - 1])
         at = slice(done - len(rows), done)
-        if turns is not None:
-            place, angle = (printed.boxes[owner, :2] + printed.boxes[owner, 2:]) / 2, turns[owner]
+        if angles is not None:
+            place, angle = (printed.boxes[owner, :2] + printed.boxes[owner, 2:]) / 2, angles[owner]
             (x, y), c, s = (rows[:, :2] - place).T, np.cos(angle), np.sin(angle)
             rows[:, :2] = place + np.column_stack([c * x - s * y, s * x + c * y])
             quats[at, 0], quats[at, 3] = np.cos(angle / 2), np.sin(angle / 2)

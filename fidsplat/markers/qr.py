@@ -30,7 +30,7 @@ def _parse(text: str, head: str, rest: str) -> QrSpec:
     code = _HEAD.fullmatch(head)
     if code is None:
         raise InputError(
-            f"{head!r} is no kind of QR code; write qr:TEXT, qr-v22-L:TEXT, qr-v22:TEXT or qr-L:TEXT"
+            f"a QR spec must be qr:TEXT, qr-v22-L:TEXT, qr-v22:TEXT or qr-L:TEXT, got {head!r}"
         )
     version, level = code["version"], code["level"]
     number = None if version is None else int(version)
@@ -47,7 +47,7 @@ def _parse(text: str, head: str, rest: str) -> QrSpec:
 
 
 def _bits(spec: QrSpec) -> tuple[Spec, np.ndarray]:
-    """Byte mode at exactly the level asked for; a version that is not asked for is the smallest that fits."""
+    """Byte mode at exactly the requested level; without a requested version the smallest that fits."""
     import segno
     from segno.encoder import DataOverflowError
 

@@ -2,7 +2,7 @@
 
 A hole is what is left of the rest of the plane once a component is taken out and the outside is taken away;
 since the component is 4-connected, cells of the rest that touch at a corner belong together. The shapely
-polygons of `polygons` are for people (geometry, pictures, tests); no decision is taken on them.
+polygons of `polygons` are for geometry, figures and tests; no decision depends on them.
 """
 
 from __future__ import annotations

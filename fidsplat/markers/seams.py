@@ -1,4 +1,4 @@
-"""Growth against seams: rectangles reach into neighbours of their own colour, never into the other."""
+"""Growth against seams: rectangles extend into neighbours of the same colour only."""
 
 import numpy as np
 
@@ -13,11 +13,11 @@ def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
     rectangles: (n, 4) ints x0, y0, x1, y1 in cells. growth: modules, 0 to 1, for short ones; `LONG` says
     what longer ones take. Returns (n, 4) float64. A mixture fades towards its edges, so two rectangles of one
     component leave a seam; where they overlap it closes. Templates are scaled, so long rectangles fade over a
-    long way, and reach accordingly far beneath what lies at their ends. All cells that a rectangle grows
+    long way, and overlap their neighbours accordingly far. All cells that a rectangle grows
     into, corners included, are of its colour. Its longer axis comes first.
     """
     h, w = grid.shape
-    padded = np.full((h + 2, w + 2), 2, np.int8)  # 2: outside, nobody's colour
+    padded = np.full((h + 2, w + 2), 2, np.int8)  # 2: outside, no colour
     padded[1:-1, 1:-1] = grid
     color = grid[rectangles[:, 1], rectangles[:, 0]]
     # sums[c, y, x]: cells of colour c above and left of the vertex of the padded grid
@@ -26,14 +26,14 @@ def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
         np.cumsum(np.cumsum(padded == c, 0), 1, out=sums[c, 1:, 1:])
 
     size = rectangles[:, 2:] - rectangles[:, :2]
-    wanted = growth * np.maximum(1.0, LONG * size)
+    target = growth * np.maximum(1.0, LONG * size)
     cells = rectangles + 1  # that a rectangle covers wholly or in part, in the padded grid
     grown = rectangles.astype(np.float64)
     first = (size[:, 1] > size[:, 0]).astype(np.int64)
     every = np.arange(len(size))
     for axis in (first, 1 - first):
         for end, way in ((0, -1), (2, 1)):
-            left = wanted[every, axis]
+            left = target[every, axis]
             corner = cells[:, :2].copy()  # of the first strip beyond; most strips end there already
             corner[every, axis] = cells[every, axis + end] - (end == 0)
             moving = np.flatnonzero((left > 0) & (padded[corner[:, 1], corner[:, 0]] == color))

@@ -85,7 +85,7 @@ def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
 def visible(
     shapes: Sequence[tuple[shapely.Geometry, int]], shape: tuple[int, int]
 ) -> tuple[shapely.MultiPolygon, ...]:
-    """What is seen on a sheet of (h, w) modules of shapes that are painted one over the other: the region of
+    """Visible regions of shapes painted one over the other on a sheet of (h, w) modules: the region of
     each value, the sheet's own being 0.
 
     Raises InputError where too many shapes overlap."""
@@ -97,11 +97,11 @@ def visible(
     for number, (painted, value) in enumerate(shapes):
         above = tree.query(painted)
         over = shapely.union_all(geometries[above[above > number]], grid_size=GRID)
-        # a shape that only touches the sheet, or what lies over it, leaves lines, which cannot be cut further
+        # a shape that only touches the sheet, or a shape above it, leaves lines, which cannot be cut further
         parts[value].append(_polygons(shapely.difference(painted, over, grid_size=GRID) & sheet))
-    seen = [_polygons(shapely.union_all(some, grid_size=GRID)) for some in parts]
-    seen[0] = _polygons(shapely.difference(sheet, shapely.union_all(seen[1:]), grid_size=GRID))
-    return tuple(seen)
+    visible = [_polygons(shapely.union_all(some, grid_size=GRID)) for some in parts]
+    visible[0] = _polygons(shapely.difference(sheet, shapely.union_all(visible[1:]), grid_size=GRID))
+    return tuple(visible)
 
 
 def with_margin(

@@ -25,7 +25,7 @@ class Spec:
     id: int | None = None
     """tag id"""
     payload: str | None = None
-    """QR text, or the path of an image or a drawing"""
+    """QR text, or the path of an image or an SVG drawing"""
     colors: tuple[tuple[float, float, float], ...] | None = None
     """RGB of modules of the values 0, 1, ..., once they are made; None: white and black"""
     regions: tuple[MultiPolygon, ...] | None = None
@@ -43,9 +43,9 @@ class Kind:
     quiet_zone: int
     """modules of white around it unless the caller says otherwise"""
     parse: Callable[[str, str, str], Spec]
-    """called with the spec, what stands before its first colon and what behind it; raises InputError"""
+    """called with the spec, its part before the first colon and the part after it; raises InputError"""
     bits: Callable[[Any], tuple[Spec, np.ndarray]]
     """called with what ``parse`` gave; returns it, its family set, and the modules without quiet zone,
     (h, w) uint8, 1 = dark or an index into the spec's colours; raises InputError"""
     is_file: bool = False
-    """whether what stands behind the colon names a file, relative to the scene file that says it"""
+    """whether the part after the colon is a file name, relative to the scene file"""

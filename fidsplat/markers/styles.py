@@ -57,7 +57,7 @@ class Rule(NamedTuple):
 
 
 def declarations(text: str) -> dict[str, str]:
-    """What stands in a ``style``: names and values. Raises ValueError for what is important."""
+    """Declarations of a ``style``: names and values. Raises ValueError for !important."""
     parts = (part.partition(":") for part in _COMMENT.sub("", text).split(";"))
     found = {key.strip().lower(): value.strip() for key, colon, value in parts if colon}
     if any("!" in value for value in found.values()):
@@ -66,7 +66,7 @@ def declarations(text: str) -> dict[str, str]:
 
 
 def rules(text: str) -> list[Rule]:
-    """The rules of a style sheet, least rank first. Raises ValueError for a selector of another kind than
+    """The rules of a style sheet, lowest specificity first. Raises ValueError for a selector of another kind than
     ``tag``, ``.class``, ``#id`` and these together, and for at-rules."""
     text = _COMMENT.sub("", text)
     left = _RULE.sub("", text).strip()

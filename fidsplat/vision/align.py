@@ -1,9 +1,9 @@
-"""Corners to a few hundredths of a pixel: the known modules of a code fitted to its picture by least squares.
+"""Subpixel corner refinement: the known modules of a code are fitted to the image by least squares.
 
-Every dark-light edge inside the code takes part, so a QR code, whose outer edge is mostly broken, gets
-corners as good as a tag's. The model is the box average of the pattern over each pixel, which is what a
-camera records; picture and model are blurred alike before they are compared, so the blur that steadies the
-steps moves no edge.
+Every dark-light edge inside the code contributes, so the corners of a QR code, whose outer edge is mostly
+broken, are as accurate as those of a tag. The model is the box average of the pattern over each pixel, as a
+camera records it. Image and model are blurred alike before the comparison, so the blur that stabilises the
+steps moves no edge. Accuracy: a few hundredths of a pixel.
 """
 
 from collections.abc import Iterable
@@ -11,18 +11,17 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-ITERATIONS = 8  # in each of three rounds: blurred, sharp, sharp with little weight on what does not fit
+ITERATIONS = 8  # in each of three rounds: blurred, sharp, sharp with robust weights
 SETTLED = 0.003  # pixels: largest move of a corner in the last step
 FINE_BLUR = 0.7  # pixels, standard deviation
-# share of the contrast by which a pixel may differ from the model before it counts for little, as when
-# something stands in front
+# difference from the model, as a share of the contrast, at which the weight of a pixel falls (occlusion)
 TOLERANCE = 0.25
-# a fit whose correlation with the picture is lower has slid to another place
+# a fit with a lower correlation has converged to another place
 MIN_CORRELATION = 0.7
 _POINTS = 3  # the pattern is averaged over 3 x 3 points of each pixel
-_LARGE = 150_000  # pixels of a picture that is halved, or more, before it is compared
-_SMALL = 10_000  # the same where many places are tried
-_COARSE_MODULE = 4.0  # pixels: a module is never made smaller than this
+_LARGE = 150_000  # pixels above which the image is downsampled before the comparison
+_SMALL = 10_000  # the same for a search over many places
+_COARSE_MODULE = 4.0  # pixels: smallest module after downsampling
 # the code spans [-1, 1]: well-conditioned parameters
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)
 _LARGEST_MODULE = 64  # points of the pattern
@@ -32,16 +31,16 @@ _QUIET = 1  # modules of light ground around the code that the model includes
 def align(
     grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure: Iterable[int] = ()
 ) -> np.ndarray | None:
-    """Better corners of a code whose modules and rough corners are known.
+    """Refined corners of a code with known modules and rough corners.
 
     Args:
         grey: (h, w) uint8.
         corners: (4, 2) pixel coordinates TL, TR, BR, BL of the code's outer edge, within half a module.
         bits: (n, n) uint8, 1 = dark, without quiet zone.
-        unsure: numbers of corners of which one may be off by two modules; each in turn is looked for when the
-            given corners lead nowhere.
+        unsure: indices of corners of which one may be off by two modules; each is searched for if the fit
+            from the given corners does not converge.
 
-    Returns (4, 2) float64, or None when the pattern does not settle near the given corners.
+    Returns (4, 2) float64, or None if the fit does not converge near the given corners.
     """
     rough = np.asarray(corners, np.float64)
     found = _settled(grey, rough, bits)
@@ -53,15 +52,15 @@ def align(
 
 
 def fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> float:
-    """How well the pattern lies over the picture between these corners: their correlation, at most 1; -1
-    where that cannot be decided. Arguments as of `align`."""
+    """Correlation of the pattern with the image between these corners, at most 1; -1 if it is undefined.
+    Arguments: as in `align`."""
     window = _window(grey, corners, bits, _LARGE)
     if window is None:
         return -1.0
-    picture, offset, shrink = window
+    image, offset, shrink = window
     start = (corners - offset) / shrink
-    model = _Model(bits, picture.shape, _module(start, bits))
-    smooth = cv2.GaussianBlur(picture, (0, 0), FINE_BLUR)
+    model = _Model(bits, image.shape, _module(start, bits))
+    smooth = cv2.GaussianBlur(image, (0, 0), FINE_BLUR)
     return model.correlation(smooth, _homography(_SQUARE, start), FINE_BLUR)
 
 
@@ -69,19 +68,19 @@ def _settled(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndar
     window = _window(grey, corners, bits, _LARGE)
     if window is None:
         return None
-    picture, offset, shrink = window
+    image, offset, shrink = window
     start = (corners - offset) / shrink
     homography = _homography(_SQUARE, start)
     module = _module(start, bits)
-    model = _Model(bits, picture.shape, module)
+    model = _Model(bits, image.shape, module)
 
-    where, smooth = start, picture
+    where, smooth = start, image
     for blur, robust, settled in (
         (float(np.clip(0.35 * module, FINE_BLUR, 2.5)), False, 0.1),
         (FINE_BLUR, False, 0.03),
         (FINE_BLUR, True, SETTLED),
     ):
-        smooth = cv2.GaussianBlur(picture, (0, 0), blur)
+        smooth = cv2.GaussianBlur(image, (0, 0), blur)
         for _ in range(ITERATIONS):
             step = _step(model, smooth, homography, blur, robust)
             if step is None:
@@ -98,14 +97,14 @@ def _settled(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndar
 
 
 def _best_start(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure: int) -> np.ndarray:
-    """The corners with the unsure one where, of places half a module apart, the pattern fits best."""
+    """The corners after a grid search, in steps of half a module, for the unsure one."""
     window = _window(grey, corners, bits, _SMALL)
     if window is None:
         return corners
-    picture, offset, shrink = window
+    image, offset, shrink = window
     start = (corners - offset) / shrink
-    model = _Model(bits, picture.shape, _module(start, bits))
-    smooth = cv2.GaussianBlur(picture, (0, 0), FINE_BLUR)
+    model = _Model(bits, image.shape, _module(start, bits))
+    smooth = cv2.GaussianBlur(image, (0, 0), FINE_BLUR)
     before, after = start[unsure - 1], start[(unsure + 1) % 4]
     steps = np.arange(-4, 5) / 2 / bits.shape[0]
     best, most = start, -1.0
@@ -120,7 +119,7 @@ def _best_start(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure:
 
 
 class _Model:
-    """The pattern with its quiet zone, drawn under a homography with every pixel averaged over its area."""
+    """The pattern with its quiet zone, rendered under a homography with box-averaged pixels."""
 
     def __init__(self, bits: np.ndarray, shape: tuple[int, ...], module: float) -> None:
         self.shape = shape
@@ -137,19 +136,19 @@ class _Model:
         rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]]
         self.pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(shape)]).reshape(3, -1)
 
-    def draw(self, homography: np.ndarray, blur: float) -> np.ndarray:
+    def render(self, homography: np.ndarray, blur: float) -> np.ndarray:
         k = _POINTS
         fine = np.array([[k, 0, -0.5], [0, k, -0.5], [0, 0, 1]])  # pixels to numbers of the fine grid
         warp = fine @ homography @ np.linalg.inv(self.to_pattern)
         size = (self.shape[1] * k, self.shape[0] * k)
-        drawn = cv2.warpPerspective(self.pattern, warp, size, flags=cv2.INTER_LINEAR, borderValue=1.0)
-        drawn = cv2.resize(drawn, (self.shape[1], self.shape[0]), interpolation=cv2.INTER_AREA)
-        return cv2.GaussianBlur(drawn, (0, 0), blur)
+        rendered = cv2.warpPerspective(self.pattern, warp, size, flags=cv2.INTER_LINEAR, borderValue=1.0)
+        rendered = cv2.resize(rendered, (self.shape[1], self.shape[0]), interpolation=cv2.INTER_AREA)
+        return cv2.GaussianBlur(rendered, (0, 0), blur)
 
     def inside(self, homography: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers of the pixels on the code, and their (s, t) in [-1, 1]."""
+        """Indices of the pixels on the code, and their (s, t) in [-1, 1]."""
         u, v, w = np.linalg.inv(homography) @ self.pixels
-        # the sign of w tells the two sides of the horizon apart; the code's own centre is on the right one
+        # the sign of w distinguishes the two sides of the horizon
         with np.errstate(divide="ignore", invalid="ignore"):
             s, t = u / w, v / w
         keep = np.flatnonzero((np.abs(s) < self.reach) & (np.abs(t) < self.reach))
@@ -159,46 +158,46 @@ class _Model:
         keep, _ = self.inside(homography)
         if keep.size < 9:
             return 0.0
-        a, b = self.draw(homography, blur).ravel()[keep], smooth.ravel()[keep]
+        a, b = self.render(homography, blur).ravel()[keep], smooth.ravel()[keep]
         spread = float(a.std() * b.std())
         return float(np.mean((a - a.mean()) * (b - b.mean()))) / spread if spread > 1e-6 else 0.0
 
 
 def _step(model: _Model, smooth: np.ndarray, homography: np.ndarray, blur: float, robust: bool):
-    """The (3, 3) change X of one Gauss-Newton step, homography (I + X), or None when it is not determined."""
+    """The (3, 3) change X of one Gauss-Newton step, homography (I + X), or None if it is undetermined."""
     keep, (s, t) = model.inside(homography)
     if keep.size < 16:
         return None
-    drawn = model.draw(homography, blur)
-    ideal, seen = drawn.ravel()[keep].astype(np.float64), smooth.ravel()[keep].astype(np.float64)
+    rendered = model.render(homography, blur)
+    ideal, observed = rendered.ravel()[keep].astype(np.float64), smooth.ravel()[keep].astype(np.float64)
     weight = np.ones(keep.size)
-    gain, base = _contrast(ideal, seen, weight)
+    gain, base = _contrast(ideal, observed, weight)
     if robust:
-        weight = 1.0 / (1.0 + ((seen - gain * ideal - base) / (TOLERANCE * abs(gain) + 1e-6)) ** 2) ** 2
-        gain, base = _contrast(ideal, seen, weight)
+        weight = 1.0 / (1.0 + ((observed - gain * ideal - base) / (TOLERANCE * abs(gain) + 1e-6)) ** 2) ** 2
+        gain, base = _contrast(ideal, observed, weight)
     if gain < 0.02:
         return None
     # the mean of both gradients makes the step second order; outside it is the plain derivative
-    slope = np.stack([np.gradient(gain * drawn + smooth, axis=axis) for axis in (1, 0)])
+    slope = np.stack([np.gradient(gain * rendered + smooth, axis=axis) for axis in (1, 0)])
     slope = 0.5 * slope.reshape(2, -1)[:, keep].astype(np.float64)
     x, y, z = homography @ np.stack([s, t, np.ones_like(s)])
     place = np.stack([x / z, y / z])
     along = [((homography[:2, k, None] - place * homography[2, k]) / z * slope).sum(0) for k in range(3)]
     columns = np.stack([along[k] * c for k in range(3) for c in (s, t, 1.0)][:8], axis=1)
-    wanted = -(seen - gain * ideal - base)
+    residual = -(observed - gain * ideal - base)
     normal = columns.T @ (columns * weight[:, None])
     try:
-        found = np.linalg.solve(normal, columns.T @ (weight * wanted))
+        found = np.linalg.solve(normal, columns.T @ (weight * residual))
     except np.linalg.LinAlgError:
         return None
     return np.append(found, 0.0).reshape(3, 3)
 
 
-def _contrast(ideal: np.ndarray, seen: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+def _contrast(ideal: np.ndarray, observed: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     total = weight.sum()
-    mean_ideal, mean_seen = (weight * ideal).sum() / total, (weight * seen).sum() / total
+    mean_ideal, mean_seen = (weight * ideal).sum() / total, (weight * observed).sum() / total
     spread = (weight * (ideal - mean_ideal) ** 2).sum()
-    gain = (weight * (ideal - mean_ideal) * (seen - mean_seen)).sum() / spread if spread > 0 else 0.0
+    gain = (weight * (ideal - mean_ideal) * (observed - mean_seen)).sum() / spread if spread > 0 else 0.0
     return float(gain), float(mean_seen - gain * mean_ideal)
 
 
@@ -208,14 +207,14 @@ def _module(corners: np.ndarray, bits: np.ndarray) -> float:
 
 
 def _window(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, large: int):
-    """The picture around the code (h, w) float32 in [0, 1], its origin (2,) and its pixel's edge in ``grey``.
+    """The image around the code (h, w) float32 in [0, 1], its origin (2,) and its pixel size in ``grey``.
 
-    None when the code lies outside.
+    None if the code is outside.
     """
     low, high = corners.min(0), corners.max(0)
-    room = 2.0 * (high - low).max() / bits.shape[0] + 4.0
-    x0, y0 = np.maximum(np.floor(low - room), 0).astype(int)
-    x1, y1 = np.minimum(np.ceil(high + room), (grey.shape[1], grey.shape[0])).astype(int)
+    margin = 2.0 * (high - low).max() / bits.shape[0] + 4.0
+    x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int)
+    x1, y1 = np.minimum(np.ceil(high + margin), (grey.shape[1], grey.shape[0])).astype(int)
     if x1 - x0 < 4 or y1 - y0 < 4:
         return None
     shrink = ((x1 - x0) * (y1 - y0) / large) ** 0.5

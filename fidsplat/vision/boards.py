@@ -1,4 +1,4 @@
-"""Boards of tags in a picture: one pose from all that is seen of them."""
+"""Boards of tags: one pose from all detected tags."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -35,7 +35,7 @@ def board_pose(
     kind, family = parse_family(spec.family or "")
     side = families(kind)[family].size
     origin = marker.corners[0]
-    points, seen = [], []
+    points, observed = [], []
     for number, (y, x) in enumerate(tag_places(spec, side)):
         own = [tag for tag in left if (tag.kind, tag.family, tag.id) == (kind, family, number)]
         corners = np.array([(x, y), (x + side, y), (x + side, y + side), (x, y + side)], float)
@@ -47,10 +47,10 @@ def board_pose(
             tag = min(own, key=lambda tag: np.nan_to_num(np.linalg.norm(tag.corners - true), nan=np.inf))
             left.remove(tag)
             points.append(where)
-            seen.append(tag.corners)
+            observed.append(tag.corners)
     if not points:
         return None, left
-    at, on = np.concatenate(points), np.concatenate(seen)
+    at, on = np.concatenate(points), np.concatenate(observed)
     if spec.kind == "charuco":
         squares, corners = _chess_corners(image, spec, side)
         if len(corners) >= ENOUGH:

@@ -1,4 +1,4 @@
-"""Pictures and their truth in the format of the BOP challenge
+"""Images and ground truth in the format of the BOP challenge
 (https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md)."""
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ DEPTH_SCALE = 0.1
 
 
 class BopScene:
-    """One scene of a BOP data set: rgb, depth and masks as pictures, intrinsics and poses as JSON. An object
+    """One scene of a BOP data set: rgb, depth and masks as images, intrinsics and poses as JSON. An object
     is a marker; its obj_id is its label.
 
     The JSON files are written by `save`, or when a `with` block ends.
@@ -55,8 +55,8 @@ class BopScene:
         if kind is None:
             self.save()
 
-    def add(self, picture: Mapping[str, np.ndarray], truth: Truth) -> None:
-        """Keep a picture, with `rgb`, and `depth` and `label` where it has them. Depths beyond what 16 bits
+    def add(self, frame: Mapping[str, np.ndarray], truth: Truth) -> None:
+        """Write a frame: `rgb`, and `depth` and `label` if present. Depths beyond what 16 bits
         hold are written as 0, which is unknown.
 
         Raises:
@@ -64,12 +64,14 @@ class BopScene:
         """
         camera = truth.camera
         if camera.lens is not None:
-            raise InputError("BOP knows pinhole cameras alone; render without a lens, or undistort first")
+            raise InputError(
+                "the camera of a BOP scene must be a pinhole without lens; render without one, or undistort first"
+            )
         number = len(self._cameras)
         name = f"{number:06d}"
-        write_png(self._folder / "rgb" / f"{name}.png", picture["rgb"])
-        if "depth" in picture:
-            steps = np.rint(picture["depth"] * (1000 / DEPTH_SCALE))
+        write_png(self._folder / "rgb" / f"{name}.png", frame["rgb"])
+        if "depth" in frame:
+            steps = np.rint(frame["depth"] * (1000 / DEPTH_SCALE))
             write_png(
                 self._folder / "depth" / f"{name}.png", np.where(steps < 65536, steps, 0).astype(np.uint16)
             )

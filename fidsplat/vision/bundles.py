@@ -1,4 +1,4 @@
-"""Markers of one rigid thing in a picture: one pose from all that is read of them."""
+"""Bundles of markers on a rigid body: one pose from all their detections."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class BundleReading:
 
 
 def read_bundles(readings: Iterable[Reading], camera: Camera) -> list[BundleReading]:
-    """The bundles of a scene (`PlacedMarker.bundle`), from what was read of its markers in one picture.
+    """The bundles of a scene (`PlacedMarker.bundle`), from the detections of its markers in one image.
 
     camera: that took it; its intrinsics and lens are used.
     """
@@ -64,9 +64,9 @@ def read_bundles(readings: Iterable[Reading], camera: Camera) -> list[BundleRead
 
 def _read(name: str, readings: list[Reading], camera: Camera) -> BundleReading:
     first = np.linalg.inv(readings[0].placed.pose)
-    seen = [(each.placed.corners, each.detection) for each in readings]
-    points = [at @ first[:3, :3].T + first[:3, 3] for at, code in seen if code is not None]
-    corners = [code.corners for _, code in seen if code is not None]
+    pairs = [(each.placed.corners, each.detection) for each in readings]
+    points = [at @ first[:3, :3].T + first[:3, 3] for at, code in pairs if code is not None]
+    corners = [code.corners for _, code in pairs if code is not None]
     facts = name, len(readings), len(corners), readings[0].truth
     pose = points_pose(np.concatenate(points), np.concatenate(corners), camera) if corners else None
     if pose is None or not np.isfinite(pose).all():

@@ -1,4 +1,4 @@
-"""The truth of pictures as COCO annotations (https://cocodataset.org/#format-data)."""
+"""Ground truth of images as COCO annotations (https://cocodataset.org/#format-data)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
 
 
 class CocoAnnotations:
-    """Annotations of many pictures: for each marker that is seen its box, mask and corners as keypoints, for
+    """Annotations of many images: for each visible marker its box, mask and corners as keypoints, for
     each named group of splats its box and mask.
 
-    A category is a marker's spec, `apriltag:36h11:5` say, or a group's name. Beside COCO's fields a marker's
-    annotation has `camera_from_marker`, `visible`, `distance_m` and `tilt_deg`.
+    A category is a marker's spec, `apriltag:36h11:5` say, or a group's name. In addition to COCO's fields a
+    marker's annotation has `camera_from_marker`, `visible`, `distance_m` and `tilt_deg`.
 
     Args:
         groups: {label: name} of groups of splats to annotate.
@@ -37,15 +37,17 @@ class CocoAnnotations:
         self._annotations: list[dict[str, Any]] = []
 
     def add(self, file_name: str, truth: Truth) -> None:
-        """Annotate a picture. file_name: as it is to stand in the file.
+        """Annotate an image. file_name: its name in the annotations.
 
         Raises:
-            InputError: the picture is there already.
+            InputError: the image is annotated already.
         """
         text("file_name", file_name)
         instance("truth", truth, Truth, "what truth_of returns")
         if any(image["file_name"] == file_name for image in self._images):
-            raise InputError(f"the picture {file_name!r} is annotated already; each has a name of its own")
+            raise InputError(
+                f"file_name must be new, got {file_name!r}, which is annotated already; use another name"
+            )
         camera = truth.camera
         image = {"id": len(self._images) + 1, "file_name": file_name}
         self._images.append(image | {"width": camera.width, "height": camera.height})
@@ -81,22 +83,22 @@ class CocoAnnotations:
         group = truth.groups.get(marker.placed.label)
         if group is not None:
             annotation = _of_group(group)
-        else:  # a picture without labels: its outline
+        else:  # an image without labels: its outline
             assert marker.box is not None
             x0, y0, x1, y1 = marker.box
-            seen = outline(marker.placed, truth.camera)
+            shape = outline(marker.placed, truth.camera)
             annotation = {
-                "segmentation": [polygon.ravel().tolist() for polygon in seen.polygons],
+                "segmentation": [polygon.ravel().tolist() for polygon in shape.polygons],
                 "bbox": [x0, y0, x1 - x0, y1 - y0],
-                "area": seen.seen_area,
+                "area": shape.visible_area,
                 "iscrowd": 0,
             }
         points, width, height = marker.corners, truth.camera.width, truth.camera.height
         inside = [bool(0 <= x < width and 0 <= y < height) for x, y in points]
         keypoints = [
             float(number)
-            for (x, y), seen in zip(points, inside, strict=True)
-            for number in ((x, y, 2) if seen else (0, 0, 0))
+            for (x, y), visible in zip(points, inside, strict=True)
+            for number in ((x, y, 2) if visible else (0, 0, 0))
         ]
         return annotation | {
             "keypoints": keypoints,

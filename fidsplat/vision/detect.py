@@ -1,4 +1,4 @@
-"""Find AprilTag, ArUco and QR codes in a picture with off-the-shelf detectors: OpenCV's aruco module and
+"""Detection of AprilTag, ArUco and QR codes with off-the-shelf detectors: OpenCV's aruco module and
 zxing-cpp.
 
 They decide what is there; `align` then moves their corners onto the edges of the code that they read.
@@ -19,7 +19,7 @@ from fidsplat.vision.align import align, fit
 
 # One family for every grid that people print; with each, a random dark square reads as a tag less than once
 # in 300 times. 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or more false tags: searched
-# when asked for.
+# on request.
 DEFAULT_FAMILIES = ("36h11", "25h9", "4x4_50", "5x5_100", "6x6_250", "7x7_250")
 
 MIN_SIDE = 8
@@ -28,7 +28,7 @@ MAX_SIDE = 32767
 """pixels, of OpenCV's detector"""
 MAX_QR_SIDE = 65535
 """pixels, of zxing-cpp"""
-# how much taller or wider the picture is made when a plain look finds no QR code: a tilted one has flat
+# how much taller or wider the image is made when the first pass finds no QR code: a tilted one has flat
 # modules
 STRETCHES = (1.5, 2.0, 3.0, 4.0)
 QR_ONLY = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
@@ -36,7 +36,7 @@ QR_ONLY = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """One code found in a picture."""
+    """A detected code."""
 
     kind: str
     """"apriltag", "aruco" or "qr"; of `read_back` also a kind of board"""
@@ -57,7 +57,7 @@ class Detection:
 
 
 def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = True) -> list[Detection]:
-    """Every code in a picture: tags in the order of ``families`` and their ids, then QR codes.
+    """All codes in an image: tags in the order of ``families`` and their ids, then QR codes.
 
     Args:
         image: (h, w, 3) RGB or (h, w) grey, uint8.
@@ -77,17 +77,17 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
         families = items("families", families, str, "several names, as ('36h11',)")
     if not isinstance(qr, bool | np.bool_ | int):
         raise InputError(f"qr must be True or False, not {type(qr).__name__}")
-    wanted = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
+    requested = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
     if min(pixels.shape[:2]) < MIN_SIDE:
         return []
     if max(pixels.shape[:2]) > MAX_SIDE:
         raise InputError(
-            f"a picture of {pixels.shape[1]} x {pixels.shape[0]} pixels; codes are looked for in at most "
+            f"an image of {pixels.shape[1]} x {pixels.shape[0]} pixels must be smaller for detection: at most "
             f"{MAX_SIDE} a side: cut it up, or make it smaller"
         )
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
     found: list[Detection] = []
-    for kind, family in dict.fromkeys(wanted):
+    for kind, family in dict.fromkeys(requested):
         found += [tag for tag in _tags(grey, kind, family) if not _known(tag, found)]
     return found + (_qr_codes(grey) if qr else [])
 
@@ -106,7 +106,7 @@ def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
     if any(not _known(tag, found) for tag in loose):
         # A contour becomes four points to within 3 % of its length: on a steep tag several corners lie
         # modules away along the long sides, where no window around them reaches the true ones. Lines through
-        # the sides do, but a dark line that touches the tag turns them.
+        # the sides do, but a dark line that touches the tag rotates them.
         _read_tags(grey, kind, family, cv2.aruco.CORNER_REFINE_CONTOUR, 0.0, found, loose)
     # the pattern settles from none of the corners: those that it fits best
     bits = {tag.id: dictionary_bits(kind, family, int(tag.id or 0)) for tag in loose}
@@ -155,19 +155,19 @@ def _same_place(one: Detection, other: Detection) -> bool:
 def _qr_codes(grey: np.ndarray) -> list[Detection]:
     codes = _read_qr(grey, 1.0, 1.0)
     for factor in STRETCHES:
-        # the wider picture is tried after the taller one: boards lean back more often than they turn aside
+        # the wider image is tried after the taller one: boards are tilted back more often than sideways
         codes = codes or _read_qr(grey, 1.0, factor) or _read_qr(grey, factor, 1.0)
     return sorted(codes, key=lambda code: (code.payload or "", tuple(code.corners[0])))
 
 
 def _read_qr(grey: np.ndarray, wider: float, taller: float) -> list[Detection]:
-    picture = grey
+    image = grey
     if max(grey.shape[1] * wider, grey.shape[0] * taller) > MAX_QR_SIDE:
         return []
     if (wider, taller) != (1.0, 1.0):
-        picture = cv2.resize(grey, None, fx=wider, fy=taller, interpolation=cv2.INTER_LINEAR)
-    scale = np.array([grey.shape[1] / picture.shape[1], grey.shape[0] / picture.shape[0]])
-    read = zxingcpp.read_barcodes(picture, formats=QR_ONLY, text_mode=zxingcpp.TextMode.Plain)
+        image = cv2.resize(grey, None, fx=wider, fy=taller, interpolation=cv2.INTER_LINEAR)
+    scale = np.array([grey.shape[1] / image.shape[1], grey.shape[0] / image.shape[0]])
+    read = zxingcpp.read_barcodes(image, formats=QR_ONLY, text_mode=zxingcpp.TextMode.Plain)
     return [_qr(grey, code, scale) for code in read]
 
 

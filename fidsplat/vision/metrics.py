@@ -1,4 +1,4 @@
-"""How far two pictures differ: PSNR, SSIM, FLIP, LPIPS. Pictures are display values in [0, 1].
+"""Image metrics: PSNR, SSIM, FLIP, LPIPS, of display values in [0, 1].
 
 LPIPS (Zhang et al. 2018) is computed with AlexNet, in NumPy, by weights that the user has: they are no part
 of fidsplat, and nothing here fetches them. `load_lpips` reads a NumPy file with the five convolutions of
@@ -26,19 +26,19 @@ _SIGMA, _RADIUS = 1.5, 5  # pixels: Wang et al. 2004, as in the 3DGS and 2DGS pa
 _C1, _C2 = 0.01**2, 0.03**2
 
 
-def psnr(picture: np.ndarray, truth: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB over all pixels, infinite for equal pictures."""
-    error = float(np.mean((np.asarray(picture, np.float64) - truth) ** 2))
+def psnr(image: np.ndarray, truth: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB over all pixels, infinite for equal images."""
+    error = float(np.mean((np.asarray(image, np.float64) - truth) ** 2))
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def ssim(picture: np.ndarray, truth: np.ndarray) -> float:
-    """Structural similarity (Wang et al. 2004) of two (h, w) pictures: Gaussian window of sigma 1.5, 11 px.
+def ssim(image: np.ndarray, truth: np.ndarray) -> float:
+    """Structural similarity (Wang et al. 2004) of two (h, w) images: Gaussian window of sigma 1.5, 11 px.
 
     The same as scikit-image's with gaussian_weights, sigma 1.5, data_range 1 and use_sample_covariance
-    False: windows that leave the picture do not count. NaN for pictures smaller than a window.
+    False: windows that cross the border are excluded. NaN for images smaller than a window.
     """
-    a, b = np.asarray(picture, np.float64), np.asarray(truth, np.float64)
+    a, b = np.asarray(image, np.float64), np.asarray(truth, np.float64)
     if min(a.shape) <= 2 * _RADIUS:
         return math.nan
 
@@ -64,8 +64,8 @@ def metric_versions() -> dict[str, str]:
     return {"flip-evaluator": version("flip-evaluator")} if has_flip() else {}
 
 
-def flip(picture: np.ndarray, truth: np.ndarray) -> float:
-    """Mean LDR-FLIP (Andersson et al. 2020) of two pictures, (h, w) or (h, w, 3), at 67 pixels per degree, 0
+def flip(image: np.ndarray, truth: np.ndarray) -> float:
+    """Mean LDR-FLIP (Andersson et al. 2020) of two images, (h, w) or (h, w, 3), at 67 pixels per degree, 0
     for equal."""
     import flip_evaluator  # type: ignore[import-not-found]  # of the extra `experiments`
 
@@ -73,7 +73,7 @@ def flip(picture: np.ndarray, truth: np.ndarray) -> float:
         values = np.asarray(values, np.float32)
         return np.ascontiguousarray(values if values.ndim == 3 else np.repeat(values[:, :, None], 3, axis=2))
 
-    a, b = coloured(picture), coloured(truth)
+    a, b = coloured(image), coloured(truth)
     _, mean, _ = flip_evaluator.evaluate(b, a, "LDR", applyMagma=False, computeMeanError=True)
     return float(mean)
 
@@ -88,7 +88,7 @@ _EPSILON = 1e-10
 
 
 def weights_name(file: Path) -> str:
-    """What tells weights apart in results: the start of the file's hash. Raises InputError when it cannot be
+    """Identity of LPIPS weights in results: the start of the file's hash. Raises InputError when it cannot be
     read."""
     try:
         return hashlib.sha256(read_input(file)).hexdigest()[:12]
@@ -97,7 +97,7 @@ def weights_name(file: Path) -> str:
 
 
 def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
-    """LPIPS of two (h, w) pictures of display values in [0, 1], by the weights in a .npz file.
+    """LPIPS of two (h, w) images of display values in [0, 1], by the weights in a .npz file.
 
     Raises InputError when the file cannot be read or lacks an array or one has another shape.
     """
@@ -107,7 +107,7 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
     except InputError:
         raise
     except (ValueError, TypeError) as error:
-        raise InputError(f"{file} is no .npz file with LPIPS weights: {error}") from error
+        raise InputError(f"cannot read {file} as LPIPS weights (.npz): {error}") from error
     for k, (out, into, size) in enumerate(_CHANNELS):
         shapes = {
             f"conv{k + 1}.weight": (out, into, size, size),
@@ -120,9 +120,9 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
             if not np.isfinite(weights[name]).all():
                 raise InputError(f"the array {name} of {file} must be finite; see docs/experiments.md")
 
-    def measure(picture: np.ndarray, truth: np.ndarray) -> float:
+    def measure(image: np.ndarray, truth: np.ndarray) -> float:
         total = 0.0
-        for k, (a, b) in enumerate(zip(_features(picture, weights), _features(truth, weights), strict=True)):
+        for k, (a, b) in enumerate(zip(_features(image, weights), _features(truth, weights), strict=True)):
             difference = (_unit(a) - _unit(b)) ** 2
             total += float(np.tensordot(weights[f"lin{k}"], difference, 1).mean())
         return total

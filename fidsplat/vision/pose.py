@@ -1,4 +1,4 @@
-"""Where a flat marker is, from its corners in a picture."""
+"""Pose of a planar marker from its corners in an image (PnP)."""
 
 import math
 
@@ -27,7 +27,7 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
 
     IPPE (Collins and Bartoli 2014) gives the two poses that a square can nearly be confused between; both are
     settled by Levenberg-Marquardt on the reprojection error and the one with the lower error is returned; NaN
-    where neither lies before the camera.
+    if neither is in front of the camera.
 
     Args:
         corners: (4, 2) pixels, TL, TR, BR, BL as printed.
@@ -36,13 +36,13 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
 
     Raises:
         InputError: corners of another shape, a size that is not above 0, or an orthographic camera, in which
-            nothing tells how far a marker is.
+            the distance of a marker is undetermined.
     """
     corners, edge = real_array("corners", corners), real_array("size", size)
     if corners.shape != (4, 2):
         raise InputError(f"corners must be (4, 2) pixels, not {corners.shape}")
     if edge.shape != () or not SMALLEST <= edge < LARGEST:
-        raise InputError(f"size must be metres above 0, {SMALLEST:g} at least, not {size!r}")
+        raise InputError(f"size must be a positive length in metres, {SMALLEST:g} or more, got {size!r}")
     if not isinstance(camera, Camera):
         raise InputError(f"camera must be a Camera, not {type(camera).__name__}")
     half = float(edge) / 2
@@ -51,7 +51,7 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
 
 
 def plane_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """`marker_pose` from any points of a marker's plane, at least four that do not lie on a line: (n, 2)
+    """`marker_pose` from any points of a marker's plane, at least four that are not collinear: (n, 2)
     metres x right, y down as printed, and (n, 2) pixels."""
     return _pose(
         np.column_stack([points * [1, -1], np.zeros(len(points))]), corners, camera, cv2.SOLVEPNP_IPPE
@@ -59,32 +59,34 @@ def plane_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.nd
 
 
 def points_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """`marker_pose` from any points of a rigid thing, at least four: (n, 3) metres and (n, 2) pixels. SQPnP
+    """`marker_pose` from at least four points of a rigid body: (n, 3) metres and (n, 2) pixels. SQPnP
     (Terzakis and Lourakis 2020) gives the poses that are settled."""
     return _pose(points * [1, -1, -1], corners, camera, cv2.SOLVEPNP_SQPNP)
 
 
 def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) -> np.ndarray:
     """camera_from_marker from points (n, 3) in OpenCV's axes."""
-    seen, matrix, turned = np.ascontiguousarray(corners, np.float64), camera.matrix, np.eye(4)
+    observed, matrix, rotated = np.ascontiguousarray(corners, np.float64), camera.matrix, np.eye(4)
     if camera.lens is not None:
-        seen, matrix, turned = _flattened(seen, camera)
-    if not np.isfinite(seen).all():
+        observed, matrix, rotated = _flattened(observed, camera)
+    if not np.isfinite(observed).all():
         return np.full((4, 4), np.nan)
-    best, least = np.full((4, 4), np.nan), math.inf
-    spread = float(np.linalg.norm(seen - seen.mean(0)))
+    best, smallest = np.full((4, 4), np.nan), math.inf
+    spread = float(np.linalg.norm(observed - observed.mean(0)))
     # face to face OpenCV's IPPE divides by next to nothing: its poses may be NaN, or anything
     for way in dict.fromkeys((method, cv2.SOLVEPNP_SQPNP)):
-        count, turns, moves, _ = cv2.solvePnPGeneric(points, seen, matrix, None, flags=way)
-        for turn, move in zip(turns[:count], moves[:count], strict=True):
-            turn, move = cv2.solvePnPRefineLM(points, seen, matrix, None, turn, move)
-            drawn, _ = cv2.projectPoints(points, turn, move, matrix, None)
-            error = float(np.linalg.norm(drawn.reshape(-1, 2) - seen))
+        count, rotations, translations, _ = cv2.solvePnPGeneric(points, observed, matrix, None, flags=way)
+        for rotation, translation in zip(rotations[:count], translations[:count], strict=True):
+            rotation, translation = cv2.solvePnPRefineLM(
+                points, observed, matrix, None, rotation, translation
+            )
+            projected, _ = cv2.projectPoints(points, rotation, translation, matrix, None)
+            error = float(np.linalg.norm(projected.reshape(-1, 2) - observed))
             fits = way == method or error < LOOSE * spread
-            if fits and error < least - SAME and move[2, 0] > 0:
-                least, best = error, np.eye(4)
-                best[:3, :3], best[:3, 3] = cv2.Rodrigues(turn)[0], move[:, 0]
-    return turned @ best @ _FLIP
+            if fits and error < smallest - SAME and translation[2, 0] > 0:
+                smallest, best = error, np.eye(4)
+                best[:3, :3], best[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    return rotated @ best @ _FLIP
 
 
 def _flattened(corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -94,17 +96,16 @@ def _flattened(corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndar
     axis /= np.linalg.norm(axis)
     side = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [0.0, 0.0, 1.0], axis)
     side /= np.linalg.norm(side)
-    turned = np.eye(4)
-    turned[:3, :3] = np.stack([side, np.cross(axis, side), axis], axis=1)
-    flat = rays @ turned[:3, :3]
+    rotated = np.eye(4)
+    rotated[:3, :3] = np.stack([side, np.cross(axis, side), axis], axis=1)
+    flat = rays @ rotated[:3, :3]
     matrix = np.diag([camera.fx, camera.fx, 1.0])
-    return np.ascontiguousarray(camera.fx * flat[:, :2] / flat[:, 2:]), matrix, turned
+    return np.ascontiguousarray(camera.fx * flat[:, :2] / flat[:, 2:]), matrix, rotated
 
 
 def pose_error(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     """Distance in metres and angle in radians between two rigid poses (4, 4)."""
     apart = float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3]))
-    turn = estimate[:3, :3].T @ truth[:3, :3]
-    # the arc tangent keeps small angles that the arc cosine of the trace would round away
-    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    return apart, math.atan2(float(sine), (float(np.trace(turn)) - 1) / 2)
+    delta = estimate[:3, :3].T @ truth[:3, :3]
+    sine = np.linalg.norm([delta[2, 1] - delta[1, 2], delta[0, 2] - delta[2, 0], delta[1, 0] - delta[0, 1]]) / 2
+    return apart, math.atan2(float(sine), (float(np.trace(delta)) - 1) / 2)

@@ -1,4 +1,4 @@
-"""What is read in a picture of a scene, compared with where the scene's markers are."""
+"""Detection of a scene's markers in an image, compared with their true poses."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +16,7 @@ from fidsplat.util.arguments import invalid
 from fidsplat.vision.boards import BOARDS, board_pose
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.pose import marker_pose, pose_error
-from fidsplat.vision.truth import MarkerTruth, marker_truth, standing
+from fidsplat.vision.truth import MarkerTruth, at_shutter, marker_truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,35 +58,35 @@ class ReadBack(NamedTuple):
     readings: list[Reading]
     """of each marker of the scene, in its order"""
     others: list[Detection]
-    """codes that were seen and that the scene does not have"""
+    """detected codes that the scene does not have"""
 
 
 def read_back(
-    picture: Mapping[str, np.ndarray] | np.ndarray,
+    frame: Mapping[str, np.ndarray] | np.ndarray,
     scene: Scene,
     camera: Camera | None = None,
     families: Iterable[str] | None = None,
 ) -> ReadBack:
-    """Read every marker of a scene in its picture: id, corners, pose, and how far these are from the truth.
+    """Detect every marker of a scene in its image: id, corners, pose, and their errors.
 
-    Boards (charuco, gridboard, aprilgrid) give one pose each, from all that is seen of them. Drawings and
+    Boards (charuco, gridboard, aprilgrid) have one pose each, from all detected tags. Drawings and
     images are not looked for.
 
     Args:
-        picture: a `Frame` with `rgb`, and with `label` if `Reading.visible` is to know what hides markers; or
+        frame: a `Frame` with `rgb`, and with `label` if `Reading.visible` is to include occlusion; or
             images by name; or (h, w, 3) uint8, or float in [0, 1].
         scene, camera: as of `truth_of`: the truth is where the Frame's own capture has the camera and the
             markers, or the scene's capture for other images.
         families: tag families to look for, see `detect`; default the scene's.
 
     Raises:
-        InputError: no camera, or one of another size than the picture.
+        InputError: no camera, or one of another size than the image.
     """
-    if isinstance(picture, Mapping) and "rgb" not in picture:
-        raise invalid("picture", "a Frame with rgb, or an array", list(picture))
-    image = to_uint8(pixels_of(picture["rgb"] if isinstance(picture, Mapping) else picture))
-    label = picture["label"] if isinstance(picture, Mapping) and "label" in picture else None
-    camera, markers = standing(picture, scene, camera, image.shape)
+    if isinstance(frame, Mapping) and "rgb" not in frame:
+        raise invalid("frame", "a Frame with rgb, or an array", list(frame))
+    image = to_uint8(pixels_of(frame["rgb"] if isinstance(frame, Mapping) else frame))
+    label = frame["label"] if isinstance(frame, Mapping) and "label" in frame else None
+    camera, markers = at_shutter(frame, scene, camera, image.shape)
     found = detect(image, families_of(placed.marker for placed in markers) if families is None else families)
     codes, left = match(found, markers, camera)
     for number, placed in enumerate(markers):
@@ -105,9 +105,9 @@ def match(
     go first.
     """
     left = list(detections)
-    seen = [camera.project(placed.corners) for placed in markers]
+    expected = [camera.project(placed.corners) for placed in markers]
     pairs = [
-        (_apart(found.corners, seen[i]), i, found)
+        (_apart(found.corners, expected[i]), i, found)
         for i, placed in enumerate(markers)
         for found in left
         if _same(found, placed.marker)
@@ -124,9 +124,9 @@ def match(
     return codes, left
 
 
-def own_code(made: Marker, picture: np.ndarray) -> Detection | None:
-    """A marker's code in a picture, (h, w) or (h, w, 3) display values; None where it is not read."""
-    found = detect(to_uint8(picture), families_of([made]), qr=made.kind == "qr")
+def own_code(made: Marker, image: np.ndarray) -> Detection | None:
+    """The detection of a marker's code in an image, (h, w) or (h, w, 3) display values; None if not found."""
+    found = detect(to_uint8(image), families_of([made]), qr=made.kind == "qr")
     return next((code for code in found if _same(code, made)), None)
 
 
@@ -143,7 +143,7 @@ def families_of(markers: Iterable[Marker]) -> tuple[str, ...]:
 
 def means(readings: Sequence[Reading]) -> dict[str, Any]:
     """How many markers were found of how many that could be, and the means of their errors, as
-    `Reading.as_dict` has them; None where none was found. Markers that are not visible (seen from behind, out
+    `Reading.as_dict` has them; None where none was found. Markers that are not visible (from behind, out
     of the image, occluded) are counted apart, in `not_visible`."""
     could_be = [reading for reading in readings if reading.visible > 0 or reading.detection is not None]
     facts = [reading.as_dict() for reading in could_be if reading.detection is not None]
@@ -168,13 +168,13 @@ def _reading(
     placed: PlacedMarker, code: tuple[Detection, np.ndarray] | None, camera: Camera, label: np.ndarray | None
 ) -> Reading:
     truth = marker_truth(placed, camera, label)
-    seen = Reading(**{field.name: getattr(truth, field.name) for field in fields(truth)})
+    reading = Reading(**{field.name: getattr(truth, field.name) for field in fields(truth)})
     if code is None:
-        return seen
+        return reading
     found, pose = code
     position, angle = pose_error(pose, truth.truth)
     return replace(
-        seen,
+        reading,
         detection=found,
         pose=pose,
         position_error=position,

@@ -1,4 +1,4 @@
-"""Off-the-shelf detectors as they come, asked one question each: is this code seen, and is it read?
+"""Off-the-shelf detectors with their defaults: does each one find and decode a given code?
 
 Unlike `detect`, which combines them and refines corners, these are for measuring how far each detector goes.
 """
@@ -21,13 +21,13 @@ from fidsplat.images.tag_dictionaries import predefined
 from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import QR_ONLY, corners_of
 
-# how much larger the picture is made, and how much taller beside that, until zxing-cpp reads the code: all
-# heights at the picture's own size first, then twice as large
+# how much larger the image is made, and how much taller in addition, until zxing-cpp reads the code: all
+# heights at the image's own size first, then twice as large
 UNFORESHORTEN = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 ENLARGE = (1.0, 2.0)
 # a quadrilateral is that of the code when it shares more than this part of their union with it
 MIN_OVERLAP = 0.5
-_MARGIN = 16  # pixels kept around what is not background
+_MARGIN = 16  # margin in pixels around the foreground
 
 _idle: dict[str, deque] = {}
 """AprilTag detectors that no thread uses, by family"""
@@ -35,7 +35,7 @@ _idle: dict[str, deque] = {}
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The code that a picture shows."""
+    """The code in an image."""
 
     kind: str
     """"apriltag" or "qr\""""
@@ -49,7 +49,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What one detector made of one picture."""
+    """The result of one detector for one image."""
 
     found: bool
     """a quadrilateral that overlaps the code (`MIN_OVERLAP`), decoded or not"""
@@ -67,10 +67,10 @@ def _aruco(grey: np.ndarray, target: Target) -> Attempt:
 
 
 def _pupil(grey: np.ndarray, target: Target) -> Attempt:
-    """The AprilTag library at full resolution. It tells nothing of tags that it cannot decode."""
+    """The AprilTag library at full resolution. It reports only decoded tags."""
     idle = _idle.setdefault(target.family, deque())
     try:
-        detector = idle.pop()  # one picture at a time: the library keeps scratch memory in it
+        detector = idle.pop()  # one image at a time: the library keeps scratch memory in it
     except IndexError:
         detector = _pupil_detector("tag" + target.family)
     found: Any = detector.detect(grey)  # its annotation says one, it is a list
@@ -145,7 +145,7 @@ def readers(kind: str) -> tuple[str, ...]:
 
 
 def attempt(name: str, grey: np.ndarray, target: Target) -> Attempt:
-    """Show a picture to one detector. May be called from several threads.
+    """Run one detector on an image. Thread-safe.
 
     Args:
         name: one of `readers` of the target's kind.
@@ -183,7 +183,7 @@ def _any_over(quads: Iterable[np.ndarray], target: Target) -> bool:
 
 
 def _content_rows(grey: np.ndarray) -> tuple[int, int]:
-    """The rows that hold anything but the level of the picture's first pixel, and a margin."""
+    """The rows that hold anything but the level of the image's first pixel, and a margin."""
     level = int(grey[0, 0])
     rows = np.flatnonzero((grey.max(1) > level + 2) | (grey.min(1) < level - 2))
     if rows.size == 0:

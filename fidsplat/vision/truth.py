@@ -1,5 +1,4 @@
-"""What a picture of a scene shows, from the scene itself: where its markers are, what is whose, what moves
-where."""
+"""Ground truth of an image from its scene: marker poses and corners, label masks, points, optical flow."""
 
 from __future__ import annotations
 
@@ -23,18 +22,18 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class MarkerTruth:
-    """One marker of a scene, and where it is in a picture."""
+    """Ground truth of one marker in an image."""
 
     placed: PlacedMarker
     truth: np.ndarray
     """(4, 4) camera_from_marker"""
     corners: np.ndarray
-    """(4, 2) pixels where the code's corners are, NaN behind the camera"""
+    """(4, 2) pixels of the code's corners, NaN behind the camera"""
     visible: float
-    """share of the marker, a module of its quiet zone included, that is in the picture, 0 to 1; of a frame
-    with labels, of what nothing hides"""
+    """visible share of the marker, a module of its quiet zone included, 0 to 1; with a label image
+    occlusion counts too"""
     box: Box | None
-    """around what of that lies in the picture; None where nothing does"""
+    """bounding box of the visible part; None if nothing is visible"""
 
     @property
     def distance(self) -> float:
@@ -43,8 +42,8 @@ class MarkerTruth:
 
     @property
     def tilt(self) -> float:
-        """Radians between the marker's normal and the line to the camera: 0 is seen head on, above pi / 2
-        from behind."""
+        """Radians between the marker's normal and the line to the camera: 0 is frontal, above pi / 2 is from
+        behind."""
         distance = self.distance
         towards = float(self.truth[:3, 2] @ self.truth[:3, 3])
         return math.acos(max(-1.0, min(1.0, towards / distance))) if distance else 0.0
@@ -66,30 +65,30 @@ class Truth:
     """What `truth_of` returns."""
 
     camera: Camera
-    """that took the picture, where it was"""
+    """of the image, at its pose"""
     markers: list[MarkerTruth]
     """of each marker of the scene, in its order"""
     groups: dict[int, GroupTruth]
-    """by label, of those that are in the picture; empty for a frame without labels"""
+    """by label, of those in the image; empty for a frame without labels"""
 
 
-def truth_of(picture: Mapping[str, np.ndarray], scene: Scene, camera: Camera | None = None) -> Truth:
+def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | None = None) -> Truth:
     """Ground truth of an image of a scene.
 
     Args:
-        picture: a Frame, whose own capture says where the camera and the markers were; or images by name,
-            taken by the scene's capture. `label` says what is occluded, and gives masks.
+        frame: a Frame, whose own capture has the poses of camera and markers; or images by name,
+            rendered with the scene's capture. `label` brings occlusion and masks.
         scene: the one that was rendered. What moves is where it was at the shutter's time.
         camera: takes the place of the capture's, with its pose.
 
     Raises:
         InputError: no camera, or one of another size than the image.
     """
-    if not isinstance(picture, Mapping) or not picture:
-        raise invalid("picture", "a Frame, or images by name", picture)
-    first = next(iter(picture))
-    camera, markers = standing(picture, scene, camera, np.shape(picture[first]))
-    label = picture.get("label")
+    if not isinstance(frame, Mapping) or not frame:
+        raise invalid("frame", "a Frame, or images by name", frame)
+    first = next(iter(frame))
+    camera, markers = at_shutter(frame, scene, camera, np.shape(frame[first]))
+    label = frame.get("label")
     return Truth(
         camera,
         [marker_truth(placed, camera, label) for placed in markers],
@@ -97,26 +96,26 @@ def truth_of(picture: Mapping[str, np.ndarray], scene: Scene, camera: Camera | N
     )
 
 
-def standing(
-    picture: Any, scene: Scene, camera: Camera | None, shape: Sequence[int]
+def at_shutter(
+    frame: Any, scene: Scene, camera: Camera | None, shape: Sequence[int]
 ) -> tuple[Camera, list[PlacedMarker]]:
     """The camera and the markers at the shutter's time of the capture that made an image of that shape: a
     Frame's own capture, for other images the scene's. Arguments and errors: as `truth_of`."""
     instance("scene", scene, Scene, remedy="fs.Scene([cloud]) makes one of splats")
     if camera is not None:
         instance("camera", camera, Camera, "a Camera or None")
-    capture = getattr(picture, "capture", None) or scene.capture
+    capture = getattr(frame, "capture", None) or scene.capture
     time = capture.shutter.time
     if camera is None:
         camera = capture.camera and capture.motion.moved(capture.camera, time)
     if camera is None:
         raise InputError("the scene has no camera, so the pose of its markers is unknown; give one")
     if len(shape) < 2:
-        raise InputError(f"the picture must be an array (h, w) or (h, w, 3), got the shape {tuple(shape)}")
+        raise InputError(f"the image must be an array (h, w) or (h, w, 3), got the shape {tuple(shape)}")
     if (camera.height, camera.width) != tuple(shape[:2]):
         raise InputError(
-            f"the picture has {shape[1]} x {shape[0]} pixels and the camera {camera.width} x "
-            f"{camera.height}; give the picture that this scene was rendered to"
+            f"the image has {shape[1]} x {shape[0]} pixels and the camera {camera.width} x "
+            f"{camera.height}; give the image that this scene was rendered to"
         )
     groups = dict(capture.motion.groups_at(time))
     markers = [replace(m, pose=groups[m.label] @ m.pose) if m.label in groups else m for m in scene.markers]
@@ -124,14 +123,14 @@ def standing(
 
 
 def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> MarkerTruth:
-    """One marker as a camera sees it. label: (h, w) int32, the labels of the picture; None: nothing stands in
-    front."""
+    """Ground truth of one marker for a camera. label: (h, w) int32, the labels of the image; None: no
+    occlusion."""
     pose, corners = camera.world_to_camera @ placed.pose, camera.project(placed.corners)
     return MarkerTruth(placed, pose, corners, *visible(placed, camera, label))
 
 
 def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
-    """Masks and boxes of the labels of a picture, (h, w) int32; -1 is nobody's."""
+    """Masks and boxes of the labels of an image, (h, w) int32; -1 is the background."""
     found = {}
     for value in np.unique(label).tolist():
         if value < 0:
@@ -144,7 +143,7 @@ def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
 
 
 def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """World points (h, w, 3) float64 that pixels show, from any of a frame's depths (`depth`, `depth_median`,
+    """World points (h, w, 3) float64 of the pixels, from any of a frame's depths (`depth`, `depth_median`,
     `depth_first`); NaN where that is 0."""
     instance("camera", camera, Camera)
     depth = real_array("depth", depth)
@@ -157,10 +156,10 @@ def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
     far = np.where(depth > 0, depth, np.nan).astype(np.float64).reshape(-1, 1)
     if isinstance(camera.lens, Orthographic):
         flat = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        seen = np.concatenate([flat, far], 1)
+        in_camera = np.concatenate([flat, far], 1)
     else:
-        seen = camera.rays(pixels) * far
-    return (seen @ camera.world_to_camera[:3, :3] + camera.position).reshape(*depth.shape, 3)
+        in_camera = camera.rays(pixels) * far
+    return (in_camera @ camera.world_to_camera[:3, :3] + camera.position).reshape(*depth.shape, 3)
 
 
 def optical_flow(
@@ -170,14 +169,14 @@ def optical_flow(
     label: np.ndarray | None = None,
     motions: Mapping[int, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Where what a pixel shows will be, (h, w, 2) float32: pixels right and down; NaN where nothing is seen,
-    or where the second camera cannot see it.
+    """Optical flow (h, w, 2) float32: pixels right and down; NaN without depth, or outside the view of the
+    second camera.
 
     Args:
-        depth: (h, w) of the first picture, any of a frame's depths; at edges `depth_first` mixes least.
-        before, after: the cameras of the two pictures, where they were.
-        label: (h, w) int32 of the first picture, where things move.
-        motions: {label: (4, 4)}: the motion of the world that its splats make between the pictures.
+        depth: (h, w) of the first image, any of a frame's depths; `depth_first` mixes the fewest surfaces at
+        edges. before, after: the cameras of the two images, at their poses.
+        label: (h, w) int32 of the first image, where things move.
+        motions: {label: (4, 4)}: the motion of the world that its splats make between the images.
 
     Raises:
         InputError: sizes that differ, motions without labels or that are not rigid.
@@ -189,7 +188,7 @@ def optical_flow(
         raise invalid("label", "an image of the size of depth, or None", label)
     points = points_of(depth, before)
     if motions and label is None:
-        raise InputError("motions say how labels move, but there is no label image; render with 'label'")
+        raise InputError("motions need a label image, got None; render with 'label'")
     for value, motion in (motions or {}).items():
         check_similarity(motion, f"the motion of label {value}", rigid=True)
         if label is not None:

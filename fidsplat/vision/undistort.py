@@ -1,4 +1,4 @@
-"""Pictures that were taken through a lens, as a pinhole would have taken them."""
+"""Undistortion: resampling images of a lens to a pinhole camera."""
 
 import math
 from functools import lru_cache
@@ -11,7 +11,7 @@ from fidsplat.util.errors import InputError
 
 MAX_FIELD = math.radians(150)
 _NOWHERE = -1e4
-"""pixels, where nothing is seen"""
+"""pixels outside the lens's field of view"""
 
 
 def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: float) -> Camera:
@@ -22,9 +22,7 @@ def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: floa
         InputError: fov_x out of range, or the target is where the camera is.
     """
     if not 0 < fov_x <= MAX_FIELD:
-        raise InputError(
-            f"fov_x is {math.degrees(fov_x):.6g} degrees; a flat picture has more than 0 and up to 150"
-        )
+        raise InputError(f"fov_x must be above 0 and at most 150 degrees, got {math.degrees(fov_x):.6g}")
     # the camera's own down is down, unless it looks that way
     down, along = camera.world_to_camera[1, :3], np.asarray(target, np.float64) - camera.position
     if np.linalg.norm(np.cross(down, along)) < 1e-3 * np.linalg.norm(along):
@@ -35,29 +33,28 @@ def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: floa
 
 
 def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
-    """What a pinhole at the same place sees in a picture, by bilinear interpolation; 0 where the lens sees
+    """The image of a pinhole at the same place, by bilinear interpolation; 0 where the lens sees
     nothing.
 
     Args:
         image: (h, w) or (h, w, 3) of uint8 or float32, taken by `camera`.
-        pinhole: its pose may turn, so that a flat picture shows what lies at the side of a fisheye's.
+        pinhole: its pose may be rotated, for instance towards the side of a fisheye image.
 
     Raises:
-        InputError: the picture has another size than the camera's, the pinhole stands elsewhere, or the
+        InputError: the image has another size than the camera's, the pinhole is at another position, or the
             camera's rays are parallel.
     """
     if isinstance(camera.lens, Orthographic):
         raise InputError(
-            "undistort: the camera's rays are parallel, and no pinhole sees what they see; its picture is "
-            "flat as it is"
+            "undistort: an orthographic camera has no pinhole equivalent; its image is flat as it is"
         )
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
-            f"the picture has {image.shape[1]} x {image.shape[0]} pixels, but its camera {camera.width} x "
+            f"the image has {image.shape[1]} x {image.shape[0]} pixels, but its camera {camera.width} x "
             f"{camera.height}"
         )
     if not np.allclose(pinhole.position, camera.position, rtol=0, atol=1e-9):
-        raise InputError("undistort: the pinhole camera must stand where the picture was taken")
+        raise InputError("undistort: the pinhole camera must have the position of the image's camera")
     y, x = np.mgrid[0.5 : pinhole.height, 0.5 : pinhole.width]
     rays = pinhole.rays(np.stack([x.ravel(), y.ravel()], 1)) @ pinhole.world_to_camera[:3, :3]
     at = camera.project(camera.position + rays).astype(np.float32) - np.float32(0.5)
@@ -66,8 +63,9 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
 
 
 def flattened(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `undistort`, by a pinhole of the same pose, size and focal length, for many pictures of one lens:
-    the picture, and where (h, w) bool all that a pixel is made of lies in it and in its mask (h, w) bool.
+    """Undistortion by a pinhole of the same pose, size and focal length, for many images of one lens.
+
+    Returns the image, and (h, w) bool: pixels whose samples are all inside the image and its mask (h, w).
     """
     lens = camera.lens
     assert lens is not None  # else it is flat
@@ -78,7 +76,7 @@ def flattened(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tuple[np.n
 
 @lru_cache(maxsize=2)
 def _found_at(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens) -> np.ndarray:
-    """x and y (2, h, w) float32, in a lens's picture, of what a pinhole's pixels see."""
+    """x and y (2, h, w) float32 in the lens's image of each pixel of a pinhole."""
     at = np.empty((2, height, width), np.float32)
     rays = np.stack([(np.arange(width) + 0.5 - cx) / fx, np.empty(width), np.ones(width)], axis=1)
     for row in range(height):  # not at once: photographs have millions of pixels

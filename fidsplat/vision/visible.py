@@ -1,4 +1,4 @@
-"""What of a marker lies in a picture."""
+"""Visible part of a marker in an image."""
 
 from typing import NamedTuple
 
@@ -16,19 +16,19 @@ POINTS = 16
 
 
 class Visible(NamedTuple):
-    """What of a marker is in a picture."""
+    """Visible share and bounding box of a marker."""
 
     share: float
-    """0 to 1, of its outline in an endless picture"""
+    """0 to 1, of its outline in an unbounded image"""
     box: tuple[float, float, float, float] | None
-    """pixels x0, y0, x1, y1 around it, without regard to what stands in front; None for a share of 0"""
+    """bounding box in pixels x0, y0, x1, y1, without occlusion; None for a share of 0"""
 
 
 def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry, shapely.Geometry]:
-    """A marker's outline in an endless picture, and what of it lies in the camera's, in pixels.
+    """A marker's outline in an unbounded image, and its part in the camera's image, in pixels.
 
     The outline is the code's with a module of its quiet zone, as far as it has one. Both are empty for a
-    marker that is seen from behind.
+    marker that faces away.
     """
     marker = placed.marker
     rows, columns = marker.bits.shape
@@ -49,9 +49,9 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
 
 
 def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> Visible:
-    """What of a marker's outline (`visible_part`) is in the picture.
+    """The visible part of a marker's outline (`visible_part`).
 
-    label: (h, w) int32, the labels of the picture; None: nothing stands in front.
+    label: (h, w) int32, the labels of the image; None: no occlusion.
     """
     whole, part = visible_part(placed, camera)
     if shapely.is_empty(part):
@@ -70,17 +70,17 @@ class Outline(NamedTuple):
     """A marker's outline, as `visible_part` has it."""
 
     area: float
-    """square pixels, in an endless picture"""
+    """square pixels, in an unbounded image"""
     box: tuple[float, float, float, float] | None
-    """pixels x0, y0, x1, y1 around that; None for a marker that is seen from behind"""
-    seen_area: float
-    """square pixels of what lies in the camera's picture"""
+    """bounding box in pixels x0, y0, x1, y1; None for a marker that faces away"""
+    visible_area: float
+    """square pixels of the part in the camera's image"""
     polygons: list[np.ndarray]
     """that, in (n, 2) pixels"""
 
 
 def outline(placed: PlacedMarker, camera: Camera) -> Outline:
-    """A marker's outline in a camera's picture."""
+    """A marker's outline in a camera's image."""
     whole, part = visible_part(placed, camera)
     parts = [p for p in shapely.get_parts(part) if p.geom_type == "Polygon"]
     box = None if shapely.is_empty(whole) else tuple(shapely.bounds(whole).tolist())
@@ -90,10 +90,10 @@ def outline(placed: PlacedMarker, camera: Camera) -> Outline:
 
 def _before(points: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """The part of a polygon (n, 3) where a linear function, of these values at its corners, is above 0."""
-    kept = []
+    clipped = []
     for a, b, at_a, at_b in zip(points, np.roll(points, -1, 0), ahead, np.roll(ahead, -1), strict=True):
         if at_a > 0:
-            kept.append(a)
+            clipped.append(a)
         if (at_a > 0) != (at_b > 0):
-            kept.append(a + at_a / (at_a - at_b) * (b - a))
-    return np.array(kept).reshape(-1, 3)
+            clipped.append(a + at_a / (at_a - at_b) * (b - a))
+    return np.array(clipped).reshape(-1, 3)

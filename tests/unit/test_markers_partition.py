@@ -18,7 +18,7 @@ from fidsplat.markers.partition import (
     chords,
     concave_vertices,
     independent_chords,
-    least_rectangles,
+    minimum_rectangles,
     partition,
 )
 from fidsplat.markers.regions import label_components
@@ -162,14 +162,14 @@ def test_the_estimate_is_a_lower_bound(grid):
         for label in set(around.ravel().tolist()) - {-1}:
             cells = around == label
             corners += {1: 1, 3: 1, 2: 2 * (cells[0, 0] == cells[1, 1])}.get(int(cells.sum()), 0)
-    assert 4 * least_rectangles(grid) <= corners
-    assert least_rectangles(grid) <= len(partition(grid))
+    assert 4 * minimum_rectangles(grid) <= corners
+    assert minimum_rectangles(grid) <= len(partition(grid))
 
 
 def test_the_estimate_is_near():
-    assert least_rectangles(CHECKERBOARD) == 36
+    assert minimum_rectangles(CHECKERBOARD) == 36
     noise = (np.random.default_rng(0).random((150, 150)) < 0.5).astype(np.uint8)
-    assert least_rectangles(noise) > 0.85 * len(partition(noise))
+    assert minimum_rectangles(noise) > 0.85 * len(partition(noise))
 
 
 def test_every_tag_of_36h11():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import fidsplat as fs
 from fidsplat.markers import marker
-from fidsplat.markers.cover import _met, turned
+from fidsplat.markers.cover import _met, rotated
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.markers.paths import circle_rings, path_rings
 from fidsplat.markers.shapes import _crosses, filled
@@ -48,7 +48,7 @@ def test_shapes_are_painted_one_over_the_other(tmp_path):
 
 def test_rectangles_of_whole_modules_are_as_few_as_can_be(tmp_path):
     made = drawn(tmp_path, '<path d="M10 5h20v10h-20z" fill="red"/>', quiet_zone=2)
-    assert (made.regions, made.turns, made.boxes.dtype) == (None, None, np.int64)
+    assert (made.regions, made.angles, made.boxes.dtype) == (None, None, np.int64)
     assert len(made.boxes) == 5
 
 
@@ -61,7 +61,7 @@ CURVED = (
 def test_rectangles_cover_what_is_drawn_and_no_more(tmp_path):
     """Circles, obtuse and acute corners, a sliver thinner than a module, of either colour at an edge."""
     made = drawn(tmp_path, CURVED, quiet_zone=2)
-    rectangles = np.array(shapely.polygons(turned(made.boxes, made.boxes, made.turns)))
+    rectangles = np.array(shapely.polygons(rotated(made.boxes, made.boxes, made.angles)))
     assert made.palette.tolist()[0] == [1, 1, 1]
     assert len(made.regions) == len(made.palette) == 5
     assert sum(region.area for region in made.regions) == pytest.approx(made.grid.size, abs=1e-4)

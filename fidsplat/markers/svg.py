@@ -1,8 +1,8 @@
-"""Drawings: the filled shapes of an SVG file in their colours, as polygons with holes.
+"""SVG drawings: the filled shapes of a file in their colours, as polygons with holes.
 
-What is drawn are the polygons themselves; `Marker.bits` have in each module the topmost shape that holds its
-centre. Everything that is filled in one colour is understood; what would have to be left out (text, strokes,
-gradients, pictures) is an error, so that no drawing comes out other than it looks.
+The splats cover the polygons themselves; `Marker.bits` has in each module the topmost shape at its centre.
+Shapes filled with one colour are supported. Everything else (text, strokes, gradients, images) is an error, so
+that a marker never differs from its drawing.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _MOVES = ("transform", "transform-origin", "translate", "rotate", "scale")
 
 @dataclass(frozen=True, kw_only=True)
 class DrawingSpec(Spec):
-    """A drawing's spec."""
+    """Spec of a drawing."""
 
     modules: int = MODULES
     """modules across"""
@@ -65,7 +65,7 @@ class _Style:
 
 
 class _File(NamedTuple):
-    """What all of a drawing is read by."""
+    """Context shared by all elements of a drawing."""
 
     name: str | None
     sheet: list[Rule]
@@ -74,7 +74,7 @@ class _File(NamedTuple):
 def _parse(text: str, head: str, rest: str) -> DrawingSpec:
     found = _HEAD.fullmatch(head)
     if found is None:
-        raise InputError(f"{head!r} is no kind of drawing; write svg:FILE.svg or svg-512:FILE.svg")
+        raise InputError(f"a drawing must be svg:FILE.svg or svg-512:FILE.svg, got {head!r}")
     modules = int(found["modules"] or MODULES)
     if not 1 <= modules <= MOST_MODULES:
         raise InputError(f"{text!r}: a drawing has 1 to {MOST_MODULES} modules across")
@@ -122,14 +122,14 @@ def _root(path: Path) -> ElementTree.Element:
     try:
         root = ElementTree.fromstring(read_input(path, MOST_BYTES))
     except ElementTree.ParseError as error:
-        raise InputError(f"{path} is no SVG file: {error}") from None
+        raise InputError(f"cannot read {path} as SVG: {error}") from None
     if _tag(root) != "svg":
-        raise InputError(f"{path} is no SVG file: it begins with <{_tag(root)}>")
+        raise InputError(f"cannot read {path} as SVG: it begins with <{_tag(root)}>")
     return root
 
 
 def _view(root: ElementTree.Element, name: str | None) -> tuple[float, float, float, float]:
-    """The part of the plane that the drawing shows: x, y, width, height."""
+    """The view box: x, y, width, height."""
     box = [float(side) for side in re.findall(_NUMBER, root.get("viewBox", ""))]
     if not box:
         sides = [re.match(_NUMBER, root.get(side, "")) for side in ("width", "height")]
@@ -165,7 +165,7 @@ def _shapes(
     if depth > 100:
         raise InputError(f"{name}: groups are nested deeper than 100")
     if tag == "svg" and depth and any(key in element.attrib for key in _PLACES):
-        raise InputError(f"{name}: it has a drawing within the drawing; make it a group")
+        raise InputError(f"{name}: a nested <svg> is not supported; make it a group")
     for what in _REFUSED:
         if look.get(what, "none") not in ("none", "normal"):
             raise InputError(f"{name}: <{tag}> has a {what}; convert it to filled paths")
@@ -194,7 +194,7 @@ def _inherited(style: _Style, look: dict[str, str]) -> _Style:
 
 
 def _first(switch: ElementTree.Element) -> list[ElementTree.Element]:
-    """The child that is drawn: the first that asks for no extension and no language."""
+    """The rendered child of a <switch>: the first without required extension and language."""
     asks = ("requiredExtensions", "systemLanguage")
     free = (
         child
@@ -221,7 +221,7 @@ def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
             return circle_rings(side("cx"), side("cy"), rx, ry)
     except ValueError as error:
         raise InputError(f"{name}: <{tag}> cannot be read: {error}") from None
-    raise InputError(f"{name}: <{tag}> is no filled shape; convert it to a path")
+    raise InputError(f"{name}: <{tag}> must be a filled shape; convert it to a path")
 
 
 def _look(element: ElementTree.Element, tag: str, file: _File) -> dict[str, str]:
@@ -253,7 +253,7 @@ def _color(text: str, name: str | None) -> tuple[float, float, float]:
     if found := re.fullmatch(r"rgb\(\s*(\d{1,9})[\s,]+(\d{1,9})[\s,]+(\d{1,9})\s*\)", word):
         r, g, b = (min(int(part), 255) / 255 for part in found.groups())
         return r, g, b
-    raise InputError(f"{name}: the fill {text!r} is no plain colour; write #rrggbb, rgb(r, g, b) or a name")
+    raise InputError(f"{name}: a fill must be #rrggbb, rgb(r, g, b) or a name, got {text!r}")
 
 
 def _transform(text: str, name: str | None) -> np.ndarray:
