@@ -30,8 +30,8 @@ class BrownConrady:
     """Radial (k1 to k6), tangential (p1, p2) and thin-prism (s1 to s4) distortion of a perspective image,
     as `cv2.projectPoints` has them. All 0 is a pinhole.
 
-    Directions beyond the first fold of the radial part are outside the field of view. Raises InputError for a coefficient
-    that is not finite.
+    Directions beyond the first fold of the radial part are outside the field of view. Raises InputError for a
+    coefficient that is not finite.
     """
 
     k1: float = 0.0
@@ -124,7 +124,8 @@ class BrownConrady:
             return np.moveaxis(np.stack([by_x, by_y, -(x * by_x + y * by_y)]), (0, 1, 2), (2, 1, 0))
 
     def rays(self, image: np.ndarray) -> np.ndarray:
-        """Directions (n, 3) = (X / Z, Y / Z, 1) of image coordinates (n, 2); NaN outside the field of view."""
+        """Directions (n, 3) = (X / Z, Y / Z, 1) of image coordinates (n, 2); NaN outside the field of
+        view."""
         a, b = image.T
         distance = np.hypot(a, b)
         x, y = _scaled(a, b, distance, self._undistorted(distance))
@@ -137,12 +138,15 @@ class BrownConrady:
                 if not np.nanmax(np.abs(off_a) + np.abs(off_b), initial=0.0) > 1e-13:
                     break
             here_a, here_b, a_x, a_y, b_x, b_y = self._distorted(x, y)
-            visible = (np.abs(here_a - a) + np.abs(here_b - b) < 1e-9 * (1 + distance)) & (a_x * b_y > a_y * b_x)
+            visible = (np.abs(here_a - a) + np.abs(here_b - b) < 1e-9 * (1 + distance)) & (
+                a_x * b_y > a_y * b_x
+            )
             visible &= np.hypot(x, y) < self.fold
         return np.where(visible[:, None], np.stack([x, y, np.ones_like(x)], 1), np.nan)
 
     def _undistorted(self, distance: np.ndarray) -> np.ndarray:
-        """tan of the angles at which the radial part, without the others, has these distances from the centre."""
+        """tan of the angles at which the radial part, without the others, has these distances from the
+        centre."""
         symmetric = BrownConrady(self.k1, self.k2, self.k3, self.k4, self.k5, self.k6)
 
         def radial(tangent: np.ndarray) -> np.ndarray:
@@ -166,8 +170,8 @@ class Fisheye:
     """Kannala-Brandt fisheye as `cv2.fisheye` has it: a ray at the angle t from the axis falls at the
     distance t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle. All 0 is the equidistant lens.
 
-    The field of view reaches 100 degrees from the axis, or less where that polynomial folds back. Raises InputError for a
-    coefficient that is not finite.
+    The field of view reaches 100 degrees from the axis, or less where that polynomial folds back. Raises
+    InputError for a coefficient that is not finite.
     """
 
     k1: float = 0.0
@@ -312,7 +316,7 @@ def _check(lens) -> None:
         ):
             raise InputError(
                 f"lens coefficient {field.name} must be a finite number, in size at most "
-                f"{MAX_COEFFICIENT:g}, not {value!r}"
+                f"{MAX_COEFFICIENT:g}, got {value!r}"
             )
         object.__setattr__(lens, field.name, float(value))
 

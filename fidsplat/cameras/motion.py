@@ -47,14 +47,14 @@ class Shutter:
         for name in ("time", "exposure_time", "readout"):
             value = getattr(self, name)
             if not math.isfinite(as_float(value)):
-                raise InputError(f"shutter {name} must be a finite number of seconds, not {value!r}")
+                raise InputError(f"shutter {name} must be a finite number of seconds, got {value!r}")
             if name != "time" and value < 0:
-                raise InputError(f"shutter {name} must be 0 or more seconds, not {value!r}")
+                raise InputError(f"shutter {name} must be 0 or more seconds, got {value!r}")
         for name, most in (("sub_poses", MAX_SUB_POSES), ("rows_per_band", math.inf)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
                 limit = f"1 to {MAX_SUB_POSES}" if name == "sub_poses" else "1 or more"
-                raise InputError(f"shutter {name} must be a whole number, {limit}, not {value!r}")
+                raise InputError(f"shutter {name} must be a whole number, {limit}, got {value!r}")
 
     def bands(self, height: int) -> list[tuple[int, int, float]]:
         """(first row, end row, middle of its exposure time) of the bands of an image of `height` rows."""

@@ -42,8 +42,8 @@ class Camera(PickledByFields):
     world_to_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) float64, rigid, read-only"""
     near: float = 0.01
-    """metres along z (along the ray for a fisheye or panorama), above 0; no part of a splat that is nearer is
-    drawn"""
+    """metres along z (along the ray for a fisheye or panorama), above 0; nearer parts of a splat are
+    clipped"""
     far: float = math.inf
     """metres, likewise, above near; a splat completely beyond it is not rendered"""
 
@@ -61,7 +61,7 @@ class Camera(PickledByFields):
         for name in ("fx", "fy", "cx", "cy", "near", "far"):
             put(self, name, _number(name, getattr(self, name)))
         if not (0 < self.near < math.inf):
-            raise InputError(f"camera near must be above 0 and finite, not {self.near!r}")
+            raise InputError(f"camera near must be above 0 and finite, got {self.near!r}")
         smallest, largest = FOCAL_LENGTHS
         for name in ("fx", "fy"):
             if not smallest <= getattr(self, name) <= largest:
@@ -71,7 +71,7 @@ class Camera(PickledByFields):
                 )
         for name in ("cx", "cy"):
             if not abs(getattr(self, name)) <= LARGEST:
-                raise InputError(f"camera {name} must be finite, not {getattr(self, name)!r}")
+                raise InputError(f"camera {name} must be finite, got {getattr(self, name)!r}")
         if not self.far > self.near:
             raise InputError(f"camera far ({self.far!r}) must be above near ({self.near!r})")
         check_similarity(self.world_to_camera, "camera world_to_camera", rigid=True)
@@ -112,7 +112,7 @@ class Camera(PickledByFields):
                 )
             if covered == 0:
                 raise InputError(
-                    f"camera lens: the complete image is outside the field of view of a {lens.kind} lens; check fx, fy "
+                    f"camera lens: no pixel is in the field of view of a {lens.kind} lens; check fx, fy "
                     f"({self.fx:g}, {self.fy:g} pixels per radian) and cx, cy ({self.cx:g}, {self.cy:g})"
                 )
 
@@ -138,7 +138,7 @@ class Camera(PickledByFields):
         """
         factors = np.ravel(coefficients).tolist()
         if len(factors) != 4:
-            raise InputError(f"a fisheye has 4 coefficients, k1 to k4, not {len(factors)}")
+            raise InputError(f"a fisheye has 4 coefficients, k1 to k4, got {len(factors)}")
         lens, width, height = Fisheye(*factors), _size("width", width), _size("height", height)
         f = fisheye_focal_length(width, fov_x, lens)
         pose = np.eye(4) if world_to_camera is None else world_to_camera
@@ -158,7 +158,7 @@ class Camera(PickledByFields):
         width, height = _size("width", width), _size("height", height)
         across = _number("metres_wide", metres_wide)
         if not 0 < across < math.inf:
-            raise InputError(f"camera metres_wide must be above 0 and finite, not {metres_wide!r}")
+            raise InputError(f"camera metres_wide must be above 0 and finite, got {metres_wide!r}")
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         f = width / across
         return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, lens=Orthographic())
@@ -196,8 +196,8 @@ class Camera(PickledByFields):
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
 
     def rays(self, pixels) -> np.ndarray:
-        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN where nothing is
-        seen.
+        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN outside
+        the field of view.
 
         Scaled to Z = 1, or to unit length for a fisheye or panorama. Raises InputError for an orthographic
         camera, whose rays differ by where they start.
@@ -223,7 +223,7 @@ def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
     if not 1e-9 < angle <= 2 * lens.limit + 1e-12:
         raise InputError(
             f"camera fov_x of this fisheye must lie between 0 and {math.degrees(2 * lens.limit):.4g} "
-            f"degrees, not {math.degrees(angle):.6g}"
+            f"degrees, got {math.degrees(angle):.6g}"
         )
     return width / 2 / float(lens.distance(angle / 2))
 
@@ -235,7 +235,7 @@ def focal_length(width: int, fov_x: float) -> float:
     """
     width, angle = _size("width", width), _number("fov_x", fov_x)
     if not 1e-9 < angle < math.pi:
-        raise InputError(f"camera fov_x must lie between 0 and pi radians (180 degrees), not {angle!r}")
+        raise InputError(f"camera fov_x must be between 0 and pi radians (180 degrees), got {angle!r}")
     return width / 2 / math.tan(angle / 2)
 
 
@@ -271,9 +271,9 @@ def _size(name: str, value) -> int:
             raise TypeError
         size = operator.index(value)
     except TypeError:
-        raise InputError(f"camera {name} must be a whole number of pixels, not {value!r}") from None
+        raise InputError(f"camera {name} must be a whole number of pixels, got {value!r}") from None
     if not 1 <= size <= MAX_SIZE:
-        raise InputError(f"camera {name} must be 1 to {MAX_SIZE} pixels, not {size}")
+        raise InputError(f"camera {name} must be 1 to {MAX_SIZE} pixels, got {size}")
     return size
 
 
@@ -281,11 +281,11 @@ def _number(name: str, value) -> float:
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"camera {name} must be a number, not {value!r}") from None
+        raise InputError(f"camera {name} must be a number, got {value!r}") from None
 
 
 def _vector(name: str, value) -> np.ndarray:
     vector = real_array(f"camera {name}", value, "three numbers")
     if vector.shape != (3,) or not (np.abs(vector) <= LARGEST).all():
-        raise InputError(f"camera {name} must be three numbers, at most {LARGEST:g}, not {value!r}")
+        raise InputError(f"camera {name} must be three numbers, at most {LARGEST:g}, got {value!r}")
     return vector

@@ -53,8 +53,8 @@ class RayRaster:
 
     @cached_property
     def slopes(self) -> np.ndarray:
-        """(h, w, 2, 3) float32: derivatives of the rays by x and by y, per sample; NaN where nothing is
-        seen."""
+        """(h, w, 2, 3) float32: derivatives of the rays by x and by y, per sample; NaN outside
+        the field of view."""
         if self.whole is not None:
             return self.whole.slopes[self.top : self.top + self.height]
         slopes = np.empty((self.height, self.width, 2, 3), np.float32)

@@ -46,7 +46,7 @@ class Trajectory(PickledByFields):
         times = real_array("the times of a trajectory", self.times, "increasing numbers of seconds")
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise InputError(
-                "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "
+                "the times of a trajectory must be one or more finite, increasing numbers of seconds, got "
                 f"{_shown(self.times, times)}"
             )
         count = len(self.poses) if isinstance(self.poses, Sequence) or np.ndim(self.poses) else 0
@@ -99,8 +99,8 @@ class Trajectory(PickledByFields):
         along = np.array([twist(*pair) for pair in itertools.pairwise(self.poses)]) / durations
         before, after = durations[:-1], durations[1:]
         inner = (along[:-1] * after + along[1:] * before) / (before + after)
-        # a fast rotation in a short interval must not spin through a long neighbouring one: a third of that one's
-        # turn, which is what the curve takes, stays below a quarter turn, so that it has one direction
+        # a fast rotation in a short interval must not spin through a long neighbouring one: a third of that
+        # one's turn, which is what the curve takes, stays below a quarter turn, so that it has one direction
         rotations = np.linalg.norm(inner[:, :3], axis=1, keepdims=True) * np.maximum(before, after) / 3
         inner *= np.minimum(1.0, math.pi / 2 / np.maximum(rotations, 1e-300))
         return np.concatenate([along[:1], inner, along[-1:]])
@@ -147,7 +147,7 @@ def _of_vector(k: int, vector) -> np.ndarray:
     numbers = real_array(f"pose {k} of a trajectory", vector, "x, y, z and a quaternion w, x, y, z")
     if numbers.shape != (7,) or not np.isfinite(numbers).all():
         raise InputError(
-            f"pose {k} of a trajectory must be 7 finite numbers, x, y, z and a quaternion w, x, y, z, not "
+            f"pose {k} of a trajectory must be 7 finite numbers, x, y, z and a quaternion w, x, y, z, got "
             f"{numbers.tolist()}"
         )
     length = float(np.linalg.norm(numbers[3:]))

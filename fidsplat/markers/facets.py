@@ -1,8 +1,8 @@
 """`facets`: Gaussians that are opaque and end in straight lines, because they lie in the planes of a dish.
 
-Ordered by depth per pixel, of two opaque splats that cross the nearer one is visible on either side of the line
-in which they do. So each module has a splat much larger than itself, in a plane of its own: the planes are
-those of the facets of a shallow dish, of which at every point the module's own is the nearest. What a
+Ordered by depth per pixel, of two opaque splats that cross the nearer one is visible on either side of the
+line in which they do. So each module has a splat much larger than itself, in a plane of its own: the planes
+are those of the facets of a shallow dish, of which at every point the module's own is the nearest. What a
 Gaussian lacks towards the corners of its module its copies make up, and what still comes through shows its
 neighbours.
 

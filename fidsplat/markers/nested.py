@@ -1,8 +1,8 @@
 """Templates by a formula instead of a fit: Gaussians that shrink geometrically towards the edges.
 
 Along each axis there is one Gaussian in the middle and pairs at the distances d = ratio^-k from the ends.
-Each is so wide that it has decayed to the level set by its reach at its overhang beyond the end. A template is
-their product over both axes. Every point inside is in the cores of several.
+Each is so wide that it has decayed to the level set by its reach at its overhang beyond the end. A template
+is their product over both axes. Every point inside is in the cores of several.
 
 562 Gaussians of a square are opaque up to its edges, and end, where other renderers cut them off, 0.03 half
 widths beyond: in whatever order splats are composited, nothing hides anything. 121 leave a tenth of the light

@@ -78,7 +78,9 @@ def without_slivers(printed: Printed) -> Printed:
     thick = sides.min(1) >= SLIVER
     if not thick.any():
         return printed
-    return printed._replace(boxes=printed.boxes[thick], values=printed.values[thick], angles=printed.angles[thick])
+    return printed._replace(
+        boxes=printed.boxes[thick], values=printed.values[thick], angles=printed.angles[thick]
+    )
 
 
 def aspect_of(boxes: np.ndarray) -> np.ndarray:

@@ -29,9 +29,7 @@ class QrSpec(Spec):
 def _parse(text: str, head: str, rest: str) -> QrSpec:
     code = _HEAD.fullmatch(head)
     if code is None:
-        raise InputError(
-            f"a QR spec must be qr:TEXT, qr-v22-L:TEXT, qr-v22:TEXT or qr-L:TEXT, got {head!r}"
-        )
+        raise InputError(f"a QR spec must be qr:TEXT, qr-v22-L:TEXT, qr-v22:TEXT or qr-L:TEXT, got {head!r}")
     version, level = code["version"], code["level"]
     number = None if version is None else int(version)
     if number is not None and number not in _VERSIONS:

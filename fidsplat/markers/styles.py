@@ -66,8 +66,8 @@ def declarations(text: str) -> dict[str, str]:
 
 
 def rules(text: str) -> list[Rule]:
-    """The rules of a style sheet, lowest specificity first. Raises ValueError for a selector of another kind than
-    ``tag``, ``.class``, ``#id`` and these together, and for at-rules."""
+    """The rules of a style sheet, lowest specificity first. Raises ValueError for a selector of another kind
+    than ``tag``, ``.class``, ``#id`` and these together, and for at-rules."""
     text = _COMMENT.sub("", text)
     left = _RULE.sub("", text).strip()
     if left:

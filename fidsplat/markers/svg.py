@@ -1,8 +1,8 @@
 """SVG drawings: the filled shapes of a file in their colours, as polygons with holes.
 
 The splats cover the polygons themselves; `Marker.bits` has in each module the topmost shape at its centre.
-Shapes filled with one colour are supported. Everything else (text, strokes, gradients, images) is an error, so
-that a marker never differs from its drawing.
+Shapes filled with one colour are supported. Everything else (text, strokes, gradients, images) is an error,
+so that a marker never differs from its drawing.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ class BopScene:
         camera = truth.camera
         if camera.lens is not None:
             raise InputError(
-                "the camera of a BOP scene must be a pinhole without lens; render without one, or undistort first"
+                "a BOP scene must have a pinhole camera without lens; render without one, or undistort"
             )
         number = len(self._cameras)
         name = f"{number:06d}"

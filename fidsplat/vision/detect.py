@@ -82,8 +82,8 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
         return []
     if max(pixels.shape[:2]) > MAX_SIDE:
         raise InputError(
-            f"an image of {pixels.shape[1]} x {pixels.shape[0]} pixels must be smaller for detection: at most "
-            f"{MAX_SIDE} a side: cut it up, or make it smaller"
+            f"an image must have at most {MAX_SIDE} pixels a side for detection, got {pixels.shape[1]} x "
+            f"{pixels.shape[0]}; crop or downsample it"
         )
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
     found: list[Detection] = []

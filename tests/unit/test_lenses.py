@@ -110,7 +110,7 @@ def test_a_lens_that_does_nothing_is_none():
     [
         (lambda: BrownConrady(k1=math.nan), "k1 must be a finite number"),
         (lambda: Fisheye(k2="a"), "k2 must be a finite number"),
-        (lambda: BrownConrady(k6=-1e300), r"k6 must be .*at most 1e\+12, not -1e\+300"),
+        (lambda: BrownConrady(k6=-1e300), r"k6 must be .*at most 1e\+12, got -1e\+300"),
         (lambda: BrownConrady.opencv([1, 2, 3]), "3 coefficients.*4, 5, 8, 12 or 14"),
         (
             lambda: BrownConrady.opencv([0.1] * 12 + [0, 0.02]),
@@ -120,8 +120,11 @@ def test_a_lens_that_does_nothing_is_none():
             lambda: fs.Camera.pinhole(64, 48, 20, 20, 32, 24, lens=BrownConrady(k1=-0.5, p2=0.01)),
             r"distortion \(k1 = -0.5, p2 = 0.01\) cannot be inverted in .* focal length \(20 pixels\)",
         ),
-        (lambda: fs.Camera.pinhole(64, 48, 9, 9, 900, 24, lens=Fisheye()), "outside what a fisheye .*900"),
-        (lambda: fs.Camera.fisheye(64, 48, 1.0, coefficients=[0.1] * 5), "4 coefficients, k1 to k4, not 5"),
+        (
+            lambda: fs.Camera.pinhole(64, 48, 9, 9, 900, 24, lens=Fisheye()),
+            "field of view of a fisheye .*900",
+        ),
+        (lambda: fs.Camera.fisheye(64, 48, 1.0, coefficients=[0.1] * 5), "4 coefficients, k1 to k4, got 5"),
         (lambda: fs.Camera.pinhole(64, 48, 20, 20, 32, 24, lens="fisheye"), "lens is 'fisheye'"),
         (lambda: fs.Camera.fisheye(64, 48, math.radians(201)), "between 0 and 200 degrees"),
         (lambda: fs.Camera.orthographic(64, 48, 0.0), "metres_wide must be above 0"),

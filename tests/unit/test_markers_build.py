@@ -186,10 +186,10 @@ def test_the_same_bits_on_every_run():
         ({"mixture": "paper", "levels": 40}, "1 to 8"),
         ({"mixture": "facets", "template": 9}, "'facets' has none"),
         ({"mixture": "facets", "growth": 0.1}, "'facets' has no seams"),
-        ({"mixture": "facets", "max_splats": 587}, "becomes 588 splats"),
+        ({"mixture": "facets", "max_splats": 587}, "at most 587 splats, got 588"),
         ({"max_splats": 0}, "max_splats must be .* got 0"),
         ({"max_splats": "many"}, "whole number from 1"),
-        ({"max_splats": 10}, "apriltag:36h11:0 becomes at least"),
+        ({"max_splats": 10}, "apriltag:36h11:0 must have at most 10 splats, got at least"),
     ],
 )
 def test_bad_options_are_refused(options, says):
@@ -208,21 +208,23 @@ def test_too_many_splats_are_refused_before_the_work(noise, monkeypatch):
         raise AssertionError("cut into rectangles all the same")
 
     monkeypatch.setattr("fidsplat.markers.build.partition_colors", partition)
-    with pytest.raises(fs.InputError, match=r"at least 1\d\d,\d{3} splats, more than 100,000: .*max_splats"):
+    with pytest.raises(
+        fs.InputError, match=r"at most 100,000 splats, got at least 1\d\d,\d{3}; .*max_splats"
+    ):
         marker(noise, mixture="fitted", max_splats=100_000)
 
 
 def test_too_many_splats_are_refused_by_their_number(noise):
     count = len(marker(noise, mixture="fitted").cloud)
     assert len(marker(noise, mixture="fitted", max_splats=count).cloud) == count
-    with pytest.raises(fs.InputError, match=f"becomes {count:,} splats, more than {count - 1:,}"):
+    with pytest.raises(fs.InputError, match=f"at most {count - 1:,} splats, got {count:,}"):
         marker(noise, mixture="fitted", max_splats=count - 1)
 
 
 def test_an_exact_marker_may_have_more_boxes_than_gaussians(noise):
     made = marker(noise, mixture="exact", max_splats=100_000)
     assert len(made.cloud) == len(made.boxes)
-    with pytest.raises(fs.InputError, match=r"as Gaussians image:.* more than 100,000"):
+    with pytest.raises(fs.InputError, match=r"as Gaussians image:.* at most 100,000 splats"):
         _ = made.gaussians
 
 
@@ -246,7 +248,7 @@ def test_a_large_checkerboard(tmp_path):
     spec = f"image:{write_png(tmp_path / 'board.png', bits)}"
     made = marker(spec, mixture="exact")
     assert len(made.cloud) == made.components == 1_000_000
-    with pytest.raises(fs.InputError, match="at least 25,000,000 splats"):
+    with pytest.raises(fs.InputError, match="at least 25,000,000"):
         marker(spec, mixture="fitted")
 
 

@@ -158,10 +158,10 @@ def test_circles():
 @pytest.mark.parametrize(
     ("body", "says"),
     [
-        ("<text>STOP</text>", "<text> is no filled shape"),
+        ("<text>STOP</text>", "<text> must be a filled shape"),
         ('<rect width="5" height="5" stroke="red"/>', "<rect> has a stroke"),
         ('<use href="#a"/>', "convert it to a path"),
-        ('<rect width="5" height="5" fill="url(#a)"/>', "no plain colour"),
+        ('<rect width="5" height="5" fill="url(#a)"/>', "a fill must be"),
         ('<rect width="5" height="5" opacity="0.5"/>', "translucent"),
         ('<g clip-path="url(#a)"/>', "has a clip-path"),
         ('<g transform="skewX(5 5)"/>', "skewX"),
@@ -187,7 +187,7 @@ def test_circles():
             5 * '<g transform="scale(1e9)">' + 40 * "<g>" + '<rect width="9" height="9"/>' + 45 * "</g>",
             "too far",
         ),
-        ('<rect width="5" height="5" fill="rgb(%s,0,0)"/>' % ("9" * 5000), "no plain colour"),
+        ('<rect width="5" height="5" fill="rgb(%s,0,0)"/>' % ("9" * 5000), "a fill must be"),
         ('<rect width="5" height="5" opacity="50%"/>', "translucent"),
         ("<g>" * 200 + "</g>" * 200, "deeper than 100"),
     ],
@@ -202,7 +202,7 @@ def test_what_cannot_be_drawn_as_it_looks_is_refused(tmp_path, body, says):
 def test_files_that_are_no_drawings(tmp_path):
     file = tmp_path / "a.svg"
     for text, says in (
-        ("", "no SVG file"),
+        ("", "as SVG"),
         ("<html/>", "begins with <html>"),
         ("<svg/>", "no viewBox"),
         ('<svg viewBox="0 0 0 5"/>', "above 0"),

@@ -70,7 +70,7 @@ CHANGES = [
     ('file = "empty.ply"\n', "", "splats[0].file is missing"),
     ("64", "64.0", "camera.width must be a whole number"),
     ("64", "true", "camera.width must be a whole number"),
-    ("64", "0", "camera: camera width must be 1 to 32767 pixels, not 0"),
+    ("64", "0", "camera: camera width must be 1 to 32767 pixels, got 0"),
     ("64", "-1", "camera width must be 1 to 32767"),
     ("48", "40000", "camera height must be 1 to 32767"),
     ("48", "1" + "0" * 400, "camera.height must be a whole number of at most 64 bits"),

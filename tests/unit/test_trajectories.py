@@ -91,7 +91,7 @@ def test_samples_are_taken_at_a_rate():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: fs.Trajectory([0, 1, 1], np.zeros((3, 7))), r"not 1 and then 1 \(number 2"),
+        (lambda: fs.Trajectory([0, 1, 1], np.zeros((3, 7))), r"got 1 and then 1 \(number 2"),
         (lambda: fs.Trajectory([0.0], [[0, 0, 0, 1, 1, 0, 0]]), "length 1.41421.*w, x, y, z"),
         (lambda: fs.Trajectory([0.0], [[0, 0, math.nan, 1, 0, 0, 0]]), "pose 0 .* 7 finite numbers"),
         (lambda: fs.Trajectory([0.0], np.eye(4)[None], smooth="yes"), "smooth is 'yes'"),
@@ -218,7 +218,7 @@ def test_files_that_hold_no_trajectory(tmp_path):
     eye = [np.eye(4).tolist()] * 2
     frames = [{"transform_matrix": m, "time": 1.0} for m in eye]
     (tmp_path / "t.json").write_text(json.dumps({"frames": frames}))
-    with pytest.raises(fs.InputError, match=r"t.json: the times .* not 1 and then 1"):
+    with pytest.raises(fs.InputError, match=r"t.json: the times .* got 1 and then 1"):
         fs.load_trajectory(tmp_path / "t.json")
     (tmp_path / "large.tum").write_bytes(b"")
     with (tmp_path / "large.tum").open("r+b") as stream:

@@ -113,7 +113,7 @@ def test_flow_of_what_does_not_move_is_nothing(frame, scene):
 
 
 def test_flow_that_cannot_be(frame, scene):
-    with pytest.raises(fs.InputError, match="no label image"):
+    with pytest.raises(fs.InputError, match="need a label image"):
         optical_flow(frame["depth"], scene.camera, scene.camera, motions={1: np.eye(4)})
     with pytest.raises(fs.InputError, match="motion of label 1 must be rigid"):
         optical_flow(frame["depth"], scene.camera, scene.camera, frame["label"], {1: np.diag([2, 2, 2, 1])})
@@ -142,7 +142,7 @@ def test_coco_reads_what_we_write(tmp_path, truth, scene, frame):
     ours = CocoAnnotations({BOX: "block"})
     ours.add("a.png", truth)
     ours.add("b.png", truth_of({"rgb": frame["rgb"]}, scene))
-    with pytest.raises(fs.InputError, match=r"'a\.png' is annotated already"):
+    with pytest.raises(fs.InputError, match=r"got 'a\.png', which is annotated"):
         ours.add("a.png", truth)
     ours.save(tmp_path / "truth.json")
     with contextlib.redirect_stdout(io.StringIO()):
@@ -214,7 +214,7 @@ def test_bop_has_what_its_format_asks_for(tmp_path, truth, frame, scene):
 
 
 def test_bop_has_no_lenses(tmp_path, truth, frame):
-    with pytest.raises(fs.InputError, match="pinhole cameras alone"):
+    with pytest.raises(fs.InputError, match="must have a pinhole camera"):
         BopScene(tmp_path / "a/b/c").add(frame, replace(truth, camera=a_camera(lens=LENSES[1])))
 
 

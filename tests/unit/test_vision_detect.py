@@ -213,8 +213,8 @@ def test_what_has_no_pose():
     camera, corners = Camera.pinhole(9, 9, 9, 9, 4, 4), np.eye(4)[:, :2]
     for given, says in (
         ((np.eye(4), 0.1, camera), r"corners must be \(4, 2\)"),
-        ((corners, (0, 0, 0), camera), "size must be metres above 0"),
-        ((corners, float("nan"), camera), "size must be metres above 0"),
+        ((corners, (0, 0, 0), camera), "size must be a positive length"),
+        ((corners, float("nan"), camera), "size must be a positive length"),
         ((corners, 0.1, None), "camera must be a Camera, not NoneType"),
     ):
         with pytest.raises(InputError, match=says):
