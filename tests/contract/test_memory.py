@@ -86,7 +86,7 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
         return bands
 
     monkeypatch.setattr(opencl.backend, "pair_budget", budget)
-    monkeypatch.setattr("fidsplat.backends.opencl.tiling.cut", noted)
+    monkeypatch.setattr("fidsplat.backends.opencl.tiling.split_by_cost", noted)
     frame = opencl.render(cloud, CAMERA, ALL_OUTPUTS)
     assert len(bands) == 2
     assert max(pairs for _, _, pairs in bands) <= budget
