@@ -91,14 +91,14 @@ class View:
         return Orthographic() if self.parallel else None
 
     @property
-    def turns_of_rows(self) -> np.ndarray:
+    def row_rotations(self) -> np.ndarray:
         """(h, 3, 3) world to camera, for each row of pixels that of the pose which normals show there."""
-        turns = np.tile(self.rotation, (self.height // self.samples, 1, 1))
+        rotations = np.tile(self.rotation, (self.height // self.samples, 1, 1))
         for sub_frame in self.sub_frames:
             if sub_frame.middle:
                 top = sub_frame.top // self.samples
-                turns[top : top + sub_frame.view.height // self.samples] = sub_frame.view.rotation
-        return turns
+                rotations[top : top + sub_frame.view.height // self.samples] = sub_frame.view.rotation
+        return rotations
 
     def rows(self, top: int, end: int) -> View:
         """The view of rows of samples [top, end) alone."""
@@ -141,8 +141,8 @@ class View:
         """An array of an effect, by its name: float32, but int32 labels."""
         if self.external_depth is not None and name.startswith("external_"):
             return getattr(self.external_depth, name.removeprefix("external_"))
-        if name == "turns":
-            return self.turns_of_rows.astype(np.float32)
+        if name == "row_rotations":
+            return self.row_rotations.astype(np.float32)
         if name == "panorama" and isinstance(self.surroundings, Panorama):
             return self.surroundings.image
         return np.asarray(self.sensor.response, np.float32)

@@ -65,7 +65,7 @@ def test_outputs_of_a_blurred_band_show_its_middle_pose_in_all_of_its_rows():
         )
         bands = [(0, 10), (10, 20), (20, 24)]
         assert [sub_frame.middle for sub_frame in view.sub_frames] == [False, True, False] * 3
-        assert view.turns_of_rows.shape == (24, 3, 3)
+        assert view.row_rotations.shape == (24, 3, 3)
         for top, end in bands:
             time = 0.1 + 0.4 * ((top + end) / 2 / 24 - 0.5)
-            assert np.allclose(view.turns_of_rows[top:end], turning(time)[:3, :3], atol=1e-12)
+            assert np.allclose(view.row_rotations[top:end], turning(time)[:3, :3], atol=1e-12)

@@ -213,7 +213,7 @@ LAYOUTS: dict[str, Layout] = {
     "external_depth_end": Layout("part/external_depth_end.cl"),
     "coverage": Layout("part/coverage.cl"),
     "ray": Layout(resolve=RAY_UNIFORMS),
-    "row_rotation": Layout("part/row_rotation.cl", resolve=takes("array float turns  // (h, 3, 3)")),
+    "row_rotation": Layout("part/row_rotation.cl", resolve=takes("array float row_rotations  // (h, 3, 3)")),
     # rays of fisheyes and panoramas have a length of 1
     "ray_length": Layout("part/ray_length.cl", behind=(("camera_brown_conrady", "rays_length"),)),
     "rays_length": Layout("part/rays_length.cl"),

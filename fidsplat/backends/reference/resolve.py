@@ -66,8 +66,8 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         total = np.where(covered[..., None], samples["normal"], 0.0).sum(1)
         length = np.linalg.norm(total, axis=1)
         out["normal"] = total / np.where(length > 0, length, 1)[:, None]
-        turns = view.turns_of_rows[np.floor(center_y / view.samples).astype(int)]
-        out["normal_world"] = np.einsum("ki,kij->kj", out["normal"], turns)
+        rotations = view.row_rotations[np.floor(center_y / view.samples).astype(int)]
+        out["normal_world"] = np.einsum("ki,kij->kj", out["normal"], rotations)
         moved = 2 * bound_covered + _ROUND * (1 - samples["t"]).sum(1)
         moved += np.where(covered, samples["normal_moved"], 0.0).sum(1)
         out["certificate_normal"] = _where_covered(

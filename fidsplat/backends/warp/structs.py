@@ -98,7 +98,7 @@ def rays_of(
 def array_of(stack: ViewStack, name: str) -> np.ndarray:
     """An array of an effect, which all views have in common, or the rows of one view after the other's."""
     view = stack.view
-    if name != "turns" or len(stack) == 1:
+    if name != "row_rotations" or len(stack) == 1:
         return view.array(name)
     return np.repeat(stack.rotation[0].astype(np.float32), view.height // view.samples, axis=0)
 
