@@ -81,8 +81,18 @@ def load_colmap(folder: Path) -> ColmapModel:
             raise InputError(f"{folder}: image {name}: {error}") from error
     values = np.array(found, np.float64).reshape(-1, 6)
     return ColmapModel(
-        tuple(name for name, _, _ in views), tuple(cameras), values[:, :3], values[:, 3:].astype(np.uint8)
+        tuple(name for name, _, _ in views),
+        tuple(cameras),
+        values[:, :3],
+        byte_colors(f"{folder}: points3D", values[:, 3:]),
     )
+
+
+def byte_colors(name: str, values: np.ndarray) -> np.ndarray:
+    """Colors of points as uint8. Raises InputError for numbers that are not from 0 to 255."""
+    if not ((values >= 0) & (values <= 255)).all():
+        raise InputError(f"{name} must have colors from 0 to 255; check the file")
+    return values.astype(np.uint8)
 
 
 def image_poses(file: Path) -> list[tuple[str, tuple[float, ...]]]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, focal_length
+from fidsplat.formats.colmap_read import byte_colors
 from fidsplat.formats.ply_header import read_header
 from fidsplat.images.files import read_image, read_over
 from fidsplat.train.dataset import TrainingView
@@ -173,4 +174,4 @@ def _points(file: Path, table: dict) -> tuple[np.ndarray, np.ndarray]:
     named = [name for name in ("red", "green", "blue") if name in element.properties]
     if len(named) < 3:
         return points, np.full((len(points), 3), 128, np.uint8)
-    return points, np.stack([rows[name] for name in named], axis=1).astype(np.uint8)
+    return points, byte_colors(str(header.path), np.stack([rows[name] for name in named], axis=1))

@@ -433,6 +433,17 @@ def test_a_lens_whose_center_is_far_beyond_float32(tmp_path):
             use_views(tmp_path)
 
 
+@pytest.mark.parametrize("color", ["256", "-1", "2222222222", "nan", "1e300"])
+def test_points_whose_colors_are_no_bytes(tmp_path, color):
+    colmap_text(tmp_path)
+    text = COLMAP["points3D"].replace("255 0 9", f"{color} 0 9", 1)
+    (tmp_path / "sparse/0/points3D.txt").write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(fs.InputError, match="must have colors from 0 to 255"):
+            use_views(tmp_path)
+
+
 # --- Python
 
 
