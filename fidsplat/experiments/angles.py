@@ -1,6 +1,6 @@
 """Table 3: the largest tilts at which markers are found and read.
 
-Every tilt of the scan is drawn and shown to every detector; nothing is skipped, so that holes show.
+Every detector reads the image of every tilt, so that gaps are found.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def angles_points(
     tilts: str = FULL_TILTS,
     markers: int = 5,
 ) -> list[dict]:
-    """The points of the experiment: one scan of one marker by one method under one protocol."""
+    """Points of the experiment: scans by marker, method and protocol."""
     parse_tilts(tilts)
     return [
         {"protocol": p, "category": c.name, "index": i, "method": m, "tilts": tilts}
@@ -63,8 +63,8 @@ def angles_points(
 def measure_angles(point: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor, workers: int) -> dict:
     """Scan one marker.
 
-    Returns for each detector two strings of 0 and 1, one sign for each tilt: whether the code was `found`
-    (its outline overlaps the code by half), and `read` exactly.
+    Returns two strings of 0 and 1 per detector, one digit per tilt: whether the code was `found` (its outline
+    overlaps the code by half), and `read` exactly.
     """
     category, protocol = CATEGORIES[point["category"]], PROTOCOLS[point["protocol"]]
     spec = category.spec(point["index"], seed)
@@ -73,7 +73,7 @@ def measure_angles(point: dict, painter: Painter, seed: int, pool: ThreadPoolExe
     draw = painter.open(point["method"], f"{category.name}-{point['index']}", spec, module)
     names = readers(category.kind)
     outline = made.corners / made.module * module
-    in_pool = point["method"] == IDEAL  # a renderer draws one picture after the other
+    in_pool = point["method"] == IDEAL  # a renderer is not shared by threads
 
     def look(picture: np.ndarray, tilt: float) -> list[tuple[bool, bool]]:
         target = Target(
@@ -91,7 +91,7 @@ def measure_angles(point: dict, painter: Painter, seed: int, pool: ThreadPoolExe
             waiting.append(pool.submit(lambda c, t: look(draw(c), t), camera, tilt))
         else:
             waiting.append(pool.submit(look, draw(camera), tilt))
-        while len(waiting) > 2 * workers:  # pictures that wait are memory
+        while len(waiting) > 2 * workers:  # bounds memory
             seen.append(interrupts.result_of(waiting.popleft()))
     seen += [interrupts.result_of(future) for future in waiting]
     return {
@@ -107,8 +107,7 @@ def measure_angles(point: dict, painter: Painter, seed: int, pool: ThreadPoolExe
 
 
 def largest(tilts: Sequence[float], hits: str) -> tuple[float | None, float | None]:
-    """The largest tilt of all hits, and the largest below which (itself included) there is no miss; None
-    where there is none."""
+    """Largest tilt of all hits, and largest tilt without a miss up to it; None if there is none."""
     good = [tilt for tilt, hit in zip(tilts, hits, strict=True) if hit == "1"]
     unbroken = len(hits) - len(hits.lstrip("1"))
     return (good[-1] if good else None), (tilts[unbroken - 1] if unbroken else None)

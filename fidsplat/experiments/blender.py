@@ -1,5 +1,5 @@
-"""Ground truth by Blender, the paper's way: Cycles on a textured plane, through `bpy` in a process and an
-environment of its own (bpy wants Python 3.11 and NumPy below 2, and its licence is the GPL)."""
+"""Ground truth from Blender as in the paper: Cycles renders a textured plane, by `bpy` in a separate process
+and environment (bpy needs Python 3.11 and NumPy below 2, and has the GPL)."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ from fidsplat.util.files import atomic_write, from_json, read_text, user_cache, 
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
-"""`standard`: sRGB texture, linear light, the 'Standard' view, as the paper's authors would have it; `raw`:
-display values all the way, so that edges are means of what is displayed"""
+"""`standard`: sRGB texture, linear light, the 'Standard' view, probably as in the paper; `raw`: display
+values, so edges are means of displayed values"""
 FULL_SAMPLES = 64
 WORKER = Path(__file__).with_name("blender_worker.py")
 
 
 def novel_picture(folder: Path, view: str, category: str, index: int, number: int) -> Path:
-    """The file of one test view."""
+    """File of a test view."""
     return folder / view / f"{category}-{index}" / f"test-{number:02d}.png"
 
 
 def training_picture(folder: Path, view: str, category: str, index: int, number: int) -> Path:
-    """The file of one training view of the densest collection."""
+    """File of a training view of the densest collection."""
     return folder / view / f"{category}-{index}" / f"view-{number:02d}.png"
 
 
 def check_pictures(folder: Path, view: str, seed: int, samples: int | None = None) -> dict:
-    """What a view's pictures were drawn with, {} where nothing is known.
+    """Settings of the images of a view; {} if unknown.
 
-    Raises InputError when that is another seed or number of samples (None: any).
+    Raises InputError for another seed or number of samples (None: any).
     """
     if not _note(folder, view).exists():
         return {}
@@ -58,14 +58,13 @@ def check_pictures(folder: Path, view: str, seed: int, samples: int | None = Non
     for name, wanted in (("seed", seed), ("samples", samples)):
         if wanted is not None and about.get(name) != wanted:
             raise InputError(
-                f"{folder / view} holds pictures of {name} {about.get(name)}, not {wanted}; "
-                "give another folder"
+                f"{folder / view} holds images of {name} {about.get(name)}, not {wanted}; give another folder"
             )
     return about
 
 
 def note_pictures(folder: Path, view: str, seed: int, samples: int) -> None:
-    """Keep what a view's pictures are drawn with. Raises InputError as `check_pictures`."""
+    """Record the settings of the images of a view. Raises InputError for other settings."""
     check_pictures(folder, view, seed, samples)
     writable_folder(folder / view)
     with atomic_write(_note(folder, view)) as stream:
@@ -77,7 +76,7 @@ def _note(folder: Path, view: str) -> Path:
 
 
 def default_environment() -> Path:
-    """Where Blender is installed by default: the user's cache folder."""
+    """Default folder of the Blender environment, in the user's cache."""
     return user_cache() / "fidsplat" / "blender"
 
 
@@ -101,7 +100,7 @@ def install(environment: Path, progress: Callable[[str], None] = lambda text: No
 
 
 def environment_python(environment: Path) -> Path:
-    """The Python of a virtual environment."""
+    """Python interpreter of a virtual environment."""
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
@@ -113,7 +112,7 @@ def _call(command: list[str]) -> None:
 
 
 def marker_job(category: Category, index: int, seed: int, folder: Path, view: str, training: bool) -> dict:
-    """What the worker needs to draw one marker's views: the test views, and the training views if wanted."""
+    """Worker job for the test views of a marker, and optionally its training views."""
     grid = plain_marker(category.spec(index, seed)).grid
     shots = [
         (novel_picture(folder, view, category.name, index, i), camera)
@@ -133,7 +132,7 @@ def marker_job(category: Category, index: int, seed: int, folder: Path, view: st
 
 
 def ready(view: str, environment: Path) -> Path:
-    """The Python that draws. Raises InputError for an unknown view or without Blender."""
+    """Python interpreter with Blender. Raises InputError for an unknown view or without Blender."""
     if view not in VIEW_NAMES:
         raise InputError(f"unknown view {view!r}; known: {', '.join(VIEW_NAMES)}")
     python = environment_python(environment)
@@ -145,9 +144,9 @@ def ready(view: str, environment: Path) -> Path:
 
 
 def camera_facts(camera: Camera) -> dict:
-    """A camera as the worker takes it. Raises InputError when its pixels are not square."""
+    """Camera of a worker job. Raises InputError unless its pixels are square."""
     if camera.fx != camera.fy:
-        raise InputError("Blender's camera has square pixels; fx and fy must be equal")
+        raise InputError("fx and fy of a Blender camera must be equal")
     names = ("width", "height", "fx", "cx", "cy")
     return {name: getattr(camera, name) for name in names} | {"matrix": camera.world_to_camera.tolist()}
 
@@ -160,17 +159,17 @@ def render(
     pixel_filter: str = "BOX",
     threads: int | None = None,
 ) -> Iterator[Path]:
-    """Draw every picture that is not there yet; yields each file as it is done, those that are there first.
+    """Render missing images; yields each file when it is done, existing ones first.
 
     Args:
-        markers: of `marker_job`.
+        markers: jobs of `marker_job`.
         view: one of `VIEW_NAMES`.
-        environment: of `install`.
-        samples: for each pixel.
+        environment: folder of `install`.
+        samples: per pixel.
         pixel_filter: "BOX" (1 px, a mean over the pixel) or "BLACKMAN_HARRIS" (Blender's default, 1.5 px).
-        threads: of Cycles, all by default.
+        threads: of Cycles; all by default.
 
-    Raises InputError when Blender is not installed, DeviceError when it fails; pictures done stay.
+    Raises InputError when Blender is not installed, DeviceError if it fails; finished images stay.
     """
     python = ready(view, environment)
     job = {
@@ -184,8 +183,8 @@ def render(
 
 
 def drawn(python: Path, worker: Path, things: Iterable[dict], job: dict) -> Iterator[Path]:
-    """Let a worker draw every shot of some things that is not there yet; yields each file as it is done,
-    those that are there first. Raises DeviceError when Blender fails; pictures done stay."""
+    """Render the missing images of some objects with a worker; yields each file when it is done, existing
+    ones first. Raises DeviceError if Blender fails; finished images stay."""
     missing = []
     for thing in things:
         there = [Path(shot["file"]) for shot in thing["shots"] if Path(shot["file"]).is_file()]
@@ -209,7 +208,7 @@ def drawn(python: Path, worker: Path, things: Iterable[dict], job: dict) -> Iter
             try:
                 assert process.stdout is not None
                 for line in interrupts.lines_of(process.stdout):
-                    if line.startswith("done "):  # Blender says much else
+                    if line.startswith("done "):  # other output of Blender
                         yield Path(line.removeprefix("done "))
                 status = process.wait()
             finally:
@@ -222,5 +221,5 @@ def drawn(python: Path, worker: Path, things: Iterable[dict], job: dict) -> Iter
 
 
 def _clean_environment() -> dict[str, str]:
-    """Without what points Python at our own packages."""
+    """Environment variables without Python paths."""
     return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}

@@ -1,4 +1,4 @@
-"""The figure of counts and table 2: components, rectangles, Gaussians and seconds of each marker."""
+"""Figure of counts and table 2: components, rectangles, Gaussians and seconds of each marker."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FULL_REPEATS, QUICK_REPEATS = 15, 3
 
 
 def counts_points(categories: Iterable[Category], repeats: int, markers: int = 5) -> list[dict]:
-    """The points of the experiment: one marker each."""
+    """Points of the experiment: one per marker."""
     return [{"category": c.name, "index": i, "repeats": repeats} for c in categories for i in range(markers)]
 
 
@@ -61,8 +61,8 @@ def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
 
 
 def _gaussians(mixture: str, boxes: np.ndarray) -> int | None:
-    """How many a mixture would need for other rectangles; None for one that is of modules, not rectangles, or
-    not known here."""
+    """Number of Gaussians of a mixture for other rectangles; None for mixtures of modules and unknown
+    ones."""
     if mixture == "exact":
         return len(boxes)
     if mixture == "paper":

@@ -35,11 +35,11 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
 
 POINTS = 1000
-"""3D points for a trainer to start from: random places on the plane, coloured as it is there"""
+"""initial 3D points for trainers: random points on the plane with its colours"""
 
 
 def dataset_scenes(categories: Iterable[Category], markers: int = 5) -> list[dict]:
-    """The scenes that are to be written."""
+    """Scenes of the data set."""
     return [
         {"category": c.name, "index": i, "views": n}
         for c in categories
@@ -49,19 +49,19 @@ def dataset_scenes(categories: Iterable[Category], markers: int = 5) -> list[dic
 
 
 def scene_name(wanted: dict) -> str:
-    """E.g. "small-0-views-17"."""
+    """Name of a scene, e.g. "small-0-views-17"."""
     return f"{wanted['category']}-{wanted['index']}-views-{wanted['views']}"
 
 
 def write_scene(wanted: dict, folder: Path, seed: int, truth: str, blender: Path) -> Path:
-    """Write one scene; a scene that is whole (its marker.json is written last) stays as it is.
+    """Write a scene unless it is complete; marker.json is written last.
 
     Args:
-        wanted: of `dataset_scenes`.
-        truth: what draws its pictures, one of `fidsplat.experiments.views.TRUTHS`.
-        blender: folder of Blender's pictures, for the truths that are Blender's.
+        wanted: scene of `dataset_scenes`.
+        truth: source of its images, one of `fidsplat.experiments.views.TRUTHS`.
+        blender: folder of Blender's images, for ground truth from Blender.
 
-    Raises InputError when a picture of Blender's is missing or the folder cannot be written.
+    Raises InputError if an image of Blender is missing or the folder cannot be written.
     """
     scene = folder / scene_name(wanted)
     category = CATEGORIES[wanted["category"]]
@@ -70,7 +70,7 @@ def write_scene(wanted: dict, folder: Path, seed: int, truth: str, blender: Path
     note = scene / "marker.json"
     if _whole(note, about):
         return scene
-    # a run that is stopped leaves no note on pictures of two kinds
+    # an interrupted run must not mix two kinds of images
     note.unlink(missing_ok=True)
     points, colors = _points(spec, f"{seed} points {category.name} {wanted['index']}")
     sets = (

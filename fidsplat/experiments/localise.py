@@ -1,4 +1,4 @@
-"""A robot that finds its way through a greenhouse by tags: how far a simulated camera moves the result."""
+"""Localisation of a robot by tags in a greenhouse, with variants of its simulated camera."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from fidsplat.worlds.greenhouse import AISLE, Greenhouse
 from fidsplat.worlds.robot import BODY, Errors, Run, camera_at, drive
 
 RATE = 4.0
-"""pictures a second"""
+"""images per second"""
 DISTANCES = 1.0, 2.0, 3.0
-"""metres between which errors of corners are counted apart"""
+"""distance bins of corner errors in metres"""
 FAMILY = "apriltag:36h11"
 CAMERA = "eye"
 """name of the camera in logs"""
@@ -41,26 +41,26 @@ _SENSOR = Sensor(full_well=2000.0, read_noise=6.0, bits=8)
 
 @dataclass(frozen=True)
 class Variant:
-    """One way of seeing tags."""
+    """Variant of the robot's camera and tags."""
 
     mixture: str | None = "exact"
-    """of the markers; None: no pictures are taken"""
+    """mixture of the markers; None: no images"""
     lens: BrownConrady | None = None
     exposure_time: float = 0.0
     readout: float = 0.0
     sensor: Sensor | None = None
     ideal: bool = False
-    """the tags that are seen, with corners where they are"""
+    """use the detected tags with ideal corners"""
     texture: bool = False
-    """tags are no splats but printed, every pixel the mean of what it shows; by a pinhole, at one moment"""
+    """replace tag splats by the exact mean of the texture per pixel; pinhole camera without exposure time"""
     reach: float = math.inf
-    """metres beyond which tags are not used"""
+    """maximum distance of tags in metres"""
     speed: float | None = None
-    """metres a second; None: the experiment's"""
+    """metres per second; None: that of the experiment"""
 
     @property
     def taken(self) -> Variant | None:
-        """What its pictures depend on; None where it needs none."""
+        """Key of the rendered images; None without images."""
         return None if self.mixture is None else replace(self, ideal=False, reach=math.inf)
 
 
@@ -81,8 +81,8 @@ VARIANTS = {
     "up to 1 m": Variant(reach=1.0),
     "up to 2 m": Variant(reach=2.0),
 }
-"""What is compared, by name: wheels and gyroscope alone; corners without error; mixtures; and of `exact`
-effects, speeds, and how far away tags are used"""
+"""variants by name: odometry only, ideal corners, mixtures, and effects, speeds and tag distances of
+`exact`"""
 
 
 @dataclass(frozen=True)
@@ -100,21 +100,21 @@ class Drive:
 
     @cached_property
     def house(self) -> Greenhouse:
-        """Where it takes place."""
+        """Greenhouse of the drive."""
         return Greenhouse(self.rows, self.plants, self.seed)
 
     @property
     def camera(self) -> Camera:
-        """640 x 480, 80 degrees across."""
+        """Camera of 640 x 480 pixels, 80 degrees wide."""
         return Camera.look_at(640, 480, math.radians(80), (0, 0, 0), (0, 0, 1))
 
     @cached_property
     def tags(self) -> dict[int, PlacedMarker]:
-        """By their ids."""
+        """Placed tags by id."""
         return {placed.marker.id: placed for placed in self.house.markers if placed.marker.id is not None}
 
     def run(self, speed: float | None = None) -> Run:
-        """The drive: up one aisle, down the next; at a speed of its own if that is given."""
+        """Drive up one aisle and down the next, at a given or the default speed."""
         ends, path = (-0.8, self.house.length + 0.8), []
         for aisle in range(self.rows + 1):
             y = (aisle - 0.5) * AISLE
@@ -122,11 +122,11 @@ class Drive:
         return drive(self.house.mjcf(BODY), np.array(path), speed or self.speed, Errors(seed=self.seed))
 
     def shots(self, run: Run) -> np.ndarray:
-        """Numbers of the moments of a drive at which pictures are taken."""
+        """Indices of the poses with images."""
         return np.unique(np.searchsorted(run.times, np.arange(1 / RATE, run.times[-1], 1 / RATE)))
 
     def pictures(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
-        """What the camera sees at each moment, (480, 640, 3) uint8."""
+        """Images (480, 640, 3) uint8 of the drive."""
         scene = replace(self.house, mixture=variant.mixture).scene
         if variant.texture:
             scene = replace(scene, markers=tuple(each for each in scene.markers if each.marker.id is None))
@@ -152,7 +152,7 @@ class Drive:
             yield frame.to_uint8()
 
     def sightings(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
-        """The tags in each picture of a variant; they are looked for while the next pictures are drawn."""
+        """Detected tags of each image; detection overlaps with rendering."""
         workers = os.cpu_count() or 1
         waiting = deque()
         with ThreadPoolExecutor(workers) as pool:
@@ -171,12 +171,12 @@ class Drive:
         noise: float = 0.5,
         reach: float = math.inf,
     ) -> tuple[Trajectory, dict[str, Any]]:
-        """Where the robot takes itself to be, and how far off that is.
+        """Estimated poses and their errors.
 
         Args:
-            sightings: the tags in each picture; None: it has no camera.
-            noise: pixels, standard deviation of a corner.
-            reach: metres beyond which tags are not used.
+            sightings: detected tags of each image; None: no camera.
+            noise: standard deviation of corners in pixels.
+            reach: maximum distance of tags in metres.
         """
         first = run.poses[0]
         filtered = Localiser(np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]), noise)
@@ -195,7 +195,7 @@ class Drive:
         return Trajectory(run.times, np.array(poses)), facts
 
     def ideal(self, run: Run, sightings: list[list[Detection]]) -> list[list[Detection]]:
-        """The same tags with corners where they are."""
+        """The detected tags with ideal corners."""
         tags, found = self.tags, []
         for k, codes in zip(self.shots(run).tolist(), sightings, strict=True):
             camera = camera_at(self.camera, run.poses[k])
@@ -206,8 +206,8 @@ class Drive:
     def corner_errors(
         self, run: Run, sightings: list[list[Detection]], camera: Camera
     ) -> list[dict[str, Any]]:
-        """By `DISTANCES`: how many tags were seen, and how far their corners were from where they are: the
-        median of each tag's root mean square, pixels; None where none was seen."""
+        """Number of detected tags and median corner error (root mean square per tag, pixels) by bin of
+        `DISTANCES`."""
         tags, found = self.tags, []
         for k, codes in zip(self.shots(run).tolist(), sightings, strict=True):
             standing = camera_at(camera, run.poses[k])
@@ -223,13 +223,13 @@ class Drive:
 
 
 def _away(tag: Detection, placed: PlacedMarker, camera: Camera) -> float:
-    """Metres to a tag, by its corners."""
+    """Distance of a tag in metres, from its corners."""
     return float(np.linalg.norm(marker_pose(tag.corners, placed.marker.size, camera)[:3, 3]))
 
 
 def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
-    """Of estimated poses (n, 4, 4): absolute trajectory error without alignment (root mean square and worst)
-    and relative error over a metre (root mean square), in metres on the floor; heading in degrees."""
+    """Errors of estimated poses (n, 4, 4): ATE without alignment (root mean square and worst) and RPE over a
+    metre (root mean square), in metres on the floor; heading in degrees."""
     off = np.linalg.norm(poses[:, :2, 3] - run.poses[:, :2, 3], axis=1)
     turn = np.einsum("nji,njk->nik", run.poses[:, :3, :3], poses[:, :3, :3])
     heading = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
@@ -249,17 +249,16 @@ def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
 def write_log(
     asked: Drive, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
 ) -> Iterator[np.ndarray]:
-    """One variant's drive as a log: pictures (JPEG), intrinsics, detections, the gyroscope, where the camera
-    is (/tf) and where the robot takes itself to be (/odom). Yields the pictures as they are logged. source:
-    as `RobotLog`.
+    """Write the drive of a variant as a log: JPEG images, intrinsics, detections, gyroscope, camera poses
+    (/tf) and estimated poses (/odom). Yields the logged images.
 
-    Raises InputError for a variant that takes no pictures, and as `RobotLog`.
+    Raises InputError for a variant without images, or if the log cannot be written.
     """
     from fidsplat.logs import RobotLog
 
     variant = VARIANTS[name]
     if variant.mixture is None:
-        raise InputError(f"{name!r} takes no pictures, of which a log is made; known: exact, fitted ...")
+        raise InputError(f"a logged variant must have images, e.g. exact, got {name!r}")
     run = asked.run()
     shots, camera = asked.shots(run), replace(asked.camera, lens=variant.lens)
     sightings = []

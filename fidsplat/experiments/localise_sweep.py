@@ -1,4 +1,4 @@
-"""The robot's drive as a sweep, a point for each variant; its trajectories, chart and page."""
+"""Sweep over the variants of the robot's drive, with trajectories, chart and report."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from fidsplat.worlds.robot import Run
 
 RESULTS, REPORT, CHART = "localise.jsonl", "localise.md", "localise.svg"
 Found = Mapping[str, Mapping[str, Any]]
-"""what was found, by the variants' names"""
+"""results by variant"""
 _SHOWN = ("odometry", "paper", "exact")
-"""variants whose way is drawn"""
+"""variants with a plotted trajectory"""
 _SPANS = (
     f"to {DISTANCES[0]:g} m",
     *(f"{near:g} to {far:g} m" for near, far in pairwise(DISTANCES)),
@@ -45,7 +45,7 @@ def drive_sweep(
     tell: Callable[[str, float], object],
     overwrite: bool = False,
 ) -> Sweep:
-    """The variants of these names as points.
+    """Sweep over the variants of these names.
 
     tell: called with a variant's name and the share of its pictures that is done.
 
@@ -64,7 +64,7 @@ def drive_sweep(
 
 
 class _Drive:
-    """Measures variants one by one; drives and detections that several share are kept."""
+    """Measurement of variants; shared drives and detections are cached."""
 
     def __init__(
         self, folder: Path, asked: Drive, renderer: Renderer, tell: Callable[[str, float], object]
@@ -74,7 +74,7 @@ class _Drive:
         self._seen: dict[Variant, list[list[Detection]]] = {}
 
     def begin(self, key: Key) -> Callable[[], dict[str, Any]]:
-        """What a variant sees; what it makes of that is returned as work to be done."""
+        """Render and detect for a variant; returns the estimation as work."""
         name = key["variant"]
         variant = VARIANTS[name]
         run = self._driven(variant.speed)
@@ -82,7 +82,7 @@ class _Drive:
         return lambda: self._localised(name, variant, run, sightings)
 
     def _driven(self, speed: float | None) -> Run:
-        """A drive, its truth kept beside the results."""
+        """A drive; its ground truth is saved with the results."""
         if speed not in self._runs:
             run = self._runs[speed] = self._asked.run(speed)
             save_trajectory(Trajectory(run.times, run.poses), self._folder / _tum(_truth(speed)))
@@ -112,12 +112,12 @@ class _Drive:
 
 
 def found_of(results: Results) -> dict[str, dict[str, Any]]:
-    """What the file of a sweep holds, by the variants' names."""
+    """Results of a sweep file by variant."""
     return {record.key["variant"]: record.result for record in results.done.values()}
 
 
 def table_of(found: Found) -> Frame:
-    """A row of text for each variant: errors in centimetres, degrees and pixels, tags."""
+    """Table row of each variant: errors in centimetres, degrees and pixels, and tags."""
     unseen = [{"median_px": None}] * len(_SPANS)
     return pd.DataFrame(
         {
@@ -138,7 +138,7 @@ def table_of(found: Found) -> Frame:
 
 
 def write_report(folder: Path, asked: Drive, device: str, found: Found) -> Path:
-    """The page, with its chart beside it."""
+    """Write the report and its chart."""
     _draw(folder, found)
     context = {
         "length": next(iter(found.values()))["length_m"],
@@ -153,11 +153,11 @@ def write_report(folder: Path, asked: Drive, device: str, found: Found) -> Path:
 
 
 def _draw(folder: Path, found: Found) -> None:
-    """The drive from above, as it was and as it was taken to be; and the errors of all variants."""
+    """Chart of true and estimated trajectories, and of the errors of all variants."""
     errors = {name: 100 * facts["ate_m"] for name, facts in found.items()}
     shown = [name for name in _SHOWN if name in errors]
     with chart(folder / CHART, panels=2, size=(11.0, 4.6), one_scale=False) as (figure, axes):
-        # the drive at its own speed, or at that of the first variant that was measured
+        # the drive at the default speed, or that of the first measured variant
         speeds = [VARIANTS[name].speed for name in found]
         for number, name in enumerate([_truth(None if None in speeds else speeds[0]), *shown]):
             path = load_trajectory(folder / _tum(name)).poses[::10, :2, 3]  # every fifth of a second
@@ -174,7 +174,7 @@ def _draw(folder: Path, found: Found) -> None:
 
 
 def _truth(speed: float | None) -> str:
-    """The name of the way that was driven at a speed; None: at the drive's own."""
+    """File name of the ground truth of a speed; None: the default speed."""
     return "truth" if speed is None else f"truth {speed:g} m/s"
 
 

@@ -1,4 +1,4 @@
-"""The rows of the tables: how a marker becomes a picture."""
+"""Methods of the tables: ways to render a marker."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ FILTERS = {
     "screen": Quality(alpha_cutoff=_CUT),
     "best": Quality(alpha_cutoff=_CUT, lowpass="none", samples=3),
 }
-"""the low-pass of 2DGS, and ours: none, the mean of 3 x 3 samples; with the cut-off of other renderers"""
+"""filters: the low-pass of 2DGS, and ours without a low-pass, 3 x 3 samples; with the cut-off of other
+renderers"""
 _LIGHT = "light"
 """the filter "best", blended in linear light and then encoded by the sensor's sRGB curve"""
-# as the paper's authors drew the models that they trained
+# the settings of the paper for trained models
 _TRAINED_QUALITY = "surfel"
 
 Draw = Callable[[Camera], np.ndarray]
@@ -34,7 +35,7 @@ Draw = Callable[[Camera], np.ndarray]
 
 
 def mixtures() -> tuple[str, ...]:
-    """Every mixture that markers can be made of, the paper's first, the default after it."""
+    """Names of all mixtures, the paper's first, then the default."""
     from fidsplat.markers.build import MIXTURES
 
     first = [name for name in ("paper", "fitted") if name in MIXTURES]
@@ -42,11 +43,10 @@ def mixtures() -> tuple[str, ...]:
 
 
 def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> tuple[str, ...]:
-    """Rows: "ideal", "MIXTURE/FILTER" for every mixture, "2dgs-N" for trained models that are there.
+    """Method names: "ideal", "MIXTURE/FILTER" for every mixture, "2dgs-N" for existing trained models.
 
     Args:
-        chosen: mixtures to take part; when empty all but `facets`, which is no mixture of the paper's kind
-            and drawn by true depth alone.
+        chosen: mixtures; by default all but `facets`, which needs order by depth.
         trained: folder with trained models, see `Painter`.
 
     Raises InputError for an unknown mixture.
@@ -61,35 +61,35 @@ def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> t
 
 
 def with_linear_light(methods: Iterable[str]) -> list[str]:
-    """The rows, and after each "MIXTURE/best" the same drawn in linear light."""
+    """Methods, with a variant in linear light after each "MIXTURE/best"."""
     more = ([m, m.replace("/best", f"/{_LIGHT}")] if m.endswith("/best") else [m] for m in methods)
     return [name for names in more for name in names]
 
 
 def in_linear_light(method: str) -> bool:
-    """Whether a row is drawn in linear light."""
+    """Whether a method blends linear light."""
     return method.endswith(f"/{_LIGHT}")
 
 
 @dataclass(eq=False)
 class Painter:
-    """Draws markers by any method.
+    """Renderer of markers by any method.
 
-    Trained models are looked for in ``trained``/2dgs-17/small-0.ply: collection, marker.
+    Trained models are read from ``trained``/2dgs-17/small-0.ply: collection, marker.
     """
 
     renderer: Renderer | None
-    """None when only the ideal is drawn"""
+    """None if only the ideal is rendered"""
     trained: Path | None = None
 
     def open(self, method: str, name: str, spec: str, module: float) -> Draw:
-        """Get ready to draw a marker.
+        """Prepare a marker for rendering.
 
         Args:
             method: one of `method_names` or `with_linear_light`.
-            name: the marker's, e.g. "small-0".
-            spec: the marker's.
-            module: metres.
+            name: of the marker, e.g. "small-0".
+            spec: of the marker.
+            module: edge of a module in metres.
 
         Raises InputError for an unknown method or a trained model that is missing.
         """
@@ -126,5 +126,5 @@ class Painter:
 
 
 def plain_marker(spec: str) -> Marker:
-    """The marker's bits and grid; its splats do not matter."""
+    """A marker for its bits and grid."""
     return marker(spec)

@@ -1,6 +1,6 @@
-"""The ideal picture of a printed plane: every pixel the exact mean of the texture over its square.
+"""Ideal image of a printed plane: each pixel is the exact mean of the texture over its square.
 
-A texture of square modules is constant but for jumps across module edges. Seen by a pinhole camera an edge is
+A texture of square modules is constant but for jumps across module edges. In a pinhole image an edge is
 a straight segment, so by Green's theorem a pixel's mean is a sum over the segments that cross it or pass on
 its left: each segment is cut where it crosses the lines between pixels, and each piece adds its jump times
 its height times the share of its pixel that lies to its right (as exact rasterisers of fonts do). Nothing is
@@ -23,23 +23,20 @@ def plane_picture(
     light: float = 1.0,
     background: float = 0.5,
 ) -> np.ndarray:
-    """The picture of a plane with square modules, centred on the world's origin in z = 0, x right, y down.
+    """Ideal image of a plane with square modules, centred on the world origin in z = 0, x right, y down.
 
-    Args:
-        grid: (h, w) uint8, 1 = dark, quiet zone included.
-        module: metres.
-        camera: the plane lies wholly in front of its near distance.
-        dark, light, background: values of dark modules, light modules and what is beside the plane. Means are
-            taken of these values, so what they stand for (display values, linear light) is what is averaged.
+    Args: grid: (h, w) uint8, 1 = dark, quiet zone included. module: edge of a module in metres. camera: the
+        complete plane must be beyond its near distance. dark, light, background: values of dark modules,
+        light modules and the background, which are averaged: display values or linear light.
 
     Returns (height, width) float64.
 
-    Raises InputError when a part of the plane is nearer than the camera's near distance.
+    Raises InputError if a part of the plane is nearer than the near distance.
     """
     start, stop, jump = _edges(grid, light - dark, light - background)
     offset = np.array([grid.shape[1], grid.shape[0]]) / 2
     begin, end = (_project((points - offset) * module, camera) for points in (start, stop))
-    # seen from behind, right and left change places
+    # from behind, right and left are swapped
     turn = np.linalg.det(camera.world_to_camera[:3, [0, 1, 3]])
     picture = _accumulate(begin, end, jump * np.sign(turn), (camera.height, camera.width))
     return background + picture
@@ -52,7 +49,7 @@ def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray,
     Segments run down along vertical lines and to the left along horizontal ones; runs of equal jumps are one
     segment.
     """
-    value = np.pad(paper - contrast * np.asarray(grid, np.float64), 1)  # beside the plane: 0
+    value = np.pad(paper - contrast * np.asarray(grid, np.float64), 1)  # background: 0
     across = np.diff(value, axis=1)[1:-1]  # at vertical lines, from left to right
     down = np.diff(value, axis=0)[:, 1:-1].T  # at horizontal lines, from above to below
     parts = []
@@ -80,8 +77,8 @@ def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
     depth = (world - camera.position) @ camera.world_to_camera[2, :3]
     if len(depth) and depth.min() < camera.near:
         raise InputError(
-            f"a part of the plane is {depth.min():.3g} m in front of the camera; the ideal picture needs all "
-            f"of it beyond {camera.near:g} m: move the camera away"
+            f"the plane must be beyond the near distance of {camera.near:g} m, got {depth.min():.3g} m; move "
+            "the camera away"
         )
     return camera.project(world)
 
@@ -97,7 +94,7 @@ def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tup
     row, column = np.floor(middle[:, 1]), np.floor(middle[:, 0])
     keep = (row >= 0) & (row < h) & (column < w) & (rise != 0)
     row, column, rise, x = row[keep].astype(int), column[keep], rise[keep], middle[keep, 0]
-    # what passes on the picture's left counts wholly from the first column on
+    # segments left of the image count fully from the first column on
     share = np.where(column >= 0, column + 1 - x, 1.0)
     column = np.maximum(column, 0).astype(int)
     flat = row * (w + 1) + column

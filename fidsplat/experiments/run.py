@@ -26,15 +26,15 @@ from fidsplat.vision.metrics import load_lpips, metric_versions, weights_name
 from fidsplat.vision.readers import reader_versions
 
 NAMES = (counts.NAME, localisation.NAME, views.NAME, angles.NAME)
-"""the experiments that measure, quickest first"""
+"""measuring experiments, fastest first"""
 QUICK_VIEWS = 1
 
 
 @contextmanager
 def prepared(names: Iterable[str], options: MeasureSettings) -> Iterator[list[Sweep]]:
-    """Experiments by name with all that they need, opened for as long as the context lasts.
+    """Prepared sweeps of experiments by name.
 
-    All are made ready before the first runs: what is wrong with the last shows before hours have gone.
+    All are prepared before the first one runs, so errors of the last appear at once.
 
     Raises InputError for options that cannot be used, DeviceError when the device cannot be opened.
     """
@@ -49,7 +49,7 @@ def prepared(names: Iterable[str], options: MeasureSettings) -> Iterator[list[Sw
     device = None if renderer is None else device_words(renderer)
     pool = ThreadPoolExecutor(workers)
     try:
-        # first, for it reads files: --overwrite drops nothing for a run that cannot begin
+        # first, since it reads files: --overwrite deletes nothing if a run cannot start
         measures = {name: _measure(name, options, painter, pool) for name in points}
         yield [
             Sweep(
@@ -61,23 +61,23 @@ def prepared(names: Iterable[str], options: MeasureSettings) -> Iterator[list[Sw
             for name in points
         ]
     finally:
-        # an interrupt must not wait for pictures that nobody will look at
+        # an interrupt must not wait for pending images
         pool.shutdown(cancel_futures=True)
 
 
 def device_words(renderer: Renderer) -> str:
-    """A device in the facts of a run: title and driver."""
+    """Title and driver of a device, for the facts of a run."""
     return f"{renderer.device.title}, {renderer.device.version}"
 
 
 def results_of(name: str, options: SweepSettings, device: str | None) -> Results:
-    """The file of an experiment's results; device: `device_words` of what draws, None where nothing does."""
+    """Results file of an experiment; device: `device_words` of the renderer, or None."""
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
     return Results(options.file(name), run_facts(device, options.seed, versions), options.overwrite)
 
 
 def points_of(name: str, options: MeasureSettings) -> list[Key]:
-    """The points of an experiment, or a run's share of them."""
+    """Points of an experiment, or of the shard of a run."""
     return share_of(_points(name, options), options.shard)
 
 

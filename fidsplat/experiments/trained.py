@@ -1,5 +1,5 @@
-"""The paper's baseline: 2DGS trained on 3, 5, 9 and 17 views of each marker, and what its splats show: novel
-views (table 4) and the largest tilts at which they are read (table 3)."""
+"""Baseline of the paper: 2DGS trained on 3, 5, 9 and 17 views of each marker, evaluated on novel views (table
+4) and on the largest readable tilts (table 3)."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from fidsplat.vision.metrics import has_flip
 
 NAME = "trained"
 _TILTS = "0:40:5,40.2:89.8:0.2"
-"""of the scans: all of them where reading ends"""
+"""tilts of the scans, dense near the limit of reading"""
 _PROTOCOL = "fixed-plane"
-"""the paper's, of which the training views are"""
+"""protocol of the paper, also of the training views"""
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class BaselineSettings(SweepSettings):
 
 @contextmanager
 def baseline_sweeps(wanted: BaselineSettings, renderer: Renderer) -> Iterator[list[Sweep]]:
-    """The trainings, and the views and angles of those of the first seed, to be measured in turn: a run that
-    is stopped has all of what it has trained.
+    """Sweeps of the trainings, and of the views and angles of the first seed, interleaved so that an
+    interrupted run has evaluated what it has trained.
 
     Raises InputError for what cannot be written, or holds results of another device, version, code, seed or
     number of iterations.
@@ -131,24 +131,24 @@ def baseline_sweeps(wanted: BaselineSettings, renderer: Renderer) -> Iterator[li
             ),
         ]
     finally:
-        # an interrupt must not wait for pictures that nobody will look at
+        # an interrupt must not wait for pending images
         pool.shutdown(cancel_futures=True)
 
 
 def _view_point(point: Key) -> Key:
-    """Of `experiment views`: against what was trained on."""
+    """Points of `experiment views` against the ground truth of the training."""
     of = {"category": point["category"], "index": point["index"], "method": f"2dgs-{point['views']}"}
     return of | {"truth": "exact", "views": TEST_VIEWS, "flip": has_flip(), "lpips": None}
 
 
 def _angle_point(point: Key) -> Key:
-    """Of `experiment angles`."""
+    """Points of `experiment angles`."""
     of = {"protocol": _PROTOCOL, "category": point["category"], "index": point["index"]}
     return of | {"method": f"2dgs-{point['views']}", "tilts": _TILTS}
 
 
 def model_file(out: Path, point: Key) -> Path:
-    """Where the splats of a training go: those of the first seed where `Painter` looks."""
+    """File of the splats of a training."""
     folder = out if point["seed"] == 0 else out / f"seed-{point['seed']}"
     return folder / f"2dgs-{point['views']}" / f"{point['category']}-{point['index']}.ply"
 
@@ -162,16 +162,16 @@ def train_marker(
     tell: Callable[[Step], None] | None = None,
     restart: bool = False,
 ) -> dict:
-    """Train one marker on one collection of views, and write its splats as `Painter` finds them.
+    """Train a marker on a collection of views and write its splats.
 
-    A training that was stopped goes on from its checkpoint, which goes when the splats are written.
+    An interrupted training resumes from its checkpoint, which is deleted at the end.
 
     Args:
         point: of `Baseline.points`.
-        folder: of the data set; the scene is written where it is missing, with the ideal pictures.
+        folder: of the data set; the scene is written where it is missing, with the ideal images.
         out: gets 2dgs-17/small-0.ply and the like, of other seeds than 0 in seed-1 and so on.
         texts: seed of the marker's text and views.
-        restart: begin again though there is a checkpoint.
+        restart: ignore a checkpoint.
 
     Returns:
         `splats`, `seconds` of the training, `iterations` that these took, and of the views held out the means

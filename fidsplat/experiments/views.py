@@ -1,4 +1,4 @@
-"""Table 4: novel views. Pictures from 20 random viewpoints against ground truth."""
+"""Table 4, novel views: images from 20 random viewpoints against ground truth."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TRUTHS = {
     "blender-raw": "Blender, view 'Raw' on display values",
 }
 LINEAR = ("exact-linear", "blender-standard")
-"""those that take means of linear light: drawing in linear light is compared with these alone"""
+"""ground truths that average linear light; methods in linear light are compared only with these"""
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
 
@@ -47,13 +47,12 @@ def views_points(
     views: int = TEST_VIEWS,
     lpips: str | None = None,
 ) -> list[dict]:
-    """The points of the experiment: one marker by one method against one ground truth.
+    """Points of the experiment: a marker, a method and a ground truth.
 
     Args:
-        blender: folder of `fidsplat experiment blender`; its pictures take part where a marker has all of
-            them.
-        views: how many of the 20.
-        lpips: what distinguishes the weights of LPIPS, when it is measured.
+        blender: folder of `fidsplat experiment blender`; used for markers with all images.
+        views: number of views, at most 20.
+        lpips: digest of the LPIPS weights, if measured.
     """
     points = []
     for category in categories:
@@ -82,15 +81,15 @@ def views_points(
 
 
 class Kept:
-    """8-bit pictures that the points after this one need again."""
+    """Cache of 8-bit images for the following points."""
 
     def __init__(self) -> None:
         self._about: dict[str, tuple] = {}
         self._pictures: dict[str, dict[int, np.ndarray]] = {}
-        self._lock = Lock()  # truths are made by the threads that look at pictures
+        self._lock = Lock()  # evaluation threads make the ground truths
 
     def get(self, kind: str, about: tuple, number: int, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """Picture `number` of what `about` names, made if it is not there; of each kind one thing is kept."""
+        """Image `number` of the subject `about`, made if missing; one subject per kind is cached."""
         with self._lock:
             if self._about.get(kind) != about:
                 self._about[kind], self._pictures[kind] = about, {}
@@ -110,14 +109,13 @@ def measure_views(
     lpips: Perceptual | None = None,
     kept: Kept | None = None,
 ) -> dict:
-    """Compare one marker's pictures, in 8 bits, with the truth.
+    """Compare the 8-bit images of a marker with the ground truth.
 
-    Args:
-        kept: the same for all points of a run: a method's pictures are drawn once for all truths, which
-            follow one another, and a marker's exact truths once for all methods.
+    Args: kept: cache of the run: images of a method are rendered once for all ground truths, and the exact
+        ground truth of a marker once for all methods.
 
-    Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for a metric that cannot be
-    measured here, and for the PSNR of equal pictures.
+    Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for an unavailable
+    metric, and for the PSNR of equal images.
     """
     category = CATEGORIES[point["category"]]
     spec = category.spec(point["index"], seed)
@@ -142,7 +140,7 @@ def measure_views(
     def compare(number: int, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:
         truth = true(number, camera)
         if truth.shape != picture.shape:
-            raise InputError(f"the Blender pictures in {blender} have another size; render them again")
+            raise InputError(f"the Blender images in {blender} have another size; render them again")
         ours, theirs = picture / 255.0, to_uint8(truth) / 255.0
         ratio = psnr(ours, theirs)
         found = {"psnr": None if np.isinf(ratio) else ratio, "ssim": ssim(ours, theirs)}
@@ -164,9 +162,9 @@ def measure_views(
 
 
 def exact_view(spec: str, camera: Camera, linear: bool) -> np.ndarray:
-    """The ground truth of one view, (h, w) display values.
+    """Ground truth of a view, (h, w) display values.
 
-    linear: a pixel's mean is taken of linear light and then encoded, as Blender's 'Standard' view does it.
+    linear: average linear light and encode the mean, as in Blender's 'Standard' view.
     """
     grid = plain_marker(spec).grid
     module = PROTOCOLS["fixed-plane"].module(grid.shape[0])

@@ -102,7 +102,7 @@ def test_without_blender_the_error_says_how_to_get_it(tmp_path):
     with pytest.raises(fs.InputError, match="unknown view 'agx'; known: standard, raw"):
         list(blender.render([job], "agx", tmp_path))
     camera = fs.Camera.pinhole(10, 10, 9.0, 8.0, 5.0, 5.0)
-    with pytest.raises(fs.InputError, match="square pixels"):
+    with pytest.raises(fs.InputError, match="fx and fy of a Blender camera must be equal"):
         blender.camera_facts(camera)
 
 

@@ -244,7 +244,7 @@ def test_pictures_of_another_seed_are_not_the_truth(capsys, tmp_path):
     ):
         status, _, err = run(capsys, *words)
         assert status == 2
-        assert "holds pictures of seed 0, not 1" in err
+        assert "holds images of seed 0, not 1" in err
     with pytest.raises(fs.InputError, match="pictures of samples 16, not 64; give another folder"):
         note_pictures(tmp_path / "b", "raw", 0, 64)
     assert check_pictures(tmp_path / "b", "raw", 0) == {"seed": 0, "samples": 16}

@@ -1,5 +1,5 @@
-"""What a picture at a setting is worth: how wrong it is, how much of that single precision may have decided,
-and how far a marker may tilt and still be read."""
+"""Errors of a frame: against the reference image, beyond float32 certificates, and the largest readable tilt
+of a marker."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from fidsplat.vision.readers import Target, attempt
 
 FULL_TILTS, QUICK_TILTS = "0:40:20,46:88:1", "0:40:40,48:88:4"
 READERS = {"apriltag": "aruco", "qr": "zxing"}
-"""one detector of each kind, those that fidsplat installs"""
+"""one installed detector of each kind"""
 FLIP_SIDE = 256
-"""pixels: FLIP is taken of the middle square of this size; of the scene of hard cases all is taken"""
+"""pixels: edge of the middle square for FLIP; the scene of hard cases is used completely"""
 NO_FLIP = "flip-evaluator is not installed; pip install 'fidsplat[experiments]'"
 _PAIRS = 2_000_000
-"""pixels times splats that the reference may look at for one picture"""
+"""maximum pixels times splats of the reference renderer per image"""
 _MOST, _LEAST = 64, 12
-"""pixels whose certificates are asked for; where fewer could be, none is"""
+"""pixels with requested certificates; none if fewer are possible"""
 _SAMPLED = 64
 
 
 def scan(session: Session, name: str, quality: Quality | None, tilts: str) -> Callable[[], dict]:
-    """Draw a marker at every tilt; what is returned looks at the pictures.
+    """Render a marker at every tilt; returns work that reads the images.
 
     quality: None for the ideal area-sampled texture, the ceiling that the detector has. The result: `reader`,
     `read` (a string of 0 and 1, one for each tilt), `splats`, `rectangles`.
@@ -69,11 +69,11 @@ def scan(session: Session, name: str, quality: Quality | None, tilts: str) -> Ca
 
 
 def compare_picture(picture: np.ndarray, truth: np.ndarray, scene: TradeScene, quality: Quality) -> dict:
-    """Errors of rgb (h, w, 3) against the truth of the same definition.
+    """Errors of rgb (h, w, 3) against the reference image of the same definition.
 
-    Returns `maximum`, `p999`, `rmse`, `psnr` (None for equal pictures), `maximum_sure` (see
-    `beyond_certificates`), `flip`; for the hard cases `cells`, the largest error in each; for markers what
-    `compare_marker` gives.
+    Returns `maximum`, `p999`, `rmse`, `psnr` (None for equal images), `maximum_sure` (see
+    `beyond_certificates`), `flip`; for the hard cases `cells`, the largest error in each; for markers the
+    result of `compare_marker`.
     """
     found = errors(picture, truth)
     off = np.abs(picture - truth).max(-1)
@@ -91,12 +91,11 @@ def compare_picture(picture: np.ndarray, truth: np.ndarray, scene: TradeScene, q
 
 
 def beyond_certificates(off: np.ndarray, scene: TradeScene, quality: Quality) -> float | None:
-    """At most how large an error is that the reference does not certify, over all pixels.
+    """Maximum error over all pixels that float32 certificates do not explain.
 
-    A pixel's certificate bounds what float32 may change in it because a decision of `quality` lies within
-    rounding of its threshold. Certificates are asked for at the pixels of the largest errors; every other
-    pixel counts with its whole error. None where the scene has too many splats for that, or the reference
-    does not draw this.
+    A certificate bounds the change of a pixel by decisions of `quality` within rounding of their thresholds.
+    Certificates are requested for the pixels with the largest errors; all other pixels count fully. None if
+    the scene has too many splats, or the reference does not render it.
 
     Args:
         off: (h, w) the largest error of each pixel.
@@ -106,7 +105,7 @@ def beyond_certificates(off: np.ndarray, scene: TradeScene, quality: Quality) ->
         return None
     worst = np.argsort(off, axis=None)[::-1][: count + 1]
     rows, columns = np.unravel_index(worst[:count], off.shape)
-    # the reference knows no rounding: what only rounds is nothing to it
+    # the reference does not round
     plain = quality.with_(arithmetic="precise", blend_precision="float32")
     picture = FrameSpec(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
     try:
@@ -151,7 +150,7 @@ def check_truth(truth: np.ndarray, scene: TradeScene, full: Quality) -> dict:
 
 
 def _flip(picture: np.ndarray, truth: np.ndarray, whole: bool) -> dict:
-    """FLIP of display values, and of which part of the picture."""
+    """FLIP of display values, and the part of the image."""
     if not has_flip():
         return {"flip": None, "flip_of": NO_FLIP}
     height, width = truth.shape[:2]

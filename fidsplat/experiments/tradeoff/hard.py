@@ -1,4 +1,4 @@
-"""The scene of hard cases: eight cells of a picture, each with what some constant hurts most."""
+"""Scene of hard cases: eight image cells, each sensitive to one constant."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from fidsplat.splats.rotations import quaternion_multiply
 WIDTH, HEIGHT, FOCAL = 640, 480, 500.0
 COLUMNS, ROWS = 4, 2
 CELL = (WIDTH // COLUMNS, HEIGHT // ROWS)
-"""pixels, width and height"""
+"""width and height in pixels"""
 PLACE = np.array([5e5, 4.5e6, 300.0])
-"""metres: the camera's centre, as far from the origin as maps are"""
+"""position of the camera in metres, as far from the origin as map coordinates"""
 
 CELLS = ("haze", "veils", "opaque", "edge-on", "tiny", "pages", "needles", "near")
-"""What the cells hold, row by row."""
+"""Contents of the cells, row by row."""
 
 
 def hard_scene(seed: int = 0) -> tuple[SplatCloud, Camera]:
@@ -60,7 +60,7 @@ def cell_window(number: int) -> tuple[slice, slice]:
 
 
 def _at(number: int, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Points (n, 3) at a depth (n,), seen pixels (n, 2) away from the middle of a cell."""
+    """Points (n, 3) at depths (n,), at pixel offsets (n, 2) from the middle of a cell."""
     row, column = divmod(number, COLUMNS)
     middle = np.array([(column + 0.5) * CELL[0] - WIDTH / 2, (row + 0.5) * CELL[1] - HEIGHT / 2])
     return np.column_stack([(middle + pixels) / FOCAL * depth[:, None], depth])
@@ -138,7 +138,7 @@ def _needles(generator: np.random.Generator, cell: int) -> SplatCloud:
 
 
 def _near(generator: np.random.Generator, cell: int) -> SplatCloud:
-    """Strips on the ground, 0.5 m below the camera, along the view: they pass below it."""
+    """Strips on the ground, 0.5 m below the camera, that extend behind it."""
     count = 12
     across = np.linspace(0.42, 1.0, count)
     means = np.column_stack([across, np.full(count, 0.5), generator.uniform(0.5, 1.5, count)])

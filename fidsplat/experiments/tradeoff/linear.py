@@ -1,5 +1,5 @@
-"""What EWA's linear image of a 3D Gaussian is wrong by: one ball of opacity 1 by its distance and its angle
-off the axis, which a wide field of view is made of. The float64 reference draws both."""
+"""Error of EWA's linear projection of a 3D Gaussian: one sphere of opacity 1 by distance and angle off the
+axis, in the float64 reference renderer."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from fidsplat.splats.cloud import SplatCloud
 DISTANCES = (3, 5, 10, 30, 100)
 """standard deviations"""
 ANGLES = (0, 20, 40, 60)
-"""degrees off the axis"""
+"""angles off the axis in degrees"""
 _SIDE, _ACROSS = 96, 4.0
 """pixels, and standard deviations from the ball's centre to the picture's edge: at 12 pixels to one EWA's 0.3
 square pixels are 0.0007 of the difference"""
 
 
 def linear_error(distance: float, degrees: float) -> float:
-    """The largest difference in alpha between `ewa` and `exact`."""
+    """Largest difference of alpha between `ewa` and `exact`."""
     angle = math.radians(degrees)
     center = distance * np.array([math.sin(angle), 0.0, math.cos(angle)])
     ball = SplatCloud([center], [[1, 0, 0, 0]], [[1.0, 1.0, 1.0]], [1.0], colors=[[1, 1, 1]])

@@ -1,5 +1,5 @@
-"""The settings that are measured: each knob over a ladder, constants of others in an exact picture, presets,
-useful combinations."""
+"""Quality settings of the trade-off: values of each setting, constants of other renderers in an exact frame,
+presets, and combinations."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.util.errors import InputError, unknown
 
 BASE = TIMED.with_(marker=MarkerQuality("fitted"))
-"""what every other setting is measured beside, turn by turn: the cut-off and the stop that other systems
-share, and our rules; pinned, so that presets and defaults may change"""
+"""baseline of all comparisons: the cut-off and stop of other renderers with our rules; independent of presets
+and defaults"""
 EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise", marker=BASE.marker)
-"""what leaves nothing out that float32 can show; a constant put into this alone shows the error it makes"""
+"""reference quality in float32; a constant changed only here shows its own error"""
 SHARP = {"lowpass": "none", "samples": 3}
-"""for markers: exact splats, the mean of 3 x 3 samples"""
+"""quality of markers: exact splats, the mean of 3 x 3 samples"""
 
-# knob -> (its values, in which kinds of scenes: r random and hard, m markers, t of 3D Gaussians)
+# setting -> (its values, kinds of scenes: r random and hard, m markers, t of 3D Gaussians)
 _BY_FORMULA: dict[str, tuple[tuple[Any, ...], str]] = {
     "alpha_cutoff": (
         (1e-6, 1e-5, 1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 512, 2 / 255, math.exp(-4.5), 4 / 255),
@@ -77,7 +77,7 @@ _ALONE: tuple[dict[str, Any], ...] = (
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
 )
-"""constants that are put into `EXACT`, one at a time"""
+"""constants that are changed in `EXACT`, one at a time"""
 
 _FRACTIONS = {
     above / below: f"{above}/{below}"
@@ -88,33 +88,33 @@ _FRACTIONS = {
 
 PRESETS_KNOB, ALONE, TOGETHER, MARKER_KNOB = "preset", "alone", "together", "marker"
 KNOBS = (PRESETS_KNOB, ALONE, *_BY_FORMULA, MARKER_KNOB, TOGETHER)
-"""what --knobs takes"""
+"""values of --knobs"""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One setting."""
+    """A quality setting to measure."""
 
     knob: str
-    """one of `KNOBS`, or `base`"""
+    """name in `KNOBS`, or `base`"""
     value: str
-    """what it is turned to, in words"""
+    """value as text"""
     quality: Quality
 
     def key(self) -> dict:
-        """For the key of a result: the setting by what it changes in the base."""
+        """Differences from the base, for the key of a result."""
         changes = _changes(asdict(self.quality), asdict(BASE))
         return {"knob": self.knob, "value": self.value, "quality": changes}
 
 
 def quality_of(changes: dict) -> Quality:
-    """The setting of a key's `quality`."""
+    """Point of a result key's `quality`."""
     marker = replace(BASE.marker, **changes.get("marker", {}))
     return BASE.with_(**changes | {"marker": marker})
 
 
 def _changes(values: dict, others: dict) -> dict:
-    """What differs of nested values, and to what."""
+    """Nested values that differ."""
     return {
         name: _changes(value, others[name]) if isinstance(value, dict) else value
         for name, value in values.items()
@@ -123,10 +123,10 @@ def _changes(values: dict, others: dict) -> dict:
 
 
 def knob_names(words: Iterable[str]) -> tuple[str, ...]:
-    """Names of knobs from words, each once; none: all of them.
+    """Distinct names of settings; all if none is given.
 
     Raises:
-        InputError: a name that no knob has.
+        InputError: an unknown setting.
     """
     names = tuple(dict.fromkeys(words)) or KNOBS
     for name in names:
@@ -138,11 +138,11 @@ def knob_names(words: Iterable[str]) -> tuple[str, ...]:
 def points(
     knobs: Iterable[str], on_marker: bool, quick: bool = False, every_ladder: bool = True
 ) -> list[Point]:
-    """The settings for one kind of scene, the most telling ones first, each once.
+    """Distinct points for one kind of scene, the most informative first.
 
-    every_ladder: whether each knob alone is turned; else only presets, and how markers are made.
+    every_ladder: whether to vary each setting; else only presets and marker qualities.
 
-    The base itself is the first: its own error, and its time beside itself, which shows the noise.
+    The base comes first: its own error, and its time relative to itself, which shows the noise.
     """
     chosen = tuple(knobs)
     found = [Point("base", "base", BASE)]
@@ -164,15 +164,14 @@ def points(
 
 
 def thick_points(knobs: Iterable[str]) -> list[Point]:
-    """The settings for scenes of 3D Gaussians: the base, and the ways of drawing them in pictures that are
-    exact otherwise."""
+    """Points of scenes with 3D Gaussians: the base, and the values of `ellipsoid` in exact frames."""
     values = _BY_FORMULA["ellipsoid"][0] if "ellipsoid" in tuple(knobs) else ()
     ways = (Point("ellipsoid", value, EXACT.with_(ellipsoid=value)) for value in values)
     return [Point("base", "base", BASE), *ways]
 
 
 def decode_points(knobs: Iterable[str], quick: bool = False) -> list[Point]:
-    """The settings whose markers are tilted until no detector reads them: what changes edges."""
+    """Points whose markers are tilted until no detector reads them: settings that change edges."""
     chosen = tuple(knobs)
     found = [Point("base", "base", BASE)]
     if PRESETS_KNOB in chosen:
@@ -186,12 +185,12 @@ def decode_points(knobs: Iterable[str], quick: bool = False) -> list[Point]:
 
 
 def preset(name: str) -> Quality:
-    """A preset, with markers as the base has them."""
+    """A preset with the marker quality of the base."""
     return PRESETS[name].with_(marker=BASE.marker)
 
 
 def marker_words(knobs: MarkerQuality) -> str:
-    """A marker's knobs in words, e.g. "paper L3 x1"."""
+    """Marker quality as text, e.g. "paper L3 x1"."""
     if knobs.mixture == "paper":
         words = f"paper L{knobs.levels} x{knobs.density}"
     else:
@@ -200,7 +199,7 @@ def marker_words(knobs: MarkerQuality) -> str:
 
 
 def alone(changes: dict[str, Any]) -> Point:
-    """A constant in the setting that is exact otherwise."""
+    """A constant changed in `EXACT`."""
     knob, value = next(iter(changes.items()))
     return Point(ALONE, f"{knob} {value_words(value)}", EXACT.with_(**changes))
 
@@ -208,38 +207,38 @@ def alone(changes: dict[str, Any]) -> Point:
 def _turned(knob: str, value: Any) -> Point:
     changes = {knob: value}
     if value == "exclusive":
-        changes["order"] = "centre"  # the exclusive stop knows no layers
+        changes["order"] = "centre"  # the exclusive stop cannot composite layers
     return Point(knob, value_words(value), BASE.with_(**changes))
 
 
 def value_words(value: Any) -> str:
-    """A knob's value; fractions that systems write as such stay such."""
+    """Value as text; well-known fractions such as 1/255 are kept."""
     if value in _FRACTIONS:
         return _FRACTIONS[value]
     if value == math.exp(-4.5):
-        return "3 sigma"  # where an opaque splat has fallen to that
+        return "3 sigma"  # cut-off of an opaque splat at 3 sigma
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _marker_points(quick: bool) -> Iterator[Point]:
-    """Every way of making a marker, drawn as the base and by `SHARP`."""
+    """Points of all marker qualities, rendered with the base and with `SHARP`."""
     for knobs in (BASE.marker, *(_QUICK_MARKERS if quick else _MARKER_LADDER)):
         words = marker_words(knobs)
         if knobs != BASE.marker:
             yield Point(MARKER_KNOB, words, BASE.with_(marker=knobs))
-        if knobs.mixture != "exact":  # boxes filter themselves
+        if knobs.mixture != "exact":  # boxes are always filtered
             yield Point(MARKER_KNOB, f"{words}, 3 x 3", BASE.with_(marker=knobs, **SHARP))
 
 
 def _together(quick: bool) -> Iterator[Point]:
-    """Cut-off and stop together, in precise and in fast arithmetic, and some with a float32 set-up too."""
+    """Combinations of cut-off and stop, in precise and fast arithmetic, some with a float32 set-up."""
     cutoffs = _COMBINED_CUTOFFS[1::2] if quick else _COMBINED_CUTOFFS
     for more, words in (({}, ""), (_FAST, ", fast"), (_FASTEST, ", fast, float32 set-up")):
         stops = (_FASTEST_STOP,) if quick or more is _FASTEST else _COMBINED_STOPS
         for cutoff in cutoffs:
             for stop in stops:
                 if not more and (cutoff == BASE.alpha_cutoff or stop == BASE.transmittance_stop):
-                    continue  # that is one knob alone
+                    continue  # a single setting
                 changes = {"alpha_cutoff": cutoff, "transmittance_stop": stop, **more}
                 value = f"cutoff {value_words(cutoff)}, stop {value_words(stop)}{words}"
                 yield Point(TOGETHER, value, BASE.with_(**changes))

@@ -1,4 +1,4 @@
-"""The trade-off as a sweep: its points, those that say most first, and what is done at each."""
+"""Trade-off as a sweep: points in order of information, and their measurement."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ POINT, DECODE, TRUTH, LINEAR = "point", "decode", "truth", "linear"
 IDEAL = "ideal"
 _EARLY = ("base", PRESETS_KNOB, ALONE, "alpha_cutoff", "transmittance_stop", MARKER_KNOB)
 _BATCH = 16
-"""points at most whose pictures wait to be looked at"""
+"""maximum number of points whose images wait for evaluation"""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class TradeoffSettings:
 def prepared(
     options: TradeoffSettings, out: Path, device: str, own: scenes.Own | None = None
 ) -> Iterator[Sweep]:
-    """A run with all that it needs. What a device refuses to draw is a result with `error`.
+    """Sweep with its renderer and results. A view that a device refuses is a result with `error`.
 
-    Raises InputError for options that cannot be used, DeviceError when the device cannot be opened.
+    Raises InputError for invalid options, DeviceError if the device cannot be opened.
     """
     own = own or {}
     keys = (
@@ -64,7 +64,7 @@ def prepared(
     renderer = Renderer(device)
     info = renderer.device
     if info.always_float64:
-        raise InputError(f"{info.name} is what others are measured against; give another --device")
+        raise InputError(f"--device must be a device to measure, got {info.name}, the reference")
     writable_folder(out)
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(f"{info.title}, {info.version}", scenes.SEED, versions)
@@ -83,15 +83,15 @@ def prepared(
     try:
         yield Sweep(f"{NAME} on {device}", results, keys, begin, options.workers, pool)
     finally:
-        # an interrupt must not wait for pictures that nobody will look at
+        # an interrupt must not wait for pending images
         pool.shutdown(cancel_futures=True)
 
 
 def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> list[Key]:
-    """The points of a run.
+    """Points of a run.
 
     Raises:
-        InputError: an unknown scene or knob.
+        InputError: an unknown scene or setting.
     """
     chosen, turned = scenes.scene_names(names, quick), points.knob_names(knobs)
     found: list[tuple[int, Key]] = []
@@ -101,9 +101,7 @@ def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> l
         for view in scenes.views_of(name):
             thick = name in scenes.THICK
             settings = points.thick_points(turned) if thick else points.points(turned, marked, quick, every)
-            if (
-                name == "r1m_1080p"
-            ):  # 18 million samples: minutes on a CPU for what the smaller scene shows too
+            if name == "r1m_1080p":  # 18 million samples: minutes on a CPU; the smaller scene suffices
                 settings = [point for point in settings if point.quality.samples <= 2]
             found += _view_points(view, settings, quick)
         if marked:
@@ -121,17 +119,17 @@ def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> l
 
 
 def own_points(views: Iterable[str], knobs: tuple[str, ...], quick: bool) -> list[Key]:
-    """The points of a run on one's own pictures, by the names of their views.
+    """Points of the user's views, by view name.
 
     Raises:
-        InputError: an unknown knob.
+        InputError: an unknown setting.
     """
     settings = points.points(points.knob_names(knobs), on_marker=False, quick=quick)
     return _in_order([pair for view in views for pair in _view_points(view, settings, quick)])
 
 
 def _view_points(view: str, settings: Iterable[points.Point], quick: bool) -> list[tuple[int, Key]]:
-    """The points of a picture and the checks of their truths, each behind how late it comes."""
+    """Points of a view and checks of their reference images, with priorities."""
     found: list[tuple[int, Key]] = []
     defined: set[tuple] = set()
     for point in settings:

@@ -1,5 +1,5 @@
-"""The scenes of `fidsplat tradeoff`: random ones, of 3D Gaussians too, the hard cases, markers at three
-tilts, and one's own: splats from a file, seen from one's own cameras."""
+"""Scenes of `fidsplat tradeoff`: random splats, 3D Gaussians, hard cases, markers at three tilts, and the
+user's files and cameras."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from fidsplat.util.provenance import digest_of
 
 RANDOM = ("r100k_720p", "r1m_1080p")
 THICK = ("r100k_720p_3d", "r1m_1080p_3d")
-"""scenes of 3D Gaussians, which show what the ways of drawing them cost"""
+"""scenes of 3D Gaussians, for the values of `ellipsoid`"""
 HARD = "hard"
 MARKERS = {"apriltag": "apriltag", "qr2": "small", "qr5": "medium", "qr10": "large", "qr22": "huge"}
-"""name -> the category of the paper that marker 0 is taken of"""
+"""name -> category of the paper; its marker 0 is used"""
 FEW_KNOBS = ("apriltag", "qr2", "qr5", "qr22")
-"""markers that show how they are made; what every other knob does to markers qr10 shows"""
+"""markers for all marker qualities; qr10 is used for every other setting"""
 NAMES = (*RANDOM, *THICK, HARD, *MARKERS)
 QUICK_NAMES = ("r100k_720p", HARD, "apriltag", "qr10")
 TILTS = (0, 60, 80)
-"""degrees from the marker's normal"""
+"""tilts in degrees"""
 PROTOCOL = PROTOCOLS["fixed-plane"]
-"""how markers are looked at: a plane of 2 x 2 m, 4 m away, in 800 x 800 pixels"""
+"""view of markers: a plane of 2 x 2 m, 4 m away, in 800 x 800 pixels"""
 GREY = (BACKGROUND, BACKGROUND, BACKGROUND)
-"""beside the plane of a marker"""
+"""background of a marker's plane"""
 SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
 class TradeScene:
-    """One picture to be drawn."""
+    """A view to render."""
 
     name: str
     """`qr10@60` is the marker qr10 at 60 degrees"""
@@ -48,19 +48,19 @@ class TradeScene:
     camera: Camera
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     made: Marker | None = None
-    """the marker, in modules of `PROTOCOL`"""
+    """marker with the module of `PROTOCOL`"""
 
     @cached_property
     def capture(self) -> Capture:
-        """How it is taken."""
+        """Capture of the view."""
         return Capture(self.camera, background=self.background)
 
 
 def scene_names(words: Iterable[str], quick: bool = False) -> tuple[str, ...]:
-    """Names of scenes from words, each once; none: all of them, or those of a quick run.
+    """Distinct names of scenes; all if none is given, or those of a quick run.
 
     Raises:
-        InputError: a name that no scene has.
+        InputError: an unknown scene.
     """
     names = tuple(dict.fromkeys(words)) or (QUICK_NAMES if quick else NAMES)
     for name in names:
@@ -70,17 +70,17 @@ def scene_names(words: Iterable[str], quick: bool = False) -> tuple[str, ...]:
 
 
 def views_of(name: str) -> tuple[str, ...]:
-    """The pictures that belong to a scene's name: itself, or a marker at each tilt."""
+    """Views of a scene name: itself, or a marker at each tilt."""
     return tuple(f"{name}@{tilt}" for tilt in TILTS) if name in MARKERS else (name,)
 
 
 def is_marker(view: str) -> bool:
-    """Whether a picture or a scene's name is of a marker."""
+    """Whether a view or scene name is a marker."""
     return view.partition("@")[0] in MARKERS
 
 
 def make(view: str, knobs: MarkerQuality) -> TradeScene:
-    """A picture of `views_of`; knobs: how its marker becomes splats.
+    """View of a name in `views_of`; marker quality for markers.
 
     Raises:
         InputError: there is no such mixture or template.
@@ -95,7 +95,7 @@ def make(view: str, knobs: MarkerQuality) -> TradeScene:
 
 @lru_cache(maxsize=32)
 def made_marker(name: str, knobs: MarkerQuality) -> Marker:
-    """The marker of that name on its plane of 2 x 2 m, quiet zone included."""
+    """Marker of a name on its plane of 2 x 2 m, quiet zone included."""
     spec = CATEGORIES[MARKERS[name]].spec(0, SEED)
     plain = marker(spec)
     module = PROTOCOL.module(plain.grid.shape[0])
@@ -103,16 +103,16 @@ def made_marker(name: str, knobs: MarkerQuality) -> Marker:
 
 
 Own = Mapping[str, TradeScene]
-"""one's own pictures, by the names of their views"""
+"""the user's views by name"""
 
 
 def own_pictures(views: Mapping[str, BenchScene]) -> dict[str, TradeScene]:
-    """The pictures of `fidsplat bench`'s own scenes: splats alone, on black."""
+    """Views of the user's `fidsplat bench` scenes: only splats, on black."""
     return {name: TradeScene(name, *view.make()) for name, view in views.items()}
 
 
 def digests(own: Own) -> dict[str, str]:
-    """16 hexadecimal digits of each picture's splats and camera, by its name: results are of these alone."""
+    """Digests of the splats and camera of each view, by name, which identify its results."""
     clouds = {id(scene.cloud): scene.cloud for scene in own.values()}
     splats = {number: digest_of(cloud) for number, cloud in clouds.items()}
     return {name: digest_of((splats[id(scene.cloud)], scene.camera)) for name, scene in own.items()}

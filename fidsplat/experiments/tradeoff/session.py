@@ -1,5 +1,5 @@
-"""What is open while points are measured: a renderer, the scenes on its device, their truths; and how long a
-setting takes beside the base, turn by turn."""
+"""Measurement session: a renderer, uploaded scenes and reference images; interleaved timing of a quality and
+the base."""
 
 from __future__ import annotations
 
@@ -19,46 +19,45 @@ from fidsplat.render.resident import ResidentCloud
 from fidsplat.util.timing import frame_timer, quartiles, ratios, time_interleaved
 
 _SCENES, _TRUTHS = 12, 6
-"""kept at a time"""
+"""cached at a time"""
 DEFINITION = ("lowpass", "samples", "order")
-"""knobs that say what a picture is; the others say how well it is drawn, and `ellipsoid` how near to 3D
-Gaussians themselves"""
+"""settings that define the image; the others define its accuracy"""
 
 
 class Session:
-    """Scenes and truths are made when they are first asked for, and the last few are kept.
+    """Scenes and reference images, made on request and cached.
 
-    Truths are drawn by the renderer itself, or by OpenCL on the processor where it cannot blend in float64.
+    Reference images come from the renderer itself, or from OpenCL on the CPU if it cannot blend in float64.
     """
 
     def __init__(self, renderer: Renderer, own: Own | None = None) -> None:
-        """own: one's own pictures, which have the splats of their files, whatever the knobs of markers."""
+        """own: views of the user's files, which ignore marker qualities."""
         self.renderer, self._reference = renderer, reference_renderer(renderer, Capture())
         self._own, self._uploaded = own or {}, {}
         self._made = lru_cache(_SCENES)(make)
         self.resident = lru_cache(_SCENES)(self._resident)
-        """(view, knobs of markers) -> its splats on the device"""
+        """(view, marker quality) -> its splats on the device"""
         self._truth = lru_cache(_TRUTHS)(self._draw_truth)
 
     def scene(self, view: str, knobs: MarkerQuality) -> TradeScene:
-        """A picture's scene."""
+        """Scene of a view."""
         return self._own[view] if view in self._own else self._made(view, knobs)
 
     def _resident(self, view: str, knobs: MarkerQuality) -> ResidentCloud:
         cloud = self.scene(view, knobs).cloud
         if view not in self._own:
             return self.renderer.upload(cloud)
-        if id(cloud) not in self._uploaded:  # the views of a file show the same splats
+        if id(cloud) not in self._uploaded:  # views of a file share their splats
             self._uploaded[id(cloud)] = self.renderer.upload(cloud)
         return self._uploaded[id(cloud)]
 
     def draw(self, view: str, quality: Quality) -> Frame:
-        """The picture at a setting, not waited for."""
+        """Frame of a view at a quality, without waiting for it."""
         capture = self.scene(view, quality.marker).capture
         return self.renderer.render(self.resident(view, quality.marker), capture, quality=quality)
 
     def truth(self, view: str, quality: Quality) -> np.ndarray:
-        """(h, w, 3) float64: the same splats by the same definition at full precision."""
+        """Reference image (h, w, 3) float64: the same splats and image definition at full precision."""
         return self._truth(view, self.definition(view, quality))
 
     def _draw_truth(self, view: str, like: Quality) -> np.ndarray:
@@ -74,14 +73,14 @@ class Session:
         return BASE.with_(**asked, ellipsoid=ellipsoid, marker=quality.marker)
 
     def full(self, view: str, quality: Quality) -> Quality:
-        """The setting at which `truth` is drawn."""
+        """Quality of `truth`."""
         like = Capture(quality=self.definition(view, quality))
         return full_precision(like, self._reference).quality
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long is measured: pairs of frames until `seconds` have passed, within limits."""
+    """Length of a measurement: pairs of frames for some seconds, within limits."""
 
     least: int = 5
     most: int = 30
@@ -92,9 +91,9 @@ FULL, QUICK = Effort(), Effort(3, 5, 0.2)
 
 
 def time_point(session: Session, view: str, quality: Quality, effort: Effort) -> tuple[Frame, dict]:
-    """Draw a picture at a setting and at the base in turn; splats lie on the device, the picture stays there.
+    """Render a view with a quality and with the base, interleaved; splats and images stay on the device.
 
-    Returns the picture, and `ms`, `base_ms` (medians), their quartiles, `ratio` (median of the pairs' ratios,
+    Returns the image, and `ms`, `base_ms` (medians), their quartiles, `ratio` (median of the pairs' ratios,
     and its quartiles), `repeats`, `stages_ms` by the device's own clock, `memory_bytes` (scratch, cloud and
     picture; None where the backend cannot tell), `splats`, `pairs`.
     """
@@ -118,8 +117,7 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
 
 
 def memory_of(session: Session, view: str, quality: Quality) -> int | None:
-    """Bytes on the device of a picture at a setting: scratch, cloud and picture; None where the backend
-    cannot tell."""
+    """Device memory of a frame in bytes: scratch, cloud and image; None if the backend does not report it."""
     backend, scene = session.renderer.backend, session.scene(view, quality.marker)
     if not backend.traits.measures_rates:
         return None

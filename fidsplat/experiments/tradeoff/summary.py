@@ -1,4 +1,4 @@
-"""What a trade-off found on a device: its results as a table, and what that says of each setting."""
+"""Results of a trade-off on a device as a table, and the verdict on each setting."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ COLUMNS = (
     "rmse", "per_rectangle", "ideal_psnr", "corners_px", "read_to", "error",
 )  # fmt: skip
 TILT = 60
-"""degrees: of markers' pictures a summary has those at this tilt"""
+"""degrees: tilt of the marker images of a summary"""
 TIME_CHANGES = 0.02
-"""share by which a time must differ at least, besides both quartiles lying on that side"""
+"""minimum relative difference of times, in addition to both quartiles"""
 ERROR_CHANGES = 1.1
-"""factor"""
+"""minimum factor between errors that differ"""
 _NOTHING = "nothing"
-"""what the base changes in itself"""
+"""text for the base"""
 _TINY = 1e-6
-"""errors below this are rounding, and equal"""
+"""errors below this are rounding"""
 _VERDICTS = {
     (0, -1): "more accurate", (-1, -1): "more accurate", (1, -1): "slower, more accurate", (-1, 0): "faster",
     (-1, 1): "faster, less accurate", (0, 1): "dominated", (1, 1): "dominated", (1, 0): "slower",
@@ -44,7 +44,7 @@ _VERDICTS = {
 
 
 def rows_of(record: Record) -> Iterator[dict[str, Any]]:
-    """The row of a record; none for markers at other tilts than `TILT`."""
+    """Rows of a record; none for markers at tilts other than `TILT`."""
     key, found = record.key, record.result
     if key["what"] == POINT and is_marker(key["scene"]) and not key["scene"].endswith(f"@{TILT}"):
         return
@@ -118,25 +118,25 @@ class Device:
         self.points = points.set_index(names)
         known = [view for name in NAMES for view in views_of(name)]
         self.own = [view for view in points["scene"].unique() if view not in known]
-        """names of pictures that users brought"""
+        """names of the user's views"""
         self.scenes = [view for view in (*self.own, *known) if (view, "base", "base") in self]
 
     def __contains__(self, point: tuple[str, str, str]) -> bool:
         return point in self.points.index
 
     def at(self, scene: str, knob: str, value: str) -> Row | None:
-        """A setting on a scene; None where it was not measured."""
+        """Row of a setting on a scene; None if it was not measured."""
         return self.points.loc[(scene, knob, value)] if (scene, knob, value) in self else None
 
     def of(self, scene: str) -> Frame:
-        """What was measured on a scene, knob by knob in their order; `ms` is beside the base's median."""
+        """Rows of a scene in the order of settings; `ms` is relative to the median of the base."""
         found: Frame = self.points[self.points["scene"] == scene]
         order = found["knob"].map(list(("base", *KNOBS)).index)
         found = found.iloc[order.argsort(kind="stable")]
         return found.assign(ms=self.base_ms(scene) * found["ratio"])
 
     def same_picture(self, scene: str) -> Frame:
-        """Of `of` what has the base's definition, so that errors may be compared."""
+        """Rows with the image definition of the base, whose errors are comparable."""
         found = self.of(scene)
         # gsplat's stop needs the order of centres, which without planes is the base's
         constants = found["quality"].str.replace("order=centre ", "")
@@ -144,7 +144,7 @@ class Device:
         return found[[not set(DEFINITION) & set(words) for words in turned]]
 
     def base_ms(self, scene: str) -> float:
-        """Milliseconds of the base: the median over all settings that it was drawn beside."""
+        """Median time of the base in milliseconds."""
         return statistics.median(self.points.loc[self.points["scene"] == scene, "base_ms"])
 
     def noise(self, scene: str) -> float:
@@ -163,7 +163,7 @@ class Device:
         return 1 + (point["ratio"] - 1) * point["base_ms"] / self.base_ms(point["scene"])
 
     def verdict(self, point: Row, other: Row) -> str:
-        """What a setting is on a scene beside another of the same definition."""
+        """Verdict on a setting relative to another with the same image definition."""
         signs = {_sign(point[name], other[name]) for name in ("maximum", "rmse")}
         if {-1, 1} <= signs:
             return "mixed"
@@ -199,7 +199,7 @@ class Device:
 
 
 def front(points: Frame) -> Frame:
-    """Those than which none is both as fast and as accurate, from fast to accurate."""
+    """Pareto front of time and error, sorted by time."""
     ranked = points.sort_values(["ratio", "maximum"])
     best = ranked["maximum"].cummin().shift(fill_value=math.inf)
     return ranked[ranked["maximum"] < best]
@@ -211,7 +211,7 @@ def _sign(error: float, other: float) -> int:
 
 
 def quality_text(changes: dict[str, Any]) -> str:
-    """What a quality changes in the base, e.g. "alpha_cutoff=1e-05 marker.template=9"."""
+    """Differences of a quality from the base, e.g. "alpha_cutoff=1e-05 marker.template=9"."""
     words = []
     for name, value in sorted(changes.items()):
         if isinstance(value, dict):
@@ -222,5 +222,5 @@ def quality_text(changes: dict[str, Any]) -> str:
 
 
 def _today(name: str) -> str | None:
-    """What a preset changes in the base; None where there is none of that name any more."""
+    """Differences of a preset from the base; None if the preset no longer exists."""
     return quality_text(Point(PRESETS_KNOB, name, preset(name)).key()["quality"]) if name in PRESETS else None
