@@ -1,8 +1,8 @@
-"""Runs inside Blender's own Python: draws plants that are given as meshes. Imports nothing of fidsplat.
+"""Blender worker: renders plants from meshes. Runs in Blender's Python without fidsplat.
 
     python blender_plants.py JOB.json
 
-Prints "done FILE" for each picture.
+Prints "done FILE" for each image.
 """
 
 import json
@@ -15,7 +15,7 @@ from blender_worker import prepare, shoot  # type: ignore[import-not-found]
 
 
 def main(job: dict) -> None:
-    """Draw every shot of every plant, on nothing."""
+    """Render all images of all plants on a transparent background."""
     scene = prepare(job)
     light(scene)
     for plant in job["things"]:
@@ -26,11 +26,11 @@ def main(job: dict) -> None:
 
 
 def light(scene) -> None:
-    """Soft light from above, the same from all sides, and what leaves pass on; a clear background."""
+    """Soft light from above that leaves transmit; a transparent background."""
     scene.cycles.max_bounces = 4
     scene.cycles.use_denoising = True
     scene.render.film_transparent = True
-    scene.render.use_persistent_data = True  # from picture to picture only the camera moves
+    scene.render.use_persistent_data = True  # only the camera moves between images
     scene.render.image_settings.color_mode = "RGBA"
     sun = bpy.data.lights.new("sun", "SUN")
     sun.energy, sun.angle = 3.0, math.radians(60)
@@ -38,7 +38,7 @@ def light(scene) -> None:
 
 
 def build(plant: dict):
-    """The mesh, smooth, with its vertices' colours as those of its surface."""
+    """Smooth mesh with vertex colours."""
     vertices, colors = np.array(plant["vertices"]), np.array(plant["colors"])
     mesh = bpy.data.meshes.new(plant["name"])
     mesh.from_pydata(vertices.tolist(), [], plant["quads"])
@@ -53,7 +53,7 @@ def build(plant: dict):
 
 
 def material():
-    """What lets some light through, with the colours of the mesh."""
+    """Translucent material with the vertex colours."""
     made = bpy.data.materials.new("plant")
     made.use_nodes = True
     tree = made.node_tree

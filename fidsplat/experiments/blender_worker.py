@@ -1,8 +1,8 @@
-"""Runs inside Blender's own Python: draws the textured planes of a job. Imports nothing of fidsplat.
+"""Blender worker: renders the textured planes of a job. Runs in Blender's Python without fidsplat.
 
     python blender_worker.py JOB.json
 
-Prints "done FILE" for each picture.
+Prints "done FILE" for each image.
 """
 
 import json
@@ -15,7 +15,7 @@ from mathutils import Matrix  # type: ignore[import-not-found]
 
 
 def main(job: dict) -> None:
-    """Draw every shot of every marker."""
+    """Render all images of all markers."""
     scene = prepare(job)
     for marker in job["things"]:
         plane = build(marker, job["view"])
@@ -25,9 +25,9 @@ def main(job: dict) -> None:
 
 
 def shoot(scene, shot: dict) -> None:
-    """Draw one picture into its file, and say so."""
+    """Render one image into its file and report it."""
     aim(scene, shot)
-    # a killed run may have left a worker that still draws the same picture
+    # a worker of a killed run may still render the same image
     part = f"{shot['file']}.{os.getpid()}.part.png"
     scene.render.filepath = part
     bpy.ops.render.render(write_still=True)
@@ -76,7 +76,7 @@ def prepare(job: dict):
 
 
 def build(marker: dict, view: str):
-    """The plane, z = 0, x right, y down, its texture one pixel a module."""
+    """Textured plane z = 0, x right, y down, one texture pixel per module."""
     grid = np.array(marker["grid"])
     rows, columns = grid.shape
     x, y = columns * marker["module"] / 2, rows * marker["module"] / 2
@@ -108,7 +108,7 @@ def build(marker: dict, view: str):
 
 
 def aim(scene, shot: dict) -> None:
-    """Set the camera. Blender's looks along -z with y up, ours along z with y down."""
+    """Set the camera. Blender's faces -z with y up, ours z with y down."""
     width, height = shot["width"], shot["height"]
     scene.render.resolution_x, scene.render.resolution_y = width, height
     data = scene.camera.data

@@ -1,4 +1,4 @@
-"""Charts by matplotlib, as SVG: grouped bars, and points on logarithmic axes whose labels do not overlap."""
+"""Charts by matplotlib as SVG: grouped bars, and points with labels that do not overlap."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ COLOURS = (
     *("#777777", "#d1495b", "#edae49", "#00798c", "#30638e"),
     *("#7b4f9d", "#2e8b57", "#1f2d3d", "#c26a2d", "#a9c5a0"),
 )
-"""of series in their order"""
+"""colours of series"""
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def chart(file: Path, panels: int = 1, size: tuple[float, float] = (9.0, 4.2), o
 
 
 def bars(axes: Axes, groups: Sequence[str], series: Mapping[str, Values], logarithmic: bool = False) -> None:
-    """Groups of bars, one for each series; NaN leaves a gap."""
+    """Grouped bars of series; NaN leaves a gap."""
     width = 0.84 / max(1, len(series))
     for number, (name, values) in enumerate(series.items()):
         places = np.arange(len(groups)) - 0.42 + width * (number + 0.5)
@@ -67,7 +67,7 @@ def bars(axes: Axes, groups: Sequence[str], series: Mapping[str, Values], logari
 
 
 def legend_above(figure: Figure, axes: Axes) -> None:
-    """One legend for all panels, above them, where it covers nothing, in as few rows as there is width."""
+    """One legend above all panels, in as few rows as fit."""
     handles, names = axes.get_legend_handles_labels()
     for columns in range(min(len(names), 6), 0, -1):
         legend = figure.legend(handles, names, loc="outside upper center", ncols=columns, frameon=False)
@@ -77,7 +77,7 @@ def legend_above(figure: Figure, axes: Axes) -> None:
 
 
 def literal(text: str) -> str:
-    """A name for charts: matplotlib takes what stands between two $ for mathematics."""
+    """Escape a name for matplotlib, which reads text between two $ as mathematics."""
     return printable(text).replace("$", r"\$")
 
 

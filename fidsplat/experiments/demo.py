@@ -1,4 +1,4 @@
-"""The main job end to end: markers from text to splats, three views drawn, read back, checked, pictured."""
+"""Demo: markers from text to splats, three rendered views, detection and comparison with ground truth."""
 
 import json
 import time
@@ -27,8 +27,7 @@ from fidsplat.scenes import Scene
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.vision.readback import Reading, read_back
 
-# a marker counts as wholly visible from this share of its area on; the rest is the soft edge of its quiet
-# zone
+# visible share of a completely visible marker; the rest is the soft edge of its quiet zone
 WHOLE = 0.98
 MAX_POSITION_ERROR = 0.01  # of the distance
 _FRAMES = 3  # timed after the one that compiles; the median counts
@@ -36,14 +35,14 @@ _FRAMES = 3  # timed after the one that compiles; the median counts
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """One marker in one view."""
+    """A marker in a view."""
 
     view: str
     reading: Reading
 
     @property
     def passed(self) -> bool | None:
-        """Found where it is; None for a marker that is not wholly visible, which nobody has to find."""
+        """Whether it was found at its position; None for a marker that is not completely visible."""
         if self.reading.visible < WHOLE:
             return None
         error = self.reading.position_error
@@ -52,31 +51,31 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """What the demo found out."""
+    """Results of the demo."""
 
     device: str
     background_splats: int
     marker_splats: dict[str, int]
     sightings: list[Sighting]
     unexpected: list[str]
-    """codes that a detector saw and that nobody placed"""
+    """detected codes that are not in the scene"""
     frame_ms: dict[str, float]
-    """by view: milliseconds on the device for one frame with all outputs"""
+    """by view: device time of a frame with all outputs, in milliseconds"""
     visible_splats: dict[str, int]
-    """by view: splats that were not culled"""
+    """by view: number of splats after culling"""
     seconds: float
-    """the whole run"""
+    """duration of the run"""
     files: list[Path]
 
     @property
     def passed(self) -> bool:
-        """Every wholly visible marker was found within the limit, there was one, and nothing else was
-        seen."""
+        """Whether all completely visible markers, at least one, were found within the limit, and nothing
+        else."""
         decided = [s.passed for s in self.sightings if s.passed is not None]
         return bool(decided) and all(decided) and not self.unexpected
 
     def as_dict(self) -> dict:
-        """For JSON."""
+        """Plain data for JSON."""
         seen = [{"view": s.view, "passed": s.passed, **s.reading.as_dict()} for s in self.sightings]
         return {"passed": self.passed} | vars(self) | {"sightings": seen, "files": [*map(str, self.files)]}
 
@@ -87,13 +86,13 @@ def run_demo(
     progress: Callable[[str], None] = lambda text: None,
     mixture: str = "exact",
 ) -> DemoResult:
-    """Run the demo and write its pictures, its scene and its figures into the folder ``out``.
+    """Run the demo and write its images, scene and results into the folder ``out``.
 
     Args:
-        out: made when it is missing; files of an earlier run are overwritten.
+        out: folder, made if missing; existing files are overwritten.
         device: as for `Renderer`.
-        progress: called with what is being done, for a progress display.
-        mixture: of the markers. Those of `exact` stand in scene.ply as `fitted`: a PLY file has no boxes.
+        progress: called with the name of each step.
+        mixture: of the markers; scene.ply has `fitted` instead of `exact`, since PLY files have no boxes.
 
     Raises InputError when the folder cannot be written or there is no such mixture, DeviceError when the
     device cannot be used.
@@ -108,7 +107,7 @@ def run_demo(
     scene.save(files[0])
     files += sorted(folder.glob("scene-splats-*.ply"))
     save_ply((scene if mixture != "exact" else demo_scene(mixture="fitted")).cloud(), files[1])
-    # files round logarithms and logits to single precision: what is drawn is what stands in them, to the bit
+    # files round logarithms and logits to float32: render the splats of the file
     scene = Scene.load(files[0])
     resident = renderer.upload(scene)
 
@@ -144,7 +143,7 @@ def run_demo(
 def _draw(
     renderer: Renderer, resident, scene: Scene, camera: Camera
 ) -> tuple[dict[str, np.ndarray], float, int]:
-    """Output images, milliseconds of a frame once all is compiled, splats that were not culled."""
+    """Output images, milliseconds of a warm frame, number of splats after culling."""
     times = []
     for _ in range(1 + _FRAMES):
         frame = renderer.render(resident, camera, outputs=OUTPUTS, background=scene.background)
@@ -167,7 +166,7 @@ def _save(folder: Path, stem: str, images: dict[str, np.ndarray], marked: np.nda
 
 
 def _sheet(seen: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
-    """A column for each view: what was read there, its depth and its normals, with their keys."""
+    """Contact sheet with a column per view: detections, depth and normals, with keys."""
     span = depth_span(depth for _, depth, _ in seen.values())
     rows = [
         [(f"{view}: what was read", marked) for view, (marked, _, _) in seen.items()],

@@ -1,8 +1,8 @@
-"""The demo's scene: three signs in a small yard, and the three views of it. All of it from one seed.
+"""Scene of the demo: three signs in a small yard and three views, generated from one seed.
 
-x right, y down, z away; the signs stand at z = 0 and face -z. Stones and bricks lie some millimetres apart in
-depth, joints before them: of splats in one plane rounding would say which is in front. What is flat is made
-of disks, blooms and bushy shrubs of 3D Gaussians.
+x right, y down, z away; the signs are at z = 0 and face -z. Stones and bricks differ by millimetres in depth,
+since the order of coplanar splats would depend on rounding. Flat things are disks, blooms and bushy shrubs 3D
+Gaussians.
 """
 
 import math
@@ -30,8 +30,7 @@ OUTPUTS = ("rgb", "depth", "normal", "label")
 
 
 def demo_scene(seed: int = 0, mixture: str = "exact") -> Scene:
-    """Signs, ground, wall and plants: about ten thousand background splats, label 0, and the splats of the
-    signs, of that mixture."""
+    """Signs of a mixture, ground, wall and plants: about ten thousand background splats with label 0."""
     random = np.random.default_rng(seed)
     placed = tuple(
         PlacedMarker(marker(spec, size=size, mixture=mixture), rigid_matrix(place))
@@ -53,7 +52,7 @@ def demo_scene(seed: int = 0, mixture: str = "exact") -> Scene:
 
 
 def demo_views() -> dict[str, Camera]:
-    """Cameras by name: from the front, from 60 degrees to the side, and past a plant that hides part of a
+    """Cameras by name: from the front, from 60 degrees to the side, and past a plant that occludes part of a
     sign."""
 
     def around(degrees: float, away: float, up: float, target) -> Camera:
@@ -69,7 +68,7 @@ def demo_views() -> dict[str, Camera]:
 
 
 def _ground(random: np.random.Generator) -> SplatCloud:
-    """Paving stones of 0.4 m, lying flat."""
+    """Paving stones of 0.4 m."""
     tones = random.uniform(0.46, 0.62, (8, 13, 1)) * np.array([1.0, 0.95, 0.87])
     down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns: x, towards the camera, down
     corner = np.array([-2.6, GROUND, WALL])
@@ -89,12 +88,12 @@ def _tiles(
     """Tiles in rows with joints between them.
 
     Args:
-        corner: (3,) where the first tile begins.
+        corner: (3,) corner of the first tile.
         axes: (3, 3) columns: along a row, across the rows, normal.
-        pitch: (2,) metres from tile to tile along and across.
+        pitch: (2,) distance of tiles along and across, metres.
         tones: (rows, columns, 3) colour of each tile.
         grid: (2,) splats of a tile along and across.
-        shift: how far every second row is moved, in tiles.
+        shift: offset of every second row, in tiles.
         joint: (3,) colour between tiles.
     """
     rows, columns = tones.shape[:2]
@@ -128,8 +127,7 @@ def _tiles(
 
 
 def _plants(random: np.random.Generator) -> list[SplatCloud]:
-    """Shrubs by the wall and to the sides, and the one that hides part of the middle sign in the third
-    view."""
+    """Shrubs, one of which occludes part of the middle sign in the third view."""
     green, dark, olive = (0.30, 0.52, 0.20), (0.16, 0.38, 0.18), (0.46, 0.50, 0.22)
     shrubs = (  # middle, half axes, leaves, whether bushy, colour, flowers
         ((-2.1, 0.35, 1.0), (0.55, 0.55, 0.55), 560, False, dark, None),
@@ -144,7 +142,7 @@ def _plants(random: np.random.Generator) -> list[SplatCloud]:
 
 
 def _shrub(random: np.random.Generator, middle, axes, leaves: int, bushy, colour, flowers) -> SplatCloud:
-    """Leaves are disks, or if bushy tufts half as thick as wide; blooms are balls."""
+    """A shrub: leaves are disks, or thick tufts if bushy; blooms are spheres."""
     direction = random.normal(size=(leaves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     means = np.asarray(middle) + direction * np.asarray(axes) * np.cbrt(random.uniform(0.15, 1, (leaves, 1)))

@@ -1,5 +1,5 @@
-"""The demo's scene as a data set to train on: pictures from an arc before it, their cameras, and points as a
-reconstruction from pictures would leave them."""
+"""Training data set of the demo scene: images from an arc, their cameras, and noisy points of a
+reconstruction."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from fidsplat.util.files import atomic_write, writable_folder
 
 POINTS = 6000
 _SPREAD = 0.005
-"""metres, by which points are off"""
+"""standard deviation of points in metres"""
 _TARGET = (0.0, 0.1, 0.3)
 _ARC = math.radians(50.0)
-"""to either side"""
+"""half angle of the arc"""
 
 
 def write_demo_views(
@@ -35,11 +35,11 @@ def write_demo_views(
     device: str | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Path:
-    """Draw the demo's scene from many places and write the data set (`fidsplat.train.load_dataset`).
+    """Render the demo scene from many poses and write the data set (`fidsplat.train.load_dataset`).
 
     Args:
-        views: pictures to train on; test: pictures to compare with, in the folder test.
-        width: pixels of a picture, 16 / 9 as wide as high.
+        views: number of training images; test: number of test images, in the folder test.
+        width: of an image in pixels; the aspect ratio is 16 : 9.
 
     Raises:
         InputError: the folder cannot be written; DeviceError: the device cannot be used.
@@ -60,15 +60,14 @@ def write_demo_views(
             if progress is not None:
                 progress("pictures", done / (views + test))
         save_colmap(where / "sparse" / "0", names, cameras, *_points(scene, seed))
-    # last: a data set with it is whole
+    # last: it marks a complete data set
     with atomic_write(place / "dataset.json") as stream:
         stream.write(json.dumps({"background": scene.background, "seed": seed}).encode())
     return place
 
 
 def _cameras(count: int, width: int, shift: float) -> list[Camera]:
-    """Cameras on an arc, nearer and farther, higher and lower in turn; shift: by which they lie between
-    those of 0."""
+    """Cameras on an arc with alternating distances and heights; shift moves them between those of shift 0."""
     height = round(width * 9 / 16)
     cameras = []
     for i in range(count):
@@ -85,5 +84,5 @@ def _points(scene: Scene, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rows = np.sort(random.choice(len(cloud), POINTS, replace=False))
     points = cloud.world_means()[rows] + random.normal(0, _SPREAD, (POINTS, 3))
     colors = cloud.plain_colors
-    assert colors is not None  # the demo's scene has no other
+    assert colors is not None  # the demo scene has plain colours
     return points, np.rint(np.clip(colors[rows], 0, 1) * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A page of pictures: scenes, as this machine draws them, with the text that each is made of."""
+"""Gallery: an HTML page of rendered scenes with their scene files."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class Piece:
     """A scene of a gallery."""
 
     name: str
-    """of its pictures' files"""
+    """stem of its image files"""
     title: str
     scene: Scene
     text: str = field(default="", repr=False)
-    """the scene file; empty for splats alone"""
+    """text of the scene file; empty for splat files"""
 
 
 def piece_of(source: Path, scene: Scene) -> Piece:
-    """A scene that was read from a file; its title is the first line's comment."""
+    """Read a scene file; the title is the comment of its first line."""
     text = read_text(source, "replace") if source.suffix.lower() == ".toml" else ""
     first = text.partition("\n")[0]
     title = first.lstrip("# ").partition(". fidsplat")[0] if first.startswith("#") else source.stem
@@ -52,14 +52,14 @@ def piece_of(source: Path, scene: Scene) -> Piece:
 
 
 def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = None) -> Iterator[Path]:
-    """Draw the pieces into a folder, and write index.html, which shows them; yields each file when it is
-    there. What was drawn before of the same splats, in the same way, is not drawn again.
+    """Render scenes into a folder and write index.html; yields each file when it is written. Unchanged scenes
+    are not rendered again.
 
     Args:
-        device: instead of the scenes' own.
+        device: replaces the devices of the scenes.
 
     Raises:
-        InputError: the folder cannot be written, or a scene's camera is missing.
+        InputError: the folder cannot be written, or a scene has no camera.
         DeviceError: a device fails.
     """
     writable_folder(folder)

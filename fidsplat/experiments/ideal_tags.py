@@ -1,4 +1,4 @@
-"""Printed tags among splats, every pixel the exact mean of what it shows of them."""
+"""Ideal images of printed tags among splats: exact mean of the texture per pixel."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from fidsplat.experiments.plane import plane_picture
 from fidsplat.scenes import PlacedMarker
 
 _LEAST = 1 / 512
-"""share of a pixel that a tag must cover to be there"""
+"""minimum share of a pixel that a tag covers"""
 
 
 def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.ndarray) -> ExternalDepth:
-    """What a camera sees of printed tags, as a layer for the picture that it took without them.
+    """External depth image of printed tags for a frame without them.
 
-    Where a tag covers a part of a pixel, the rest is what is behind it, and the layer is at the tag's depth.
+    A partly covered pixel is mixed with the frame, at the depth of the tag.
 
     Args:
-        tags: markers of one bit. Those that are seen from behind, or reach behind the camera, are left out.
+        tags: black and white markers; those that face away or reach behind the camera are skipped.
         camera: a pinhole.
-        behind: (h, w, 3) what it sees without them.
+        behind: (h, w, 3) frame without the tags.
     """
     rgb, depth = np.array(behind, np.float64), np.zeros(behind.shape[:2])
     poses = [(camera.world_to_camera @ tag.pose, tag) for tag in tags]
@@ -53,7 +53,7 @@ def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.nda
 
 
 def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, int, int, int] | None:
-    """Pixels left, top, right, bottom that may show a tag at `pose`, camera from marker; None for none."""
+    """Bounding box (left, top, right, bottom) of a tag at `pose`, camera from marker; None if not visible."""
     height, width = np.array(tag.marker.grid.shape) * tag.marker.module / 2
     corners = np.array([(x, y, 0.0) for x in (-width, width) for y in (-height, height)])
     seen = corners @ pose[:3, :3].T + pose[:3, 3]
@@ -66,7 +66,7 @@ def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, i
 
 
 def _depth(pose: np.ndarray, camera: Camera) -> np.ndarray:
-    """Depth along z of a marker's plane at each pixel, (h, w) metres."""
+    """Depth along z of the plane of a marker at each pixel, (h, w) metres."""
     y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
     with np.errstate(divide="ignore"):

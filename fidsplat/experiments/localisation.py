@@ -1,4 +1,4 @@
-"""Accuracy of localisation, which the paper claims: pose errors of one marker by distance and tilt."""
+"""Localisation accuracy: pose errors of one marker by distance and tilt."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fidsplat.vision.readback import corner_error, own_code
 NAME = "localisation"
 LOCATED = ("apriltag", "small")
 SIZE = 0.16
-"""metres, edge of the code"""
+"""edge of the code in metres"""
 WIDTH, HEIGHT, FOV = 1280, 720, 60.0
 DISTANCES = (0.5, 1.0, 2.0, 3.0, 4.0)
 """metres"""
@@ -36,7 +36,7 @@ def localisation_points(
     tilts: Iterable[float] = TILTS,
     markers: int = 5,
 ) -> list[dict]:
-    """The points of the experiment: one marker by one method, at every distance and tilt."""
+    """Points of the experiment: a marker and a method, at every distance and tilt."""
     distances, tilts = list(distances), list(tilts)
     return [
         {"category": c.name, "index": i, "method": m, "distances": distances, "tilts": tilts}

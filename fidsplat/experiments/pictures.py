@@ -1,4 +1,4 @@
-"""Picture sheets: every method beside the ideal, at several tilts."""
+"""Contact sheets: every method next to the ideal, at several tilts."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _PIXELS = 160  # of the cut-out in the middle of each picture, at most
 
 
 def sheet_files(folder: Path) -> list[Path]:
-    """The sheets that a folder holds."""
+    """Sheets in a folder."""
     return sorted(folder.glob("sheet-*.png"))
 
 
 def write_sheets(
     categories: Iterable[Category], methods: Iterable[str], painter: Painter, seed: int, folder: Path
 ) -> Iterator[Path]:
-    """Draw marker 0 of each category by every method, rows of equal tilt; yields each file as it is written.
+    """Render marker 0 of each category by every method, one row per tilt; yields each file.
 
-    The middle of the 800 x 800 picture, pixel by pixel, so that edges show.
+    Shows the middle of the 800 x 800 image at full resolution.
     """
     writable_folder(folder)
     protocol = PROTOCOLS["fixed-plane"]

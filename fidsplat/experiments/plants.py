@@ -1,5 +1,5 @@
-"""Plants from Blender: meshes grown from a seed, drawn by Cycles from many poses, and splats trained on the
-pictures, from disks on the mesh."""
+"""Plants from Blender: meshes rendered by Cycles from many poses, and splats trained on the images, starting
+from disks on the mesh."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from fidsplat.util.provenance import code_hash
 from fidsplat.worlds.plants import GOLDEN, KINDS, Mesh
 
 BACKGROUND = (0.9, 0.2, 0.9)
-"""behind plants in training: no plant has it, so that holes show"""
+"""background of training, a colour that no plant has, so that holes are visible"""
 WORKER = Path(__file__).with_name("blender_plants.py")
 NOTE = "plants.json"
 HEIGHT, FOCAL = 320, 480.0
-"""pixels of the pictures"""
+"""height and focal length of the images in pixels"""
 _LOW, _HIGH = math.radians(-15), math.radians(60)
-"""the cameras' elevation"""
+"""range of camera elevations"""
 _FAINT = 0.05
-"""opacity below which trained splats go"""
+"""minimum opacity of trained splats"""
 Tell = Callable[[str, float], None]
 
 
@@ -70,21 +70,21 @@ class PlantSettings:
 
     @property
     def names(self) -> list[tuple[str, int]]:
-        """Kind and number of each plant, one of every kind first."""
+        """Kind and number of each plant, one of each kind first."""
         return [(kind, number) for number in range(self.each) for kind in self.kind or KINDS]
 
     def mesh(self, kind: str, number: int) -> Mesh:
-        """A plant's surface."""
+        """Mesh of a plant."""
         return KINDS[kind](np.random.default_rng([self.seed, list(KINDS).index(kind), number]))
 
 
 def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:
-    """Cameras on a spiral around a plant that see all of it, from a little below to far above; shift: by
-    which they lie between those of 0."""
+    """Cameras on a spiral around a plant, from below to far above; shift moves them between those of shift
+    0."""
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     off = mesh.vertices - middle
     reach, aside = (float(np.linalg.norm(part, axis=1).max()) for part in (off, off[:, :2]))
-    away = 1.01 * reach * math.hypot(1, 2 * FOCAL / HEIGHT)  # a ball around it fills the height
+    away = 1.01 * reach * math.hypot(1, 2 * FOCAL / HEIGHT)  # its bounding sphere fills the height
     width = min(HEIGHT, 2 * math.ceil(FOCAL * aside / (away - reach)))
     found = []
     for i in range(count):
@@ -103,17 +103,16 @@ def write_plants(
     device: str | None = None,
     tell: Tell = lambda words, share: None,
 ) -> Iterator[tuple[Path, float | None]]:
-    """Make what is not there yet: yields each plant's PLY file, and the mean PSNR of the views held out where
-    it was trained now.
+    """Make missing plants: yields each PLY file, and the mean PSNR of held-out views if it was trained now.
 
     Args:
-        folder: KIND-NUMBER.ply go there, and the pictures into folders KIND-NUMBER.
-        environment: Blender's, of `fidsplat.experiments.blender.install`.
-        tell: told what is done, and the share of all.
+        folder: for KIND-NUMBER.ply, and folders KIND-NUMBER of images.
+        environment: of `fidsplat.experiments.blender.install`.
+        tell: called with the step and the completed share.
 
     Raises:
         InputError: Blender is not installed, or the folder holds plants of other numbers or sources.
-        DeviceError: Blender fails; pictures done stay.
+        DeviceError: Blender fails; finished images stay.
     """
     python = ready("standard", environment) if wanted.iterations else None
     _note(wanted, writable_folder(folder))
@@ -138,9 +137,9 @@ def write_plants(
 
 
 def _note(wanted: PlantSettings, folder: Path) -> None:
-    """What the folder's plants are made with, kept beside them."""
+    """Check and record the settings of the plants of a folder."""
     file = folder / NOTE
-    # more of them, or of other kinds, may come to those that are there
+    # plants may be added later
     own = {name: value for name, value in asdict(wanted).items() if name not in ("kind", "each")}
     own["sources"] = code_hash()
     try:
@@ -154,7 +153,7 @@ def _note(wanted: PlantSettings, folder: Path) -> None:
 
 
 def _draw(wanted: PlantSettings, mesh: Mesh, place: Path, python: Path, tell: Tell) -> None:
-    """The data set of a plant; pictures that are there stay."""
+    """Write the data set of a plant; existing images stay."""
     views, shots = [], []
     for folder, stem, cameras in (
         (place, "view", cameras_around(mesh, wanted.views)),
@@ -181,7 +180,7 @@ def _draw(wanted: PlantSettings, mesh: Mesh, place: Path, python: Path, tell: Te
     for done, _ in enumerate(drawn(python, WORKER, [plant], job)):
         tell("Blender", 0.5 * (done + 1) / len(shots))
     disks = mesh.splats(wanted.splats, wanted.seed)
-    assert disks.colors is not None  # a mesh has no other
+    assert disks.colors is not None  # meshes have plain colours
     points, colors = disks.world_means(), np.rint(255 * disks.colors).astype(np.uint8)
     for folder, names, cameras in views:
         save_colmap(folder / "sparse" / "0", names, cameras, points, colors)
@@ -192,12 +191,12 @@ def _draw(wanted: PlantSettings, mesh: Mesh, place: Path, python: Path, tell: Te
 def _train(
     wanted: PlantSettings, mesh: Mesh, place: Path, file: Path, renderer: Renderer, tell: Tell
 ) -> float:
-    """Train on the pictures from disks on the mesh, and write those that show; the mean PSNR of the test
-    views."""
+    """Train on the images from disks on the mesh, and write the visible splats; returns the mean test
+    PSNR."""
     settings = TrainSettings(
         iterations=wanted.iterations,
         seed=wanted.seed,
-        sh_degree=0,  # plants are turned, and their light comes from above
+        sh_degree=0,  # plants are rotated, with light from above
         densify_until=0,
         position_steps=wanted.iterations,
     )
@@ -211,7 +210,7 @@ def _train(
     trainer.run(step)
     score = float(np.mean([view.psnr for view in trainer.evaluate()]))
     cloud = trainer.cloud()
-    assert cloud.sh is not None  # a trainer makes no other
+    assert cloud.sh is not None  # trainers make SH
     seen = cloud.opacities > _FAINT
     parts = (getattr(cloud, name)[seen] for name in ("means", "quats", "scales", "opacities"))
     save_ply(SplatCloud(*parts, sh=cloud.sh[seen], origin=cloud.origin), file)

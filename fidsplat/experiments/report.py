@@ -1,4 +1,4 @@
-"""The page of the paper's experiments: its tables with ours beside them, charts, what was to be reached."""
+"""Report of the paper's experiments: tables of the paper and ours, and charts."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from fidsplat.experiments.views import LINEAR, TRUTHS
 from fidsplat.util.files import atomic_write, open_input
 
 _FURTHEST = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
-"""the detectors of each kind by how far they read on the ideal texture: the first that is there is shown"""
+"""detectors of each kind by limit on the ideal texture; the first available one is shown"""
 _SHOWN_TRUTHS = (("exact", "blender-raw"), ("blender-standard", "exact-linear"))
-"""of display values and of linear light: the first that is there is shown"""
+"""ground truths of display values and of linear light; the first available one is shown"""
 _COMMANDS = {trained.NAME: "baseline"}
-"""of experiments that have another name"""
+"""commands of experiments with another name"""
 PAPER, TRAINED = "paper, its own", "paper, 2DGS 17 views"
 
 
@@ -76,13 +76,13 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
 
 
 def category_order(names: Iterable[str]) -> list[str]:
-    """Those that occur, in the paper's order."""
+    """Occurring categories in the paper's order."""
     there = set(names)
     return [name for name in CATEGORIES if name in there]
 
 
 def method_order(names: Iterable[str]) -> list[str]:
-    """Those that occur and are shown: the ideal, mixtures drawn sharp, trained models."""
+    """Occurring methods that are shown: the ideal, mixtures without a low-pass, trained models."""
     own = with_linear_light(f"{mixture}/{name}" for mixture in mixtures() for name in FILTERS)
     known = [IDEAL, *(name for name in own if not name.endswith("/screen"))]
     there = set(names)
@@ -173,7 +173,7 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
 
 
 def _of_furthest(rows: Frame) -> Frame:
-    """What the detector of each kind saw that reads furthest, of those to which a method was shown."""
+    """Rows of the detector with the furthest limit for each method."""
     places = {name: place for names in _FURTHEST.values() for place, name in enumerate(names)}
     place = rows["reader"].map(places)
     each = place.groupby([rows["protocol"], rows["category"], rows["method"]])
@@ -189,7 +189,7 @@ def _angle(values: Row) -> str:
 
 
 def _views(rows: Frame, folder: Path) -> dict:
-    """Table 4 against a truth of display values and one of linear light, and its chart."""
+    """Table 4 against ground truth of display values and of linear light, and its chart."""
     categories = category_order(rows["category"])
     there = set(rows["truth"])
     shown = [name for names in _SHOWN_TRUTHS if (name := next((n for n in names if n in there), ""))]
@@ -261,7 +261,7 @@ def _trained(rows: Frame, seen: Frame | None, scans: Frame | None) -> dict:
 
 
 def _unread(rows: Frame, scans: Frame) -> str:
-    """Of which categories and numbers of views not all that was trained was shown to the detectors."""
+    """Categories and numbers of views with trainings that the detectors did not read."""
     markers, lacking = ["category", "views", "marker"], {}
     scans = scans.assign(views=pd.to_numeric(scans["method"].str.extract(r"^2dgs-(\d+)$")[0]))
     shown = set(scans[markers].itertuples(index=False, name=None))
@@ -303,19 +303,19 @@ def _enough(table: Frame) -> list[dict]:
 
 
 def _flips(seen: Frame) -> dict[tuple[str, str], str]:
-    """FLIP of novel views against what trainings saw, by category and method."""
+    """FLIP of novel views against the ground truth of training, by category and method."""
     means = seen[seen["truth"] == "exact"].groupby(["category", "method"])["flip"].mean()
     return {place: fixed(mean, 3) for place, mean in means.items()}
 
 
 def _read_of(scans: Frame) -> dict[tuple[str, str], str]:
-    """The largest tilt that is read on the paper's plane, by category and method."""
+    """Largest readable tilt on the paper's plane, by category and method."""
     scans = _of_furthest(scans[scans["protocol"] == "fixed-plane"])
     return {place: _angle(own["read"]) for place, own in scans.groupby(["category", "method"])}
 
 
 def _localisation(rows: Frame, folder: Path) -> Frame:
-    """Median error of position by every other distance, and how many of the views were read."""
+    """Median position error by every other distance, and number of views read."""
     methods = method_order(rows["method"])
     rows = rows[rows["distance_m"].isin(sorted(set(rows["distance_m"]))[::2])]
     table = []
@@ -338,7 +338,7 @@ def _beside_paper(
     cell: Callable[[tuple[str, str]], str],
     paper: dict[str, dict],
 ) -> Frame:
-    """A row for each category: the paper's figures if there are any, then ours."""
+    """Rows by category: figures of the paper if any, then ours."""
     theirs = {PAPER: "ours", TRAINED: 17} if paper else {}
     return pd.DataFrame(
         [
@@ -353,7 +353,7 @@ def _beside_paper(
 def _series(
     categories: Sequence[str], methods: Sequence[str], values: Row, paper: dict[str, dict]
 ) -> dict[str, list[float]]:
-    """Ours by method, then the paper's, for `_panels`."""
+    """Our figures by method, then the paper's, for `_panels`."""
     nan = float("nan")
     own = {_short(m): [values.get((c, m), nan) for c in categories] for m in methods}
     theirs = {
@@ -364,7 +364,7 @@ def _series(
 
 
 def _short(method: str) -> str:
-    """A method's name in charts: which filter it is drawn with stands above them."""
+    """Name of a method in charts, without its filter."""
     mixture, slash, _ = method.partition("/")
     return f"mixture {mixture}" if slash else method
 
@@ -372,7 +372,7 @@ def _short(method: str) -> str:
 def _panels(
     file: Path, categories: Sequence[str], panels: dict[str, dict[str, list[float]]], unit: str
 ) -> None:
-    """Bars for each category side by side, one legend for all panels."""
+    """Panels of bars by category with one legend."""
     names = list(dict.fromkeys(name for series in panels.values() for name in series))
     names.sort(key=lambda name: (name in (PAPER, TRAINED), name != IDEAL))
     nothing = [float("nan")] * len(categories)

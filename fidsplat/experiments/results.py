@@ -1,4 +1,4 @@
-"""What the paper's experiments found, as tables: a summary for each, which gives the rows of every page."""
+"""Results of the paper's experiments as a summary table each."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from fidsplat.experiments.sweep import Record
 from fidsplat.util.errors import InputError
 
 ALLOWED_GAP = {"exact": 0.2, "fitted": 1.0}
-"""degrees by which reading may end below the ideal texture's, by mixture"""
+"""allowed gap below the limit of the ideal texture in degrees, by mixture"""
 NEVER = 90.0
-"""degrees behind the ideal of what is not read at all"""
+"""gap in degrees of a code that is never read"""
 Rows = Iterator[dict[str, Any]]
 
 
@@ -30,23 +30,23 @@ class _Scan(NamedTuple):
 
 
 Ideals = dict[tuple, dict[str, _Scan]]
-"""protocol and marker -> what each detector reads of the ideal texture"""
+"""protocol and marker -> readings of the ideal texture by detector"""
 
 
 class Kind(NamedTuple):
-    """How the results of one experiment become rows."""
+    """Conversion of the results of an experiment to rows."""
 
     about: tuple[str, ...]
-    """columns that say what a row is of"""
+    """key columns of a row"""
     columns: tuple[str, ...]
     rows: Callable[[Ideals, Record], Rows]
-    """the rows of a record; what a method reads is compared with what the ideal texture gives"""
+    """rows of a record, compared with readings of the ideal texture"""
 
 
 def load(folders: Sequence[Path]) -> dict[str, Summary]:
-    """The results in folders, raw (NAME.jsonl) or summarised (NAME.csv), by experiment; those that there are.
+    """Results of folders by experiment, raw (NAME.jsonl) or summarised (NAME.csv).
 
-    Of a thing that was measured twice the larger measurement counts.
+    Of two measurements the larger one is used.
 
     Raises InputError when there are none, or they are of another version.
     """
@@ -89,14 +89,14 @@ def _counts_rows(ideals: Ideals, record: Record) -> Rows:
 
 
 def _scans(record: Record) -> dict[str, _Scan]:
-    """By detector."""
+    """Readings by detector."""
     tilts = angles.parse_tilts(record.key["tilts"])
     found = record.result["readers"].items()
     return {name: _Scan(tilts, seen["found"], seen["read"]) for name, seen in found}
 
 
 def _ideals(records: Iterable[Record]) -> Ideals:
-    """What the ideal texture gives, for each protocol and marker: of several scans the longest."""
+    """Readings of the ideal texture by protocol and marker, from the longest scan."""
     found: Ideals = {}
     for record in records:
         if record.key["method"] == IDEAL:
@@ -124,7 +124,7 @@ def _angles_rows(ideals: Ideals, record: Record) -> Rows:
 
 
 def _beside_ideal(scan: _Scan, ideal: _Scan, method: str) -> dict[str, float | None]:
-    """How far a scan stays behind that of the ideal texture, on the tilts that both have.
+    """Gap between a scan and that of the ideal texture, on common tilts.
 
     `behind`, `behind_all`: degrees by which the largest tilt that is read, and the largest without a miss,
     lie below the ideal's; `NEVER` where there is none, None where the ideal has none. `missed` of `below`:
@@ -162,7 +162,7 @@ def _views_rows(ideals: Ideals, record: Record) -> Rows:
 
 
 def _localisation_rows(ideals: Ideals, record: Record) -> Rows:
-    """A row for each distance: medians over the tilts at which the marker was read."""
+    """Rows by distance: medians over the tilts at which the marker was read."""
     key = record.key
     for distance in key["distances"]:
         seen = [view for view in record.result["views"] if view["distance_m"] == distance]
@@ -175,7 +175,7 @@ def _localisation_rows(ideals: Ideals, record: Record) -> Rows:
 
 
 def _trained_rows(ideals: Ideals, record: Record) -> Rows:
-    """What was stopped and went on has no time of its whole training."""
+    """A resumed training has no total time."""
     key, found = record.key, dict(record.result)
     whole = found["iterations"] == key["iterations"]
     row = {name: key[name] for name in ("category", "views", "seed")} | {"marker": key["index"]}

@@ -1,4 +1,4 @@
-"""The set-up of the paper's section 4.1: markers, planes, viewpoints; and the two protocols for angles."""
+"""Set-up of the paper's section 4.1: markers, planes, viewpoints, and two protocols for angles."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ SEED = 0
 MARKERS = 5
 """markers of each category"""
 PLANE = 2.0
-"""metres, edge of the plane that carries a marker with its quiet zone"""
+"""edge of the plane of a marker with its quiet zone, metres"""
 BACKGROUND = 128 / 255
-"""grey beside the plane, display value: one that 8 bits hold, so that nothing hangs on a rounding"""
+"""grey background, a display value that 8 bits represent exactly"""
 
 
 @dataclass(frozen=True)
 class Category:
-    """One row of the paper's tables."""
+    """Marker category, a row of the paper's tables."""
 
     name: str
     title: str
@@ -31,7 +31,7 @@ class Category:
     length: int | None = None
     """characters of a QR code's text"""
     version: int | None = None
-    """of the QR code"""
+    """version of the QR code"""
 
     def spec(self, index: int, seed: int = SEED) -> str:
         """Marker spec of marker 0 to 4: tags 0 to 4 of 36h11, QR codes of seeded random letters and
@@ -65,17 +65,17 @@ def chosen_categories(names: tuple[str, ...]) -> tuple[Category, ...]:
 
 @dataclass(frozen=True)
 class Protocol:
-    """How a marker is looked at while it tilts: azimuth 0, always towards its middle."""
+    """Camera of a tilt scan: azimuth 0, aimed at the middle of the marker."""
 
     title: str
     pixels: int
-    """width and height of the picture"""
+    """width and height of the image"""
     distance: float
     """metres"""
     fov: float
     """degrees"""
     module_px: float | None
-    """pixels of a module seen frontally; None: the plane is `PLANE` wide whatever the code"""
+    """pixels per frontal module; None: the plane is always `PLANE` wide"""
 
     def module(self, cells: int) -> float:
         """Metres per module of a marker with ``cells`` modules a side, quiet zone included."""
@@ -84,7 +84,7 @@ class Protocol:
         return self.module_px * self.distance / self.camera(0.0).fx
 
     def camera(self, tilt: float) -> Camera:
-        """The camera at ``tilt`` degrees from the marker's normal, above it."""
+        """Camera at ``tilt`` degrees from the normal of the marker, above it."""
         a = math.radians(tilt)
         place = (0.0, -self.distance * math.sin(a), -self.distance * math.cos(a))
         return Camera.look_at(self.pixels, self.pixels, math.radians(self.fov), place, (0.0, 0.0, 0.0))
@@ -94,13 +94,13 @@ PROTOCOLS = {
     "fixed-plane": Protocol("2 x 2 plane, 800 x 800, 4 m, 50 degrees", 800, 4.0, 50.0, None),
     "fixed-module": Protocol("P*: 8 px a module, 1600 x 1600, 12 m, 17.7 degrees", 1600, 12.0, 17.7, 8.0),
 }
-"""the paper's plane (its camera is not stated), and one that makes modules of all codes equally large"""
+"""plane of the paper (its camera is unknown), and one with modules of equal size for all codes"""
 
 COLLECTIONS = (3, 5, 9, 17)
-"""numbers of training views, from narrow to dense; each collection holds the smaller ones"""
+"""numbers of training views; each collection contains the smaller ones"""
 TEST_VIEWS = 20
 MAX_TEST_TILT = 60.0
-"""degrees; the test views lie within the ring of the densest collection"""
+"""degrees; test views are inside the ring of the densest collection"""
 
 # tilt and azimuth in degrees: the front, to the sides, above and below, diagonals, a wide ring
 _VIEWS = (
@@ -112,9 +112,9 @@ _VIEWS = (
 
 
 def training_cameras(views: int = COLLECTIONS[-1]) -> list[Camera]:
-    """The cameras of a collection. Raises InputError for a number that is not in `COLLECTIONS`."""
+    """Cameras of a collection. Raises InputError for a number that is not in `COLLECTIONS`."""
     if views not in COLLECTIONS:
-        raise InputError(f"there is no collection of {views} views; known: 3, 5, 9, 17")
+        raise InputError(f"number of training views must be 3, 5, 9 or 17, got {views}")
     return [_around(tilt, azimuth) for tilt, azimuth in _VIEWS[:views]]
 
 

@@ -1,8 +1,7 @@
-"""The runner of all that is measured point by point: it goes on after a kill, takes shares of the work, and
-joins what several machines found.
+"""Sweeps over points with results in a file: resume after a kill, shards, and merging of shards.
 
 Results are JSON lines. A line {"run": ...} holds the facts of a run (`fidsplat.util.provenance.run_facts`)
-for the lines after it, each of which is {"key": ..., "result": ...}: what was measured, and what was found.
+for the following lines {"key": ..., "result": ...}.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, ordinary_file, read_text, writable_folder
 
 Key = dict[str, Any]
-"""a point of a sweep: plain data that names what is measured"""
+"""key of a measured point: plain data"""
 
 
 class Record(NamedTuple):
-    """One point that was measured."""
+    """A measured point."""
 
     key: Key
     result: dict[str, Any]
@@ -34,27 +33,27 @@ class Record(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The key as one string."""
+        """Key as a string."""
         return name_of(self.key)
 
     @property
     def failed(self) -> bool:
-        """Whether the device refused the point: its result is then the reason, as `error`."""
+        """Whether the device refused the point; the result has the reason as `error`."""
         return "error" in self.result
 
 
 def name_of(key: Key) -> str:
-    """A key as one string, whatever the order of its parts."""
+    """Key as a string that is independent of order."""
     return json.dumps(key, sort_keys=True)
 
 
 class Results:
-    """The results of a sweep in a file to which each is added as soon as it is there.
+    """Results file of a sweep, written point by point.
 
     Args:
-        file: made with its folder when it is missing.
+        file: made with its folder if missing.
         run: facts of this run.
-        overwrite: drop what the file holds.
+        overwrite: delete existing results.
 
     Raises InputError when the file cannot be written, is none of ours, or holds results of another device,
     version, code or seed.
@@ -70,14 +69,14 @@ class Results:
                     f"{file} holds results of another {' and '.join(differ)}; give another folder with -o, "
                     "or --overwrite to measure again"
                 )
-        # a device that failed may be there again
+        # a device that failed may work again
         self.done = {record.name: record for record in records if not record.failed}
-        if overwrite or file.exists():  # what a killed run left half written goes
+        if overwrite or file.exists():  # discards an incomplete line of a killed run
             _write(file, self.done.values())
         self._last_run = next((record.run for record in reversed(self.done.values())), None)
 
     def left(self, points: Iterable[Key]) -> list[Key]:
-        """The points that are not measured yet, in their order."""
+        """Missing points, in their order."""
         return [key for key in points if name_of(key) not in self.done]
 
     def append(self, key: Key, result: dict[str, Any]) -> Record:
@@ -104,22 +103,21 @@ class Results:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Points that are ready to be measured."""
+    """Points with their measurement."""
 
     name: str
     results: Results
     points: list[Key]
     begin: Callable[[Key], Callable[[], dict[str, Any]]]
-    """does the device's share of a point; what it returns does the host's share and gives the result"""
+    """runs the device work of a point and returns its host work, which returns the result"""
     batch: int = 1
-    """points whose shares on the device are done before those on the host, so that neither disturbs the
-    timing of the other"""
+    """number of points whose device work runs before their host work, so that neither disturbs timings"""
     pool: Executor | None = None
-    """does the host's shares of a batch at the same time"""
+    """runs the host work of a batch in parallel"""
 
     @property
     def left(self) -> list[Key]:
-        """Points that are still to be measured."""
+        """Missing points."""
         return self.results.left(self.points)
 
     def run(self) -> Iterator[Record]:
@@ -181,24 +179,23 @@ def shard(points: list[Key], text: str | None) -> list[Key]:
         return points
     first, _, of = text.partition("/")
     if not (first.isdecimal() and of.isdecimal() and 1 <= int(first) <= int(of)):
-        raise InputError(f"--shard is {text!r}; write i/n with 1 <= i <= n, e.g. 1/4")
+        raise InputError(f"--shard must be i/n with 1 <= i <= n, e.g. 1/4, got {text!r}")
     return points[int(first) - 1 :: int(of)]
 
 
 class Merged(NamedTuple):
-    """What `merge` found."""
+    """Result of `merge`."""
 
     points: int
     repeated: int
-    """points that more than one file had"""
+    """number of points in more than one file"""
     differ: tuple[str, ...]
-    """facts on which numbers depend and that are not the same in all runs"""
+    """facts that affect results and differ between runs"""
 
 
 def merge(files: list[Path], target: Path) -> Merged:
-    """Join files of shards into one; of a point that several have the first stays.
-
-    What the target holds already and the files do not stays in it.
+    """Merge files of shards into one; of duplicate points the first one is kept, and so are points that only
+    the target has.
 
     Raises InputError when a file is missing or none of ours.
     """
@@ -213,7 +210,7 @@ def merge(files: list[Path], target: Path) -> Merged:
     for record in read_records(target):
         found.setdefault(record.name, record)
     runs = [record.run for record in found.values()]
-    # one that draws nothing has no device to differ from
+    # a run without rendering has no device
     first = next((run for run in runs if run.get("device")), runs[0] if runs else {})
     differ = {name for run in runs for name in differences(run, first)}
     writable_folder(target.parent)
@@ -222,7 +219,7 @@ def merge(files: list[Path], target: Path) -> Merged:
 
 
 def missing_shards(files: Iterable[Path]) -> list[str]:
-    """The "i/n" that are not among files named as `--shard i/n` names them."""
+    """Missing shards "i/n", by the file names of `--shard i/n`."""
     there: dict[int, set[int]] = {}
     for file in files:
         if match := re.fullmatch(r".*-(\d+)-of-(\d+)\.jsonl", file.name):
@@ -231,7 +228,7 @@ def missing_shards(files: Iterable[Path]) -> list[str]:
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """The facts on which numbers depend and that are not the same. A run that draws nothing has no device."""
+    """Facts that affect results and differ; runs without rendering have no device."""
     names = [name for name in ("versions", "code", "seed", "scene") if old.get(name) != new.get(name)]
     devices = (old.get("device"), new.get("device"))
     return names + (["device"] if None not in devices and devices[0] != devices[1] else [])
@@ -248,12 +245,12 @@ def _header(run: dict[str, Any]) -> str:
 
 
 def _line(record: Record) -> str:
-    # NaN and infinities are not JSON: a result that has them is a fault, found here
+    # NaN and infinities are not JSON
     return json.dumps({"key": record.key, "result": record.result}, allow_nan=False) + "\n"
 
 
 def rounded(value: Any) -> Any:
-    """Plain data with its numbers to six digits."""
+    """Plain data with numbers rounded to six digits."""
     if isinstance(value, dict):
         return {name: rounded(item) for name, item in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""A page about a training run: curves, pictures of views that were held out, settings."""
+"""Report of a training: curves, held-out views, settings."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from fidsplat.train import Trainer, TrainingView, ViewScore
 from fidsplat.util.provenance import run_facts
 
 PICTURES = 4
-"""views that are shown at most"""
+"""maximum number of views"""
 _POINTS = 200
-"""of a curve: means of as many stretches of the run"""
+"""number of points of a curve, means of equal parts of the run"""
 
 
 def write_training_page(
@@ -56,7 +56,7 @@ def write_training_page(
 
 
 def draw_curves(history: Mapping[str, np.ndarray], file: Path) -> None:
-    """Loss, PSNR of the views trained on, and number of splats, each over the iterations."""
+    """Charts of loss, training PSNR and number of splats over the iterations."""
     panels = (("losses", "loss"), ("psnrs", "PSNR of the view, dB"), ("counts", "splats"))
     with chart(file, panels=len(panels), size=(9.0, 3.0), one_scale=False) as (_, axes):
         for (name, words), axis, colour in zip(panels, axes, COLOURS[1:], strict=False):
@@ -66,13 +66,13 @@ def draw_curves(history: Mapping[str, np.ndarray], file: Path) -> None:
 
 
 def beside(view: TrainingView, score: ViewScore) -> np.ndarray:
-    """The picture, the splats, and four times their difference around grey, side by side."""
+    """Ground truth, rendering, and their difference times four around grey, side by side."""
     difference = 4 * (score.image.astype(float) - view.image) + 128
     return np.hstack([view.image, score.image, np.clip(difference, 0, 255).astype(np.uint8)])
 
 
 def _means(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middles and means of stretches of a curve; what is infinite is left out."""
+    """Centres and means of equal parts of a curve, without infinite values."""
     parts = [part for part in np.array_split(np.arange(len(values)), _POINTS) if len(part)]
     kept = [values[part][np.isfinite(values[part])] for part in parts]
     means = [float(np.mean(one)) if len(one) else np.nan for one in kept]

@@ -189,7 +189,7 @@ def test_shards_share_the_work():
     assert [len(part) for part in parts] == [2, 2, 1]
     assert shard(POINTS, None) == POINTS
     for text in ("0/3", "4/3", "1", "a/b", "1/0", "-1/3", "", "²/3"):
-        with pytest.raises(fs.InputError, match="write i/n with 1 <= i <= n"):
+        with pytest.raises(fs.InputError, match="--shard must be i/n with 1 <= i <= n"):
             shard(POINTS, text)
 
 

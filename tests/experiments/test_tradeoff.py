@@ -155,11 +155,11 @@ def test_errors_are_those_of_the_cut_off():
 def test_a_certified_flip_is_no_error():
     renderer, scene = fs.Renderer("opencl"), faint_rim()
     quality = fs.Quality(alpha_cutoff=0.1)
-    truth_of = compare.truth_of(
-        compare.Picture(scene.cloud, scene.camera, quality, ("rgb",)),
+    reference = compare.reference_images(
+        compare.FrameSpec(scene.cloud, scene.camera, quality, ("rgb",)),
         tuple(part.ravel() for part in np.mgrid[0:48, 0:64]),
     )
-    certificate = truth_of["certificate"].reshape(48, 64)
+    certificate = reference["certificate"].reshape(48, 64)
     off = np.zeros((48, 64))
     row, column = np.unravel_index(np.argmax(certificate), off.shape)
     off[row, column] = certificate[row, column]

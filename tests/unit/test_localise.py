@@ -231,7 +231,7 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
         counts["/eye/image_raw/compressed"] == counts["/tf"] == counts["/eye/detections"] == len(pictures) > 3
     )
     assert counts["/odom"] == counts["/imu"] > 50 * len(pictures)
-    with pytest.raises(fs.InputError, match="must have images, e.g. exact, got"):
+    with pytest.raises(fs.InputError, match=r"must have images, e.g. exact, got"):
         list(write_log(asked, "odometry", None, str(tmp_path / "other.mcap"), False))
 
 
