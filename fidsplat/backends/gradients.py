@@ -24,17 +24,17 @@ class CapacityExceeded(Exception):
 class DifferentiableImages:
     """Output images with what the stages have left, for `backward` of the device that drew them."""
 
-    picture: Any
+    frame: Any
     images: Images
 
-    def __init__(self, picture: Any, images: Images) -> None:
-        self.picture, self.images = picture, images
-        self._number = picture.workspace.frames
+    def __init__(self, frame: Any, images: Images) -> None:
+        self.frame, self.images = frame, images
+        self._number = frame.workspace.frames
 
     @property
     def last(self) -> bool:
         """Whether no other picture has been begun on the device since."""
-        return self.picture.workspace.frames == self._number
+        return self.frame.workspace.frames == self._number
 
     def read(self, name: str) -> np.ndarray:
         """The image as a NumPy array of its own."""

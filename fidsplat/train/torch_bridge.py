@@ -1,6 +1,6 @@
-"""Pictures as functions of PyTorch's tensors: forward and backward on our devices, for loops of one's own.
+"""PyTorch bridge: differentiable rendering as an autograd function, for your own optimisation.
 
-Arrays pass through the host's memory. Derivatives are those of docs/gradients.md.
+Arrays are copied through host memory. docs/gradients.md describes the gradients.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from fidsplat.util.errors import InputError
 try:
     import torch as _torch  # type: ignore[import-not-found]
 except ImportError as error:
-    raise InputError(f"PyTorch is not here ({error}); pip install 'fidsplat[torch]'") from None
+    raise InputError(f"PyTorch must be installed, got {error}; pip install 'fidsplat[torch]'") from None
 
-torch: Any = _torch  # whose names its types do not tell where it is not installed
+torch: Any = _torch  # without types, since it may not be installed
 _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh", "background", "pose")
 
 
@@ -39,39 +39,38 @@ def draw(
     background: Any = None,
     pose: Any = None,
 ) -> dict[str, Any]:
-    """Draw splats that are tensors; gradients go back to each of them.
+    """Render splats from tensors; `backward` of a loss fills the gradients of the tensors.
 
-    `backward` belongs to the picture that was drawn last on the device: call it before the next one, and let
-    the gradients of several views add up.
+    Call `backward` before the next frame of the device, and accumulate the gradients of several views.
 
     Args:
-        renderer: of a device with gradients.
+        renderer: a device with gradients.
         capture: camera, outputs (`rgb`, `alpha`, `depth`, `normal`), quality; see docs/gradients.md.
-        means, quats, scales, opacities: (n, 3), (n, 4) wxyz of any length, (n, 2), (n,), as a `SplatCloud`
-            has them.
+        means, quats, scales, opacities: (n, 3), (n, 4) wxyz of any length, (n, 2), (n,), as in a
+            `SplatCloud`.
         colors, sh: (n, 3), or (n, k, 3) harmonics; one of them.
-        background: (3,), in place of the capture's.
+        background: (3,), instead of the capture's.
         pose: (6,) rotation vector [rad] and translation [m] of a motion after the camera's
             `world_to_camera`, in its axes.
 
     Returns:
-        the capture's outputs as float32 tensors, where `means` is. Splats that cannot be drawn are left out
-        with a warning, as a `SplatCloud` does, and have gradients of 0.
+        the capture's outputs as float32 tensors on the device of `means`. Splats with invalid values are
+        dropped with a warning, as by `SplatCloud`, and have gradients of 0.
 
     Raises:
         DeviceError: the device has no gradients, or fails.
-        InputError: splats that cannot be drawn, or something without a gradient; from `backward`, where
-            another picture has been drawn since.
+        InputError: invalid arrays, or an effect without a gradient; in `backward`, if the device has rendered
+            another frame since.
     """
-    if sh is not None and sh.shape[1] == 1:  # drawn as plain colours, which end at 0
+    if sh is not None and sh.shape[1] == 1:  # rendered as colours, which are clamped at 0
         colors, sh = torch.clamp(C0 * sh[:, 0] + 0.5, min=0), None
     quats = torch.nn.functional.normalize(quats, dim=1)
     given = (means, quats, scales, opacities, colors, sh, background, pose)
-    images = _Picture.apply(renderer, capture, *given)
+    images = _Rendered.apply(renderer, capture, *given)
     return dict(zip(capture.outputs, images, strict=True))
 
 
-class _Picture(torch.autograd.Function):
+class _Rendered(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, renderer: Renderer, capture: Capture, *tensors: Any) -> tuple[Any, ...]:
         arrays = {
@@ -84,9 +83,9 @@ class _Picture(torch.autograd.Function):
             capture = replace(capture, background=tuple(background.tolist()))
         if pose is not None:
             if capture.camera is None or pose.shape != (6,):
-                raise InputError(f"pose must be 6 numbers, for a capture with a camera, not {pose!r}")
+                raise InputError(f"pose must be 6 numbers, for a capture with a camera, got {pose!r}")
             capture = replace(capture, camera=offset_camera(capture.camera, pose.astype(np.float64)))
-        # which row a splat came from: those that cannot be drawn are left out
+        # labels are the input rows, since invalid splats are dropped
         cloud = SplatCloud(**arrays, labels=np.arange(len(np.atleast_1d(arrays["means"]))))
         frame = ctx.frame = renderer.render_differentiable(cloud, capture)
         ctx.outputs, ctx.pose, ctx.rows, ctx.count = capture.outputs, pose, cloud.labels, len(tensors[0])
@@ -103,9 +102,9 @@ class _Picture(torch.autograd.Function):
         found = ctx.frame.backward(given)
         if ctx.pose is not None:
             found["pose"] = offset_gradient(found["pose"].astype(np.float64), ctx.pose.astype(np.float64))
-        gradients: list[Any] = [None, None]  # of the renderer and the capture
-        for name, like, wanted in zip(_INPUTS, ctx.like, ctx.needs_input_grad[2:], strict=True):
-            if like is None or not wanted:
+        gradients: list[Any] = [None, None]  # none by the renderer and the capture
+        for name, like, needed in zip(_INPUTS, ctx.like, ctx.needs_input_grad[2:], strict=True):
+            if like is None or not needed:
                 gradients.append(None)
                 continue
             device, dtype = like

@@ -1,6 +1,6 @@
-"""Pictures on a `warp.Tape`: our rendering as a step of a Warp program that is differentiated as a whole.
+"""Warp bridge: differentiable rendering recorded on a `warp.Tape`.
 
-Arrays stay on the device. Derivatives are those of docs/gradients.md.
+Arrays stay on the device. docs/gradients.md describes the gradients.
 """
 
 from __future__ import annotations
@@ -34,20 +34,19 @@ def draw(
     background: Any = None,
     pose: Any = None,
 ) -> dict[str, Any]:
-    """Draw splats that are wp.arrays, and record it: `tape.backward` adds to the `grad` of each of them that
+    """Render splats from wp.arrays and record it: `tape.backward` adds to the `grad` of each array that
     `requires_grad`.
 
-    It belongs to the picture that was drawn last on the device: call it before the next one. On CUDA all of
-    it runs on the stream of the device.
+    Call `tape.backward` before the next frame of the device. On CUDA all kernels run on the device's stream.
 
     Args:
         tape: a `warp.Tape`.
-        renderer: of a Warp device.
+        renderer: a Warp device.
         capture: camera, outputs (`rgb`, `alpha`, `depth`, `normal`), quality; see docs/gradients.md.
         means, quats, scales, opacities: (n,) float32 vectors or (n, 3), (n, 4) wxyz of any length, (n, 2),
-            (n,), as a `SplatCloud` has them, on the renderer's device; read where they lie.
+            (n,), as in a `SplatCloud`, on the renderer's device; read without a copy.
         colors, sh: (n, 3), or (n, k, 3) harmonics of degree 1 to 3; one of them.
-        background: (3,), in place of the capture's.
+        background: (3,), instead of the capture's.
         pose: (6,) rotation vector [rad] and translation [m] of a motion after the camera's
             `world_to_camera`, in its axes.
 
@@ -55,9 +54,9 @@ def draw(
         the capture's outputs as float32 arrays (h, w) or (h, w, 3) of their own, with gradients.
 
     Raises:
-        DeviceError: the renderer is not of a Warp device, or the device fails.
-        InputError: arrays that cannot be drawn, or something without a gradient; from `tape.backward`, where
-            another picture has been drawn since.
+        DeviceError: the renderer is not a Warp device, or the device fails.
+        InputError: invalid arrays, or an effect without a gradient; in `tape.backward`, if the device has
+            rendered another frame since.
     """
     wp, backend = load(), renderer.backend
     if not isinstance(backend, WarpBackend):
@@ -92,7 +91,7 @@ def draw(
 
 
 def _numbers(name: str, array: Any, count: int) -> np.ndarray:
-    """So many numbers, float64, of an array."""
+    """An array of `count` numbers as float64."""
     numbers = on_host(array).astype(np.float64)
     if numbers.shape != (count,):
         raise InputError(f"{name} must be {count} numbers, got the shape {numbers.shape}")

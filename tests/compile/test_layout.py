@@ -34,7 +34,7 @@ SETS = {
 def offsets_on(backend, source: Source) -> dict[str, dict[str, int]]:
     """Offsets on the device by record and field, and under "" the size of the record."""
     structs = re.findall(
-        r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.programs["picture"].compiled
+        r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.programs["frame"].compiled
     )
     assert len(structs) == len(source.records)
     requested, lines = [], []

@@ -87,7 +87,7 @@ def test_what_cannot_be_refined_is_said(renderer, tmp_path):
         refine(fs.marker(f"svg-10:{drawing}"), renderer)
     with pytest.raises(InputError, match=r"iterations must be .* got 0"):
         refine(made(), renderer, 0)
-    with pytest.raises(InputError, match="leak is -1"):
+    with pytest.raises(InputError, match=r"leak must be .* got -1"):
         refine(made(), renderer, leak=-1)
     with pytest.raises(InputError, match=r"fs\.train\.refine"):
         fs.marker(SPEC, mixture="refined")

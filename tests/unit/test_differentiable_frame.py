@@ -162,9 +162,9 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     tensors = {name: Tensor(array) for name, array in (given | {"pose": pose}).items()}
     images = bridge.draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
     by_depth = np.random.default_rng(1).normal(size=(18, 24))
-    context = bridge._Picture.context
+    context = bridge._Rendered.context
     context.needs_input_grad[3] = False  # quats
-    back = bridge._Picture.backward(context, None, None, Tensor(by_depth))
+    back = bridge._Rendered.backward(context, None, None, Tensor(by_depth))
 
     frame = renderer.render_differentiable(fs.SplatCloud(**given), offset_camera(CAMERA, pose), OUTPUTS)
     wanted = frame.backward({"depth": by_depth})
@@ -181,7 +181,7 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     kept = {name: array[[0, 2, 3, 4, 5]] for name, array in given.items()}
     frame = renderer.render_differentiable(fs.SplatCloud(**kept), offset_camera(CAMERA, pose), OUTPUTS)
     wanted = frame.backward({"rgb": ONES})
-    back = bridge._Picture.backward(bridge._Picture.context, Tensor(ONES), None, None)
+    back = bridge._Rendered.backward(bridge._Rendered.context, Tensor(ONES), None, None)
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors")):
         np.testing.assert_array_equal(np.delete(back[place].numpy(), 1, 0), wanted[name])
         assert not back[place].numpy()[1].any()

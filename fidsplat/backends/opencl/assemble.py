@@ -1,6 +1,6 @@
 """Kernel source assembly: flat program texts from a FeatureSet and the shape of a device. Needs no OpenCL.
 
-A frame takes two programs, `lists` and `picture`: drivers cache compiled programs by their text, and most
+A frame needs two programs, `lists` and `frame`: drivers cache compiled programs by their text, and most
 feature sets have the same `lists`. Derivatives (`gradients`, `step`) and `training` are separate programs,
 which a renderer without derivatives never compiles.
 
@@ -56,7 +56,7 @@ _DRAWN = (
     "schedule/{}",
     "resolve",
 )
-"""stages of the program `picture`, with the way in which a device walks tiles; only splats that are listed in
+"""stages of the program `frame`, with the schedule of the device; only splats that are listed in
 order are packed"""
 _GRADIENTS = (
     *("prelude", "math", "splat", "bounds", "moments", "blend_backward"),
@@ -154,7 +154,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     files = [layout.file for layout in layouts.values() if layout.file]
     files.append(LAYOUTS["resolve_pixel"].file)
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
-        # disks and 3D Gaussians among each other are not asked: their images are bounded otherwise
+        # not for mixtures of disks and 3D Gaussians, whose bounds are computed otherwise
         if "lowpass_screen" in layouts and "thickness" not in layouts:
             files.append(LAYOUTS["cull_frustum"].file)
         if "lowpass_pixel" in layouts and "thickness" not in layouts:
@@ -177,7 +177,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files.append(LAYOUTS["external_depth_end"].file)
     stages = {
         "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),
-        "picture": [
+        "frame": [
             stage.format(shape.schedule)
             for stage in _DRAWN
             if not (stage == "pack" and shape.lists != "ordered") and not (stage == "resolve" and fused)
@@ -257,7 +257,7 @@ def _scalars(features: FeatureSet) -> Scalars:
 
 
 def _resolves_fused(features: FeatureSet, layouts: Mapping[str, Layout]) -> bool:
-    """Whether who has drawn a pixel resolves it too, which saves a launch: where a pixel is one
+    """Whether blend and resolve are fused, which saves a launch: if a pixel is one
     sample of one pose, and nothing but blending adds to it."""
     alone = features.samples == 1 and "background_constant" in layouts and "rays" not in layouts
     return alone and not any(name.startswith("shutter_") for name in layouts)
@@ -423,7 +423,7 @@ def _refuse_unknown_hooks(files: list[str]) -> None:
 
 
 def kernel_text(path: str) -> str:
-    """A file below kernels/opencl/, as it stands."""
+    """The text of a file below kernels/opencl/."""
     return "\n".join(lines_of(path)) + "\n"
 
 

@@ -1,6 +1,5 @@
-"""What declarations of the kernels' data are made of, and what is made from them: C text, NumPy types, and
-the kinds of arguments that the host binds. The declarations themselves stand in layout.py, those of effects
-in effect_layouts.py.
+"""Elements of kernel declarations, and their translation to C text and NumPy types. layout.py has the
+declarations, effect_layouts.py those of effects.
 """
 
 from __future__ import annotations
@@ -26,22 +25,22 @@ _TYPES = {"float": "f4", "int": "i4", "uint": "u4", "short": "i2", "ulong": "u8"
 
 @dataclass(frozen=True)
 class Member:
-    """Fields of a record, or places in a buffer of one record, that have one type and one remark."""
+    """Fields of a record with one type and one note."""
 
     ctype: str
     names: tuple[tuple[str, int], ...]
-    """with their lengths; 1: no array"""
+    """names with lengths; 1: not an array"""
     note: str = ""
 
     @property
     def text(self) -> str:
-        """The line of C that declares them."""
+        """The C declaration."""
         names = ", ".join(name if length == 1 else f"{name}[{length}]" for name, length in self.names)
         return f"    {self.ctype} {names};" + (f"  // {self.note}" if self.note else "") + "\n"
 
 
 def member(declaration: str, note: str = "") -> Member:
-    """From the type and the names, as in C but without commas: `real rotation[9]`, `wide r g b`."""
+    """Parse a type and names, as in C but without commas: `real rotation[9]`, `wide r g b`."""
     ctype, *names = declaration.split()
     found = [_NAME.fullmatch(name) for name in names]
     return Member(ctype, tuple((match[1], int(match[2] or 1)) for match in found if match), note)
@@ -49,37 +48,37 @@ def member(declaration: str, note: str = "") -> Member:
 
 @dataclass(frozen=True)
 class Scalars:
-    """What the two types are that depend on the build."""
+    """The C types that depend on the build."""
 
     real: str
-    """of the per-splat set-up: float or double"""
+    """type of the per-splat set-up: float or double"""
     wide: str
-    """of fragments"""
+    """type of fragments: float or double"""
 
     def of(self, ctype: str) -> str:
-        """The type of C that `ctype` stands for."""
+        """The C type of `ctype`."""
         return {"real": self.real, "wide": self.wide}.get(ctype, ctype)
 
     def dtype(self, ctype: str) -> np.dtype:
-        """NumPy's type for one of C's."""
+        """The NumPy type of a C type."""
         return np.dtype(_TYPES[self.of(ctype)])
 
 
 @dataclass(frozen=True)
 class Record:
-    """A struct that host and kernels, or two kernels, both know."""
+    """A struct shared by host and kernels, or by two kernels."""
 
     name: str
     members: tuple[Member, ...]
     alignment: int = 1
-    """bytes of which its size is a multiple"""
+    """bytes; the size is a multiple of it"""
 
     def with_members(self, members: Iterable[Member]) -> Record:
-        """The record with more members behind its own."""
+        """The record with more members appended."""
         return Record(self.name, (*self.members, *members), self.alignment)
 
     def without(self, names: Collection[str]) -> Record:
-        """The record without these fields, which keep their order."""
+        """The record without these fields, in the same order."""
         kept = (
             Member(one.ctype, tuple(field for field in one.names if field[0] not in names), one.note)
             for one in self.members
@@ -87,7 +86,7 @@ class Record:
         return Record(self.name, tuple(one for one in kept if one.names), self.alignment)
 
     def dtype(self, scalars: Scalars) -> np.dtype:
-        """Its layout: that of C, by natural alignment."""
+        """The C layout, by natural alignment."""
         fields = [
             (name, scalars.dtype(one.ctype), *(((length,),) if length > 1 else ()))
             for one in self.members
@@ -106,7 +105,7 @@ class Record:
         )
 
     def text(self, scalars: Scalars) -> str:
-        """The C struct, and a line that does not compile where its size is not the host's."""
+        """The C struct, with a compile-time check of its size."""
         aligned = f" __attribute__((aligned({self.alignment})))" if self.alignment > 1 else ""
         size = self.dtype(scalars).itemsize
         check = f"typedef char {self.name}_has_the_size_that_the_host_knows"
@@ -122,17 +121,17 @@ class Argument:
     ctype: str
     name: str
     access: Access
-    """of a buffer: whether the kernel only reads it; empty: a number"""
+    """of a buffer: `in` if the kernel only reads it; empty for a number"""
     source: Source = "stage"
-    """Who gives it: the stage that is launched, or what it holds by this name; the cloud; a uniform of the
-    view (`View.uniform`); an array of the view (`View.array`)."""
+    """Origin of the value: the launch or the frame, the cloud, a uniform of the view (`View.uniform`), or an
+    array of the view (`View.array`)."""
     uniform: tuple[str, int] = ("", 0)
-    """of which group of uniforms it is which"""
+    """group of uniforms, and index in it"""
     note: str = ""
 
     @property
     def text(self) -> str:
-        """As it stands in the kernel's signature."""
+        """The C text in the kernel's signature."""
         if not self.access:
             return f"{self.ctype} {self.name}"
         const = "const " if self.access == "in" else ""
@@ -161,7 +160,7 @@ def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
 
 
 def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, ...]:
-    """All numbers of a group of uniforms of the view (`View.uniform`), in its order."""
+    """Arguments for all numbers of a group of uniforms (`View.uniform`), in its order."""
     words = [declaration.split() for declaration in declarations]
     named = [(ctype, name) for ctype, *names in words for name in names]
     return tuple(
@@ -172,7 +171,7 @@ def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, 
 
 @dataclass(frozen=True)
 class Samples:
-    """A sample buffer: channels, one after the other, that pass from blending to resolving for an effect."""
+    """A sample buffer of an effect, channel by channel, from the blend stage to the resolve stage."""
 
     ctype: str
     name: str
@@ -182,15 +181,15 @@ class Samples:
 
 @dataclass(frozen=True)
 class Layout:
-    """How OpenCL lays out an effect: what it adds to records and to the arguments of kernels."""
+    """OpenCL declaration of an effect: its additions to records and to kernel arguments."""
 
     file: str = ""
-    """below kernels/opencl/; empty: no text of its own"""
+    """file below kernels/opencl/; empty: none"""
     parts: tuple[str, ...] = ()
-    """other layouts that it needs: parts, or outputs whose samples it reads"""
+    """other layouts that it requires: parts, or outputs whose samples it reads"""
     splat: tuple[Member, ...] = ()
     constant: tuple[tuple[str, str], ...] = ()
-    """(field of `Splat`, value): every splat has it, so that no record holds it and kernels read the value"""
+    """(field of `Splat`, value): the same for all splats, so it is a constant in the kernels"""
     bounds: tuple[Member, ...] = ()
     view: tuple[Member, ...] = ()
     project: tuple[Argument, ...] = ()
@@ -199,19 +198,19 @@ class Layout:
     resolve: tuple[Argument, ...] = ()
     samples: tuple[Samples, ...] = ()
     averaged: bool = False
-    """Whether its samples are light: the mean of what several sub-frames leave, not one sub-frame's."""
+    """whether the samples of sub-frames are averaged (light), instead of one sub-frame's"""
     backward_file: str = ""
-    """derivatives, below kernels/opencl/; empty: no text of their own"""
+    """file of its derivatives below kernels/opencl/; empty: none"""
     moments: tuple[Member, ...] = ()
     """fields of `Moments` (layout.py)"""
     blend_backward: tuple[Argument, ...] = ()
     project_backward: tuple[Argument, ...] = ()
     behind: tuple[tuple[str, str], ...] = ()
-    """(camera or another slot, part): where that is chosen that part takes this one's place"""
+    """(camera or another slot, part): with that slot, the part replaces this one"""
 
 
 def output_argument(output: Output) -> Argument:
-    """Where a kernel puts an output image."""
+    """The kernel argument of an output image."""
     ctype = {"float32": "float", "int32": "int"}[output.dtype]
     shape = "(h, w)" if output.channels == 1 else f"(h, w, {output.channels})"
     return Argument(ctype, f"{output.name}_out", "out", note=shape)

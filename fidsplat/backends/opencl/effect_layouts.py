@@ -1,6 +1,6 @@
-"""What each effect and output adds to records and to the arguments of kernels (layout.py), declared once.
+"""OpenCL declarations of effects and outputs: additions to the records and kernel arguments of layout.py.
 
-Buffers are (channels, rows, columns) of the padded grid of samples, unless they say otherwise.
+Buffers are (channels, rows, columns) of the padded grid of samples, unless their note has another shape.
 """
 
 from __future__ import annotations
@@ -8,18 +8,18 @@ from __future__ import annotations
 from fidsplat.backends.opencl.declare import Layout, Samples, member, takes, uniforms
 from fidsplat.backends.opencl.layout import RAY_UNIFORMS
 
-_RAYS = takes("in float rays  // 3 channels X, Y, Z; NaN where nothing is seen")
+_RAYS = takes("in float rays  // 3 channels X, Y, Z; NaN outside the field of view")
 _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 LAYOUTS: dict[str, Layout] = {
-    # one of each kind
+    # slots: one of each kind
     "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("chord", "conic", "perspective")),
     "camera_brown_conrady": Layout(
         "slot/camera_brown_conrady.cl",
         parts=("perspective", "ray_map", "rays"),
         view=(
             member("real lens[12]", "k1 to k6, p1, p2, s1 to s4"),
-            member("real lens_fold", "square of the radius where the polynomial turns back"),
+            member("real lens_fold", "squared radius where the polynomial stops being monotonic"),
         ),
     ),
     "camera_fisheye": Layout(
@@ -27,7 +27,7 @@ LAYOUTS: dict[str, Layout] = {
         parts=("polygon", "ray_map", "rays"),
         view=(
             member("real lens[4]", "k1 to k4"),
-            member("real lens_limit", "largest angle that is seen [rad]"),
+            member("real lens_limit", "half field of view [rad]"),
         ),
     ),
     "camera_equirectangular": Layout("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
@@ -72,7 +72,7 @@ LAYOUTS: dict[str, Layout] = {
     "compose_pixel": Layout(
         "slot/compose_pixel.cl",
         parts=("ray_depth",),
-        splat=(member("wide nearest", "depth before which no fragment of the splat lies"),),
+        splat=(member("wide nearest", "minimum depth of the splat's fragments"),),
     ),
     "compose_coplanar": Layout(
         "slot/compose_coplanar.cl",
@@ -99,7 +99,7 @@ LAYOUTS: dict[str, Layout] = {
     "ellipsoid_ewa": Layout(
         "slot/ellipsoid_ewa.cl",
         parts=("thickness",),
-        view=(member("real slopes[4]", "of rays, -x, x, -y, y: where derivatives are taken at most"),),
+        view=(member("real slopes[4]", "of rays, -x, x, -y, y: limits of the linearisation"),),
     ),
     "ellipsoid_ewa_antialiased": Layout("slot/ellipsoid_ewa_antialiased.cl", parts=("ellipsoid_ewa",)),
     "ellipsoids_only": Layout(
@@ -147,7 +147,7 @@ LAYOUTS: dict[str, Layout] = {
             "in uint keys", "out uint termination_depths  // of each tile: the key at which it was finished"
         )
     ),
-    # what several of them share
+    # parts that several effects share
     "cull_frustum": Layout("part/cull_frustum.cl"),
     "cull_frustum_ewa": Layout("part/cull_frustum_ewa.cl"),
     "cull_frustum_pixel": Layout("part/cull_frustum_pixel.cl"),
@@ -187,7 +187,7 @@ LAYOUTS: dict[str, Layout] = {
     "rays_box": Layout(
         "part/rays_box.cl",
         parts=("box_cover",),
-        project=takes("in float ray_step  // (1) how far a ray turns from a sample to the next, at most"),
+        project=takes("in float ray_step  // (1) maximum angle between the rays of neighbouring samples"),
         blend=takes("in float ray_slopes  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
     ),
     "ray_depth": Layout(
@@ -196,7 +196,7 @@ LAYOUTS: dict[str, Layout] = {
         backward_file="part/ray_depth_backward.cl",
         moments=(member("float z_numerator z_center"),),
     ),
-    # how pixels are made of samples, and by whom
+    # resolving samples to pixels
     "resolve_pixel": Layout("part/resolve_pixel.cl"),
     "resolve_fused": Layout("part/resolve_fused.cl"),
     # loop through a tile's list on CPUs, without a k-buffer
@@ -285,7 +285,7 @@ LAYOUTS: dict[str, Layout] = {
     "overdraw": Layout("output/overdraw.cl", samples=(Samples("int", "overdraw_raw"),)),
     "rounding": Layout("output/rounding.cl", samples=(Samples("float", "rounding_raw"),)),
     "blended": Layout("output/blended.cl", samples=(Samples("int", "blended_raw"),)),
-    # what changes rgb on its way out
+    # effects on the resolved rgb
     "fog": Layout(
         "output/fog.cl",
         parts=("ray_depth", "ray_length"),
@@ -328,4 +328,4 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "quantise": Layout("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),
 }
-"""How each effect is laid out, and the parts that several share."""
+"""declaration of each effect, and of the parts that several share"""

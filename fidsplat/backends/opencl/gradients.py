@@ -46,17 +46,17 @@ _ZERO = np.zeros(1, np.uint32)  # of floats too
 class OpenCLDifferentiable(DifferentiableImages):
     """Output images of `OpenCLGradients.forward`."""
 
-    picture: DeviceFrame
+    frame: DeviceFrame
     images: OpenCLImages
 
     def device_array(self, name: str) -> Array:
         """The image as a pyopencl array, (h, w) or (h, w, channels), without a copy."""
         buffer, shape = self.device_buffer(name)
-        return Array(self.picture.queue, shape, np.dtype(IMAGES[name].dtype), data=buffer)
+        return Array(self.frame.queue, shape, np.dtype(IMAGES[name].dtype), data=buffer)
 
     def device_buffer(self, name: str) -> tuple[cl.Buffer, tuple[int, ...]]:
         """The buffer of an image, and its shape; faster than an array."""
-        return self.picture.named[f"{name}_out"], gradient_shape(name, self.picture.view)
+        return self.frame.named[f"{name}_out"], gradient_shape(name, self.frame.view)
 
 
 @contextmanager
@@ -133,7 +133,7 @@ class OpenCLGradients(GradientPipeline):
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """Gradients as pyopencl arrays."""
-        with images.picture.workspace.lock:
+        with images.frame.workspace.lock:
             return self.backward_to_tiles(images, gradients).gradients()
 
     def backward_to_tiles(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> TileGradients:
@@ -141,8 +141,8 @@ class OpenCLGradients(GradientPipeline):
         check_gradients(self._pipeline.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)
-        with _differentiating(images.picture):
-            frame = self._backward_frame(images.picture)
+        with _differentiating(images.frame):
+            frame = self._backward_frame(images.frame)
             self._submit_to_tiles(frame, gradients)
             return TileGradients(self, images, frame)
 

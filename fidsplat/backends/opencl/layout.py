@@ -1,9 +1,8 @@
-"""What the stages of drawing pass on and take, declared once: records, and the arguments of kernels.
+"""Records and kernel arguments, declared once for host and kernels.
 
-The C structs and signatures of kernels/opencl/ are printed from this (assemble.py), and the host binds
-arguments by these names (program.py). What effects and outputs add to both stands in
-effect_layouts.py. Buffers are (channels, rows, columns) of the padded grid of samples, unless they say
-otherwise.
+assemble.py prints the C structs and signatures of kernels/opencl/ from these declarations, and the host binds
+arguments by their names. effect_layouts.py declares the additions of effects and outputs. Buffers are
+(channels, rows, columns) of the padded grid of samples, unless their note has another shape.
 """
 
 from __future__ import annotations
@@ -21,11 +20,10 @@ VIEW = Record(
         member("real log_cut", "ln(alpha cut-off)"),
         member("real width height", "of the sample grid"),
         member("real filter", "(pixels per sample)^2, for filters that are defined in pixels"),
-        member("real band band_end", "rows of samples that are drawn now"),
+        member("real band band_end", "rows of samples to render"),
     ),
 )
-"""The uniforms of the projection; one for each view, then as many for each group of splats that moves by
-itself."""
+"""Uniforms of the projection: one record for each view, then one for each view and moving group."""
 
 SPLAT = Record(
     "Splat",
@@ -40,7 +38,7 @@ SPLAT = Record(
         member("short y0 y1", "rows [y0, y1) that the splat can touch"),
         member("short x0 x1", "columns [x0, x1)"),
     ),
-    alignment=16,  # whole vectors of 16 bytes are read and written
+    alignment=16,  # vectors of 16 bytes are read and written
 )
 
 BOUNDS = Record(
@@ -58,22 +56,22 @@ BOUNDS = Record(
 MOMENTS = Record(
     "Moments",
     (
-        member("float nu0 nux nuy", "by n_u: its derivatives times 1, x, y, summed over a tile"),
+        member("float nu0 nux nuy", "gradients by n_u times 1, x, y, summed over a tile"),
         member("float nv0 nvx nvy"),
         member("float d0 dx dy"),
         member("float log_opacity"),
         member("float r g b"),
     ),
-    alignment=16,  # as few lines of a cache as can be
+    alignment=16,  # few cache lines
 )
-"""What a tile adds to the derivatives by a splat's record."""
+"""Contribution of a tile to the gradient of a splat's record."""
 
 _SIZE = takes("int width height  // of the sample grid")
-_IMAGE_SIZE = takes("int width height  // of the picture")
+_IMAGE_SIZE = takes("int width height  // of the image")
 _BIG = takes("uint big_capacity", "in Bounds big_bounds")
-_DIGIT = takes("uint count  // places for the splats of a view", "in uint tallies", "uint first shift")
+_DIGIT = takes("uint count  // capacity in splats of a view", "in uint tallies", "uint first shift")
 _WALK = takes(
-    "uint count  // places for the splats of a view",
+    "uint count  // capacity in splats of a view",
     "in uint order tallies",
     "in uint2 windows",
     _BIG,
@@ -95,14 +93,14 @@ RAY_UNIFORMS = uniforms(
 _TILES = takes("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _IMAGE_SIZE)
 _RESERVED = takes(
     *("uint count", "in uint keys", _TILES),
-    "out uint splat_slots  // (n): the first of a splat's, which has one for each of its tiles",
-    "out uint reserved  // how many there are",
+    "out uint splat_slots  // (n) first gradient buffer offset of each splat, which has one per tile",
+    "out uint reserved  // number of offsets",
 )
 
 _BLENDED = takes(
     "wide log_cut ceiling stop filter",
     *("float log_ceiling", "float background_r background_g background_b"),
-    *("int stride  // of the padded picture", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
+    *("int stride  // of the padded image", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
 )
 
 _LOSS_SIZE = takes(
@@ -130,7 +128,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "cloud float opacities  // (n)",
         "out Splat splats  // (views, n)",
         "out uint keys  // (views, n)",
-        "out uint2 windows  // (views, n): corner and bits, or a place in `big` and 0",
+        "out uint2 windows  // (views, n): corner and bits, or an index in `big` and 0",
         "out uint tallies",
         "uint big_capacity",
         "out uint big  // splats that touch more than a window",
@@ -189,10 +187,10 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float raw",
     ),
     "resolve": takes(
-        "int width height  // of the picture",
+        "int width height  // of the image",
         "int stride  // samples per row of raw",
         "uint channel_stride  // samples per channel of raw, of all views",
-        "in uint slots  // of each view: its place among the output images",
+        "in uint slots  // index of each view in the output images",
         *("float background_r background_g background_b", "in float raw"),
     ),
     # derivatives
@@ -209,11 +207,11 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
             "in uint splat_slots big_rows",
         ),
         _BLENDED,
-        "out float checkpoints  // tiles' transmittances in front of every CHUNK splats",
-        "out float moments  // of the record Moments, by slots",
+        "out float checkpoints  // transmittance of each tile in front of every CHUNK splats",
+        "out float moments  // records Moments by gradient buffer offset",
         "out real tile_sums  // (tiles, 3) by the background",
         "out float tapes  // a Tape for each work-item",
-        "out uint reserved  // its second word: tiles that are taken",
+        "out uint reserved  // second word: number of claimed tiles",
     ),
     "project_backward": takes(
         *("uint count", "in View view", "cloud float means quats scales opacities"),
@@ -228,10 +226,10 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "project_step": takes(
         *("uint count", "in View view", "in Splat splats", "in uint keys", _TILES),
         *("in uint splat_slots", "in float moments"),
-        "int counted move sparse  // sparse: splats that the picture does not depend on rest",
-        "uint all  // coefficients of a splat",
+        "int counted move sparse  // sparse: update only splats that contribute",
+        "uint all  // SH coefficients of a splat",
         "float beta1 beta2 rest1 rest2 root epsilon",
-        "float size_means size_scales size_quats size_logits  // rates of this step",
+        "float size_means size_scales size_quats size_logits  // step sizes",
         "float size_sh size_rest  // of degree 0 and above",
         "float scale_penalty opacity_penalty",
         "out float gradient_sums",
@@ -300,21 +298,21 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float means",
     ),
 }
-"""The arguments of each kernel; those of effects and outputs follow them."""
+"""The arguments of each kernel, before those of effects and outputs."""
 
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": _RESERVED,
     "blend_checkpoints": takes(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
-        "out float checkpoints  // of each pixel of CHUNK splats: light in front, its worth behind",
-        "out uint reached  // (tiles) chunks that light comes to",
-        "out uint chunk_tiles  // the tiles of chunks",
+        "out float checkpoints  // per pixel and CHUNK splats: transmittance in front, light behind",
+        "out uint reached  // (tiles) number of chunks before the transmittance stop",
+        "out uint chunk_tiles  // tile of each chunk",
         "out real tile_sums  // (tiles, 3) by the background",
     ),
     "blend_backward": takes(
         *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots", _BLENDED),
         *("in float checkpoints", "in uint reached chunk_tiles"),
-        "out float moments  // of the record Moments, by slots",
+        "out float moments  // records Moments by gradient buffer offset",
     ),
 }
-"""Where work-groups share a tile."""
+"""Kernels with other arguments in the group schedule, where a work-group shares a tile."""

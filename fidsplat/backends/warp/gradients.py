@@ -33,7 +33,7 @@ _SHARES = 2048
 class WarpDifferentiable(DifferentiableImages):
     """Output images of `WarpGradients.forward`."""
 
-    picture: DeviceFrame
+    frame: DeviceFrame
     images: WarpImages
 
     def device_array(self, name: str) -> Any:
@@ -63,7 +63,7 @@ class WarpGradients(GradientPipeline):
 
     def backward(self, images: WarpDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """Gradients as wp.arrays."""
-        frame = images.picture
+        frame = images.frame
         check_gradients(frame.program.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)
