@@ -145,19 +145,19 @@ def test_a_capacity_of_exactly_the_pairs_of_a_frame(backend, spare):
     cloud, quality = random_splats(3000, seed=5, scale=(1e-3, 0.5)), fs.Quality()
     groups = listing(backend, "tiled")
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
-    drawn = []
-    for room in (None, spare):
+    rendered = []
+    for extra in (None, spare):
         own = type(backend)(backend.device)  # with new buffers
-        if room is not None:
-            pairs = drawn[0].stats["pairs"] + room
+        if extra is not None:
+            pairs = rendered[0].stats["pairs"] + extra
             own.pool.scratch("lists", 4 * pairs)
             own.pool.scratch("pairs", 8 * pairs)
-        drawn.append(own.pipeline(features, groups).render(own.upload(cloud), view))
-        grown = own.pool.size("pairs") > 8 * (drawn[0].stats["pairs"] + spare)
-        assert room is None or grown == (spare < 0)
-    assert drawn[0].stats == drawn[1].stats
+        rendered.append(own.pipeline(features, groups).render(own.upload(cloud), view))
+        grown = own.pool.size("pairs") > 8 * (rendered[0].stats["pairs"] + spare)
+        assert extra is None or grown == (spare < 0)
+    assert rendered[0].stats == rendered[1].stats
     for name in ALL_OUTPUTS:
-        assert np.array_equal(drawn[0].read(name), drawn[1].read(name)), name
+        assert np.array_equal(rendered[0].read(name), rendered[1].read(name)), name
 
 
 def test_a_list_longer_than_local_memory_is_sorted(backend):

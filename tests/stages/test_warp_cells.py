@@ -18,9 +18,9 @@ MORE = {"around": 2.5, "needles": 1.06}
 """maximum ratio of marked cells to cells with fragments; near a horizon the box is used, not the ellipse"""
 
 
-def marked(picture):
+def marked(frame):
     """(splats, tiles, cells of a tile): cells that blending marks."""
-    wp, program = runtime.load(), picture.program
+    wp, program = runtime.load(), frame.program
     effects, outputs = program.needs.among(("lowpass_screen", "ray_depth")), program.needs.blending
     cells = runtime.kernels("cells").make_cells(effects, outputs)
     staging = runtime.kernels("staging").make_staging(program.layout, 32, 4)
@@ -41,9 +41,9 @@ def marked(picture):
         left, top = tile % view.tiles_x * view.tile_w, tile / view.tiles_x * view.tile_h
         found[k, tile] = cells(s, box, left, top, 0, view)
 
-    count = picture.resident.count
-    found = wp.zeros((count, picture.tiles), dtype=wp.uint32, device="cpu")
-    held, lists = picture.named, wp.array(np.arange(count), dtype=wp.int32, device="cpu")
+    count = frame.resident.count
+    found = wp.zeros((count, frame.tiles), dtype=wp.uint32, device="cpu")
+    held, lists = frame.named, wp.array(np.arange(count), dtype=wp.int32, device="cpu")
     wp.launch(ask, found.shape, [held["views"], held["lines"], lists, found], device="cpu")
     return (found.numpy()[:, :, None] >> np.arange(32) & 1).astype(bool)
 
@@ -55,11 +55,11 @@ def covered(records, names, view, rows, columns):
     x, y = x - of["ax"], y - of["ay"]
     u, v, d = (of[f"{n}0"] + of[f"{n}x"] * x + of[f"{n}y"] * y for n in ("nu", "nv", "d"))
     half_r2 = of["log_opacity"] - view.log_cut
-    drawn = (u**2 + v**2 <= half_r2 * d**2) & (d > 0) & (d <= of["d_near"])
+    covers = (u**2 + v**2 <= half_r2 * d**2) & (d > 0) & (d <= of["d_near"])
     if "dot_x" in of:
-        drawn |= (x - of["dot_x"]) ** 2 + (y - of["dot_y"]) ** 2 <= half_r2
-    drawn[:, view.height :] = drawn[:, :, view.width :] = False
-    by_cell = drawn.reshape(-1, rows // 4, 4, columns // 2, 2).any((2, 4))
+        covers |= (x - of["dot_x"]) ** 2 + (y - of["dot_y"]) ** 2 <= half_r2
+    covers[:, view.height :] = covers[:, :, view.width :] = False
+    by_cell = covers.reshape(-1, rows // 4, 4, columns // 2, 2).any((2, 4))
     tiles = by_cell.reshape(-1, rows // 16, 4, columns // 16, 8).swapaxes(2, 3)
     return tiles.reshape(len(records), -1, 32)
 
@@ -72,11 +72,11 @@ def test_marked_cells_contain_all_fragments_and_few_others(renderer, cloud, qual
         pytest.skip("asked one by one on the CPU; blending itself is compared with the reference")
     resident = backend.upload(CLOUDS[cloud]())
     features, view = prepare(resident, fs.Capture(CAMERA, quality=fs.Quality.of(quality), outputs=("rgb",)))
-    picture = backend.pipeline(features).render_counted(resident, view)[0]
-    seen = picture.named["drawn"].numpy()[: resident.count] != 0
-    found = marked(picture)[seen]
-    lines = picture.named["lines"].numpy()[: resident.count * picture.program.layout.lines]
-    records = lines.reshape(resident.count, -1)[seen]
-    wanted = covered(records, picture.program.layout.names, view, *picture.grid)
-    assert not (wanted & ~found).any()
-    assert found.sum() < MORE[cloud] * wanted.sum()
+    frame = backend.pipeline(features).render_counted(resident, view)[0]
+    visible = frame.named["drawn"].numpy()[: resident.count] != 0
+    found = marked(frame)[visible]
+    lines = frame.named["lines"].numpy()[: resident.count * frame.program.layout.lines]
+    records = lines.reshape(resident.count, -1)[visible]
+    expected = covered(records, frame.program.layout.names, view, *frame.grid)
+    assert not (expected & ~found).any()
+    assert found.sum() < MORE[cloud] * expected.sum()
