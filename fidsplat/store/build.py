@@ -272,7 +272,7 @@ class _Build:
         first, end = int(children["first"][0]), int(children["first"][-1] + children["count"][-1])
         return merged(self.columns.read(first, end), self.plan.grid)
 
-    # all together
+    # completion
 
     def _finish(self) -> None:
         """Write headers and the index, and remove temporary files."""

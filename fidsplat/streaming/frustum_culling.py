@@ -82,7 +82,7 @@ class Extent:
         rays (an unbounded footprint) and for cut-offs as low as 1e-13.
         """
         radius = max(cutoff_radius(view), minimum)
-        # the dot of the low-pass, or the widening by EWA
+        # the disc of the low-pass, or the widening by EWA
         plain = Extent(radius, radius * view.samples + 2.0, radius)
         if not _widened(features):
             return plain
