@@ -13,7 +13,8 @@ from fidsplat.effects import IMAGES
 from fidsplat.util.errors import InputError
 
 NOT_THE_LAST = (
-    "backward takes the images that forward has made last on this device; call it before the next picture"
+    "backward must be called before the next frame of the device, got images of an earlier frame; "
+    "render again"
 )
 
 
@@ -22,7 +23,7 @@ class CapacityExceeded(Exception):
 
 
 class DifferentiableImages:
-    """Output images with what the stages have left, for `backward` of the device that drew them."""
+    """Output images with the frame that made them, for `backward`."""
 
     frame: Any
     images: Images
@@ -33,7 +34,7 @@ class DifferentiableImages:
 
     @property
     def last(self) -> bool:
-        """Whether no other picture has been begun on the device since."""
+        """Whether the device has started no other frame since."""
         return self.frame.workspace.frames == self._number
 
     def read(self, name: str) -> np.ndarray:
@@ -61,7 +62,7 @@ def check_shape(name: str, given: tuple[int, ...], view: View) -> None:
     """Raises InputError unless a gradient has its output's shape."""
     if tuple(given) != gradient_shape(name, view):
         raise InputError(
-            f"the gradient of {name} has the shape {tuple(given)}; it must be {gradient_shape(name, view)}"
+            f"the gradient of {name} must have the shape {gradient_shape(name, view)}, got {tuple(given)}"
         )
 
 

@@ -148,7 +148,7 @@ def test_a_differentiable_frame_has_the_bits_of_render_and_of_the_backends_gradi
     resident = renderer.upload(cloud)
     on_device = renderer.render_differentiable(resident, capture).backward(weights, on_device=True)
     assert all(np.array_equal(on_host(array), found[name]) for name, array in on_device.items())
-    with pytest.raises(fs.InputError, match="made last"):
+    with pytest.raises(fs.InputError, match="images of an earlier frame"):
         frame.backward(weights)
 
 
@@ -218,7 +218,7 @@ def test_derivatives_are_timed_and_another_picture_in_between_is_an_error(backen
     assert {"blend", "blend backward", "project backward"} <= images.timings.keys()
     assert all(isinstance(name, str) and ms >= 0 for name, ms in images.timings.items())
     renderer.render(cloud, capture)
-    with pytest.raises(fs.InputError, match="made last"):
+    with pytest.raises(fs.InputError, match="images of an earlier frame"):
         pipeline.backward(images, {})
 
 

@@ -95,7 +95,7 @@ def test_gradients_are_named_arrays_in_the_shapes_of_the_cloud():
     precise = frame.backward({"rgb": ONES, "distortion": ONES[..., 0]}, on_device=True)
     assert all(np.array_equal(array.astype(np.float32), found[name]) for name, array in precise.items())
     assert not any(array.any() for array in frame.backward({}).values())
-    with pytest.raises(fs.InputError, match="the output 'normal' was not drawn"):
+    with pytest.raises(fs.InputError, match="the output 'normal' was not rendered"):
         frame.backward({"normal": ONES})
 
 
