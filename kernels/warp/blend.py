@@ -1,7 +1,6 @@
-"""Tiles from their lists: on a GPU a block of threads per tile, records staged in shared memory, and threads
-that are neighbours draw a cell of 2 x 4 samples, for which they walk those of the staged splats alone that
-can touch it; on a CPU a thread per tile that walks each splat's box within it.
-The same functions see every sample, so both take the same decisions.
+"""Blending of tiles. On a GPU a block of threads renders a tile: records are staged in shared memory, and
+adjacent threads render a cell of 2 x 4 samples, of the staged splats that can touch it. On a CPU a thread
+renders a tile, splat by splat within its box. Both use the same functions of a sample.
 """
 
 from functools import cache
@@ -12,8 +11,8 @@ from . import output
 from .bounds import Bounds, make_bounds
 from .buffers import make_samples, sample_fields
 from .cells import CELL_H, CELL_W, make_cells
-from .common import STRICT, View, first_sample, place_of, reread, store_line
-from .crossing import make_crossing
+from .common import STRICT, View, first_sample, locate_tile, reread, store_line
+from .intersection import make_intersection
 from .pixel import make_pixel
 from .rays import SLOPES
 from .records import Layout
@@ -26,18 +25,20 @@ _NONE, _ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
 def samples_each(effects: tuple[str, ...]) -> int:
-    """Samples of a row that a thread of a GPU draws: two, for which it reads a record once, unless each has a
-    ray of its own or fragments that wait.
+    """Samples of a row per thread on a GPU: two, which share the reading of a record, unless each has its own
+    ray or k-buffer.
     """
     return CELL_W if {"rays", "compose_pixel"}.isdisjoint(effects) else 1
 
 
 @cache
-def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool, area: int, room: int):
-    """The kernel for these effects of splats and samples, and these outputs, the struct that a sample keeps,
-    and on a GPU the threads of a block; area: samples of a tile; room: for fragments that wait.
+def make_blend(
+    effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool, area: int, k_buffer_size: int
+):
+    """The kernel for these effects and outputs, the struct of a sample's state, and the threads of a block on
+    a GPU. area: samples of a tile.
     """
-    splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
+    splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
     each = samples_each(effects)
     threads, items, pair = area // each, _CELL // each, each == 2
     staging = make_staging(Layout(effects, outputs), area // _CELL, items)
@@ -49,10 +50,10 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
     staged = splats.reading(staging.line)
     load, box_of, read = staged.load, staged.box_of, splats.read
     row_of, cross, cross_ray, cross_slopes = (
-        *(crossing.row, crossing.cross),
-        *(crossing.cross_ray, crossing.cross_slopes),
+        *(intersection.row, intersection.cross),
+        *(intersection.cross_ray, intersection.cross_slopes),
     )
-    pixels = make_pixel(effects, outputs, room)
+    pixels = make_pixel(effects, outputs, k_buffer_size)
     Splat, Rays, Pixel = splats.Splat, pixels.Rays, pixels.Pixel
     start, unfinished = pixels.start, pixels.unfinished
     blend_one, end_pass, cover, finish = pixels.blend, pixels.end, pixels.cover, pixels.finish
@@ -60,7 +61,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(sample_fields(outputs).items()))
     stores, words = output.functions(outputs, "store"), output.digest(outputs)
-    Crossing, opacity_of = crossing.Crossing, crossing.opacity_of
+    Intersection, opacity_of = intersection.Intersection, intersection.opacity_of
     asking = bool(output.having(outputs, "fragment"))
     fragments, screen = output.functions(outputs, "fragment"), "lowpass_screen" in effects
     bent, curved = "rays" in effects, cross_slopes is not None
@@ -72,27 +73,27 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
             wp.static(stores[k])(p, at, samples)
 
     @wp.func
-    def begun(x: int, y: int, rays: Rays, view: View):
-        """A sample before anything is drawn; one beyond the picture is finished from the start."""
+    def new_sample(x: int, y: int, rays: Rays, view: View):
+        """Initial state of a sample; one outside the image is finished."""
         p = start(x, y, rays, view)
         if x >= view.width or y >= view.height:
             p.t = 0.0
         return p
 
     @wp.func
-    def met(pixel: Pixel, s: Splat, c: Crossing, x: float, y: float, view: View):
-        """The sample after outputs have seen a splat of its list; nothing is composited yet."""
-        p, dot, opacity = pixel, float(wp.inf), float(0.0)
+    def observe(pixel: Pixel, s: Splat, c: Intersection, x: float, y: float, view: View):
+        """Apply the `fragment` functions of outputs to a listed splat, before it is composited."""
+        p, disc, opacity = pixel, float(wp.inf), float(0.0)
         if wp.static(screen):
-            dot = c.screen
-        if c.drawn:
+            disc = c.screen
+        if c.contributes:
             opacity = opacity_of(s, c, 1.0 / c.d, view)
         for k in range(wp.static(len(fragments))):
-            p = wp.static(fragments[k])(p, s, c, x, y, dot, opacity, view)
+            p = wp.static(fragments[k])(p, s, c, x, y, disc, opacity, view)
         return p
 
     @wp.func
-    def drawn(
+    def blend_splat(
         pixel: Pixel,
         s: Splat,
         row: wp.vec3,  # of the three forms, along the sample's row
@@ -106,7 +107,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """The sample after the splat at `place` in the list."""
+        """Blend the splat at `place` in the list."""
         p = pixel
         if unfinished(p, view):
             if wp.static(curved):
@@ -116,12 +117,12 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
             else:
                 c = cross(s, row[0], row[1], row[2], x, y, view)
             if wp.static(asking):
-                p = met(p, s, c, x, y, view)
-            if c.drawn:
+                p = observe(p, s, c, x, y, view)
+            if c.contributes:
                 p = blend_one(p, s, c, place, lines, lists, coplanar_groups, view)
         return p
 
-    # so many threads at once: at most 64 registers, which is what two samples take that keep only their light
+    # 1024 threads at once: at most 64 registers, enough for two samples without other outputs
     launched = (threads, 1024 // threads) if not outputs and _PLAIN.issuperset(effects) else threads
     options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
 
@@ -139,10 +140,10 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         thread = wp.tid()
         tile = band_first + thread / threads
         item = thread % threads
-        number, tile_column, tile_row = place_of(tile, views)
+        number, tile_column, tile_row = locate_tile(tile, views)
         view = views[reread(number)]
         left, top = tile_column * view.tile_w, tile_row * view.tile_h
-        # a warp draws `each` rows of four cells
+        # a warp renders `each` rows of four cells
         warp, lane = item / 32, item % 32
         across, own = view.tile_w / (4 * CELL_W), lane % items
         cell_x = warp % across * 4 + lane / items % 4
@@ -150,10 +151,10 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         cell = cell_y * (4 * across) + cell_x
         x0 = left + cell_x * CELL_W + own % (CELL_W / each) * each
         y0 = top + cell_y * CELL_H + own / (CELL_W / each)
-        p = begun(x0, y0, rays, view)
+        p = new_sample(x0, y0, rays, view)
         open = unfinished(p, view)
         if wp.static(pair):
-            q = begun(x0 + 1, y0, rays, view)
+            q = new_sample(x0 + 1, y0, rays, view)
             open = open or unfinished(q, view)
         ray, slopes = wp.vec3(), SLOPES()
         if wp.static(bent):
@@ -198,9 +199,11 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                             continue
                     x, y = float(x0) - s.d[3], float(y0) - s.c[0]
                     row = wp.vec3(row_of(s.u, y), row_of(s.v, y), row_of(s.d, y))
-                    p = drawn(p, s, row, ray, slopes, x, y, k + which, lines, lists, coplanar_groups, view)
+                    p = blend_splat(
+                        p, s, row, ray, slopes, x, y, k + which, lines, lists, coplanar_groups, view
+                    )
                     if wp.static(pair):
-                        q = drawn(
+                        q = blend_splat(
                             q, s, row, ray, slopes, x + 1.0, y, k + which, lines, lists, coplanar_groups, view
                         )
                 open = unfinished(p, view)
@@ -212,7 +215,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                 p = end_pass(p, lines, lists, view)
                 open = unfinished(p, view)
                 again = stage(records, lines, lists, end, 0, open)
-        number, tile_column, tile_row = place_of(tile, views)
+        number, tile_column, tile_row = locate_tile(tile, views)
         view = views[reread(number)]
         at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
         if wp.static(opaque):
@@ -240,7 +243,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         state_first: int,
     ):
         tile = band_first + wp.tid()
-        number, tile_column, tile_row = place_of(tile, views)
+        number, tile_column, tile_row = locate_tile(tile, views)
         view = views[number]
         x0 = tile_column * view.tile_w
         y0 = tile_row * view.tile_h
@@ -277,8 +280,8 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                         if wp.static(asking):
                             at = state_first + (row - y0) * view.tile_w + column - x0
                             if unfinished(state[at], view):
-                                state[at] = met(state[at], s, c, x, y, view)
-                        if c.drawn:
+                                state[at] = observe(state[at], s, c, x, y, view)
+                        if c.contributes:
                             at = state_first + (row - y0) * view.tile_w + column - x0
                             p = state[at]
                             if unfinished(p, view):

@@ -1,5 +1,5 @@
 """What part of the picture a splat can touch: its ellipse, or a box where the disk crosses the near plane,
-and the low-pass dot. Of most splats a window says which tiles these are: 8 x 4 tiles as bits.
+and the low-pass disc. Of most splats a window says which tiles these are: 8 x 4 tiles as bits.
 
 Everything here is conservative; the test of each sample decides.
 """
@@ -32,9 +32,9 @@ class Bounds:
     half_width: float
     inverse_hy2: float  # 0: a box
     tip: float  # height at which it is widest to the right
-    dot_x: float
-    dot_y: float
-    dot_r: float  # below 0: no dot
+    disc_x: float
+    disc_y: float
+    disc_r: float  # below 0: no dot
 
 
 @wp.func
@@ -46,7 +46,7 @@ def box_bounds(x0: float, x1: float, y0: float, y1: float):
     b.half_x = 0.5 * (x1 - x0) * (1.0 + PAD_RELATIVE) + PAD
     b.half_y = 0.5 * (y1 - y0) * (1.0 + PAD_RELATIVE) + PAD
     b.half_width = b.half_x
-    b.dot_r = -1.0
+    b.disc_r = -1.0
     return b
 
 
@@ -63,7 +63,7 @@ def ellipse_bounds(x: float, y: float, half_x: float, half_y: float, shear: floa
     # the pad of the height shifts a sheared chord too
     b.half_width = across * (1.0 + PAD_RELATIVE) + PAD_RELATIVE * half_x + PAD * (1.0 + wp.abs(shear))
     b.inverse_hy2 = 1.0 / (b.half_y * b.half_y)
-    b.dot_r = -1.0
+    b.disc_r = -1.0
     return b
 
 
@@ -81,7 +81,7 @@ def window_tile(corner: int, bit: int, view: View) -> int:
 
 @cache
 def make_bounds(screen: bool) -> SimpleNamespace:
-    """rows(bounds, height) and span(bounds, y0, y1, width), with or without the low-pass dot."""
+    """rows(bounds, height) and span(bounds, y0, y1, width), with or without the low-pass disc."""
 
     @wp.func
     def rows(b: Bounds, height: int):
@@ -89,9 +89,9 @@ def make_bounds(screen: bool) -> SimpleNamespace:
         low = b.y - b.half_y
         high = b.y + b.half_y
         if wp.static(screen):
-            if b.dot_r >= 0.0:
-                low = wp.min(low, b.dot_y - b.dot_r)
-                high = wp.max(high, b.dot_y + b.dot_r)
+            if b.disc_r >= 0.0:
+                low = wp.min(low, b.disc_y - b.disc_r)
+                high = wp.max(high, b.disc_y + b.disc_r)
         first = wp.max(to_sample(wp.ceil(low - 0.5), height), 0)
         end = wp.min(to_sample(wp.floor(high - 0.5) + 1.0, height), height)
         return first, end
@@ -116,13 +116,13 @@ def make_bounds(screen: bool) -> SimpleNamespace:
             x1 = b.x + wp.min(fma(b.shear, right, b.half_width * over), b.half_x)
             x0 = b.x + wp.max(fma(b.shear, left, -b.half_width * under), -b.half_x)
         if wp.static(screen):
-            low = wp.max(top - b.dot_y, -b.dot_r)
-            high = wp.min(bottom - b.dot_y, b.dot_r)
+            low = wp.max(top - b.disc_y, -b.disc_r)
+            high = wp.min(bottom - b.disc_y, b.disc_r)
             if low <= high:
                 at = wp.clamp(0.0, low, high)
-                half = wp.sqrt(wp.max(b.dot_r * b.dot_r - at * at, 0.0)) + PAD
-                x0 = wp.min(x0, b.dot_x - half)
-                x1 = wp.max(x1, b.dot_x + half)
+                half = wp.sqrt(wp.max(b.disc_r * b.disc_r - at * at, 0.0)) + PAD
+                x0 = wp.min(x0, b.disc_x - half)
+                x1 = wp.max(x1, b.disc_x + half)
         first = wp.max(to_sample(wp.ceil(x0 - 0.5), width), 0)
         end = wp.min(to_sample(wp.floor(x1 - 0.5) + 1.0, width), width)
         return first, end

@@ -23,7 +23,7 @@ _SLACK = wp.constant(2e-5)
 """of the forms' terms: more than rounding can change f by at a sample, here and where fragments are tested"""
 _PAD, _PAD_RELATIVE = wp.constant(0.02), wp.constant(1e-4)
 """of chords: samples, and by how far the tile is from the splat's anchor"""
-_FLAT, _NO_DOT = wp.constant(1e-12), wp.constant(1e17)
+_FLAT, _NO_DISC = wp.constant(1e-12), wp.constant(1e17)
 _ONE, _TWO = wp.constant(wp.uint32(1)), wp.constant(wp.uint32(2))
 
 
@@ -136,11 +136,11 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
             if wp.static(elliptic):
                 low, high = chord(c, y0, y1)
                 if wp.static(screen):
-                    away = wp.clamp(s.dot_y, y0, y1) - s.dot_y
+                    away = wp.clamp(s.disc_y, y0, y1) - s.disc_y
                     rest = s.half_r2 / view.per_pixel * (1.0 + _PAD_RELATIVE) - away * away
-                    if rest >= 0.0 and s.dot_x < _NO_DOT:
+                    if rest >= 0.0 and s.disc_x < _NO_DISC:
                         half = wp.sqrt(rest) + _PAD
-                        low, high = wp.min(low, s.dot_x - half), wp.max(high, s.dot_x + half)
+                        low, high = wp.min(low, s.disc_x - half), wp.max(high, s.disc_x + half)
             first = wp.max(int(wp.clamp(wp.ceil(low + shift), 0.0, last + 1.0)), box[0] - left)
             end = wp.min(int(wp.clamp(wp.floor(high + shift), -1.0, last)), box[1] - left - 1)
             if first <= end:

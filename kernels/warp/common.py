@@ -4,7 +4,7 @@ import warp as wp
 
 # Order and culling must not depend on what a compiler fuses: contraction is off everywhere, and fused
 # operations are
-# written out as `fma` (numerics F1). No fast maths: a NaN must fail a comparison (numerics F3).
+# written out as `fma`. No fast maths: a NaN must fail a comparison.
 # Loops over the functions of outputs are unrolled, however many there are.
 STRICT = {
     **{"fuse_fp": False, "fast_math": False, "enable_backward": False, "default_grid_stride": False},
@@ -13,7 +13,7 @@ STRICT = {
 
 CULLED = wp.constant(wp.uint32(0xFFFFFFFF))
 """key of a splat that is not drawn"""
-LEAST_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
+MIN_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
 """less of a sample than this is nothing to label, depth, median depth and normal"""
 
 
@@ -73,7 +73,7 @@ def reread(number: int) -> int:
 
 
 @wp.func
-def place_of(tile: int, views: wp.array(dtype=View)):
+def locate_tile(tile: int, views: wp.array(dtype=View)):
     """Of one of all views' tiles: its view, and the column and row of tiles in it."""
     view = views[0]
     row = tile / view.tiles_x
@@ -127,7 +127,7 @@ def store_line(lines: wp.array(dtype=wp.vec4), at: int, value: wp.vec4):
 
 @wp.func
 def sortable(x: float) -> wp.uint32:
-    """Bits of a float in an order that unsigned comparison keeps, negative values included (numerics C2). No
+    """Bits of a float in an order that unsigned comparison keeps, negative values included. No
     depth is -0: it is a sum with a term of the view's, which is not.
     """
     bits = wp.cast(x, wp.uint32)
@@ -176,6 +176,6 @@ def of_bits(bits: float):
 @wp.func
 def to_sample(x: float, limit: int) -> int:
     """A sample's coordinate to int; clamped as a float, since conversions of huge values are undefined
-    (numerics E2).
+    .
     """
     return int(wp.clamp(x, -1.0, float(limit) + 1.0))

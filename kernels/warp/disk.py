@@ -11,8 +11,8 @@ from .common import View
 
 @cache
 def make_disk(real) -> SimpleNamespace:
-    """seen(a, b, p, radius, reach, view) of a pinhole, with half of the disk's range of depths; parallel of
-    parallel rays.
+    """Functions for bounds of a disk: perspective(a, b, p, radius, reach, view), reach half its range of
+    depths, and parallel.
     """
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
     one, zero = real(1.0), real(0.0)
@@ -50,7 +50,7 @@ def make_disk(real) -> SimpleNamespace:
         """Box of the part of the disk beyond the near plane: of its arc, and of the chord in which the plane
         cuts it.
 
-        The part is convex and depth is positive in it, so ratios are largest on its rim (numerics A1 ii).
+        The part is convex and depth is positive in it, so ratios are largest on its rim.
         """
         near = real(view.near)
         depth = vec3(a[2], b[2], p[2])
@@ -76,7 +76,7 @@ def make_disk(real) -> SimpleNamespace:
     @wp.func
     def ellipse(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
         """Image of a disk that lies wholly beyond the near plane, from its dual conic about the projected
-        centre (numerics A4).
+        centre.
         """
         fx, fy = real(view.focal_x), real(view.focal_y)
         px, py = p[0] / p[2], p[1] / p[2]
@@ -120,10 +120,10 @@ def make_disk(real) -> SimpleNamespace:
         )
 
     @wp.func
-    def seen(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
+    def perspective(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
         """Bounds of a disk before a pinhole."""
         if p[2] - reach >= real(view.near):
             return ellipse(a, b, p, radius, reach, view)
         return clipped(a, b, p, radius, reach, view)
 
-    return SimpleNamespace(seen=seen, parallel=parallel)
+    return SimpleNamespace(perspective=perspective, parallel=parallel)

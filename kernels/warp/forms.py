@@ -38,8 +38,9 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     """whether records say of a box where its edges are, or of any splat whether it is a box"""
     of_box, optics = make_boxes(real), make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
-    at_dot, at_depth, at_edges, at_ray, at_plane, at_flag, at_bulge = (
-        layout.word(name) for name in ("dot_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "bulge")
+    at_disc, at_depth, at_edges, at_ray, at_plane, at_flag, at_bulge = (
+        layout.word(name)
+        for name in ("disc_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "bulge")
     )
 
     @wp.func
@@ -64,7 +65,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         record = words()
         cx, cy = real(view.center_x), real(view.center_y)
         per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
-        # about the sample of the picture that is nearest to the centre (numerics B1)
+        # about the sample of the picture that is nearest to the centre
         ax = wp.clamp(wp.floor(float(center_x)), 0.0, float(view.width - 1))
         ay = wp.clamp(wp.floor(float(center_y)), 0.0, float(view.height - 1))
         anchor_x, anchor_y = real(ax) + half, real(ay) + half
@@ -96,7 +97,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
                 nv0 = nvx * (anchor_x - center_x) + nvy * (anchor_y - center_y)
         scale = wp.where(height < zero, -one, one) / steepest
         n_scale = scale * sqrt_half
-        # edge-on within rounding: no ray meets the plane, only the low-pass dot is drawn (numerics B2)
+        # edge-on within rounding: no ray meets the plane, only the low-pass disc is drawn
         away2 = wp.dot(p, p)
         if wp.static(parallel):
             away2 = one
@@ -129,8 +130,8 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
             record[at_flag] = wp.where(boxed, 1.0, 0.0)
         if wp.static(screen):
             # far away if there is none
-            record[at_dot] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
-            record[at_dot + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
+            record[at_disc] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
+            record[at_disc + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
         if wp.static(exact):
             record[at_bulge] = float(two * inverse_m2)
         if wp.static(parallel):

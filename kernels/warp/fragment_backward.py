@@ -13,7 +13,7 @@ import warp as wp
 
 from .buffers import make_samples, sample_fields
 from .common import View, fma, line_of, of_bits, struct_of
-from .crossing import HALF_RHO_OF_RANGE, make_crossing
+from .intersection import HALF_RHO_OF_RANGE, make_intersection
 from .output.distortion import INVERSE_DEPTH, SPREAD_NEAR
 from .records import Layout
 from .splat import make_splat
@@ -27,7 +27,7 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
     numbers of the record. That by D is at constant z_numerator - z_center D: the rest cancels most of that by
     z_numerator, so `make_project_backward` adds it in float64."""
     names = list(_FORMS)
-    names += ("dot_x", "dot_y") if "lowpass_screen" in effects else ()
+    names += ("disc_x", "disc_y") if "lowpass_screen" in effects else ()
     names += ("z_numerator", "z_numerator_x", "z_numerator_y", "z_center") if "ray_depth" in effects else ()
     names += ("nx", "ny", "nz") if "normal" in outputs else ()
     return tuple(names)
@@ -38,9 +38,9 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     """By (a struct of the derivatives by the images named in `losses`), Samples, Splat, Loss, Moments; read,
     loss_at, opacity_at, back. effects and outputs: as blending has them.
     """
-    splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
-    Splat, Crossing = splats.Splat, crossing.Crossing
-    cross, row_of, opacity_of = crossing.cross, crossing.row, crossing.opacity_of
+    splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
+    Splat, Intersection = splats.Splat, intersection.Intersection
+    cross, row_of, opacity_of = intersection.cross, intersection.row, intersection.opacity_of
     screen, exclusive, has_depth = (
         name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth")
     )
@@ -114,7 +114,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         opacity = float(0.0)
         if light > view.stop:
             c = crossed(s, float(column) - s.d[3], float(row) - s.c[0], view)
-            if c.drawn:
+            if c.contributes:
                 opacity = opacity_of(s, c, 1.0 / c.d, view)
                 if wp.static(exclusive):
                     if light * (1.0 - opacity) <= view.stop:
@@ -126,7 +126,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         lines: wp.array(dtype=wp.vec4),
         index: int,
         s: Splat,
-        c: Crossing,
+        c: Intersection,
         inverse_d: float,
         low_pass: float,
     ):
@@ -240,8 +240,8 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
             if on_plane:
                 by_dot = 0.0
             by_dot -= 2.0 * view.per_pixel * by_z * by_dot_depth[1]
-            m[wp.static(at.get("dot_x", 0))] = by_dot * (x - s.dot_x)
-            m[wp.static(at.get("dot_y", 0))] = by_dot * (y - s.dot_y)
+            m[wp.static(at.get("disc_x", 0))] = by_dot * (x - s.disc_x)
+            m[wp.static(at.get("disc_y", 0))] = by_dot * (y - s.disc_y)
         if wp.static(normal):
             for k in range(3):
                 m[wp.static(at.get("nx", 0)) + k] = weight * loss.normal[k]

@@ -1,10 +1,9 @@
-"""One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
+"""State of a sample and compositing of its fragments. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
 alpha_j).
 
-Fragments may wait for nearer ones (waiting.py), splats of one plane together (layers.py). A picture with
-depths of another renderer may be an opaque surface among them: of a fragment at its depth or behind it
-nothing is seen, and it is composited itself after the last. What outputs keep stands in their files
-(output/).
+Fragments may be buffered until no nearer one can follow (k_buffer.py), coplanar ones as a layer
+(coplanar.py). An external depth image is an opaque surface: fragments at its depth or behind are invisible,
+and it is composited last. State of outputs is declared in their files (output/).
 """
 
 from functools import cache
@@ -13,48 +12,55 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import output
-from .common import LEAST_ALPHA, View, fma, line_of, struct_of
-from .crossing import make_crossing
-from .layers import make_layer
+from .common import MIN_ALPHA, View, fma, line_of, struct_of
+from .coplanar import make_layer
+from .intersection import make_intersection
+from .k_buffer import make_k_buffer, make_k_buffer_struct
 from .rays import make_rays
 from .records import BOXES, Layout
 from .splat import make_splat
-from .waiting import make_queue, make_waiting
 
 
 @cache
-def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) -> SimpleNamespace:
-    """The state of a sample, and what is done with it: Rays, Pixel; start, unfinished, blend, end (None
-    without a second pass), cover (None without an opaque surface), finish. room: for fragments that wait.
+def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size: int) -> SimpleNamespace:
+    """The structs Rays and Pixel, and functions of a sample: start, unfinished, blend, end (None
+    without a second pass), cover (None without an opaque surface), finish.
     """
-    Splat, crossing = make_splat(effects, outputs).Splat, make_crossing(effects, outputs)
-    Crossing, is_box = crossing.Crossing, crossing.is_box
-    opacity_of, depth_of = crossing.opacity_of, crossing.depth_of
+    Splat, intersection = make_splat(effects, outputs).Splat, make_intersection(effects, outputs)
+    Intersection, is_box = intersection.Intersection, intersection.is_box
+    opacity_of, depth_of = intersection.opacity_of, intersection.depth_of
     layout = Layout(effects, outputs)
     each = layout.lines
-    exclusive, has_depth, waits, layered, bent = (
+    exclusive, has_depth, k_buffered, layered, bent = (
         name in effects
         for name in ("stop_exclusive", "ray_depth", "compose_pixel", "compose_coplanar", "rays")
     )
     boxes, opaque = any(name in effects for name in BOXES), "external_depth" in effects
     rays = make_rays(bent, "rays_length" in effects, bent and boxes, opaque)
     Rays, length_of = rays.Rays, rays.length_of
-    starts, sees, attenuates, composites, covers, clears = (
+    starts, attribute_readers, attenuates, composites, covers, clears = (
         output.functions(outputs, part)
-        for part in ("start", "see", "attenuate", "composite", "cover", "clear")
+        for part in ("start", "read_attributes", "attenuate", "composite", "cover", "clear")
     )
     measured = bool(output.having(output.having(outputs, "start"), "length"))
-    readers = [make_reader(layout, output.declared(name).record) for name in output.having(outputs, "see")]
-    seen = {"rgb": wp.vec3}
-    seen |= {"z": wp.float32} if has_depth else {}
-    Seen = struct_of("Seen", "What shows where something is drawn.", seen | output.fields(outputs, "seen"))
-    layer = make_layer(Seen, effects, outputs) if layered else None
+    readers = [
+        make_reader(layout, output.declared(name).record)
+        for name in output.having(outputs, "read_attributes")
+    ]
+    attributes = {"rgb": wp.vec3}
+    attributes |= {"z": wp.float32} if has_depth else {}
+    Attributes = struct_of(
+        "Attributes",
+        "Attributes of a fragment or layer.",
+        attributes | output.fields(outputs, "attributes"),
+    )
+    layer = make_layer(Attributes, effects, outputs) if layered else None
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     fields |= {"finished": wp.int32} if exclusive else {}
     fields |= {"opaque_z": wp.float32} if opaque else {}
     fields |= output.fields(outputs, "state")
-    fields |= {"queue": make_queue(layer, room)} if waits else {}
-    Pixel = struct_of("Pixel", "What a sample keeps.", fields)
+    fields |= {"k_buffer": make_k_buffer_struct(layer, k_buffer_size)} if k_buffered else {}
+    Pixel = struct_of("Pixel", "State of a sample.", fields)
 
     @wp.func
     def pixel_at(x: int, y: int, view: View) -> int:
@@ -63,17 +69,17 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
 
     @wp.func
     def start(x: int, y: int, rays: Rays, view: View):
-        """The state of a sample before anything is drawn."""
+        """Initial state of a sample."""
         p = Pixel()
         p.t = 1.0
-        if wp.static(waits):
-            p = waiting.start(p)
+        if wp.static(k_buffered):
+            p = k_buffer.start(p)
         length = float(1.0)
         if wp.static(measured):
             length = length_of(x, y, rays, view)
         if wp.static(opaque):
             p.opaque_z = wp.inf
-            # a tile has samples beyond the picture too
+            # tiles extend beyond the image
             if x < view.width and y < view.height:
                 p.opaque_z = rays.external_depth[pixel_at(x, y, view)]
         for k in range(wp.static(len(starts))):
@@ -82,77 +88,79 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
 
     @wp.func
     def unfinished(p: Pixel, view: View) -> bool:
-        """Whether anything that follows can still be seen."""
+        """Whether a later fragment can still contribute."""
         if wp.static(exclusive):
             return p.t > view.stop and p.finished == 0
-        elif wp.static(waits):
-            return p.t > view.stop and p.queue.after_z < wp.inf
+        elif wp.static(k_buffered):
+            return p.t > view.stop and p.k_buffer.after_z < wp.inf
         else:
             return p.t > view.stop
 
     @wp.func
-    def see(color: wp.vec3, z: float, lines: wp.array(dtype=wp.vec4), index: int):
-        """What a fragment of a splat shows at depth z."""
-        seen = Seen()
-        seen.rgb = color
+    def attributes_at(color: wp.vec3, z: float, lines: wp.array(dtype=wp.vec4), index: int):
+        """Attributes of a splat's fragment at depth z."""
+        attributes = Attributes()
+        attributes.rgb = color
         if wp.static(has_depth):
-            seen.z = z
-        for k in range(wp.static(len(sees))):
-            seen = wp.static(sees[k])(seen, wp.static(readers[k])(lines, index * each), index)
-        return seen
+            attributes.z = z
+        for k in range(wp.static(len(attribute_readers))):
+            attributes = wp.static(attribute_readers[k])(
+                attributes, wp.static(readers[k])(lines, index * each), index
+            )
+        return attributes
 
     @wp.func
-    def composite(pixel: Pixel, seen: Seen, opacity: float, view: View):
-        """The pixel with something over all that follows; as it was if it lets no light through."""
+    def composite(pixel: Pixel, attributes: Attributes, opacity: float, view: View):
+        """Composite attributes in front of all that follows, if light is left."""
         p = pixel
         if not (p.t > view.stop):
             return p
         if wp.static(exclusive):
-            # as gsplat and the 2DGS authors: what would close the pixel is dropped (for parity; numerics D1)
+            # parity with gsplat and the 2DGS authors: the fragment that would end the pixel is dropped
             if p.t * (1.0 - opacity) <= view.stop:
                 p.finished = 1
                 return p
         weight = p.t * opacity
-        shown = weight
+        color_weight = weight
         for k in range(wp.static(len(attenuates))):
-            shown = wp.static(attenuates[k])(p, seen, shown)
-        p.r = fma(shown, seen.rgb[0], p.r)
-        p.g = fma(shown, seen.rgb[1], p.g)
-        p.b = fma(shown, seen.rgb[2], p.b)
+            color_weight = wp.static(attenuates[k])(p, attributes, color_weight)
+        p.r = fma(color_weight, attributes.rgb[0], p.r)
+        p.g = fma(color_weight, attributes.rgb[1], p.g)
+        p.b = fma(color_weight, attributes.rgb[2], p.b)
         for k in range(wp.static(len(composites))):
-            p = wp.static(composites[k])(p, seen, weight, shown, view)
+            p = wp.static(composites[k])(p, attributes, weight, color_weight, view)
         p.t = p.t - weight
         return p
 
     @wp.func
-    def see_again(lines: wp.array(dtype=wp.vec4), index: int, z: float):
-        """What a fragment shows that was seen before."""
+    def stored_attributes(lines: wp.array(dtype=wp.vec4), index: int, z: float):
+        """Attributes of a fragment with the stored colour of its splat."""
         c = line_of(lines, index * each + wp.static(layout.place("r")[0]))
-        return see(wp.vec3(c[1], c[2], c[3]), z, lines, index)
+        return attributes_at(wp.vec3(c[1], c[2], c[3]), z, lines, index)
 
     @wp.func
     def nearest_of(lines: wp.array(dtype=wp.vec4), index: int) -> float:
-        """Depth before which no fragment of the splat lies."""
+        """Lower bound of the depths of a splat's fragments."""
         return line_of(lines, index * each + wp.static(layout.place("nearest")[0]))[
             wp.static(layout.place("nearest")[1])
         ]
 
-    waiting = make_waiting(Pixel, composite, see_again, layer, room) if waits else None
+    k_buffer = (
+        make_k_buffer(Pixel, composite, stored_attributes, layer, k_buffer_size) if k_buffered else None
+    )
 
     @wp.func
     def blend(
         pixel: Pixel,
         s: Splat,
-        c: Crossing,
+        c: Intersection,
         place: int,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """The pixel after a fragment that is drawn of the splat at `place` in the list, of a pixel that is
-        not finished.
-        """
+        """Blend a contributing fragment of the splat at `place` in the list into an unfinished pixel."""
         index = lists[place]
         inverse_d = 1.0 / c.d
         opacity = opacity_of(s, c, inverse_d, view)
@@ -171,49 +179,47 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         if wp.static(layered):
             p = pixel
             if not (opacity > 0.0):
-                return p  # of no optical depth: a mean over it would be 0 / 0
+                return p  # of no optical depth: its mean would be 0 / 0
             nearest = nearest_of(lines, index)
-            if plane != p.queue.open.plane:
-                p = waiting.close(p, nearest, lines, lists, view)
-                p.queue.open = layer.begun(plane, place, nearest)
+            if plane != p.k_buffer.open.plane:
+                p = k_buffer.close(p, nearest, lines, lists, view)
+                p.k_buffer.open = layer.empty_layer(plane, place, nearest)
             if plane < 0:
-                return waiting.take(p, nearest, z, opacity, place, lines, lists, view)
-            seen = see(color, wp.max(z, nearest), lines, index)
+                return k_buffer.take(p, nearest, z, opacity, place, lines, lists, view)
+            attributes = attributes_at(color, wp.max(z, nearest), lines, index)
             if wp.static(boxes):
                 if is_box(s):
-                    p.queue.open = layer.gather_box(p.queue.open, seen, opacity)
+                    p.k_buffer.open = layer.accumulate_box(p.k_buffer.open, attributes, opacity)
                     return p
-            p.queue.open = layer.gather(p.queue.open, seen, opacity)
+            p.k_buffer.open = layer.accumulate(p.k_buffer.open, attributes, opacity)
             return p
-        elif wp.static(waits):
-            return waiting.take(pixel, nearest_of(lines, index), z, opacity, place, lines, lists, view)
+        elif wp.static(k_buffered):
+            return k_buffer.take(pixel, nearest_of(lines, index), z, opacity, place, lines, lists, view)
         else:
-            return composite(pixel, see(color, z, lines, index), opacity, view)
+            return composite(pixel, attributes_at(color, z, lines, index), opacity, view)
 
     @wp.func
     def cover(pixel: Pixel, x: int, y: int, rays: Rays, view: View):
-        """The pixel with the opaque surface behind all that is drawn of it: it takes all the light that is
-        left, also where that is so little that splats would not be drawn.
-        """
+        """Composite the external opaque surface, with all transmittance that is left, even below the stop."""
         p = pixel
         if p.opaque_z < wp.inf:
-            seen = Seen()
-            seen.rgb = rays.external_rgb[pixel_at(x, y, view)]
-            seen.z = p.opaque_z
+            attributes = Attributes()
+            attributes.rgb = rays.external_rgb[pixel_at(x, y, view)]
+            attributes.z = p.opaque_z
             for k in range(wp.static(len(covers))):
-                seen = wp.static(covers[k])(seen)
+                attributes = wp.static(covers[k])(attributes)
             if wp.static(exclusive):
                 p.finished = 0
             unstopped = view
             unstopped.stop = -1.0
-            p = composite(p, seen, 1.0, unstopped)
+            p = composite(p, attributes, 1.0, unstopped)
         return p
 
     @wp.func
     def finish(pixel: Pixel):
-        """The pixel after the last fragment."""
+        """Finish a pixel after the last fragment."""
         p = pixel
-        if 1.0 - p.t < LEAST_ALPHA:
+        if 1.0 - p.t < MIN_ALPHA:
             for k in range(wp.static(len(clears))):
                 p = wp.static(clears[k])(p)
         return p
@@ -224,14 +230,14 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         start=start,
         unfinished=unfinished,
         blend=blend,
-        end=waiting.end if waits else None,
+        end=k_buffer.end if k_buffered else None,
         cover=cover if opaque else None,
         finish=finish,
     )
 
 
 def make_reader(layout: Layout, names: tuple[str, ...]):
-    """The function (lines, at) that reads these numbers of the record at line `at`: a vector; 0 of none."""
+    """The function (lines, at) that reads these numbers of the record at line `at` as a vector."""
     places = [layout.place(name) for name in names]
     vector = wp.types.vector(max(len(names), 1), wp.float32)
 

@@ -1,4 +1,4 @@
-"""Per splat: is it drawn, where, in which order, and what its record says."""
+"""Per splat: is it visible, where, in which order, and what its record says."""
 
 import math
 from functools import cache
@@ -15,11 +15,11 @@ from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .forms import make_forms
 from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
-from .placing import make_placing
 from .records import Layout
 from .slopes import make_slopes
+from .splat_pose import make_splat_pose
 
-# [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
+# [m]; invisible, and quotients stay above float32's denormals
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
 BLOCK = 128
 """threads of a block on a GPU"""
@@ -32,18 +32,18 @@ def make_project(
     effects: tuple[str, ...], outputs: tuple[str, ...], sh_terms: int, precision: str, every_bounds: bool
 ):
     """The kernel for these effects and outputs that matter to records; sh_terms: coefficients per colour, 0
-    for plain colours; every_bounds: bounds are written of all that is drawn, not only of splats that touch
+    for plain colours; every_bounds: bounds are written of all that is visible, not only of splats that touch
     more than a window.
     """
     layout = Layout(effects, outputs)
     lines_each = layout.lines
-    has_depth, screen, filtered, waits, layers = (
+    has_depth, screen, filtered, k_buffered, layers = (
         name in effects
         for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_pixel", "compose_coplanar")
     )
     recorded = output.having(outputs, "project")
     projects = output.functions(recorded, "project")
-    places = [layout.word(output.declared(name).record[0]) for name in recorded]
+    words = [layout.word(output.declared(name).record[0]) for name in recorded]
     real = wp.float64 if precision == "float64" else wp.float32
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
     sqrt_two, two, zero = real(math.sqrt(2.0)), real(2.0), real(0.0)
@@ -55,8 +55,8 @@ def make_project(
     surfaced = drawn_ewa and len(projects) > 0
     ellipsoid = make_ellipsoids(effects, real)
     limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
-    placing = make_placing(effects, real)
-    Moving = placing.Moving
+    splat_pose = make_splat_pose(effects, real)
+    Moving = splat_pose.Moving
     camera = next((name for name in effects if name in LENSES), None)
     parallel = "camera_orthographic" in effects
     ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # distances, not along z
@@ -68,14 +68,16 @@ def make_project(
     at_depth, at_nearest, at_box = (layout.word(name) for name in ("z_numerator", "nearest", "columns"))
 
     @wp.func
-    def seen(a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens):
+    def bounds_of(
+        a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens
+    ):
         """Bounds of a disk, or of what a lens takes for its picture; x, y: where parallel rays show p."""
         if wp.static(parallel):
             return disk.parallel(a, b, x, y, radius, view)
         elif wp.static(ray_depths):
             return optics.enclose(a, b, p, radius, view, lens)
         else:
-            return disk.seen(a, b, p, radius, reach, view)
+            return disk.perspective(a, b, p, radius, reach, view)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
@@ -89,20 +91,20 @@ def make_project(
         opacities: wp.array(dtype=wp.float32),  # (n)
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
         coplanar_groups: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
-        plane_keys: wp.array(
+        group_keys: wp.array(
             dtype=wp.float32
         ),  # (views groups) depth at which a group's splats are sorted [m]
-        plane_count: int,
+        group_count: int,
         boxes: wp.array(dtype=wp.int32),  # (n) 1: a box, of a cloud that has boxes and others
         thickness: wp.array(dtype=wp.float32),  # (n) [m], of a cloud that has 3D Gaussians; 0: a disk
-        lines: wp.array(dtype=wp.vec4),  # (views n lines_each) out: records of splats that are drawn
+        lines: wp.array(dtype=wp.vec4),  # (views n lines_each) out: records of splats that are visible
         bounds: wp.array(dtype=Bounds),  # (views n) out: as `every_bounds` says
         windows: wp.array(
             dtype=wp.uint64
         ),  # (views n) out: bits of the tiles, below the window's first tile; 0: more
         keys: wp.array(dtype=wp.uint32),  # (views n) out: depth key, or CULLED
         counts: wp.array(dtype=wp.int64),  # (views n) out: tiles that the splat can touch
-        drawn: wp.array(dtype=wp.int32),  # (views n) out: 1 or 0
+        visible: wp.array(dtype=wp.int32),  # (views n) out: 1 or 0
     ):
         at = wp.tid() + first
         number = at / views[0].splats
@@ -113,8 +115,8 @@ def make_project(
         quat, center = wp.vec4(quats[i]), wp.vec3(means[i])
         keys[at] = CULLED
         counts[at] = wp.int64(0)
-        drawn[at] = 0
-        # conditions are written so that a NaN culls (numerics E1)
+        visible[at] = 0
+        # conditions are written so that a NaN culls
         log_opacity = float(wp.log(real(opacity)))
         half_r2 = log_opacity - view.log_cut
         if not (half_r2 > 0.0 and opacity < wp.inf):
@@ -127,10 +129,10 @@ def make_project(
         su = real(wp.max(size[0], SMALLEST_SCALE))
         sv = real(wp.max(size[1], SMALLEST_SCALE))
 
-        turn, shift, eye = placing.pose(i, number, view, moving)
-        tangent_u, tangent_v = placing.tangents(turn, quat)
+        rotation, translation, eye = splat_pose.pose(i, number, view, moving)
+        tangent_u, tangent_v = splat_pose.tangents(rotation, quat)
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
-        p = turn * mean + shift
+        p = rotation * mean + translation
         a, b = tangent_u * su, tangent_v * sv
         depth = p[2]
         if wp.static(ray_depths):
@@ -144,7 +146,7 @@ def make_project(
         if wp.static(boxes_too):
             itself = boxed
         third = vec3()  # half axis of an ellipsoid that is conjugate to a and b
-        outward = vec3()  # its normal, where it is drawn by a disk that has another
+        outward = vec3()  # its normal, where it is visible by a disk that has another
         inverse_m2 = zero
         thick = bool(False)
         if wp.static(thick_too):
@@ -178,7 +180,7 @@ def make_project(
                     sv *= wide[2]
                     tangent_u = a / su  # of unit area with tangent_v, whose direction stays
         radius = wp.sqrt(two * real(half_r2))
-        reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)
+        reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range
         if wp.static(boxes_too):
             if boxed:
                 reach = wp.abs(a[2]) + wp.abs(b[2])
@@ -187,7 +189,7 @@ def make_project(
             if wp.static(boxes_too):
                 if boxed:
                     reach = su + sv
-        rim, rim_reach = radius, reach  # of the disk whose picture bounds what is drawn
+        rim, rim_reach = radius, reach  # of the disk whose picture bounds what is visible
         if wp.static(exact):
             if thick:
                 rim = ellipsoid.rim(radius, inverse_m2)
@@ -196,7 +198,7 @@ def make_project(
         if not (depth + reach >= near and depth - reach <= real(view.far)):
             return
 
-        # where it can be seen
+        # where it can be bounds_of
         fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
         in_front = depth >= near  # or, of a lens, whether it is known where the centre falls
         center_x, center_y = zero, zero
@@ -218,18 +220,18 @@ def make_project(
                     return
                 box = box_bounds(float(area[0]), float(area[1]), float(area[2]), float(area[3]))
             elif wp.static(mixed):
-                box = seen(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
+                box = bounds_of(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
         elif wp.static(boxes_too):
             if boxed:
                 # the disk around a larger rectangle
                 sides = of_box.spread(tangent_u, tangent_v, p, su, sv, real(view.ray_step))
                 side_u, side_v = tangent_u * sides[0], tangent_v * sides[1]
                 range_z = sqrt_two * wp.length(vec2(side_u[2], side_v[2]))
-                box = seen(side_u, side_v, p, sqrt_two, range_z, center_x, center_y, view, lens)
+                box = bounds_of(side_u, side_v, p, sqrt_two, range_z, center_x, center_y, view, lens)
             elif wp.static(mixed):
-                box = seen(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
+                box = bounds_of(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
         else:
-            box = seen(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
+            box = bounds_of(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
         if wp.static(exact and not parallel and not bent):
             if thick and p[2] - reach < near:
                 box = ellipsoid.clipped(box, a, b, p, third, inverse_m2, view)
@@ -245,11 +247,11 @@ def make_project(
                 center_x, center_y = real(box.x), real(box.y)
         if wp.static(screen):
             if in_front:
-                box.dot_x = float(center_x)
-                box.dot_y = float(center_y)
-                box.dot_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
+                box.disc_x = float(center_x)
+                box.disc_y = float(center_y)
+                box.disc_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
             if itself:
-                box.dot_r = -1.0
+                box.disc_r = -1.0
         view = views[reread(number)]
         row_first, row_end = limits.rows(box, view.height)
         first_column, end_column = limits.span(box, row_first, row_end, view.width)
@@ -271,7 +273,7 @@ def make_project(
         )  # fmt: skip
         if not met:
             return
-        turn, shift, eye = placing.pose(i, number, view, moving)
+        rotation, translation, eye = splat_pose.pose(i, number, view, moving)
         rgb = color_of(i, colors, mean - eye)
         if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
             return
@@ -286,21 +288,21 @@ def make_project(
             plane = int(-1)
             if wp.static(layers):
                 plane = coplanar_groups[i]
-            middle, depth_reach = placing.depth_range(depth, reach, radius, near, plane, boxed)
+            middle, depth_reach = splat_pose.depth_range(depth, reach, radius, near, plane, boxed)
             record[at_depth + 1] = float(middle)
             record[at_depth + 2] = float(depth_reach)
         key = float(depth)
-        if wp.static(waits):
+        if wp.static(k_buffered):
             key = float(middle) - float(depth_reach)  # as blending bounds depths
             if wp.static(layers):
                 if coplanar_groups[i] >= 0:
-                    key = plane_keys[number * plane_count + coplanar_groups[i]]
+                    key = group_keys[number * group_count + coplanar_groups[i]]
             record[at_nearest] = key
         if wp.static(surfaced):
             if thick:
                 normal = outward
         for k in range(wp.static(len(projects))):
-            record = wp.static(projects[k])(record, wp.static(places[k]), normal, height)
+            record = wp.static(projects[k])(record, wp.static(words[k]), normal, height)
         for line in range(wp.static(lines_each)):
             k = 4 * line
             store_line(
@@ -312,6 +314,6 @@ def make_project(
         windows[at] = (corner << BITS) | wp.uint64(bits)
         keys[at] = sortable(key)
         counts[at] = wp.int64(tiles)
-        drawn[at] = 1
+        visible[at] = 1
 
     return project

@@ -72,10 +72,10 @@ def make_project_backward(
     each, fields = layout.lines, len(names)
     at = {name: place for place, name in enumerate(names)}
     Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
-    screen_filter, has_depth, normal = (name in at for name in ("dot_x", "z_center", "nx"))
+    screen_filter, has_depth, normal = (name in at for name in ("disc_x", "z_center", "nx"))
     zc_line, zc_lane = layout.place("z_center")
     terms = max(sh_terms, 1)
-    dot_x, z_numerator, nx = (at.get(name, 0) for name in ("dot_x", "z_numerator", "nx"))
+    disc_x, z_numerator, nx = (at.get(name, 0) for name in ("disc_x", "z_numerator", "nx"))
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def project_backward(
@@ -183,7 +183,7 @@ def make_project_backward(
         if wp.static(has_depth):
             by_p += volume * form_d
         if wp.static(screen_filter):
-            by_x, by_y = total[dot_x] * view.focal_x / p[2], total[dot_x + 1] * view.focal_y / p[2]
+            by_x, by_y = total[disc_x] * view.focal_x / p[2], total[disc_x + 1] * view.focal_y / p[2]
             by_p += wp.vec3d(by_x, by_y, -(by_x * p[0] + by_y * p[1]) / p[2])
         # by the entries of the homography that place the centre, in half pictures
         across = wp.float64(view.width) * by_p[0] * per_x

@@ -19,7 +19,7 @@ _WHOLE = {
     "rays": ("nuz", "nvz", "dz", "ray_x", "ray_y", "ray_z"),
 }
 _EXTRA = {
-    "lowpass_screen": ("dot_x", "dot_y"),
+    "lowpass_screen": ("disc_x", "disc_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
     "compose_pixel": ("nearest",),
     "ellipsoid_exact": ("bulge",),
@@ -31,7 +31,7 @@ class Layout:
 
     nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples from the centre of the anchor sample
     (ax, ay); D is at
-    most d_near beyond the near plane. dot_x, dot_y: projected centre from the anchor's; z_numerator / D is
+    most d_near beyond the near plane. disc_x, disc_y: projected centre from the anchor's; z_numerator / D is
     the depth. columns and rows hold first and end, 16 bits each, of the box of samples that it can touch.
     Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z), and boxed is 1 of a box,
     0 of another splat. For parallel rays plane_z0 + plane_zx x + plane_zy y is D times the depth, which is at

@@ -25,7 +25,10 @@ def make_resolve(
     own = [name for name in outputs if name in asked]
     over = [name for name in outputs if output.declared(name).over in asked]
     resolving = output.having([*own, *over], "resolve")
-    resolves, hiddens = output.functions(resolving, "resolve"), output.functions(outputs, "hidden")
+    resolves, background_shares = (
+        output.functions(resolving, "resolve"),
+        output.functions(outputs, "background_share"),
+    )
     measured = bool(output.having(resolving, "length"))
     n = samples
     mean = 1.0 / (n * n)
@@ -67,8 +70,8 @@ def make_resolve(
             if wp.static(measured):
                 lengths[k] = length_of(x + k % n, y + k / n, rays, view)
         left = total[3] * mean
-        for k in range(wp.static(len(hiddens))):
-            left += wp.static(hiddens[k])(grid, samples)
+        for k in range(wp.static(len(background_shares))):
+            left += wp.static(background_shares[k])(grid, samples)
         for channel in range(3):
             out.rgb[3 * grid.pixel + channel] = fma(left, background[channel], total[channel] * mean)
         for k in range(wp.static(len(resolves))):

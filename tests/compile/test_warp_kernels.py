@@ -64,12 +64,12 @@ def everything():
     return made("output.with_needed", {*made("output.known"), "fog"})
 
 
-def blending(*effects, outputs=None, on_gpu=True, area=256, waiting=8):
-    """The kernel with these effects, and with all that outputs add to blending. waiting: layers for which a
-    thread has room, each of which CUDA's compiler takes a second for."""
+def blending(*effects, outputs=None, on_gpu=True, area=256, k_buffer_size=8):
+    """The kernel with these effects, and with all that outputs add to blending. k_buffer_size: each
+    entry takes CUDA's compiler a second."""
     if outputs is None:
-        outputs = made("output.having", everything(), "seen", "state", "samples")
-    return made("blend.make_blend", effects, outputs, on_gpu, area, waiting)[0]
+        outputs = made("output.having", everything(), "attributes", "state", "samples")
+    return made("blend.make_blend", effects, outputs, on_gpu, area, k_buffer_size)[0]
 
 
 GRADIENTS = ("rgb", "alpha", "depth", "normal", "distortion")
@@ -131,14 +131,14 @@ def started():
         pytest.param(lambda: made("column_sums.add_rows"), id="sums"),
         pytest.param(lambda: resolving(False, 3), id="resolve"),
         pytest.param(lambda: resolving(True, 1), id="resolve-stretched"),
-        pytest.param(lambda: made("surroundings.make_backdrop", "gradient", False), id="backdrop-gradient"),
-        pytest.param(lambda: made("surroundings.make_backdrop", "panorama", True), id="backdrop-panorama"),
+        pytest.param(lambda: made("background.make_backdrop", "gradient", False), id="backdrop-gradient"),
+        pytest.param(lambda: made("background.make_backdrop", "panorama", True), id="backdrop-panorama"),
         pytest.param(lambda: made("sensor.make_sensor", STEPS)[0], id="sensor"),
         pytest.param(lambda: made("shutter.make_expose", wp.vec4), id="expose"),
-        pytest.param(lambda: made("lists.make_lists", True).emit, id="emit"),
-        pytest.param(lambda: made("lists.make_lists", True).count, id="count"),
-        pytest.param(lambda: made("lists.make_lists", False).histogram, id="histogram"),
-        pytest.param(lambda: made("lists.compact"), id="compact, gather, starts, sums"),
+        pytest.param(lambda: made("tile_lists.make_lists", True).emit, id="emit"),
+        pytest.param(lambda: made("tile_lists.make_lists", True).count, id="count"),
+        pytest.param(lambda: made("tile_lists.make_lists", False).histogram, id="histogram"),
+        pytest.param(lambda: made("tile_lists.compact"), id="compact, gather, starts, sums"),
     ],
 )
 def test_the_kernels_compile_for_cuda(kernel, tmp_path):
@@ -148,7 +148,7 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
 
 def test_the_base_has_nothing_of_absent_effects_and_takes_no_more_of_a_gpu(tmp_path):
     text, blend = measured(blending(outputs=()), tmp_path, 128)
-    absent = (*OF_SAMPLES, *OF_BOXES, *OF_LAYERS, "finished", "dot_x", "cross_ray", "origin")
+    absent = (*OF_SAMPLES, *OF_BOXES, *OF_LAYERS, "finished", "disc_x", "cross_ray", "origin")
     for name in absent:
         assert not re.search(rf"\b{name}", text), name
     project, projection = measured(projecting(outputs=()), tmp_path / "project", 128)
@@ -156,7 +156,7 @@ def test_the_base_has_nothing_of_absent_effects_and_takes_no_more_of_a_gpu(tmp_p
         assert name not in project, name
     if wp.__version__ in TAKEN:  # includes the compiler
         assert {"blend": blend, "project": projection} == TAKEN[wp.__version__]
-    text = compiled(blending(*MIXED, waiting=2), tmp_path / "all")
+    text = compiled(blending(*MIXED, k_buffer_size=2), tmp_path / "all")
     project = compiled(projecting(*MIXED, "lowpass_pixel"), tmp_path / "mixed", 128)
     assert all(name in project for name in FILTERS)
     for name in (*OF_SAMPLES, *OF_BOXES, *OF_LAYERS):
@@ -167,7 +167,7 @@ def test_records_move_as_whole_lines(tmp_path):
     """Stores by field would access 32 records per warp."""
     project = compiled(projecting(*RECORD, terms=16), tmp_path / "project", 128, assembly=True)
     assert project.count("st.global.v4") == 7
-    blend = compiled(blending(*RECORD, outputs=NORMAL, waiting=2), tmp_path / "blend", assembly=True)
+    blend = compiled(blending(*RECORD, outputs=NORMAL, k_buffer_size=2), tmp_path / "blend", assembly=True)
     assert blend.count("ld.shared.v4") >= 5
     assert "shfl.sync.bfly" in blend
     assert "ld.shared.u8" in blend
@@ -182,7 +182,7 @@ def test_derivatives_read_records_where_they_lie(tmp_path):
 def test_a_record_grows_by_what_is_asked_for():
     layout = runtime.kernels("records").Layout
     assert layout(()).lines == 5
-    assert layout(("lowpass_screen",)).names[-2:] == ["dot_x", "dot_y"]
+    assert layout(("lowpass_screen",)).names[-2:] == ["disc_x", "disc_y"]
     assert layout(RECORD, NORMAL).lines == 7
     assert layout(RECORD, NORMAL).place("nz") == (6, 2)
     assert layout(()).place("nz") == (0, 0)

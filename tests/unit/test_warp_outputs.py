@@ -27,7 +27,7 @@ from . import Output
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
     p.strongest = wp.max(p.strongest, weight)
     return p
@@ -140,7 +140,7 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
         [difference] = compare({"strongest": toys["strongest"] + error}, truth, ("strongest",))
         assert difference.agrees == agrees
 
-    # an output whose file has changed, which Warp's cache would not see, is compiled again
+    # an output whose file has changed, which Warp's cache would not read_attributes, is compiled again
     largest, sum_of_all = "wp.max(p.strongest, weight)", "p.strongest + weight"
     (tmp_path / "output" / "strongest.py").write_text(STRONGEST.replace(largest, sum_of_all), "utf-8")
     del sys.modules[f"{runtime.kernels('output').__name__}.strongest"]

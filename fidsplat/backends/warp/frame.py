@@ -24,7 +24,7 @@ from fidsplat.backends.warp.memory_plan import MemoryPlanner
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
-from fidsplat.backends.warp.structs import (
+from fidsplat.backends.warp.uniforms import (
     array_of,
     lens_of,
     moving_of,
@@ -183,12 +183,12 @@ class DeviceFrame:
         self._take("windows", n, wp.uint64)
         self._take("keys", n, wp.uint32)
         counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
-        drawn, places = self._exact("drawn", n, wp.int32), self._exact("places", n, wp.int32)
+        visible, offsets = self._exact("visible", n, wp.int32), self._exact("offsets", n, wp.int32)
         # not read if all splats are of one kind
-        cloud = {"boxes": drawn, "thickness": self.resident.arrays["opacities"]} | self.resident.arrays
-        cloud |= {name: self.named[name] for name in ("coplanar_groups", "plane_keys")}
+        cloud = {"boxes": visible, "thickness": self.resident.arrays["opacities"]} | self.resident.arrays
+        cloud |= {name: self.named[name] for name in ("coplanar_groups", "group_keys")}
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
-        wp.utils.array_scan(drawn, places, inclusive=True)
+        wp.utils.array_scan(visible, offsets, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)
         totals = self._take("totals", 2, wp.int64)
         self.launcher.launch_whole(sort.sum_up, 1, {**self.named, "splats": n})
@@ -201,14 +201,14 @@ class DeviceFrame:
         """Coplanar group of each splat, and sort keys of the groups in these views."""
         wp, table = self.wp, self.resident.group_table
         if table is None or not self.program.layered:
-            none = self.pool.scratch("no planes", 1, wp.int32), self.pool.scratch("no keys", 1, wp.float32)
-            return {"coplanar_groups": none[0], "plane_keys": none[1], "plane_count": 0}
+            none = self.pool.scratch("no groups", 1, wp.int32), self.pool.scratch("no keys", 1, wp.float32)
+            return {"coplanar_groups": none[0], "group_keys": none[1], "group_count": 0}
         keys = table.keys_of(self.stack)
-        filled = self.inputs.filled("plane keys", keys.ravel(), wp.float32)
+        filled = self.inputs.filled("group keys", keys.ravel(), wp.float32)
         return {
             "coplanar_groups": self.resident.arrays["coplanar_groups"],
-            "plane_keys": filled,
-            "plane_count": keys.shape[1],
+            "group_keys": filled,
+            "group_count": keys.shape[1],
         }
 
     def _sort(self, visible: int) -> None:

@@ -11,7 +11,7 @@ from fidsplat.backends.view import View
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import load
-from fidsplat.backends.warp.structs import memory_bytes
+from fidsplat.backends.warp.uniforms import memory_bytes
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.util.errors import DeviceError, bytes_words
 

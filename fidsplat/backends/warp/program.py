@@ -82,7 +82,7 @@ class _Needs:
         if not effects.isdisjoint({"compose_pixel", "external_depth"}) or output.having(outputs, "depth"):
             effects.add("ray_depth")
         steps = tuple(name for name in features.posts if name in kernels("post").known())
-        blending = output.having(outputs, "seen", "state", "samples")
+        blending = output.having(outputs, "attributes", "state", "samples")
         return cls(frozenset(effects), outputs, blending, steps)
 
     def among(self, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -131,7 +131,7 @@ class Program:
             features.setup_precision,
             self.shape.schedule == "tiles",
         )
-        self.sort = kernels("lists")
+        self.sort = kernels("tile_lists")
         self.lists = self.sort.make_lists("lowpass_screen" in needs.effects)
 
     def _make_blend(self, needs: _Needs) -> None:
@@ -156,7 +156,7 @@ class Program:
         """kernels that gather sample buffers of several poses, by the buffer's name"""
 
     def _make_resolve(self, features: FeatureSet, needs: _Needs) -> None:
-        output, behind = kernels("output"), kernels("surroundings")
+        output, behind = kernels("output"), kernels("background")
         kinds = [kind for kind in behind.KINDS if f"background_{kind}" in needs.effects]
         self.backdrop = behind.make_backdrop(kinds[0], "rays" in needs.effects) if kinds else None
         """the kernel of what is seen behind everything; None where that is of one colour"""

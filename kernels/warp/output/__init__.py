@@ -1,7 +1,6 @@
-"""What a picture's outputs add to the stages: one file for each, which declares an `Output`.
+"""Outputs: one file for each, which declares an `Output`: fields and functions that it adds to the stages.
 
-A file needs no other place to be known: a picture that asks for an output of that name gets what its file
-declares, and kernels of other pictures hold nothing of it.
+A file is found by its name. Kernels of frames without an output contain nothing of it.
 """
 
 from __future__ import annotations
@@ -18,71 +17,72 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """What one output, or a part that several need, adds to the stages; by default nothing.
+    """Additions of one output, or of a part that several need, to the stages; by default none.
 
-    Fields are name: type. Functions are Warp's; their parameters stand here by name. `pixel`, `seen`,
-    `layer`, `samples` and `out` are structs with the fields that all of a picture's outputs declare, so
-    their types are `Any`; a function whose first parameter is such a struct, or a record, returns it changed.
+    Fields are name: type. Functions are Warp's; their parameters are given here. `pixel`, `attributes`,
+    `layer`, `samples` and `out` are structs with the fields of all outputs of a frame, so their types are
+    `Any`; a function whose first parameter is such a struct, or a record, returns it changed.
     """
 
     needs: tuple[str, ...] = ()
     """other files here whose fields this one reads"""
     depth: bool = False
-    """whether `seen.z` is read: depth of what shows [m]"""
+    """whether `attributes.z` is read: depth of the fragment [m]"""
     length: bool = False
-    """whether lengths of rays are read: what turns a depth into a distance"""
+    """whether lengths of rays are read, which turn a depth into a distance"""
 
     record: tuple[str, ...] = ()
     """numbers of a splat's record"""
     project: Any = None
-    """(record, at, normal, height): puts them into record[at], record[at + 1] ...; normal: of the splat's
-    plane in the camera frame; height: of the camera above it, with its side [m]"""
+    """(record, at, normal, height): stores them in record[at], record[at + 1] ...; normal: of the splat's
+    plane in the camera frame; height: signed height of the camera above it [m]"""
 
-    seen: Mapping[str, Any] = field(default_factory=dict)
-    """what a fragment shows, and a layer, whose fragments have their mean by optical depth"""
-    see: Any = None
-    """(seen, numbers, index): numbers: the vector of those of the record; index: of the splat"""
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    """of a fragment, and of a layer: the mean of its fragments by optical depth"""
+    read_attributes: Any = None
+    """(attributes, numbers, index): numbers: the vector of those of the record; index: of the splat"""
     layer: Mapping[str, Any] = field(default_factory=dict)
-    """what a layer keeps besides the sums `layer.mean` of what its fragments show"""
-    gather: Any = None
-    """(layer, seen, tau): the layer with a fragment of optical depth tau"""
+    """state of a layer in addition to the sums `layer.mean` of its fragments' attributes"""
+    accumulate: Any = None
+    """(layer, attributes, tau): adds a fragment of optical depth tau to a layer"""
     average: Any = None
-    """(seen, tau): from the sums of a layer of optical depth tau what it shows"""
+    """(attributes, tau): attributes of a layer of optical depth tau from its sums"""
 
     state: Mapping[str, Any] = field(default_factory=dict)
-    """what a sample keeps while its list is composited; 0 before the first fragment"""
+    """state of a sample while its list is composited; 0 before the first fragment"""
     start: Any = None
     """(pixel, length, view): other first values; length: of the sample's ray, 1 unless `length`"""
     fragment: Any = None
-    """(pixel, s, c, x, y, dot, opacity, view): a splat that the sample's tile lists, whether its fragment is
-    drawn or not (c.drawn), before it is composited; x, y: from the anchor; dot: squared distance from the
-    projected centre in pixels, infinite without a low-pass; opacity: 0 of one that is not drawn"""
+    """(pixel, s, c, x, y, disc, opacity, view): a splat of the tile's list before it is composited, whether
+    it contributes to the sample or not (c.contributes); x, y: from the anchor; disc: squared distance from
+    the projected centre in pixels, infinite without a low-pass; opacity: 0 if it does not contribute"""
     attenuate: Any = None
-    """(pixel, seen, shown): how much of a fragment's weight shows as its colour, of `shown`"""
+    """(pixel, attributes, color_weight): the weight of a fragment's colour"""
     composite: Any = None
-    """(pixel, seen, weight, shown, view): a fragment or a layer of this weight, before `pixel.t` changes"""
+    """(pixel, attributes, weight, color_weight, view): a fragment or a layer of this weight, before `pixel.t`
+    changes"""
     cover: Any = None
-    """(seen): what an opaque surface of another renderer shows, where that is not 0"""
+    """(attributes): attributes of an external opaque surface, where they are not 0"""
     clear: Any = None
-    """(pixel): where less than 1/255 of the sample is covered, which shows nothing"""
+    """(pixel): for samples of which less than 1/255 is covered"""
     samples: Mapping[str, Any] = field(default_factory=dict)
     """sample buffers between blending and resolving, by the type of an element"""
     store: Any = None
     """(pixel, at, samples): fills them"""
     light: bool = False
-    """whether they are light: the mean of what several poses leave, not one pose's"""
+    """whether they are light: averaged over sub-frames, not taken from one pose"""
 
     cloud_arrays: Mapping[str, Any] = field(default_factory=dict)
     """arrays of the cloud that resolving reads as out.NAME, by the type of an element"""
     view_arrays: Mapping[str, Any] = field(default_factory=dict)
-    """the same of the view (`View.array`)"""
-    hidden: Any = None
-    """(grid, samples): share of the background that shows besides what is transmitted"""
+    """arrays of the view (`View.array`), likewise"""
+    background_share: Any = None
+    """(grid, samples): share of the background that is visible in addition to the transmittance"""
     resolve: Any = None
     """(grid, samples, lengths, out): a pixel of the output image out.NAME from its samples; lengths: a
     vector with a float for each of them, of rays if `length`"""
     over: str = ""
-    """the output whose image `resolve` changes once that is resolved, of a file without one of its own"""
+    """the output whose resolved image `resolve` changes, if it has no image of its own"""
 
 
 def known() -> frozenset[str]:
@@ -96,7 +96,7 @@ def declared(name: str) -> Output:
 
 
 def with_needed(names: Iterable[str]) -> tuple[str, ...]:
-    """These and all that they need, sorted."""
+    """Names with all that they need, sorted."""
     found: set[str] = set()
     todo = list(names)
     while todo:
@@ -108,12 +108,12 @@ def with_needed(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def having(names: Iterable[str], *parts: str) -> tuple[str, ...]:
-    """Those that declare at least one of these parts."""
+    """Names of files that declare at least one of these parts."""
     return tuple(name for name in names if any(getattr(declared(name), part) for part in parts))
 
 
 def fields(names: Iterable[str], part: str) -> dict[str, Any]:
-    """The fields of this part of all of them.
+    """Fields of a part, of all files.
 
     Raises:
         ValueError: two of them declare one name.
@@ -128,15 +128,15 @@ def fields(names: Iterable[str], part: str) -> dict[str, Any]:
 
 
 def functions(names: Iterable[str], part: str) -> tuple[Any, ...]:
-    """The functions that they have for this part."""
+    """Functions of a part, of all files that have one."""
     return tuple(getattr(declared(name), part) for name in having(names, part))
 
 
 def digest(names: Iterable[str]) -> str:
     """16 hexadecimal digits of these files' text, for the name of a kernel that calls their functions.
 
-    Warp keeps a compiled kernel by the text of all functions that it calls, but for those that one of them
-    takes from a tuple in a loop, as all do that ask every output: it would draw with what stood there before.
+    Warp caches a compiled kernel by the text of all functions that it calls, except those that are called
+    from a tuple in a loop, as functions of outputs are: changes of them would not be noticed.
     """
     text = hashlib.blake2b(digest_size=8)
     for name in names:

@@ -10,23 +10,23 @@ from . import Output
 
 
 @wp.func
-def see(seen: Any, numbers: float, index: int):
-    s = seen
+def read_attributes(attributes: Any, numbers: float, index: int):
+    s = attributes
     s.blended = 1
     return s
 
 
 @wp.func
-def gather(layer: Any, seen: Any, tau: float):
+def accumulate(layer: Any, attributes: Any, tau: float):
     after = layer
-    after.mean.blended = layer.mean.blended + seen.blended
+    after.mean.blended = layer.mean.blended + attributes.blended
     return after
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
-    p.blended += seen.blended
+    p.blended += attributes.blended
     return p
 
 
@@ -44,9 +44,9 @@ def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
 
 
 OUTPUT = Output(
-    seen={"blended": wp.int32},
-    see=see,
-    gather=gather,
+    attributes={"blended": wp.int32},
+    read_attributes=read_attributes,
+    accumulate=accumulate,
     state={"blended": wp.int32},
     composite=composite,
     samples={"blended": wp.int32},

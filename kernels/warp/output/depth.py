@@ -10,9 +10,9 @@ from . import Output
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
-    p.depth = fma(weight, seen.z, p.depth)
+    p.depth = fma(weight, attributes.z, p.depth)
     p.depth_weight += weight
     return p
 

@@ -11,10 +11,10 @@ from . import Output
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
     if p.depth_first == 0.0 and p.t - weight <= view.first_light:
-        p.depth_first = seen.z
+        p.depth_first = attributes.z
     return p
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from ..common import LEAST_ALPHA, View
+from ..common import MIN_ALPHA, View
 from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
@@ -18,11 +18,11 @@ def start(pixel: Any, length: float, view: View):
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
     # faint ones count together
-    if p.t > 0.5 and p.median_light - (p.t - weight) >= LEAST_ALPHA:
-        p.depth_median = seen.z
+    if p.t > 0.5 and p.median_light - (p.t - weight) >= MIN_ALPHA:
+        p.depth_median = attributes.z
         p.median_light = p.t - weight
     return p
 

@@ -1,4 +1,4 @@
-"""How far apart in depth the fragments of a sample lie whose light is seen: sum over pairs of w_i w_j (m_i -
+"""Depth distortion, the spread of a sample's fragments in depth: sum over pairs of w_i w_j (m_i -
 m_j)^2, m = constant - INVERSE_DEPTH / z the depth in a depth buffer from 0.2 to 100 m (the 2DGS authors'
 loss). What is nearer counts as at 0.2 m.
 
@@ -18,10 +18,10 @@ SPREAD_NEAR = wp.constant(0.2)
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
-    if weight > 0.0 and seen.z > 0.0:
-        inverse = INVERSE_DEPTH / wp.max(seen.z, SPREAD_NEAR)
+    if weight > 0.0 and attributes.z > 0.0:
+        inverse = INVERSE_DEPTH / wp.max(attributes.z, SPREAD_NEAR)
         if p.spread[1] == 0.0:
             p.spread[0] = inverse
         nearer = inverse - p.spread[0]

@@ -18,14 +18,14 @@ def start(pixel: Any, length: float, view: View):
 
 
 @wp.func
-def attenuate(pixel: Any, seen: Any, shown: float) -> float:
-    return shown * wp.exp(pixel.fog_slope * seen.z)
+def attenuate(pixel: Any, attributes: Any, color_weight: float) -> float:
+    return color_weight * wp.exp(pixel.fog_slope * attributes.z)
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
-    p.fogged += weight - shown
+    p.fogged += weight - color_weight
     return p
 
 
@@ -35,7 +35,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def hidden(grid: PixelGrid, samples: Any) -> float:
+def background_share(grid: PixelGrid, samples: Any) -> float:
     """Fog is of one colour with what lies behind everything."""
     fogged = float(0.0)
     for k in range(grid.count):
@@ -54,5 +54,5 @@ OUTPUT = Output(
     samples={"fogged": wp.float32},
     store=store,
     light=True,
-    hidden=hidden,
+    background_share=background_share,
 )

@@ -11,18 +11,18 @@ from . import Output
 
 
 @wp.func
-def see(seen: Any, numbers: float, index: int):
-    s = seen
+def read_attributes(attributes: Any, numbers: float, index: int):
+    s = attributes
     s.heaviest = index
     return s
 
 
 @wp.func
-def gather(layer: Any, seen: Any, tau: float):
+def accumulate(layer: Any, attributes: Any, tau: float):
     after = layer
     if tau > layer.thickest:
         after.thickest = tau
-        after.mean.heaviest = seen.heaviest
+        after.mean.heaviest = attributes.heaviest
     return after
 
 
@@ -34,17 +34,17 @@ def start(pixel: Any, length: float, view: View):
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
     if weight > p.weight:
         p.weight = weight
-        p.heaviest = seen.heaviest
+        p.heaviest = attributes.heaviest
     return p
 
 
 @wp.func
-def cover(seen: Any):
-    s = seen
+def cover(attributes: Any):
+    s = attributes
     s.heaviest = -1
     return s
 
@@ -78,10 +78,10 @@ def heaviest_of(grid: PixelGrid, samples: Any) -> int:
 
 
 OUTPUT = Output(
-    seen={"heaviest": wp.int32},  # among all views' splats; a layer's is that of greatest optical depth
-    see=see,
+    attributes={"heaviest": wp.int32},  # among all views' splats; a layer's is that of greatest optical depth
+    read_attributes=read_attributes,
     layer={"thickest": wp.float32},
-    gather=gather,
+    accumulate=accumulate,
     state={"weight": wp.float32, "heaviest": wp.int32},
     start=start,
     composite=composite,

@@ -11,7 +11,7 @@ from . import Output
 
 @wp.func
 def project(record: Any, at: int, normal: Any, height: Any):
-    """The camera is on one side of the whole plane, so the sign is the splat's (numerics B7)."""
+    """The camera is on one side of the whole plane, so the sign is the splat's."""
     r = record
     one = type(height)(1.0)
     towards = wp.where(height > type(height)(0.0), -one, one)
@@ -22,30 +22,30 @@ def project(record: Any, at: int, normal: Any, height: Any):
 
 
 @wp.func
-def see(seen: Any, numbers: wp.vec3, index: int):
-    s = seen
+def read_attributes(attributes: Any, numbers: wp.vec3, index: int):
+    s = attributes
     s.normal = numbers
     return s
 
 
 @wp.func
-def gather(layer: Any, seen: Any, tau: float):
+def accumulate(layer: Any, attributes: Any, tau: float):
     after = layer
-    after.mean.normal = layer.mean.normal + tau * seen.normal
+    after.mean.normal = layer.mean.normal + tau * attributes.normal
     return after
 
 
 @wp.func
-def average(seen: Any, tau: float):
-    s = seen
-    s.normal = seen.normal / tau
+def average(attributes: Any, tau: float):
+    s = attributes
+    s.normal = attributes.normal / tau
     return s
 
 
 @wp.func
-def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
-    p.normal += weight * seen.normal
+    p.normal += weight * attributes.normal
     return p
 
 
@@ -84,9 +84,9 @@ def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
 OUTPUT = Output(
     record=("nx", "ny", "nz"),
     project=project,
-    seen={"normal": wp.vec3},
-    see=see,
-    gather=gather,
+    attributes={"normal": wp.vec3},
+    read_attributes=read_attributes,
+    accumulate=accumulate,
     average=average,
     state={"normal": wp.vec3},
     composite=composite,

@@ -27,7 +27,7 @@ def opacity_rounding(log_opacity: float, half_rho: float) -> float:
 
 
 @wp.func
-def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, dot: float, opacity: float, view: View):
+def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, disc: float, opacity: float, view: View):
     off = OF_FORM * (terms(s.u, x, y) + terms(s.v, x, y))
     off_d = OF_FORM * terms(s.d, x, y)
     d_low, d_high, root = c.d - off_d, c.d + off_d, wp.sqrt(c.q)
@@ -38,8 +38,8 @@ def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, dot: float, opacity
     if d_low > 0.0 and d_high <= (1.0 - OF_FORM) * s.v[3]:
         far = (root + off) / d_low
         furthest = far * far
-    if dot < wp.inf:
-        away = wp.sqrt(dot)
+    if disc < wp.inf:
+        away = wp.sqrt(disc)
         off_dot = OF_FORM * (wp.sqrt(view.per_pixel) * (1.0 + 2.0 * (wp.abs(x) + wp.abs(y))) + 3.0 * away)
         least, most = wp.max(away - off_dot, 0.0), away + off_dot
         nearest = wp.min(nearest, least * least)
@@ -48,7 +48,7 @@ def fragment(pixel: Any, s: Any, c: Any, x: float, y: float, dot: float, opacity
     low = fast_exp(s.u[3] - furthest) * (1.0 - opacity_rounding(s.u[3], furthest))
     p = pixel
     p.rounding += p.t * wp.max(high - opacity, opacity - low)
-    if c.drawn:
+    if c.contributes:
         p.rounding += 1.5 * UNIT
     return p
 

@@ -156,7 +156,7 @@ def surroundings_of(view: View, workspace: Workspace) -> Any:
     """
     wp, behind = load(), view.surroundings
     kind = "gradient" if isinstance(behind, Gradient) else "panorama"
-    filled = kernels("surroundings").struct_of_surroundings(kind)()
+    filled = kernels("background").struct_of_surroundings(kind)()
     if isinstance(behind, Gradient):
         numbers = view.uniform("gradient")
         filled.top, filled.bottom, filled.up = (wp.vec3(*numbers[k : k + 3]) for k in (0, 3, 6))

@@ -12,9 +12,9 @@ from .records import BOXES
 
 
 @cache
-def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
+def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
     """pose, tangents, depth_range, and the struct Moving of what moves by itself."""
-    moves, waits, layers = (
+    moves, k_buffered, layers = (
         name in effects for name in ("motion_groups", "compose_pixel", "compose_coplanar")
     )
     screen = "lowpass_screen" in effects
@@ -30,21 +30,21 @@ def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
         """Rotation and translation to the camera, and the camera's centre relative to the cloud's origin, in
         the view of this number.
         """
-        turn, shift, eye = mat33(view.rotation), vec3(view.translation), vec3(view.eye)
+        rotation, translation, eye = mat33(view.rotation), vec3(view.translation), vec3(view.eye)
         if wp.static(moves):
             group = motion.group_of(moving, i)
             if group >= 0:
                 own = moving.poses[number * moving.groups.shape[0] + group]
-                turn, shift, eye = mat33(own.rotation), vec3(own.translation), vec3(own.eye)
-        return turn, shift, eye
+                rotation, translation, eye = mat33(own.rotation), vec3(own.translation), vec3(own.eye)
+        return rotation, translation, eye
 
     @wp.func
-    def tangents(turn: mat33, q: wp.vec4):
+    def tangents(rotation: mat33, q: wp.vec4):
         """The first two columns of the rotation of a quaternion of any length, turned."""
         w, x, y, z = real(q[0]), real(q[1]), real(q[2]), real(q[3])
         s = two / (w * w + x * x + y * y + z * z)
-        tangent_u = turn * vec3(one - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
-        tangent_v = turn * vec3(s * (x * y - w * z), one - s * (x * x + z * z), s * (y * z + w * x))
+        tangent_u = rotation * vec3(one - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
+        tangent_v = rotation * vec3(s * (x * y - w * z), one - s * (x * x + z * z), s * (y * z + w * x))
         return tangent_u, tangent_v
 
     @wp.func
@@ -53,10 +53,10 @@ def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
         plane: -1 for none."""
         middle, found = depth, reach
         if wp.static(screen):
-            # what the dot shows, whatever the cut-off
+            # what the disc shows, whatever the cut-off
             if not boxed:
                 found = reach * wp.max(one, range_radius / radius)
-        if wp.static(waits):
+        if wp.static(k_buffered):
             # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same at
             # every cut-off
             found = reach * (range_radius / radius)

@@ -1,9 +1,8 @@
-"""From keys to tile lists: splats in depth order, then their pairs with tiles in that order.
+"""Tile binning: visible splats in depth order, then their pairs with tiles in that order.
 
-Between these kernels stand Warp's scan and its stable radix sort: of the splats drawn by key (ties by index,
-since they are
-gathered in that order), then of the pairs by tile (ties by depth, since they are emitted in that order). No
-atomics.
+Warp's scan and stable radix sort run between these kernels: visible splats are sorted by key (ties by index,
+since they are compacted in that order), then pairs by tile (ties by depth, since they are emitted in that
+order). There are no atomics.
 """
 
 from functools import cache
@@ -14,7 +13,7 @@ import warp as wp
 from .bounds import Bounds, make_bounds, window_tile
 from .common import CULLED, STRICT, View, lowest
 
-# kernels that are the same for all feature sets are one module: the first picture compiles it once
+# kernels that all feature sets share are one module
 wp.set_module_options(STRICT)
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
@@ -23,16 +22,16 @@ NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 def compact(
     first: int,
     keys: wp.array(dtype=wp.uint32),  # (n)
-    drawn: wp.array(dtype=wp.int32),  # (n)
-    places: wp.array(dtype=wp.int32),  # (n) inclusive sums of drawn
-    totals: wp.array(dtype=wp.int64),  # (2) splats drawn, pairs
+    visible: wp.array(dtype=wp.int32),  # (n)
+    offsets: wp.array(dtype=wp.int32),  # (n) inclusive sums of visible
+    totals: wp.array(dtype=wp.int64),  # (2) visible splats, pairs
     capacity: int,  # of the outputs, at most n; further splats are dropped
-    sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of those drawn, by index; behind them the last of all
-    order: wp.array(dtype=wp.int32),  # out: their indices
+    sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of visible splats, by index, then CULLED
+    order: wp.array(dtype=wp.int32),  # out: indices of visible splats
 ):
     i = wp.tid() + first
-    if drawn[i] != 0:
-        k = places[i] - 1
+    if visible[i] != 0:
+        k = offsets[i] - 1
         if k < capacity:
             sorted_keys[k] = keys[i]
             order[k] = i
@@ -45,7 +44,7 @@ def gather(
     first: int,
     order: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int64),
-    totals: wp.array(dtype=wp.int64),  # (2) splats drawn, pairs
+    totals: wp.array(dtype=wp.int64),  # (2) visible splats, pairs
     capacity: int,  # in splats
     pairs: int,  # and so many pairs
     lengths: wp.array(dtype=wp.int64),  # out: counts in depth order; all 0 where a capacity is too small
@@ -65,36 +64,36 @@ def find_starts(
     starts: wp.array(dtype=wp.int32),  # out: where each tile's list begins
 ):
     tile = band_first + first + wp.tid()
-    # Warp's search answers with its last place at most, so its end is one further
+    # Warp's search returns at most its last index, so its end is one further
     starts[tile] = wp.lower_bound(tiles, 0, pairs + 1, tile)
 
 
 @wp.kernel(enable_backward=False)
 def sum_up(
     splats: int,
-    places: wp.array(dtype=wp.int32),  # inclusive sums
+    offsets: wp.array(dtype=wp.int32),  # inclusive sums
     ends_by_index: wp.array(dtype=wp.int64),  # inclusive sums
-    totals: wp.array(dtype=wp.int64),  # (2) out: splats drawn, pairs
+    totals: wp.array(dtype=wp.int64),  # (2) out: visible splats, pairs
 ):
-    totals[0] = wp.int64(places[splats - 1])
+    totals[0] = wp.int64(offsets[splats - 1])
     totals[1] = ends_by_index[splats - 1]
 
 
 @wp.func
 def window_of(window: wp.uint64):
-    """Its first tile, and the bits of the splat's tiles: none if its bounds must be asked."""
+    """First tile of a window, and the bits of the splat's tiles; 0 if its bounds must be read."""
     return int(window >> wp.uint64(32)), wp.uint32(window & wp.uint64(0xFFFFFFFF))
 
 
 @wp.func
 def first_tile(index: int, view: View) -> int:
-    """Of the view to which this of all views' splats belongs."""
+    """First tile of the view of a splat."""
     return index / view.splats * (view.tiles_x * view.tiles_y)
 
 
 @cache
 def make_lists(screen: bool) -> SimpleNamespace:
-    """count, histogram and emit, with or without the low-pass dot in the bounds."""
+    """count, histogram and emit, with or without the low-pass disc in the bounds."""
     limits = make_bounds(screen)
 
     @wp.func
@@ -173,7 +172,7 @@ def make_lists(screen: bool) -> SimpleNamespace:
         capacity: int,  # size of `ends`
         pairs: int,  # capacity of the outputs
         end_tile: int,  # number of tiles
-        tiles: wp.array(dtype=wp.int32),  # out: pairs in depth order; behind them what lies beyond
+        tiles: wp.array(dtype=wp.int32),  # out: pairs in depth order, then end_tile
         lists: wp.array(dtype=wp.int32),  # out: their splats
     ):
         k = wp.tid() + first
@@ -182,7 +181,7 @@ def make_lists(screen: bool) -> SimpleNamespace:
             tiles[rest] = end_tile
             rest += capacity
         if lengths[k] == wp.int64(0):
-            return  # what `order` has here may be nothing
+            return  # `order` may be undefined here
         view = views[0]
         index = order[k]
         place = int(ends[k] - lengths[k])

@@ -2,7 +2,7 @@
 fragments by optical depth.
 
 They stand together in the lists, where the nearest point of the plane puts them; when another splat follows,
-the layer waits as one fragment among the others (waiting.py).
+the layer waits as one fragment among the others (k_buffer.py).
 """
 
 from types import SimpleNamespace
@@ -23,10 +23,10 @@ NEARER = wp.constant(wp.float32(-(2.0**-16)))
 """of a depth, by which a layer lies before what lies in its plane"""
 
 
-def make_layer(Seen, effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """Layer, and what is known of it: gather, gather_box; nothing, depth, shown."""
+def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
+    """Layer, and what is known of it: accumulate, accumulate_box; nothing, depth, averaged."""
     log = fast_log if "arithmetic_fast" in effects else wp.log
-    gathers, averages = (output.functions(outputs, part) for part in ("gather", "average"))
+    accumulators, averages = (output.functions(outputs, part) for part in ("accumulate", "average"))
     # tau: optical depth; `mean`: sums over fragments, each times its optical depth; of boxes, its opacity
     # place: of the first in the list; nearest: depth before which none lies
     fields = {
@@ -35,13 +35,13 @@ def make_layer(Seen, effects: tuple[str, ...], outputs: tuple[str, ...]) -> Simp
         "nearest": wp.float32,
         "opacity": wp.float32,
         "tau": wp.float32,
-        "mean": Seen,
+        "mean": Attributes,
     }
     fields |= output.fields(outputs, "layer")
-    Layer = struct_of("Layer", "What a sample sees of one plane; plane -1: nothing.", fields)
+    Layer = struct_of("Layer", "What a sample attribute_readers of one plane; plane -1: nothing.", fields)
 
     @wp.func
-    def begun(plane: int, place: int, nearest: float):
+    def empty_layer(plane: int, place: int, nearest: float):
         """The layer of a plane before its first fragment, whose splat stands at this place of the list."""
         layer = Layer()
         layer.plane = plane
@@ -51,7 +51,7 @@ def make_layer(Seen, effects: tuple[str, ...], outputs: tuple[str, ...]) -> Simp
 
     @wp.func
     def nothing():
-        return begun(-1, 0, 0.0)
+        return empty_layer(-1, 0, 0.0)
 
     @wp.func
     def depth(layer: Layer) -> float:
@@ -62,50 +62,50 @@ def make_layer(Seen, effects: tuple[str, ...], outputs: tuple[str, ...]) -> Simp
         return wp.max(fma(wp.abs(z), NEARER, z), layer.nearest)
 
     @wp.func
-    def shown(layer: Layer):
+    def averaged(layer: Layer):
         """What the layer shows as one thing."""
-        seen = layer.mean
-        seen.rgb = layer.mean.rgb / layer.tau
-        seen.z = layer.mean.z / layer.tau
+        attributes = layer.mean
+        attributes.rgb = layer.mean.rgb / layer.tau
+        attributes.z = layer.mean.z / layer.tau
         for k in range(wp.static(len(averages))):
-            seen = wp.static(averages[k])(seen, layer.tau)
-        return seen
+            attributes = wp.static(averages[k])(attributes, layer.tau)
+        return attributes
 
     @wp.func
-    def gather(layer: Layer, seen: Seen, opacity: float):
+    def accumulate(layer: Layer, attributes: Attributes, opacity: float):
         """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
         tau = opacity + 0.5 * opacity * opacity  # of a faint one, which 1 - opacity would blur
         if opacity > FAINT:
             # an opaque fragment has the optical depth at which float32 leaves no light
             tau = -log(wp.max(1.0 - opacity, DARKEST))
-        after = mixed_in(layer, seen, tau)
+        after = with_fragment(layer, attributes, tau)
         after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
         return after
 
     @wp.func
-    def gather_box(layer: Layer, seen: Seen, opacity: float):
+    def accumulate_box(layer: Layer, attributes: Attributes, opacity: float):
         """The layer with one more box: they lie side by side, so what they cover adds up."""
-        after = mixed_in(layer, seen, opacity)
+        after = with_fragment(layer, attributes, opacity)
         after.opacity = wp.min(after.tau, 1.0)
         return after
 
     @wp.func
-    def mixed_in(layer: Layer, seen: Seen, tau: float):
-        """The layer with a fragment of optical depth tau that shows `seen`."""
+    def with_fragment(layer: Layer, attributes: Attributes, tau: float):
+        """The layer with a fragment of optical depth tau that shows `attributes`."""
         after = layer
         after.tau = layer.tau + tau
-        after.mean.rgb = layer.mean.rgb + tau * seen.rgb
-        after.mean.z = fma(tau, seen.z, layer.mean.z)
-        for k in range(wp.static(len(gathers))):
-            after = wp.static(gathers[k])(after, seen, tau)
+        after.mean.rgb = layer.mean.rgb + tau * attributes.rgb
+        after.mean.z = fma(tau, attributes.z, layer.mean.z)
+        for k in range(wp.static(len(accumulators))):
+            after = wp.static(accumulators[k])(after, attributes, tau)
         return after
 
     return SimpleNamespace(
         Layer=Layer,
         nothing=nothing,
-        begun=begun,
+        empty_layer=empty_layer,
         depth=depth,
-        shown=shown,
-        gather=gather,
-        gather_box=gather_box,
+        averaged=averaged,
+        accumulate=accumulate,
+        accumulate_box=accumulate_box,
     )

@@ -19,9 +19,9 @@ HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
 
 
 @cache
-def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """Crossing; row, cross, cross_ray, cross_slopes (None without boxes behind a lens); is_box, opacity_of,
-    depth_of.
+def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
+    """The struct Intersection and functions row, cross, cross_ray, cross_slopes (None without boxes behind a
+    lens), is_box, opacity_of and depth_of.
     """
     Splat = make_splat(effects, outputs).Splat
     layout = Layout(effects, outputs)
@@ -34,13 +34,13 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
     curved, edged = boxes and bent, boxes and not bent  # their edges: from each sample's ray, from a record
     exp = fast_exp if "arithmetic_fast" in effects else wp.exp
     # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
-    fields = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
+    fields = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "contributes": wp.bool}
     # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
     fields |= {"screen": wp.float32} if screen else {}
     fields |= {"z": wp.float32} if parallel else {}  # d times the depth
     # cover: share of the sample that a box covers
     fields |= {"cover": wp.float32} if boxes else {}
-    Crossing = struct_of("Crossing", "Where the ray of a sample meets a splat.", fields)
+    Intersection = struct_of("Intersection", "Where the ray of a sample meets a splat.", fields)
     z_line, z_lane = layout.place("z_numerator")
     zc_line, zc_lane = layout.place("z_center")
     zr_line, zr_lane = layout.place("z_reach")
@@ -79,7 +79,7 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
         """The same for the sample that has this ray."""
         n = forms_of(s, ray)
         c = meet(s, n[0], n[1], n[2], x, y, view)
-        c.drawn = c.drawn and n[2] == n[2]  # nothing is seen without a ray
+        c.contributes = c.contributes and n[2] == n[2]  # nothing is seen without a ray
         return c
 
     @wp.func
@@ -91,12 +91,12 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
             across = between_curves(n[2], n[0], of_d, wp.vec3(s.u[1], s.u[2], s.w[0]), slopes)
             c.cover = across * between_curves(n[2], n[1], of_d, wp.vec3(s.v[1], s.v[2], s.w[1]), slopes)
             c.inside = c.cover > 0.0 and c.d > 0.0 and c.d <= s.v[3]
-            c.drawn = c.inside
+            c.contributes = c.inside
         return c
 
     @wp.func
     def meet(s: Splat, nu: float, nv: float, d: float, x: float, y: float, view: View):
-        c = Crossing()
+        c = Intersection()
         c.d = d
         ahead = c.d > 0.0 and c.d <= s.v[3]
         if wp.static(parallel):
@@ -104,7 +104,7 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
             ahead = ahead and c.z >= s.plane[3] * c.d
         if wp.static(not all_boxes):
             c.q = fma(nu, nu, nv * nv)
-            # product form: no division, no special value of D (numerics B2)
+            # product form: no division, no special value of D
             c.inside = c.q <= s.half_r2 * (c.d * c.d) and ahead
         if wp.static(thick):
             if s.bulge > 0.0:
@@ -119,16 +119,16 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
                 across = between(c.d, nu, wp.vec2(s.edges[0], s.edges[1]))
                 c.cover = across * between(c.d, nv, wp.vec2(s.edges[2], s.edges[3]))
                 c.inside = c.cover > 0.0 and ahead
-        c.drawn = c.inside
+        c.contributes = c.inside
         if wp.static(screen):
-            ex = x - s.dot_x
-            ey = y - s.dot_y
+            ex = x - s.disc_x
+            ey = y - s.disc_y
             c.screen = fma(ex, ex, ey * ey) * view.per_pixel
-            c.drawn = c.inside or c.screen <= s.half_r2
+            c.contributes = c.inside or c.screen <= s.half_r2
         return c
 
     @wp.func
-    def opacity_of(s: Splat, c: Crossing, inverse_d: float, view: View) -> float:
+    def opacity_of(s: Splat, c: Intersection, inverse_d: float, view: View) -> float:
         if wp.static(boxes):
             if is_box(s):
                 return wp.min(wp.exp(s.u[3]), view.ceiling) * c.cover
@@ -142,10 +142,10 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
 
     @wp.func
     def depth_of(
-        lines: wp.array(dtype=wp.vec4), index: int, s: Splat, c: Crossing, inverse_d: float, printed: bool
+        lines: wp.array(dtype=wp.vec4), index: int, s: Splat, c: Intersection, inverse_d: float, printed: bool
     ) -> float:
         """Depth of ray and plane within the splat's own range; the centre's where the ray meets no plane
-        beyond `near` (numerics B2, B4). What lies outside of the circle with the dot's rho, at least
+        beyond `near`. What lies outside of the circle with the radius of the disc, at least
         2 ln 255, is mirrored at that circle, unless the splat is `printed` on a plane: the way from the
         centre's depth is multiplied by the ratio of their rho.
         """
@@ -171,7 +171,7 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
         return wp.clamp(depth, center - reach, center + reach)
 
     return SimpleNamespace(
-        Crossing=Crossing,
+        Intersection=Intersection,
         row=row,
         cross=cross,
         cross_ray=cross_ray,
