@@ -8,7 +8,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
-from fidsplat.backends.reference.gradients import FrozenPicture
+from fidsplat.backends.reference.gradients import FrozenFrame
 from fidsplat.effects.differentiable import with_distortion
 
 OUTPUTS = ("rgb", "alpha", "depth", "normal", "distortion")
@@ -79,7 +79,7 @@ def test_frozen_pictures_are_the_references(name):
     cloud, features, view = pictured(name)
     backend = ReferenceBackend()
     drawn = backend.pipeline(features).render(backend.upload(cloud), view)
-    frozen = FrozenPicture(cloud, view, features)
+    frozen = FrozenFrame(cloud, view, features)
     images = frozen.images(frozen.parameters)
     for output in OUTPUTS:
         assert np.allclose(images[output], drawn.read_float64(output), rtol=1e-9, atol=1e-9), output
@@ -89,7 +89,7 @@ def test_frozen_pictures_are_the_references(name):
 @pytest.mark.parametrize("name", SCENES)
 def test_derivatives_are_those_of_central_differences(name):
     cloud, features, view = pictured(name)
-    frozen = FrozenPicture(cloud, view, features)
+    frozen = FrozenFrame(cloud, view, features)
     at = frozen.parameters
     weights = weights_of(frozen.images(at))
 
@@ -118,22 +118,22 @@ def test_every_decision_occurs():
     made = {}
     for name in SCENES:
         cloud, features, view = pictured(name)
-        ((_, _, made[name]),) = FrozenPicture(cloud, view, features)._blocks
-    assert made["dots"].by_dot[made["dots"].drawn].all()
+        ((_, _, made[name]),) = FrozenFrame(cloud, view, features)._blocks
+    assert made["dots"].by_disc[made["dots"].contributes].all()
     both = made["dots and disks"]
-    assert {*both.by_dot[both.drawn].tolist()} == {True, False}
-    assert made["ceiling"].clamped[made["ceiling"].drawn].any()
-    assert (made["edge-on"].missed & made["edge-on"].drawn).any()
+    assert {*both.by_disc[both.contributes].tolist()} == {True, False}
+    assert made["ceiling"].clamped[made["ceiling"].contributes].any()
+    assert (made["edge-on"].missed & made["edge-on"].contributes).any()
     # depths between the centre's and the plane's
-    assert {*both.mirrored[both.drawn & ~both.missed].tolist()} == {True, False}
-    assert {*made["edge-on"].wide[made["edge-on"].mirrored & made["edge-on"].drawn].tolist()} == {True, False}
-    assert not made["opaque"].drawn.all()
+    assert {*both.mirrored[both.contributes & ~both.missed].tolist()} == {True, False}
+    assert {*made["edge-on"].wide[made["edge-on"].mirrored & made["edge-on"].contributes].tolist()} == {True, False}
+    assert not made["opaque"].contributes.all()
 
 
 def test_the_screen_statistic_is_the_derivative_by_the_centres_place():
     """What the 2DGS authors call dL_dmean2D: by the centre's place in the picture, in half pictures."""
     cloud, features, view = pictured("dots")
-    found = FrozenPicture(cloud, view, features).backward({"rgb": np.ones((view.height, view.width, 3))})
+    found = FrozenFrame(cloud, view, features).backward({"rgb": np.ones((view.height, view.width, 3))})
     z, (x, y, _) = cloud.means[:, 2].astype(float), found["means"].T
     across = 0.5 * z * np.hypot(view.width * x / view.focal_x, view.height * y / view.focal_y)
     assert np.allclose(found["screen"], across)

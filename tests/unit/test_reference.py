@@ -44,14 +44,14 @@ def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camer
         shares.append(seen.mean())
         return seen
 
-    choose = backend.may_see
+    choose = backend.may_contribute
     monkeypatch.setattr(backend, "_BLOCK", 1 << 15)
     for lowpass in LOWPASSES:
         quality = fs.Quality(lowpass=lowpass, ellipsoid="exact")
         picture = FrameSpec(clouds()[kind], camera, quality, tuple(OUTPUTS))
-        monkeypatch.setattr(backend, "may_see", counted)
+        monkeypatch.setattr(backend, "may_contribute", counted)
         fewer = reference_images(picture)
-        monkeypatch.setattr(backend, "may_see", lambda setup, view, x, y: np.ones(len(setup.order), bool))
+        monkeypatch.setattr(backend, "may_contribute", lambda setup, view, x, y: np.ones(len(setup.order), bool))
         for name, image in reference_images(picture).items():
             assert np.allclose(fewer[name], image, rtol=1e-11, atol=1e-11, equal_nan=True), (lowpass, name)
     assert np.mean(shares) < 0.8
@@ -60,8 +60,8 @@ def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camer
 def test_pixels_that_are_far_apart_are_those_of_the_whole_picture(monkeypatch):
     """Splats are chosen for many of them together."""
     monkeypatch.setattr(backend, "_BLOCK", 1000)
-    chosen, choose = [], backend.may_see
-    monkeypatch.setattr(backend, "may_see", lambda *asked: chosen.append(choose(*asked)) or chosen[-1])
+    chosen, choose = [], backend.may_contribute
+    monkeypatch.setattr(backend, "may_contribute", lambda *asked: chosen.append(choose(*asked)) or chosen[-1])
     camera = fs.Camera.look_at(200, 150, 1.0, (0, 0, -2), (0, 0, 0))
     picture = FrameSpec(random_splats(100, 3, depth=(-0.5, 1.0)), camera, outputs=("rgb", "depth"))
     whole = reference_images(picture)

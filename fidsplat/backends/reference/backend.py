@@ -12,7 +12,7 @@ import numpy as np
 
 from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits, Images, Pipeline, ResidentData
 from fidsplat.backends.reference.blend import composite
-from fidsplat.backends.reference.culling import may_see
+from fidsplat.backends.reference.culling import may_contribute
 from fidsplat.backends.reference.gradients import ReferenceGradients
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
@@ -184,7 +184,7 @@ class ReferencePipeline(Pipeline):
         places, starts = _by_tile(view, x, y, widest)
         parts = []
         for mine in np.split(places, starts):
-            seen = splats.among(may_see(splats, view, x[mine], y[mine]))
+            seen = splats.subset(may_contribute(splats, view, x[mine], y[mine]))
             step = max(1, _BLOCK // max(1, len(seen.order)))
             for k in range(0, len(mine), step):
                 block = mine[k : k + step]

@@ -1,57 +1,57 @@
-"""Compositing of fragments and layers, with every decision that devices take."""
+"""Blending: compositing of fragments and layers, with all decisions of the devices."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from fidsplat.backends.reference import error_bounds
+from fidsplat.backends.reference.coverage import MIN_ALPHA, median_of
+from fidsplat.backends.reference.external_depth import surface_at
+from fidsplat.backends.reference.fragment_order import by_center, by_depth
 from fidsplat.backends.reference.fragments import fragments_of, shifted
-from fidsplat.backends.reference.layers import by_center, by_depth
-from fidsplat.backends.reference.opaque import surface_at
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import background_at
 from fidsplat.backends.reference.setup import Setup
-from fidsplat.backends.reference.shown import LEAST_ALPHA, median_of
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
 INVERSE_DEPTH = 0.2 * 100 / (100 - 0.2)
 """metres, by which inverse depths are multiplied for the depth distortion"""
 SPREAD_NEAR = 0.2
-"""metres; what is nearer counts as there for the depth distortion"""
+"""metres: minimum depth for the depth distortion"""
 _SURE = 5e-5
-"""share of a depth within which rounding may move one that is still compared: half of what is tolerated"""
+"""relative error of a depth that is still compared: half of the tolerance"""
 
 
 def composite(
     s: Setup, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Samples (k,) at grid positions x, y against all splats: what blending leaves, before resolving."""
+    """Blend all splats at samples (k,) with grid positions x, y; the sample buffers before resolving."""
     f = fragments_of(s, view, x, y)
     span = error_bounds.span_of(s, view, f)
     surface = None if view.external_depth is None else surface_at(view.external_depth, view, x, y)
     if surface is not None:
-        span = surface.hide(s, f, span)
-    stack = by_depth(s, f, span) if s.by_depth else by_center(s, f, span)
-    before, live, final = transmittance(stack.alpha, view.stop, s.exclusive)
+        span = surface.occlude(s, f, span)
+    ordered = by_depth(s, f, span) if s.by_depth else by_center(s, f, span)
+    before, live, final = transmittance(ordered.alpha, view.stop, s.exclusive)
     if surface is not None:
-        stack = surface.behind(stack)
+        ordered = surface.append_to(ordered)
         before = np.column_stack([before, final])
-        live = np.column_stack([live, surface.there])
-        final = np.where(surface.there, 0.0, final)
-    alpha, z, span = stack.alpha, stack.z, stack.span
+        live = np.column_stack([live, surface.exists])
+        final = np.where(surface.exists, 0.0, final)
+    alpha, z, span = ordered.alpha, ordered.z, ordered.span
     weight = np.where(live, before * alpha, 0.0)
     out = {
-        "rgb": _sum(weight, stack.colors),
+        "rgb": _sum(weight, ordered.colors),
         "t": final,
-        "certificate": error_bounds.of_color(s, view, span, before, stack.moved) + stack.reordered,
+        "certificate": error_bounds.of_color(s, view, span, before, ordered.moved) + ordered.reordered,
     }
-    out["shown"] = 1 - final >= LEAST_ALPHA
-    out["shown_may_flip"] = np.abs(1 - final - LEAST_ALPHA) <= out["certificate"] + error_bounds.STOP
+    out["covered"] = 1 - final >= MIN_ALPHA
+    out["covered_may_flip"] = np.abs(1 - final - MIN_ALPHA) <= out["certificate"] + error_bounds.STOP
     if "fog" in features.posts:
         reach = -view.fog_density * ray_lengths(x, y, view)[:, None]
         left = np.exp(reach * z)
-        out["rgb"] = _sum(weight * left, stack.colors)
+        out["rgb"] = _sum(weight * left, ordered.colors)
         out["fogged"] = (weight * (1 - left)).sum(1)
         with np.errstate(invalid="ignore"):
             moved = np.abs(np.exp(reach * np.maximum(span.z_low, 0)) - np.exp(reach * span.z_high))
@@ -60,7 +60,7 @@ def composite(
         behind, moved = background_at(view, x, y)
         out["rgb"] = out["rgb"] + final[:, None] * behind
         out["behind_bound"] = final * moved
-    drawn = live & (alpha > 0)
+    contributes = live & (alpha > 0)
     if "distortion" in features.names:
         inverse = inverse_depth(z)
         sums = [(weight * np.where(z > 0, inverse**k, 0.0)).sum(1) for k in range(3)]
@@ -69,12 +69,12 @@ def composite(
         out["weight"] = weight.sum(1)
         out["depth"] = (weight * z).sum(1)
         out |= error_bounds.of_depth(span, weight, z)
-        last, seen, may_flip = median_of(before, alpha, drawn, span)
-        out["depth_median"] = _pick(z, last, seen, 0.0)
+        last, found, may_flip = median_of(before, alpha, contributes, span)
+        out["depth_median"] = _pick(z, last, found, 0.0)
         out["depth_median_may_flip"] = may_flip | (
-            _pick(span.z_high - span.z_low, last, seen, 0.0) > _SURE * out["depth_median"]
+            _pick(span.z_high - span.z_low, last, found, 0.0) > _SURE * out["depth_median"]
         )
-        first = drawn & (before * (1 - alpha) <= view.first_light)
+        first = contributes & (before * (1 - alpha) <= view.first_light)
         out["depth_first"] = _pick(z, _first(first), np.asarray(first.any(1)), 0.0)
         out["depth_first_may_flip"] = error_bounds.of_first(span, view.first_light)
         out["depth_first_may_flip"] |= (
@@ -82,27 +82,27 @@ def composite(
             > _SURE * out["depth_first"]
         )
     if "normal" in features.names:
-        out["normal"] = _sum(weight, stack.normal)
+        out["normal"] = _sum(weight, ordered.normal)
         out["normal_moved"] = (f.alpha * s.turned).sum(1)
-    ids = {"label": stack.labels, "splat_id": stack.ids}
-    flips = {"label": stack.label_may_flip, "splat_id": stack.id_may_flip}
+    ids = {"label": ordered.labels, "splat_id": ordered.ids}
+    flips = {"label": ordered.label_may_flip, "splat_id": ordered.id_may_flip}
     for name in sorted(ids.keys() & features.names):
         heaviest = _first(weight)
-        out["heaviest"] = _pick(weight, heaviest, out["shown"], 0.0)
-        out[name] = _pick(ids[name], heaviest, out["shown"], -1)
+        out["heaviest"] = _pick(weight, heaviest, out["covered"], 0.0)
+        out[name] = _pick(ids[name], heaviest, out["covered"], -1)
         flip = error_bounds.of_label(span, ids[name], out[name]) | flips[name].any(1)
-        out[f"{name}_may_flip"] = (flip & out["shown"]) | out["shown_may_flip"]
+        out[f"{name}_may_flip"] = (flip & out["covered"]) | out["covered_may_flip"]
     if "splat_id" in features.names and len(s.order):
         out["splat_id"] = np.where(out["splat_id"] >= 0, s.order[out["splat_id"].astype(int)], -1)
     if "blended" in features.names:
-        out["blended"] = np.where(drawn, stack.count, 0).sum(1)
-        out["blended_bound"] = error_bounds.of_count(span, stack.count, stack.count_bound, view.stop)
+        out["blended"] = np.where(contributes, ordered.count, 0).sum(1)
+        out["blended_bound"] = error_bounds.of_count(span, ordered.count, ordered.count_bound, view.stop)
     return out
 
 
 def inverse_depth(z: np.ndarray) -> np.ndarray:
-    """1 / z in the units of the depth distortion, those of a depth buffer from 0.2 to 100 m as the 2DGS
-    authors have it; what lies before the buffer counts as at its front."""
+    """1 / z in the units of the depth distortion, those of a depth buffer from 0.2 to 100 m as in 2DGS;
+    nearer depths count as the near plane of that buffer."""
     return INVERSE_DEPTH / np.maximum(z, SPREAD_NEAR)
 
 
@@ -114,7 +114,7 @@ def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
 def transmittance(
     alpha: np.ndarray, stop: float, exclusive: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transmittance before each thing, which are drawn, and what is left at the end."""
+    """Transmittance before each thing, which are contributes, and what is left at the end."""
     after = np.cumprod(1 - alpha, axis=1)
     before = shifted(after)
     live = before > stop
@@ -124,7 +124,7 @@ def transmittance(
 
 
 def _first(values: np.ndarray) -> np.ndarray:
-    """Place (k,) of the first of the largest in each row (k, n)."""
+    """Index (k,) of the first maximum of each row (k, n)."""
     return np.argmax(values, axis=1) if values.shape[1] else np.zeros(len(values), int)
 
 

@@ -1,8 +1,7 @@
-"""Which splats some neighbouring samples may see, by interval arithmetic over their forms.
+"""Culling of splats for a block of samples, by interval arithmetic over their forms.
 
-A splat that is left out has an opacity of exactly 0 at each of the samples, whatever float32 makes of its
-forms: nothing that is composited changes. Bounds of footprints, as devices have them, are not computed: what
-those lose shows in a comparison with the reference as it would without this.
+A culled splat has an opacity of exactly 0 at each of the samples, for all roundings to float32, so the result
+does not change. Bounds of footprints are not used: an error in those of a device shows in a comparison.
 """
 
 from __future__ import annotations
@@ -17,16 +16,16 @@ _SPARE = 1.001
 """relative: rounding of the intervals themselves in float64 is far less"""
 
 
-def may_see(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether any of the samples (k,) at grid positions x, y may see each splat, (n,) bool.
+def may_contribute(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Whether each splat, (n,) bool, may contribute to any of the samples (k,) at grid positions x, y.
 
-    The first splat of a plane of which any is seen is kept: the layer arrives with it.
+    The first splat of a visible coplanar group is included: it determines the position of the layer.
     """
     samples = samples_of(view, x, y)
-    if not samples.seen.any():
+    if not samples.valid.any():
         return np.zeros(len(s.order), bool)
-    seeing = samples.seen[:, 0]
-    x, y, coordinates = x[seeing], y[seeing], samples.coordinates[:, seeing, 0]
+    valid = samples.valid[:, 0]
+    x, y, coordinates = x[valid], y[valid], samples.coordinates[:, valid, 0]
     low, high = coordinates.min(1), coordinates.max(1)
     middle, half = (low + high) / 2, (high - low) / 2
     corners = Samples(_ends(x), _ends(y), np.stack([low, high], 1)[..., None], np.ones((2, 1), bool))
@@ -45,7 +44,7 @@ def may_see(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     for form in (s.forms[:, :, 0], s.forms[:, :, 1]):
         error = rounding(form)
         q_low += np.maximum(np.abs(middle @ form) - half @ np.abs(form) - error, 0) ** 2
-        # an edge of a box shows half a sample beyond it, and the gradient's terms are rounded
+        # an edge of a box is visible half a sample beyond it, and the gradient's terms are rounded
         off = d_error + 1.5 * error + 2 * ROUND * (reach @ (np.abs(d) + np.abs(form)))
         for side in (d + form, d - form):
             meets &= middle @ side + (half + reach) @ np.abs(side) + _SPARE * off > 0
@@ -53,17 +52,17 @@ def may_see(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         # of a 3D Gaussian rho falls by 1 + rho / m^2: below r2 everywhere, if m^2 is
         r2_of_disk = np.where(s.inverse_m2 * r2 < 1, r2 / (1 - s.inverse_m2 * r2), np.inf)
-        seen = (d_high > 0) & np.where(s.box, meets, q_low <= d_high**2 * r2_of_disk)
+        contributing = (d_high > 0) & np.where(s.box, meets, q_low <= d_high**2 * r2_of_disk)
     if s.screen:
         across, down = _outside(x, s.center_x), _outside(y, s.center_y)
         off = ROUND * (
             1 + sum(np.abs(_ends(at) - to).max(0) for at, to in ((x, s.anchor_x), (y, s.anchor_y)))
         )
-        seen |= np.maximum(np.hypot(across, down) / view.samples - off, 0) ** 2 <= r2 / 2
+        contributing |= np.maximum(np.hypot(across, down) / view.samples - off, 0) ** 2 <= r2 / 2
     if s.coplanar_groups is not None:
         planes, first = np.unique(s.coplanar_groups, return_index=True)
-        seen[first[(planes >= 0) & np.isin(planes, s.coplanar_groups[seen])]] = True
-    return seen
+        contributing[first[(planes >= 0) & np.isin(planes, s.coplanar_groups[contributing])]] = True
+    return contributing
 
 
 def _ends(at: np.ndarray) -> np.ndarray:
@@ -71,12 +70,12 @@ def _ends(at: np.ndarray) -> np.ndarray:
 
 
 def _outside(at: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """How far centres (n,) lie outside the range of positions."""
+    """Distance of centres (n,) from the range of positions."""
     return np.maximum(np.maximum(at.min() - center, center - at.max()), 0)
 
 
 def _steps(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """At most how far a sample's coordinates (3,) move with it by one sample in any direction."""
+    """Upper bound of the change of coordinates (3,) per sample in any direction."""
     if view.raster is None:
         return np.array([0.0, 1.0, 1.0])
     slopes = np.nan_to_num(view.raster.slopes[y.astype(int), x.astype(int)].astype(np.float64))

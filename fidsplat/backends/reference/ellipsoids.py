@@ -1,4 +1,4 @@
-"""3D Gaussians as the disks that have their picture (docs/primitives.md).
+"""3D Gaussians as disks with the same image (docs/primitives.md).
 
 `exact`: with W the map that makes the covariance the unit matrix, the disk through the centre p that is
 perpendicular to W p there. A ray's least squared distance is rho / (1 + rho / |W p|^2) of that disk's rho.
@@ -28,7 +28,7 @@ class Axes:
     normal: np.ndarray
     """unit"""
     surface: np.ndarray
-    """unit normal (n, 3) of what is seen, which is that of the disk but for `ewa`"""
+    """unit normal (n, 3) of the visible surface; that of the disk except with `ewa`"""
     area: np.ndarray
     """|a x b|"""
     third: np.ndarray

@@ -1,8 +1,8 @@
-"""What single precision may change: the certificates that go with the reference's outputs.
+"""Error bounds (certificates) of the reference's outputs for rendering in float32.
 
 A device evaluates the affine forms n_u, n_v, D of a pixel in float32, about the pixel nearest to the splat's
-centre. Interval arithmetic over their rounding gives for each fragment the least and the greatest opacity
-that it may be drawn with: far apart where a decision lies on its threshold (a rim, the near plane, the
+centre. Interval arithmetic over their rounding gives for each fragment the lowest and the highest opacity
+that it may have: far apart where a decision lies on its threshold (a rim, the near plane, the
 horizon) or where the splat is thinner than the rounding of its distance (needles, grazing disks). A pixel's
 certificate adds up what that can change in it, to first order.
 """
@@ -27,7 +27,7 @@ STOP = 5e-5
 
 @dataclass
 class Span:
-    """Between which values fragments or layers (k, n) may lie."""
+    """Intervals of fragments or layers (k, n)."""
 
     low: np.ndarray
     """opacity"""
@@ -41,7 +41,7 @@ class Span:
 
     @classmethod
     def of(cls, low: np.ndarray, high: np.ndarray, z_low: np.ndarray, z_high: np.ndarray) -> Span:
-        """With the transmittances that follow, for things in the order in which they are composited."""
+        """Intervals in compositing order, with the transmittances that follow."""
         fronts = shifted(np.cumprod(1 - high, axis=1)), shifted(np.cumprod(1 - low, axis=1))
         return cls(low, high, z_low, z_high, *fronts)
 
@@ -65,9 +65,9 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
             thick, ahead = s.inverse_m2 > 0, d_low > 0
             nearest = np.where(thick, 1 / (1 / nearest + 2 * s.inverse_m2), nearest)
             furthest = np.where(thick, 1 / (1 / furthest + 2 * s.inverse_m2), furthest)
-            least, most = s.inverse_m2 * q_low / d_high, s.inverse_m2 * q_high / d_low
-            d_high = np.where(thick & (d_high > 0), d_high + np.where(ahead, most, np.inf), d_high)
-            d_low = np.where(thick & ahead, d_low + least, d_low)
+            lowest, highest = s.inverse_m2 * q_low / d_high, s.inverse_m2 * q_high / d_low
+            d_high = np.where(thick & (d_high > 0), d_high + np.where(ahead, highest, np.inf), d_high)
+            d_low = np.where(thick & ahead, d_low + lowest, d_low)
             q_low = np.where(thick, 2 * nearest * np.maximum(d_low, 0) ** 2, q_low)
             q_high = np.where(thick, 2 * furthest * d_high**2, q_high)
             weight = np.where(thick, 2 * _WEIGHT, _WEIGHT)  # twice the roundings
@@ -81,9 +81,9 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         z_high = np.where(d_low > 0, far_dz / np.where(far_dz < 0, d_high, d_low), np.inf)
     if s.screen:
         away, off = np.sqrt(f.offset), _ROUND * (1 + f.dx + f.dy)
-        dot_low, dot_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
-        nearest = np.minimum(nearest, np.where(dot_low <= s.half_r2 + slack, dot_low, np.inf))
-        furthest = np.minimum(furthest, np.where(dot_high <= s.half_r2 - slack, dot_high, np.inf))
+        disc_low, disc_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
+        nearest = np.minimum(nearest, np.where(disc_low <= s.half_r2 + slack, disc_low, np.inf))
+        furthest = np.minimum(furthest, np.where(disc_high <= s.half_r2 - slack, disc_high, np.inf))
     low = np.exp(s.log_opacity - furthest * (1 + weight)) * (1 - weight)
     high = np.exp(s.log_opacity - nearest * (1 - weight)) * (1 + weight)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
@@ -97,22 +97,22 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
             ]
         )
         whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
-        least = whole * cover(f.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
-        most = whole * cover(f.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
-        low = np.where(s.box, np.where(must, least, 0.0), low)
-        high = np.where(s.box, np.where(may, most, 0.0), high)
+        lowest = whole * cover(f.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
+        highest = whole * cover(f.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
+        low = np.where(s.box, np.where(must, lowest, 0.0), low)
+        high = np.where(s.box, np.where(may, highest, 0.0), high)
     z_low = np.where(d_low > 0, z_low, -np.inf)
     if s.screen:
         # beyond the circle; where rounding decides what lies there, both, which are the same on the circle
-        circle = np.maximum(dot_low, HALF_RHO_OF_RANGE), np.maximum(dot_high, HALF_RHO_OF_RANGE)
+        circle = np.maximum(disc_low, HALF_RHO_OF_RANGE), np.maximum(disc_high, HALF_RHO_OF_RANGE)
         beyond = _of_mirrored_depth(s, (d_low, d_high), (q_low, q_high), (near_dz, far_dz), circle)
-        may_plane = s.printed | (plane[0] * (1 - weight) <= circle[1] * (1 + weight))
-        may_beyond = ~s.printed & ((d_low <= 0) | (plane[1] * (1 + weight) >= circle[0] * (1 - weight)))
+        may_plane = s.coplanar | (plane[0] * (1 - weight) <= circle[1] * (1 + weight))
+        may_beyond = ~s.coplanar & ((d_low <= 0) | (plane[1] * (1 + weight) >= circle[0] * (1 - weight)))
         z_low = np.minimum(np.where(may_plane, z_low, np.inf), np.where(may_beyond, beyond[0], np.inf))
         z_high = np.maximum(np.where(may_plane, z_high, -np.inf), np.where(may_beyond, beyond[1], -np.inf))
     z_low, z_high = np.clip(z_low, s.z_low, s.z_high), np.clip(z_high, s.z_low, s.z_high)
     # no ray to the plane beyond `near`: the centre's depth, of dots
-    missed = ~must & s.dot
+    missed = ~must & s.disc
     z_low = np.where(missed, np.where(may, np.minimum(z_low, s.pz), s.pz), z_low)
     z_high = np.where(missed, np.where(may, np.maximum(z_high, s.pz), s.pz), z_high)
     # the ends of the depth range are a sum and a difference of float32; of a disk that faces the camera
@@ -124,18 +124,18 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
 
 
 _Pair = tuple[np.ndarray, np.ndarray]
-"""least and most, (k, n) or (n,)"""
+"""lowest and highest, (k, n) or (n,)"""
 
 
 def _of_mirrored_depth(s: Setup, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -> _Pair:
-    """Between which depths (k, n) fragments may lie that are mirrored at a circle of half a rho, as
-    pz + circle (dz - pz d) 2 d / q, with each factor between its least and most."""
+    """Interval of depths (k, n) that are mirrored at a circle of half a rho, pz + circle (dz - pz d) 2 d / q,
+    from the intervals of its factors."""
     d = np.maximum(d[0], 0.0), np.maximum(d[1], 0.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         beyond = dz[0] - np.maximum(s.pz * d[0], s.pz * d[1]), dz[1] - np.minimum(s.pz * d[0], s.pz * d[1])
-        least, most = 2 * circle[0] * d[0] / q[1], 2 * circle[1] * d[1] / q[0]
-        low = s.pz + np.where(beyond[0] < 0, beyond[0] * most, beyond[0] * least)
-        high = s.pz + np.where(beyond[1] > 0, beyond[1] * most, beyond[1] * least)
+        lowest, highest = 2 * circle[0] * d[0] / q[1], 2 * circle[1] * d[1] / q[0]
+        low = s.pz + np.where(beyond[0] < 0, beyond[0] * highest, beyond[0] * lowest)
+        high = s.pz + np.where(beyond[1] > 0, beyond[1] * highest, beyond[1] * lowest)
     off = 2 * _ROUND * np.abs(s.pz)  # of a difference that is multiplied by a share
     return np.where(np.isnan(low), -np.inf, low - off), np.where(np.isnan(high), np.inf, high + off)
 
@@ -171,10 +171,10 @@ def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
     """What may change (k, 1) in the colour of a layer, per unit of light in front of it, whose n splats have
     optical depths (k, n) between `thin` and `thick`.
     """
-    least = thin.sum(1, keepdims=True)
+    lowest = thin.sum(1, keepdims=True)
     others = thick.sum(1, keepdims=True) - thick
     # slope of the layer's colour over one splat's depth, at most: by the light left and the others' share
-    slope = np.exp(-least) + np.minimum(1.0, others / np.maximum(least, 1e-9)) / np.maximum(least, 1.0)
+    slope = np.exp(-lowest) + np.minimum(1.0, others / np.maximum(lowest, 1e-9)) / np.maximum(lowest, 1.0)
     moved = np.minimum(1.0, slope * (thick - thin)).sum(1, keepdims=True)
     return np.where((thick > 0).sum(1, keepdims=True) > 1, moved, 0.0)
 
@@ -196,9 +196,9 @@ def of_layer_depth(
     nearest = np.where(may, z_low, np.inf).min(1, keepdims=True, initial=np.inf)
     furthest = np.where(may, z_high, -np.inf).max(1, keepdims=True, initial=-np.inf)
     nearest, furthest = np.where(none, 0.0, nearest), np.where(none, 0.0, furthest)
-    least = thin.sum(1, keepdims=True)
+    lowest = thin.sum(1, keepdims=True)
     spread = furthest - nearest
-    moved = spread * np.minimum(1.0, 2 * (thick - thin).sum(1, keepdims=True) / np.maximum(least, 1e-9))
+    moved = spread * np.minimum(1.0, 2 * (thick - thin).sum(1, keepdims=True) / np.maximum(lowest, 1e-9))
     low = np.where(share > 0, share * z_low, 0.0).sum(1, keepdims=True) - moved
     high = np.where(share > 0, share * z_high, 0.0).sum(1, keepdims=True) + moved
     drawn = share.any(1, keepdims=True)
@@ -234,7 +234,7 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
     nearest = np.minimum.accumulate(near[:, ::-1], axis=1)[:, ::-1]
     dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
     light = np.cumsum(dimmed, axis=1) - dimmed
-    least = span.front_low.copy()
+    lowest = span.front_low.copy()
     pairs = []
     for apart in range(1, m):
         first, second = np.s_[:, :-apart], np.s_[:, apart:]
@@ -244,21 +244,21 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
         meet &= ~(exact[first] & exact[second] & (near[first] == near[second]))
         pairs.append((first, second, meet))
         light[second] -= np.where(meet, dimmed[first], 0.0)
-        least[first] *= np.where(meet, 1 - span.high[second], 1.0)
-    most = np.exp(light) if pairs else span.front_high
+        lowest[first] *= np.where(meet, 1 - span.high[second], 1.0)
+    highest = np.exp(light) if pairs else span.front_high
     bound = np.zeros(k)
     for first, second, meet in pairs:
-        front = np.minimum(most[first], most[second])
+        front = np.minimum(highest[first], highest[second])
         bound += np.where(meet, front * span.high[first] * span.high[second], 0.0).sum(1)
-    return replace(span, front_low=least, front_high=most), bound
+    return replace(span, front_low=lowest, front_high=highest), bound
 
 
 def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
-    """Nearest and furthest depth (k,) that may be seen; sum of weights times what each may move."""
-    seen = span.front_high * span.high > 0
+    """Nearest and furthest possible depth (k,), and the sum of weights times the error of each depth."""
+    possible = span.front_high * span.high > 0
     return {
-        "nearest": np.where(seen, span.z_low, np.inf).min(1, initial=np.inf),
-        "furthest": np.where(seen, span.z_high, -np.inf).max(1, initial=-np.inf),
+        "nearest": np.where(possible, span.z_low, np.inf).min(1, initial=np.inf),
+        "furthest": np.where(possible, span.z_high, -np.inf).max(1, initial=-np.inf),
         "depth_moved": (weight * np.maximum(span.z_high - z, z - span.z_low)).sum(1),
     }
 

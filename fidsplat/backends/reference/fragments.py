@@ -1,4 +1,4 @@
-"""Fragments: what samples see of each splat before compositing."""
+"""Fragments: intersections of samples' rays with splats, before compositing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fidsplat.backends.view import View
 _NO_EDGES = np.zeros((4, 0))
 HALF_RHO_OF_RANGE = math.log(255)
 """where a splat is 1/255 of its opacity"""
-DARKEST = 24 * math.log(2)
+MAX_OPTICAL_DEPTH = 24 * math.log(2)
 """optical depth at which float32 leaves no light"""
 
 
@@ -26,14 +26,14 @@ class Fragments:
     """distance from the anchor, samples"""
     dy: np.ndarray
     away: np.ndarray
-    """(3, k, n) at most how far from the anchor, in each coordinate of the samples"""
+    """(3, k, n) upper bound of the distance from the anchor, by coordinate"""
     n_u: np.ndarray
     n_v: np.ndarray
     d: np.ndarray
     dz: np.ndarray
     """d times the depth; (n,) unless rays are parallel"""
     offset: np.ndarray
-    """squared distance from the projected centre, pixels; infinite where the sample sees nothing"""
+    """squared distance from the projected centre, pixels; infinite where the sample has no ray"""
     alpha: np.ndarray
     z: np.ndarray
     edges: np.ndarray
@@ -50,18 +50,18 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
     dz = s.z_numerator
     if s.depth_forms is not None:
         dz = c0 * s.depth_forms[0] + c1 * s.depth_forms[1] + c2 * s.depth_forms[2]
-    drawn_d, q = bulged(s.inverse_m2, d, n_u * n_u + n_v * n_v)
-    inside = (q <= 2 * s.half_r2 * drawn_d * drawn_d) & (drawn_d > 0) & (drawn_d * view.near <= dz)
+    d_bulged, q = bulged(s.inverse_m2, d, n_u * n_u + n_v * n_v)
+    inside = (q <= 2 * s.half_r2 * d_bulged * d_bulged) & (d_bulged > 0) & (d_bulged * view.near <= dz)
     offset = ((x - s.center_x) ** 2 + (y - s.center_y) ** 2) / view.samples**2
-    offset = np.where(samples.seen, offset, np.inf)
+    offset = np.where(samples.valid, offset, np.inf)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        half_rho = np.where(inside, q / (2 * drawn_d * drawn_d), np.inf)
-        z = dz / drawn_d
+        half_rho = np.where(inside, q / (2 * d_bulged * d_bulged), np.inf)
+        z = dz / d_bulged
         if s.screen:
-            # what lies beyond the circle with the dot's rho is mirrored at it
+            # depths beyond the circle of the disc are mirrored at it
             circle = np.maximum(offset, HALF_RHO_OF_RANGE)
-            mirrored = s.pz + circle * (dz - s.pz * drawn_d) * (2 * drawn_d / q)
-            z = np.where((q <= 2 * circle * drawn_d**2) | s.printed, z, mirrored)
+            mirrored = s.pz + circle * (dz - s.pz * d_bulged) * (2 * d_bulged / q)
+            z = np.where((q <= 2 * circle * d_bulged**2) | s.coplanar, z, mirrored)
     if s.screen:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
@@ -69,14 +69,14 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
         visible = (d > 0) & (d * view.near <= dz)
         whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
         alpha = np.where(s.box, np.where(visible, whole * cover(edges, n_u, n_v, d, 0.0), 0.0), alpha)
-    met = (drawn_d > 0) & (drawn_d * view.near <= dz)
-    z = np.where(met, np.clip(z, s.z_low, s.z_high), s.pz)
+    hit = (d_bulged > 0) & (d_bulged * view.near <= dz)
+    z = np.where(hit, np.clip(z, s.z_low, s.z_high), s.pz)
     dx, dy, away = np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), away_of(view, samples, s.anchors)
     return Fragments(dx, dy, away, n_u, n_v, d, dz, offset, alpha, z, edges, edge_terms)
 
 
 def bulged(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """D and n_u^2 + n_v^2 (k, n) of 3D Gaussians, from those of the disks that stand for them: rho = q / D^2
+    """D and n_u^2 + n_v^2 (k, n) of 3D Gaussians, from those of their disks: rho = q / D^2
     falls, and D, by which depths are divided, grows by 1 + rho / m^2. inverse_m2 (n,): 0 for disks."""
     if not inverse_m2.any():
         return d, q
@@ -86,7 +86,7 @@ def bulged(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.nda
 
 
 def cover(edges: np.ndarray, n_u: np.ndarray, n_v: np.ndarray, d: np.ndarray, shift) -> np.ndarray:
-    """What boxes cover of samples (k, n), 0 to 1, every edge moved outwards by `shift` (broadcast to (4, k,
+    """Coverage of samples by boxes (k, n), 0 to 1, every edge moved outwards by `shift` (broadcast to (4, k,
     n)).
 
     `shift` is in samples, or one array for each of the edges.
@@ -101,14 +101,14 @@ def cover(edges: np.ndarray, n_u: np.ndarray, n_v: np.ndarray, d: np.ndarray, sh
 
 
 def optical_depth(alpha: np.ndarray) -> np.ndarray:
-    """-ln(1 - alpha), at most `DARKEST`."""
-    return np.minimum(-np.log1p(-np.clip(alpha, 0.0, 1 - 2.0**-24)), DARKEST)
+    """-ln(1 - alpha), at most `MAX_OPTICAL_DEPTH`."""
+    return np.minimum(-np.log1p(-np.clip(alpha, 0.0, 1 - 2.0**-24)), MAX_OPTICAL_DEPTH)
 
 
 def shifted(after: np.ndarray, last: bool = False) -> np.ndarray:
-    """What is in front of each fragment (k, n), from what is left behind each.
+    """Transmittance in front of each fragment (k, n), from that behind each.
 
-    last: also of what comes after them all, (k, n + 1).
+    last: append the final transmittance, (k, n + 1).
     """
     before = np.concatenate([np.ones((len(after), 1)), after], axis=1)
     return before if last else before[:, :-1]

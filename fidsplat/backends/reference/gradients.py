@@ -1,4 +1,4 @@
-"""The reference's derivatives: of the picture in float64, its decisions as they were."""
+"""Gradients of the reference in float64, with the decisions of the forward pass held constant."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once
 
 
 class ReferenceGradients(GradientPipeline):
-    """Pictures of the reference, and their derivatives."""
+    """The reference pipeline with its gradients."""
 
     def __init__(self, pipeline: Pipeline, features: FeatureSet) -> None:
         self._pipeline, self._features = pipeline, features
-        self._drawn: tuple[Images, FrozenPicture] | None = None
+        self._last: tuple[Images, FrozenFrame] | None = None
 
     def forward(self, resident: Any, view: View, waits: bool = True) -> Images:
         """Render one view."""
         images = self._pipeline.render(resident, view)
-        self._drawn = images, FrozenPicture(resident.cloud, view, self._features)
+        self._last = images, FrozenFrame(resident.cloud, view, self._features)
         return images
 
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Gradients in float64."""
         check_gradients(self._features, gradients)
-        if self._drawn is None or self._drawn[0] is not images:
+        if self._last is None or self._last[0] is not images:
             raise InputError(NOT_THE_LAST)
-        picture = self._drawn[1]
-        return picture.backward({name: np.asarray(array, np.float64) for name, array in gradients.items()})
+        frame = self._last[1]
+        return frame.backward({name: np.asarray(array, np.float64) for name, array in gradients.items()})
 
 
-class FrozenPicture:
-    """One picture as a function of what gradients are taken by, with its decisions as they were."""
+class FrozenFrame:
+    """A frame as a differentiable function of its parameters, with its decisions held constant."""
 
     def __init__(self, cloud: Any, view: View, features: FeatureSet) -> None:
         self.parameters = Parameters.of(cloud, view)
@@ -58,14 +58,14 @@ class FrozenPicture:
             self._blocks.append((*at, decide(self._setup, view, *at)))
 
     def images(self, parameters: Parameters) -> dict[str, np.ndarray]:
-        """The output images, float64, of other parameters."""
+        """Output images, float64, of other parameters."""
         parts = [_images(blend.samples, made, parameters) for blend, made in self._blend(parameters)]
         height, width = self._view.height, self._view.width
         whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return {name: image.reshape(height, width, *image.shape[1:]) for name, image in whole.items()}
 
     def backward(self, gradients: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Derivatives of a loss by the parameters, and `screen`, from those by the images."""
+        """Gradients by the parameters, and `screen`, from those by the images."""
         view, parameters = self._view, self.parameters
         flat = {}
         for name in GRADIENT_OUTPUTS:
@@ -74,7 +74,7 @@ class FrozenPicture:
             flat[name] = given.reshape(view.height * view.width, *given.shape[2:])
         slopes, by_background, start = Placed.zeros(len(parameters.means)), np.zeros(3), 0
         for blend, made in self._blend(parameters):
-            rows = slice(start, start + len(made.shown))
+            rows = slice(start, start + len(made.covered))
             start = rows.stop
             samples = blend.samples
             here = {name: array[rows] for name, array in flat.items()}
@@ -83,7 +83,7 @@ class FrozenPicture:
             for name, values in vars(found).items():
                 getattr(slopes, name)[...] += values
         placed = place(parameters, view)
-        # as the 2DGS authors have it: the derivative by the centre's place in the picture, in half pictures
+        # as in 2DGS: the gradient by the projected centre, in half images
         slope_x, slope_y = slopes.p[:, 0] / view.focal_x, slopes.p[:, 1] / view.focal_y
         screen = 0.5 * placed.p[:, 2] * np.hypot(view.width * slope_x, view.height * slope_y)
         return {
@@ -100,24 +100,26 @@ class FrozenPicture:
 def _images(samples: Samples, made: Decisions, parameters: Parameters) -> dict[str, np.ndarray]:
     """Pixels (k,) or (k, 3) from their samples."""
     length = np.linalg.norm(samples.normal, axis=1)
-    seen = made.shown & (length > 0)
+    has_normal = made.covered & (length > 0)
     return {
         "rgb": samples.rgb + samples.t[:, None] * parameters.background,
         "alpha": 1 - samples.t,
-        "depth": np.where(made.shown, samples.depth / np.where(made.shown, samples.weight, 1), 0.0),
+        "depth": np.where(made.covered, samples.depth / np.where(made.covered, samples.weight, 1), 0.0),
         "distortion": samples.weight * samples.squares - samples.inverse**2,
-        "normal": np.where(seen[:, None], samples.normal / np.where(seen, length, 1)[:, None], 0.0),
+        "normal": np.where(
+            has_normal[:, None], samples.normal / np.where(has_normal, length, 1)[:, None], 0.0
+        ),
     }
 
 
 def _images_backward(
     by: Mapping[str, np.ndarray], samples: Samples, made: Decisions, parameters: Parameters
 ) -> Samples:
-    """Derivatives of a loss by samples, from those by pixels."""
-    weight = np.where(made.shown, samples.weight, np.inf)
-    depth = np.where(made.shown, samples.depth / weight, 0.0)
+    """Gradients by samples, from those by pixels."""
+    weight = np.where(made.covered, samples.weight, np.inf)
+    depth = np.where(made.covered, samples.depth / weight, 0.0)
     length = np.linalg.norm(samples.normal, axis=1)
-    length = np.where(made.shown & (length > 0), length, np.inf)[:, None]
+    length = np.where(made.covered & (length > 0), length, np.inf)[:, None]
     normal = samples.normal / length
     return Samples(
         rgb=by["rgb"],

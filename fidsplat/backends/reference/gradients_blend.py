@@ -1,4 +1,4 @@
-"""Samples as functions of placed splats, with the picture's decisions as they were; and their derivatives.
+"""Samples as functions of placed splats, with the frame's decisions held constant; and their derivatives.
 
 Where a ray meets a splat's plane is computed here from the ray and the plane's normal, not from the forms of
 the set-up, which devices have: so each finds the mistakes of the other.
@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.reference.blend import INVERSE_DEPTH, SPREAD_NEAR, inverse_depth, transmittance
+from fidsplat.backends.reference.coverage import MIN_ALPHA
 from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, fragments_of
 from fidsplat.backends.reference.gradients_scene import Placed
 from fidsplat.backends.reference.optics import rays_of
 from fidsplat.backends.reference.setup import Setup
-from fidsplat.backends.reference.shown import LEAST_ALPHA
 from fidsplat.backends.view import View
 
 
@@ -25,10 +25,10 @@ class Decisions:
 
     order: np.ndarray
     """(m,) int: the cloud's splats, nearest first"""
-    drawn: np.ndarray
+    contributes: np.ndarray
     """in reach, and light was left"""
-    by_dot: np.ndarray
-    """the low-pass's dot is the larger weight"""
+    by_disc: np.ndarray
+    """the disc of the low-pass is the larger weight"""
     clamped: np.ndarray
     """at the ceiling of opacities"""
     missed: np.ndarray
@@ -36,29 +36,29 @@ class Decisions:
     mirrored: np.ndarray
     """the depth is mirrored at a circle"""
     wide: np.ndarray
-    """that circle is the dot's, not the one where the splat is 1/255 of its opacity"""
-    shown: np.ndarray
+    """that circle is the disc's, not the one where the splat is 1/255 of its opacity"""
+    covered: np.ndarray
     """(k,): enough is covered for depths and normals"""
 
 
 def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
-    """The decisions of the picture at samples (k,) at grid positions x, y."""
+    """The decisions of the forward pass at samples (k,) at grid positions x, y."""
     f = fragments_of(s, view, x, y)
     _, live, final = transmittance(f.alpha, view.stop, s.exclusive)
     q = f.n_u**2 + f.n_v**2
     inside = (q <= 2 * s.half_r2 * f.d**2) & (f.d > 0) & (f.d * view.near <= f.dz)
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = np.where(inside, q / (2 * f.d**2), np.inf)
-    dot = np.where(f.offset <= s.half_r2, f.offset, np.inf) if s.screen else np.full_like(plane, np.inf)
+    disc = np.where(f.offset <= s.half_r2, f.offset, np.inf) if s.screen else np.full_like(plane, np.inf)
     return Decisions(
         order=s.order,
-        drawn=live & (f.alpha > 0),
-        by_dot=dot < plane,
-        clamped=s.log_opacity - np.minimum(plane, dot) > np.log(view.ceiling),
+        contributes=live & (f.alpha > 0),
+        by_disc=disc < plane,
+        clamped=s.log_opacity - np.minimum(plane, disc) > np.log(view.ceiling),
         missed=(f.d <= 0) | (f.d * view.near > f.dz),
         mirrored=s.screen & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * f.d**2),
         wide=f.offset > HALF_RHO_OF_RANGE,
-        shown=1 - final >= LEAST_ALPHA,
+        covered=1 - final >= MIN_ALPHA,
     )
 
 
@@ -102,19 +102,19 @@ class Blend:
             self._u = (self._off * self._unit_a).sum(2) / self._su
             self._v = (self._off * self._unit_b).sum(2) / self._sv
             pz = self._p[:, 2]
-            self._dot_x = x[:, None] - (view.focal_x * self._p[:, 0] / pz + view.center_x)
-            self._dot_y = y[:, None] - (view.focal_y * self._p[:, 1] / pz + view.center_y)
-            dot, plane = self._dot_x**2 + self._dot_y**2, (self._u**2 + self._v**2) / 2
-            half_rho = np.where(made.by_dot, dot, plane)
+            self._disc_x = x[:, None] - (view.focal_x * self._p[:, 0] / pz + view.center_x)
+            self._disc_y = y[:, None] - (view.focal_y * self._p[:, 1] / pz + view.center_y)
+            disc, plane = self._disc_x**2 + self._disc_y**2, (self._u**2 + self._v**2) / 2
+            half_rho = np.where(made.by_disc, disc, plane)
             # of the way from the centre's depth to that on the plane
-            circle = np.where(made.wide, dot, HALF_RHO_OF_RANGE)
+            circle = np.where(made.wide, disc, HALF_RHO_OF_RANGE)
             self._share = np.where(made.mirrored, circle / plane, 1.0)
             self._plane = plane
             z = pz + self._share * (self._z_plane - pz)
             opacity = np.where(made.clamped, view.ceiling, np.exp(log_opacity - half_rho))
-        self._z = np.where(made.drawn, np.where(made.missed, pz, z), 0.0)
-        self._inverse = np.where(made.drawn, inverse_depth(self._z), 0.0)
-        self._alpha = np.where(made.drawn, opacity, 0.0)
+        self._z = np.where(made.contributes, np.where(made.missed, pz, z), 0.0)
+        self._inverse = np.where(made.contributes, inverse_depth(self._z), 0.0)
+        self._alpha = np.where(made.contributes, opacity, 0.0)
         after = np.cumprod(1 - self._alpha, axis=1)
         self._before = np.concatenate([np.ones((len(x), 1)), after], axis=1)
         self._weight = self._before[:, :-1] * self._alpha
@@ -139,11 +139,11 @@ class Blend:
         by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
         by_inverse = np.where(self._z > SPREAD_NEAR, by_inverse, 0.0)
         by_z = self._weight * (by.depth[:, None] - by_inverse * self._inverse**2 / INVERSE_DEPTH)
-        by_alpha = np.where(made.drawn, self._by_opacity(by, facing), 0.0)
+        by_alpha = np.where(made.contributes, self._by_opacity(by, facing), 0.0)
         by_log = np.where(made.clamped, 0.0, by_alpha * self._alpha)
 
-        met = made.drawn & ~made.missed
-        on_plane, mirrored = made.drawn & ~made.by_dot, met & made.mirrored
+        met = made.contributes & ~made.missed
+        on_plane, mirrored = made.contributes & ~made.by_disc, met & made.mirrored
         share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             by_share = np.where(mirrored, by_z * (self._z_plane - self._p[:, 2]), 0.0)
@@ -151,8 +151,8 @@ class Blend:
             by_plane -= np.where(on_plane, by_log, 0.0)
             by_u = np.where(on_plane | met, by_plane * self._u / self._su, 0.0)
             by_v = np.where(on_plane | met, by_plane * self._v / self._sv, 0.0)
-            by_dot = np.where(made.drawn & made.by_dot, by_log, 0.0)
-            by_dot -= np.where(mirrored & made.wide, by_share / self._plane, 0.0)
+            by_disc = np.where(made.contributes & made.by_disc, by_log, 0.0)
+            by_disc -= np.where(mirrored & made.wide, by_share / self._plane, 0.0)
             off = np.where((on_plane | met)[..., None], self._off, 0.0)
             by_off = by_u[..., None] * self._unit_a + by_v[..., None] * self._unit_b
             by_plane_z = (by_off * self._rays).sum(2) + by_z * share
@@ -162,9 +162,9 @@ class Blend:
         by_b = np.einsum("kn,knc->nc", by_v, off) + np.cross(by_normal, self._unit_a)
         by_p = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
 
-        # the dot, at the centre's image
-        by_x = 2 * np.where(by_dot != 0, by_dot * self._dot_x, 0.0).sum(0)
-        by_y = 2 * np.where(by_dot != 0, by_dot * self._dot_y, 0.0).sum(0)
+        # the disc, at the centre's image
+        by_x = 2 * np.where(by_disc != 0, by_disc * self._disc_x, 0.0).sum(0)
+        by_y = 2 * np.where(by_disc != 0, by_disc * self._disc_y, 0.0).sum(0)
         x, y, z = self._p.T
         by_p += np.stack(
             [

@@ -10,12 +10,12 @@ from fidsplat.backends.view import View
 from fidsplat.splats.cloud import SplatCloud, sh_basis
 
 _SMALLEST = float(np.float32(1e-20))
-"""metres: scales below it are drawn as that"""
+"""metres: smallest scale that is rendered"""
 
 
 @dataclass
 class Parameters:
-    """What a picture is differentiated by."""
+    """Parameters by which a frame is differentiated."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -30,7 +30,7 @@ class Parameters:
 
     @classmethod
     def of(cls, cloud: SplatCloud, view: View) -> Parameters:
-        """Those of a picture, in float64; its pose is 0."""
+        """Parameters of a frame in float64; the pose is 0."""
         arrays = (cloud.means, cloud.quats, cloud.scales, cloud.opacities)
         color = cloud.colors if cloud.colors is not None else cloud.plain_colors
         sh = None if color is not None else cloud.sh
@@ -53,7 +53,7 @@ class Placed:
     p: np.ndarray
     """(n, 3) centres [m]"""
     scales: np.ndarray
-    """(n, 2) as they are drawn [m]"""
+    """(n, 2) as rendered [m]"""
     log_opacity: np.ndarray
     rgb: np.ndarray
 
@@ -75,9 +75,12 @@ def motion_of(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def place(parameters: Parameters, view: View) -> Placed:
-    """The splats as the camera has them."""
-    turn, shift = motion_of(parameters.pose)
-    rotation, translation = turn @ view.rotation, turn @ view.translation + shift
+    """Transform splats to the camera frame."""
+    rotation_offset, translation_offset = motion_of(parameters.pose)
+    rotation, translation = (
+        rotation_offset @ view.rotation,
+        rotation_offset @ view.translation + translation_offset,
+    )
     tangent_u, tangent_v = _tangents(parameters.quats)
     with np.errstate(divide="ignore"):
         log_opacity = np.log(parameters.opacities)
@@ -93,17 +96,17 @@ def place(parameters: Parameters, view: View) -> Placed:
 
 def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: Placed) -> dict:
     """Derivatives by the parameters, where their pose is 0, from those by what is placed."""
-    turn = view.rotation
+    rotation = view.rotation
     by_color, by_ray = _rgb_backward(parameters, _eye(parameters, view), slopes.rgb)
     pairs = [(slopes.unit_a, placed.unit_a), (slopes.unit_b, placed.unit_b), (slopes.p, placed.p)]
     turned = sum(np.cross(at, slope).sum(0) for slope, at in pairs)
     # a motion of the camera moves its centre against the motion, and turns around it
-    moved = slopes.p.sum(0) + by_ray.sum(0) @ turn.T
+    moved = slopes.p.sum(0) + by_ray.sum(0) @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
         by_opacity = slopes.log_opacity / parameters.opacities
     return {
-        "means": slopes.p @ turn + by_ray,
-        "quats": _tangents_backward(parameters.quats, slopes.unit_a @ turn, slopes.unit_b @ turn),
+        "means": slopes.p @ rotation + by_ray,
+        "quats": _tangents_backward(parameters.quats, slopes.unit_a @ rotation, slopes.unit_b @ rotation),
         "scales": np.where(parameters.scales >= _SMALLEST, slopes.scales, 0.0),
         "opacities": np.where(slopes.log_opacity != 0, by_opacity, 0.0),
         "sh" if parameters.colors is None else "colors": by_color,
@@ -137,8 +140,8 @@ def _tangents_backward(quats: np.ndarray, by_u: np.ndarray, by_v: np.ndarray) ->
 
 
 def _eye(parameters: Parameters, view: View) -> np.ndarray:
-    turn, shift = motion_of(parameters.pose)
-    return view.eye - view.rotation.T @ (turn.T @ shift)
+    rotation_offset, translation_offset = motion_of(parameters.pose)
+    return view.eye - view.rotation.T @ (rotation_offset.T @ translation_offset)
 
 
 def _rgb(parameters: Parameters, eye: np.ndarray) -> np.ndarray:

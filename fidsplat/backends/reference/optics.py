@@ -1,4 +1,4 @@
-"""How the reference's samples look into the scene: the forms of a splat for each kind of camera.
+"""Cameras of the reference: rays of samples, and the affine forms of a splat for each camera model.
 
 A sample has three coordinates, in which the numerators n_u, n_v and the denominator D of a splat are linear:
 1, x, y for a pinhole or parallel rays, and X, Y, Z of the sample's float32 ray behind a lens.
@@ -25,8 +25,8 @@ class Samples:
     x: np.ndarray
     y: np.ndarray
     coordinates: np.ndarray
-    """0 where nothing is seen"""
-    seen: np.ndarray
+    """0 where there is no ray"""
+    valid: np.ndarray
     """(k, 1) bool"""
 
 
@@ -36,9 +36,9 @@ def samples_of(view: View, x: np.ndarray, y: np.ndarray) -> Samples:
         one = np.ones_like(x)
         return Samples(x[:, None], y[:, None], np.stack([one, x, y])[:, :, None], one[:, None] > 0)
     rays = view.raster.rays[y.astype(int), x.astype(int)].astype(np.float64)
-    seen = np.isfinite(rays[:, :1])
-    coordinates = np.where(seen, rays, 0.0).T[:, :, None]
-    return Samples(x[:, None], y[:, None], coordinates, seen)
+    valid = np.isfinite(rays[:, :1])
+    coordinates = np.where(valid, rays, 0.0).T[:, :, None]
+    return Samples(x[:, None], y[:, None], coordinates, valid)
 
 
 def rays_of(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -61,8 +61,8 @@ def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
     none."""
     if view.along_ray or view.parallel:
         return np.ones_like(x)
-    rays, seen = rays_of(view, x.ravel(), y.ravel())
-    return np.where(seen, np.linalg.norm(rays, axis=1), 1.0).reshape(x.shape)
+    rays, valid = rays_of(view, x.ravel(), y.ravel())
+    return np.where(valid, np.linalg.norm(rays, axis=1), 1.0).reshape(x.shape)
 
 
 def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -84,8 +84,7 @@ def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[n
 
 
 def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the centres p (n, 3) fall [samples]; infinite where that is not `known` or the lens does not see
-    it."""
+    """Image positions of centres p (n, 3) [samples]; infinite where not `known` or without an image."""
     if view.raster is not None or view.parallel:
         image = p[:, :2] if view.raster is None else view.raster.lens.image(p)
         x, y = (image * (view.focal_x, view.focal_y) + (view.center_x, view.center_y)).T
@@ -98,16 +97,16 @@ def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray
 
 
 def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
-    """Of the places where points p (n, 3) fall [samples] by their coordinates, (n, 2, 3); NaN where a lens
-    does not see them."""
+    """Jacobian (n, 2, 3) of the image positions [samples] of points p (n, 3); NaN where a lens has no image
+    of them."""
     if view.lens is None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y, ahead = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], 1 / p[:, 2]
             none = np.zeros_like(x)
             slopes = np.stack([ahead, none, -x * ahead, none, ahead, -y * ahead], 1).reshape(-1, 2, 3)
     else:
-        seen = np.isfinite(view.lens.image(p)[:, 0])[:, None, None]
-        slopes = np.where(seen, view.lens.derivative(p), np.nan)
+        valid = np.isfinite(view.lens.image(p)[:, 0])[:, None, None]
+        slopes = np.where(valid, view.lens.derivative(p), np.nan)
     return slopes * np.array([[view.focal_x], [view.focal_y]])
 
 
@@ -144,8 +143,8 @@ def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tup
 
 
 def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Coordinates (3, n) about which devices keep the forms of splats with the anchor pixel (x, y); NaN where
-    that is not known."""
+    """Coordinates (3, n) about which devices store the forms of splats with anchor pixels (x, y); NaN where
+    unknown."""
     if view.raster is None:
         return np.stack([np.ones_like(x), x, y])
     known = (x > 0) & (y > 0)
@@ -154,9 +153,9 @@ def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def away_of(view: View, samples: Samples, anchors: np.ndarray) -> np.ndarray:
-    """At most how far (3, k, n) samples are from the anchors, in each coordinate."""
+    """Upper bound (3, k, n) of the distance of samples from the anchors, by coordinate."""
     away = np.abs(samples.coordinates - anchors[:, None, :])
     if view.raster is not None:
         furthest = np.nanmax(np.abs(view.raster.rays), axis=(0, 1), initial=1.0)[:, None, None]
         away = np.where(np.isnan(away), np.abs(samples.coordinates) + furthest, away)
-    return np.where(samples.seen, away, 0.0)
+    return np.where(samples.valid, away, 0.0)

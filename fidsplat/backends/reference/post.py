@@ -1,4 +1,4 @@
-"""What changes rgb on its way out: what is seen behind everything, and the steps of the sensor."""
+"""What changes rgb on its way out: what is valid behind everything, and the steps of the sensor."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from fidsplat.backends.view import View
 from fidsplat.capture.environment import Gradient, Panorama
 
 _ROUND = 2e-6
-"""what float32 may change in a value, per unit, before a step that may magnify it"""
+"""relative error of float32 before each step"""
 
 
 def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (k, 3) that samples at x, y (k,) on the grid see behind everything, 0 where they see nothing,
-    and what float32 may change in them (k,)."""
+    """Background colours (k, 3) at samples with grid positions x, y (k,), 0 without a ray, and their error
+    bounds (k,) in float32."""
     around = view.surroundings
     assert around is not None
-    rays, seen = rays_of(view, x, y)
-    rays = np.where(seen[:, None], rays, 1.0) @ view.rotation
+    rays, valid = rays_of(view, x, y)
+    rays = np.where(valid[:, None], rays, 1.0) @ view.rotation
     if isinstance(around, Gradient):
         up = np.array(around.up) / np.linalg.norm(around.up)
         share = np.clip(0.5 + 0.5 * (rays @ up) / np.linalg.norm(rays, axis=1), 0, 1)[:, None]
@@ -28,11 +28,11 @@ def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
         )
     else:
         colors, bound = _panorama_at(around, rays)
-    return np.where(seen[:, None], colors, 0.0), np.where(seen, bound, 0.0)
+    return np.where(valid[:, None], colors, 0.0), np.where(valid, bound, 0.0)
 
 
-def brightest(around: Gradient | Panorama | None) -> float:
-    """The largest value that is seen behind everything."""
+def max_value(around: Gradient | Panorama | None) -> float:
+    """Largest absolute value of a background."""
     if around is None:
         return 0.0
     colors = (around.top, around.bottom) if isinstance(around, Gradient) else around.image

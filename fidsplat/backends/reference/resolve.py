@@ -1,4 +1,4 @@
-"""Pixels from their samples."""
+"""Resolving: pixels from their samples."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fidsplat.backends.reference.optics import ray_lengths
-from fidsplat.backends.reference.post import apply_sensor, brightest
+from fidsplat.backends.reference.post import apply_sensor, max_value
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
@@ -29,7 +29,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     if features.posts or view.surroundings is not None:
         steps = tuple(step for step in features.posts if step != "fog")
         most = max(1.0, float(np.abs(out["rgb"]).max(initial=1.0)), float(np.abs(view.background).max()))
-        unsure = out["certificate"] * max(most, brightest(view.surroundings))
+        unsure = out["certificate"] * max(most, max_value(view.surroundings))
         if view.surroundings is not None:
             unsure = unsure + samples["behind_bound"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
@@ -39,12 +39,12 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         out["alpha"] = 1 - t
     if "distortion" in features.names:
         out["distortion"] = samples["distortion"].mean(1)
-    covered, unsure = samples["shown"], np.asarray(samples["shown_may_flip"].any(1))
+    covered, unsure = samples["covered"], np.asarray(samples["covered_may_flip"].any(1))
     bound_covered = np.where(covered, bound, 0.0).sum(1)
     # of the ray through each sample, per metre of depth
     length = ray_lengths(samples["x"], samples["y"], view)
     if "depth" in features.names:
-        # samples whose rays differ in length share out what moves, too
+        # rays of samples may differ in length
         for name, along in (("depth", 1.0), ("distance", length)):
             depth, off, weight = (
                 np.where(covered, samples[key], 0.0) for key in ("depth", "depth_moved", "weight")
@@ -90,7 +90,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """The lower median (k,) of those of (k, n) above 0; 0 where there is none."""
+    """Lower median (k,) of the positive values (k, n); 0 where there is none."""
     medians = np.sort(np.where(values > 0, values, math.inf), axis=1)
     hits = np.isfinite(medians).sum(1)
     middle = np.take_along_axis(medians, np.maximum((hits - 1) // 2, 0)[:, None], 1)[:, 0]
@@ -98,13 +98,13 @@ def _median(values: np.ndarray) -> np.ndarray:
 
 
 def _nearest(values: np.ndarray) -> np.ndarray:
-    """The smallest (k,) of those of (k, n) above 0; 0 where there is none."""
+    """Smallest positive value (k,) of (k, n); 0 where there is none."""
     nearest = np.where(values > 0, values, math.inf).min(1)
     return np.where(np.isfinite(nearest), nearest, 0.0)
 
 
 def _where_covered(bound: np.ndarray, covered: np.ndarray, unsure: np.ndarray) -> np.ndarray:
-    """What may change (k,) in a plane that is 0 where no sample (k, n) is covered of, which may flip."""
+    """Error bound (k,) of an image that is 0 where no sample (k, n) is covered; infinite where `unsure`."""
     return np.where(unsure, math.inf, np.where(covered.any(1), bound, 0.0))
 
 

@@ -15,7 +15,7 @@ from fidsplat.splats.cloud import SplatCloud, sh_basis
 
 
 class Setup:
-    """What the samples need of the splats that may be drawn; float64 arrays (n, ...) in depth order."""
+    """Camera-space splats that are not culled; float64 arrays (n, ...) in depth order."""
 
     def __init__(self, cloud: SplatCloud, view: View, features: FeatureSet) -> None:
         q = cloud.quats.astype(np.float64)
@@ -58,11 +58,11 @@ class Setup:
             reach, box_reach = np.hypot(a[:, 2], b[:, 2]), np.abs(a[:, 2]) + np.abs(b[:, 2])
             reach = np.hypot(reach, shape.third[:, 2])
         radius = np.sqrt(np.maximum(2 * half_r2, 0))
-        # what a low-pass's dot shows, whatever the cut-off
+        # the disc of the low-pass, at any cut-off
         within = np.maximum(radius, _RANGE_RADIUS if "lowpass_screen" in features.slots else 0.0) * reach
         within = np.where(box, box_reach, within)
         reach = np.where(box, box_reach, radius * reach)
-        drawn = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
+        visible = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
         self.by_depth = "compose_ordered" not in features.slots
         """whether fragments are composited by their own depth"""
         planes, nearest = None, np.full(len(cloud), -np.inf)
@@ -92,18 +92,18 @@ class Setup:
             planes = table.index
             nearest = np.where(planes < 0, nearest, np.append(table.keys(view), 0)[planes])
             self.key = np.where(planes < 0, self.key, nearest.astype(np.float32))
-        drawn &= np.isfinite(shape.inverse_m2)  # else the camera is at its centre: nothing is ahead
-        order = np.flatnonzero(drawn)
+        visible &= np.isfinite(shape.inverse_m2)  # else the camera is at its centre
+        order = np.flatnonzero(visible)
         order = order[np.argsort(self.key[order], kind="stable")]
         self.order = order
 
         normal, self.turned = shape.normal[order], shape.turned[order]
         self.inverse_m2 = shape.inverse_m2[order]
-        """above 0 for 3D Gaussians that are drawn exactly"""
+        """above 0 for 3D Gaussians with `ellipsoid_exact`"""
         a, b, p, area = a[order], b[order], p[order], area[order]
         self.log_opacity, self.half_r2 = log_opacity[order], half_r2[order]
         self.z_low, self.z_high = z_low[order], z_high[order]
-        """between which the depths of fragments lie"""
+        """range of the fragments' depths"""
         self.labels = cloud.labels[order]
         self.pz = depth[order]
         # the plane's height above the camera's centre decides its side, and whether it is edge-on
@@ -122,9 +122,9 @@ class Setup:
         ahead = self.pz >= view.near
         middle_x, middle_y = optics.centers_of(view, p, ahead)
         ahead &= np.isfinite(middle_x)
-        self.dot = ahead & ~unfiltered[order]  # the low-pass dot belongs to the centre of a Gaussian
-        self.center_x, self.center_y = (np.where(self.dot, at, np.inf) for at in (middle_x, middle_y))
-        # devices keep the forms about the pixel nearest to the centre; unknown here where that is behind
+        self.disc = ahead & ~unfiltered[order]  # the low-pass disc belongs to the centre of a Gaussian
+        self.center_x, self.center_y = (np.where(self.disc, at, np.inf) for at in (middle_x, middle_y))
+        # devices store the forms about the pixel nearest to the centre; unknown if that is behind the camera
         self.anchor_x = _anchor(middle_x, ahead, view.width)
         self.anchor_y = _anchor(middle_y, ahead, view.height)
         self.anchors = optics.anchors_of(view, self.anchor_x, self.anchor_y)
@@ -135,14 +135,14 @@ class Setup:
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.coplanar_groups = None if planes is None else planes[order]
-        self.printed = (
+        self.coplanar = (
             np.zeros(len(order), bool) if self.coplanar_groups is None else self.coplanar_groups >= 0
         )
         self.nearest = nearest[order]
-        """depth before which none of a printed plane lies; -inf for splats of none"""
+        """lower bound of depths in a coplanar group; -inf for splats without a group"""
 
-    def among(self, chosen: np.ndarray) -> Setup:
-        """The set-up of those of the splats alone, chosen (n,) bool, in the same order."""
+    def subset(self, chosen: np.ndarray) -> Setup:
+        """The chosen splats (n,) bool, in the same order."""
         if chosen.all():
             return self
         part = copy(self)
@@ -158,17 +158,27 @@ class Setup:
 
 
 DEPTH_SHARE = 1 / 8
-"""of the depth: standard deviation, along its ray, of what a sample sees under the low-pass `pixel`"""
+"""standard deviation along the ray of the low-pass `pixel`, per metre of depth"""
 _RANGE_RADIUS = math.sqrt(2 * math.log(255))
 """radius, in standard deviations, of the part of a splat whose depths bound those of all of it"""
 _PLANE_RADIUS = 64.0
-"""the same of splats that are printed on a plane: they lie on it wherever any cut-off and a low-pass let them
-be drawn, so that those that a cut-off leaves out move no layer; of boxes half sides, so that those that are a
-small part of a pixel move none"""
+"""the same for splats of a coplanar group: beyond every cut-off and low-pass, so that culled splats do not
+move the layer; for boxes in half sides"""
 _OF_SPLATS = (
     *("order", "log_opacity", "half_r2", "z_low", "z_high", "labels", "pz", "z_numerator"),
     *("inverse_m2", "turned"),
-    *("box", "dot", "center_x", "center_y", "anchor_x", "anchor_y", "colors", "normal", "nearest", "printed"),
+    *(
+        "box",
+        "disc",
+        "center_x",
+        "center_y",
+        "anchor_x",
+        "anchor_y",
+        "colors",
+        "normal",
+        "nearest",
+        "coplanar",
+    ),
 )
 """arrays (n, ...) of a Setup"""
 _OF_COORDINATES = ("forms", "anchors")
@@ -184,7 +194,7 @@ def _shapes(
     view: View,
     features: FeatureSet,
 ) -> ellipsoids.Axes:
-    """The disks that are drawn, of 3D Gaussians those that have their picture.
+    """Disks with the image of the splats, 3D Gaussians included.
 
     unit_a, unit_b, p (n, 3) in the camera frame, scale (n, 2).
     """
@@ -199,7 +209,7 @@ def _shapes(
         own = ellipsoids.exact(axes, scales, p[thick], view)
     else:
         own = ellipsoids.ewa(axes, scales, p[thick], view, "ellipsoid_ewa_antialiased" in features.slots)
-        # of no use otherwise
+        # undefined otherwise
         own.faint = np.where(p[thick, 2] >= view.near, own.faint, -np.inf)
     for name, values in vars(own).items():
         getattr(found, name)[thick] = values
@@ -211,8 +221,8 @@ def _posed(
 ) -> tuple[np.ndarray, ...]:
     """Unit tangents and centre in the camera frame, and the centre from the eye in the cloud's, (n, 3)
     each."""
-    turn = view.rotation.T
-    return tangent_u @ turn, tangent_v @ turn, mean @ turn + view.translation, mean - view.eye
+    rotation = view.rotation.T
+    return tangent_u @ rotation, tangent_v @ rotation, mean @ rotation + view.translation, mean - view.eye
 
 
 def _filtered(
@@ -220,9 +230,9 @@ def _filtered(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
 
-    chosen (n,) bool: the others stay as they are, and those whose centre a lens does not see. What a sample
-    sees is a Gaussian about its ray, with a standard deviation of half a sample across and of `DEPTH_SHARE`
-    of the depth along it; of parallel rays an endless one, since their picture is linear. So the covariance
+    chosen (n,) bool: others are unchanged, and those whose centre has no image. The filter of a sample
+    is a Gaussian about its ray, with a standard deviation of half a sample across and of `DEPTH_SHARE`
+    of the depth along it; infinite for parallel rays, whose projection is linear. So the covariance
     of the filter in (u, v) is (G^T G)^-1 with G the derivative of the two by (u, v) at the centre, in these
     units.
     """
@@ -238,7 +248,7 @@ def _filtered(
         l11 = np.sqrt(c11)
         grown, wide_a = np.where(chosen, grown, 1.0), l11[:, None] * a + (c12 / l11)[:, None] * b
         wide_b = (grown / l11)[:, None] * b
-    # those that parallel rays see edge-on grow without limit and are not drawn
+    # edge-on to parallel rays: they grow without limit and are culled
     chosen = (chosen & np.isfinite(grown))[:, None]
     return np.where(chosen, wide_a, a), np.where(chosen, wide_b, b), grown
 

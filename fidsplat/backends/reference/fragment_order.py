@@ -13,14 +13,13 @@ from fidsplat.backends.reference.error_bounds import Span
 from fidsplat.backends.reference.fragments import Fragments, optical_depth
 from fidsplat.backends.reference.setup import Setup
 
-LIFT = 2.0**-16
-"""by what share of its depth a printed plane counts as nearer: more than rounding, less than is seen"""
+COPLANAR_BIAS = 2.0**-16
+"""share of its depth by which a coplanar layer is nearer: more than rounding, and invisible"""
 
 
 @dataclass
-class Stack:
-    """What k samples see, m things each in the order in which they are composited: fragments, or layers as
-    one."""
+class OrderedFragments:
+    """Fragments and layers of k samples, m each, in compositing order."""
 
     alpha: np.ndarray
     """(k, m), as z [m], labels, moved, label_may_flip"""
@@ -31,28 +30,28 @@ class Stack:
     normal: np.ndarray
     labels: np.ndarray
     ids: np.ndarray
-    """places in the depth order of the splats that stand for the layers"""
+    """index in the depth order, of a layer that of its heaviest splat"""
     count: np.ndarray
     """splats that are blended in each"""
     count_bound: np.ndarray
-    """how many more or less they may be, if it is drawn at all"""
+    """error bound of the count, if it contributes"""
     moved: np.ndarray
-    """what may change in a layer's mean colour, per unit of light in front of it"""
+    """error bound of a layer's mean colour, per unit of light in front of it"""
     label_may_flip: np.ndarray
-    """bool: whether another label may be the layer's"""
+    """bool: whether rounding may change the layer's label"""
     id_may_flip: np.ndarray
     reordered: np.ndarray
-    """(k,) what may change in colour because things may be composited in another order"""
+    """(k,) error bound of colour from changes of the order"""
 
-    def take(self, rank: np.ndarray) -> Stack:
-        """The same in another order: rank (k, m)."""
+    def take(self, rank: np.ndarray) -> OrderedFragments:
+        """Reorder by rank (k, m)."""
 
         def of(array: np.ndarray) -> np.ndarray:
             return np.take_along_axis(array, rank if array.ndim == 2 else rank[:, :, None], 1)
 
         s = self.span
         span = Span.of(of(s.low), of(s.high), of(s.z_low), of(s.z_high))
-        return Stack(
+        return OrderedFragments(
             span=span, reordered=self.reordered, **{name: of(getattr(self, name)) for name in _COLUMNS}
         )
 
@@ -70,41 +69,41 @@ _COLUMNS = (
     "label_may_flip",
     "id_may_flip",
 )
-"""fields of Stack that have a value for each of the m things"""
+"""fields of OrderedFragments with m values per sample"""
 
 
-def by_center(s: Setup, f: Fragments, span: Span) -> Stack:
-    """Every fragment by itself, in the order of the splats' centres."""
+def by_center(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
+    """Fragments in the order of the splats' centres."""
     # colours and normals once, not for each sample
     return replace(_plain(s, f, span, slice(None)), colors=s.colors, normal=s.normal)
 
 
-def by_depth(s: Setup, f: Fragments, span: Span) -> Stack:
-    """Fragments, and those of each printed plane as one layer, by their own depths at each sample; of equals
-    the first of the splats' order. What is not drawn there is left out."""
+def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
+    """Fragments, and one layer per coplanar group, by their own depths at each sample, ties in the splats'
+    order. Those that do not contribute are left out."""
     planes = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
     plain = np.flatnonzero(planes < 0)
     members = [np.flatnonzero(planes == plane) for plane in np.unique(planes[planes >= 0])]
-    columns = _side_by_side([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])
+    columns = _concatenated([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])
     arrival = np.concatenate([plain, [splats[0] for splats in members]])
     may = columns.span.high > 0
-    # a printed plane lies before splats of none that lie in it
-    lift = np.where(np.arange(columns.z.shape[1]) < len(plain), 0.0, LIFT * np.abs(columns.z))
+    # a coplanar layer is in front of other splats in its plane
+    lift = np.where(np.arange(columns.z.shape[1]) < len(plain), 0.0, COPLANAR_BIAS * np.abs(columns.z))
     depth = np.where(may, columns.z - lift, np.inf)
     rank = np.lexsort((np.broadcast_to(arrival, depth.shape), depth, ~may), axis=1)
     rank = rank[:, : may.sum(1).max(initial=0)]
-    stack = columns.take(rank)
+    ordered = columns.take(rank)
     lift = np.take_along_axis(lift, rank, 1)
-    stack.span, stack.reordered = error_bounds.of_order(stack.span, lift)
-    return stack
+    ordered.span, ordered.reordered = error_bounds.of_order(ordered.span, lift)
+    return ordered
 
 
-def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> Stack:
-    """The fragments of the splats, each by itself."""
+def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> OrderedFragments:
+    """Fragments of splats without a coplanar group."""
     ids = np.arange(f.alpha.shape[1])[splats]
     k, m = len(f.alpha), len(ids)
     nothing = np.zeros((k, m))
-    return Stack(
+    return OrderedFragments(
         alpha=f.alpha[:, splats],
         z=f.z[:, splats],
         span=Span.of(
@@ -123,8 +122,8 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> St
     )
 
 
-def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
-    """The layer (k, 1) of the splats (indices) of a plane."""
+def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFragments:
+    """Layer (k, 1) of the splats (indices) of a coplanar group."""
     alpha, nearest = f.alpha[:, splats], s.nearest[splats]
     z, z_low, z_high = (np.maximum(z[:, splats], nearest) for z in (f.z, span.z_low, span.z_high))
     low, high = span.low[:, splats], span.high[:, splats]
@@ -140,12 +139,12 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
     labels = s.labels[splats]
     label = labels[heaviest]
     as_heavy = (high > 0) & (thick >= np.take_along_axis(thin, heaviest, 1))
-    drawn = alpha > 0
+    contributes = alpha > 0
     z_low, z_high = error_bounds.of_layer_depth(z_low, z_high, share, thin, thick)
     depth = np.where(total > 0, (share * z).sum(1, keepdims=True), (z_low + z_high) / 2)
-    covered = (_covered(each, boxes) for each in (alpha, low, high))
+    covered = (_coverage(each, boxes) for each in (alpha, low, high))
     opacity, least, most = covered
-    return Stack(
+    return OrderedFragments(
         alpha=opacity,
         z=depth,
         span=Span.of(least, most, z_low, z_high),
@@ -153,7 +152,7 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
         normal=(share @ s.normal[splats])[:, None],
         labels=label,
         ids=splats[heaviest],
-        count=drawn.sum(1, keepdims=True),
+        count=contributes.sum(1, keepdims=True),
         count_bound=((low > 0) != (high > 0)).sum(1, keepdims=True),
         moved=error_bounds.of_box_color(low, high) if boxes else error_bounds.of_layer_color(thin, thick),
         label_may_flip=(as_heavy & (labels != label)).any(1, keepdims=True),
@@ -162,14 +161,14 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
     )
 
 
-def _covered(opacity: np.ndarray, boxes: bool) -> np.ndarray:
-    """Opacity (k, 1) of a layer: boxes lie side by side, Gaussians over one another."""
+def _coverage(opacity: np.ndarray, boxes: bool) -> np.ndarray:
+    """Opacity (k, 1) of a layer: boxes are next to each other, Gaussians overlap."""
     if boxes:
         return np.minimum(opacity.sum(1, keepdims=True), 1.0)
     return 1 - (1 - opacity).prod(1, keepdims=True)
 
 
-def _side_by_side(parts: list[Stack]) -> Stack:
+def _concatenated(parts: list[OrderedFragments]) -> OrderedFragments:
     def joined(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts], axis=1)
 
@@ -177,6 +176,6 @@ def _side_by_side(parts: list[Stack]) -> Stack:
         np.concatenate([getattr(part.span, name) for part in parts], axis=1)
         for name in ("low", "high", "z_low", "z_high")
     )
-    return Stack(
+    return OrderedFragments(
         span=Span.of(*spans), reordered=parts[0].reordered, **{name: joined(name) for name in _COLUMNS}
     )

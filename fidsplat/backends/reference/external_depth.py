@@ -1,4 +1,4 @@
-"""An opaque surface of another renderer among what samples see."""
+"""An external depth image as an opaque surface among the fragments."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from fidsplat.backends.reference.error_bounds import Span
+from fidsplat.backends.reference.fragment_order import OrderedFragments
 from fidsplat.backends.reference.fragments import Fragments
-from fidsplat.backends.reference.layers import Stack
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.capture.environment import ExternalDepth
@@ -16,7 +16,7 @@ from fidsplat.capture.environment import ExternalDepth
 
 @dataclass
 class Surface:
-    """What k samples see of an external depth image."""
+    """An external depth image at k samples."""
 
     z: np.ndarray
     """(k,) metres; infinite where there is none"""
@@ -26,29 +26,29 @@ class Surface:
     """(k,)"""
 
     @property
-    def there(self) -> np.ndarray:
-        """(k,) bool: where there is one."""
+    def exists(self) -> np.ndarray:
+        """(k,) bool: whether there is a surface."""
         return np.isfinite(self.z)
 
-    def hide(self, s: Setup, f: Fragments, span: Span) -> Span:
-        """Take away the fragments at its depth or behind it; the span of those that are left, in which one
-        that rounding may put on either side has all opacities down to 0."""
+    def occlude(self, s: Setup, f: Fragments, span: Span) -> Span:
+        """Remove fragments at its depth or behind it. In the returned span a fragment that rounding may move
+        to the other side has opacities down to 0."""
         z = self.z[:, None]
-        # as fragments of printed planes are put: no nearer than these
+        # depths of coplanar groups are no nearer than these
         depth, low, high = (np.maximum(one, s.nearest) for one in (f.z, span.z_low, span.z_high))
         f.alpha = np.where(depth < z, f.alpha, 0.0)
         return Span.of(
             np.where(high < z, span.low, 0.0), np.where(low < z, span.high, 0.0), span.z_low, span.z_high
         )
 
-    def behind(self, stack: Stack) -> Stack:
-        """The stack with the surface as its last thing."""
-        k, m = stack.alpha.shape
-        there = self.there[:, None].astype(float)
-        z = np.where(there > 0, self.z[:, None], 0.0)
-        span = stack.span
+    def append_to(self, ordered: OrderedFragments) -> OrderedFragments:
+        """Append the surface behind all fragments."""
+        k, m = ordered.alpha.shape
+        exists = self.exists[:, None].astype(float)
+        z = np.where(exists > 0, self.z[:, None], 0.0)
+        span = ordered.span
         last = {
-            "alpha": there,
+            "alpha": exists,
             "z": z,
             "colors": self.color[:, None],
             "normal": np.zeros((k, 1, 3)),
@@ -61,28 +61,28 @@ class Surface:
             "id_may_flip": np.zeros((k, 1), bool),
         }
         joined = {}
-        for field in fields(Stack):
+        for field in fields(OrderedFragments):
             if field.name in last:
-                own = getattr(stack, field.name)
+                own = getattr(ordered, field.name)
                 shape = (k, m, *last[field.name].shape[2:])
                 joined[field.name] = np.concatenate([np.broadcast_to(own, shape), last[field.name]], axis=1)
-        # transmittances in front hold in every order of the splats: the surface comes behind them all
+        # the surface is behind all fragments, whatever their order
         front_low = np.prod(1 - span.high, axis=1, keepdims=True)
         front_high = np.prod(1 - span.low, axis=1, keepdims=True)
         joined["span"] = replace(
             span,
-            low=np.column_stack([span.low, there]),
-            high=np.column_stack([span.high, there]),
+            low=np.column_stack([span.low, exists]),
+            high=np.column_stack([span.high, exists]),
             z_low=np.column_stack([span.z_low, z]),
             z_high=np.column_stack([span.z_high, z]),
             front_low=np.column_stack([span.front_low, front_low]),
             front_high=np.column_stack([span.front_high, front_high]),
         )
-        return replace(stack, **joined)
+        return replace(ordered, **joined)
 
 
 def surface_at(external: ExternalDepth, view: View, x: np.ndarray, y: np.ndarray) -> Surface:
-    """What samples (k,) at grid positions x, y see of an external depth image."""
+    """An external depth image at samples (k,) with grid positions x, y."""
     row, column = (np.floor(at / view.samples).astype(int) for at in (y, x))
     color, label = external.rgb[row, column].astype(np.float64), np.asarray(external.label)[row, column]
     return Surface(external.depth[row, column].astype(np.float64), color, label)
