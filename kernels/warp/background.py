@@ -78,9 +78,9 @@ def make_backdrop(kind: str, bent: bool):
             at = first_sample(number, view) + row * view.tiles_x * view.tile_w + column
             light = color[at]
             # in the axes of the world
-            color = behind(surroundings, wp.transpose(wp.mat33(view.rotation)) * ray)
+            added = behind(surroundings, wp.transpose(wp.mat33(view.rotation)) * ray)
             for channel in range(3):
-                light[channel] = fma(light[3], color[channel], light[channel])
+                light[channel] = fma(light[3], added[channel], light[channel])
             store_line(color, at, light)
 
     return backdrop

@@ -126,7 +126,10 @@ def test_every_decision_occurs():
     assert (made["edge-on"].missed & made["edge-on"].contributes).any()
     # depths between the centre's and the plane's
     assert {*both.mirrored[both.contributes & ~both.missed].tolist()} == {True, False}
-    assert {*made["edge-on"].wide[made["edge-on"].mirrored & made["edge-on"].contributes].tolist()} == {True, False}
+    assert {*made["edge-on"].wide[made["edge-on"].mirrored & made["edge-on"].contributes].tolist()} == {
+        True,
+        False,
+    }
     assert not made["opaque"].contributes.all()
 
 

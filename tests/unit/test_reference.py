@@ -51,7 +51,9 @@ def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camer
         picture = FrameSpec(clouds()[kind], camera, quality, tuple(OUTPUTS))
         monkeypatch.setattr(backend, "may_contribute", counted)
         fewer = reference_images(picture)
-        monkeypatch.setattr(backend, "may_contribute", lambda setup, view, x, y: np.ones(len(setup.order), bool))
+        monkeypatch.setattr(
+            backend, "may_contribute", lambda setup, view, x, y: np.ones(len(setup.order), bool)
+        )
         for name, image in reference_images(picture).items():
             assert np.allclose(fewer[name], image, rtol=1e-11, atol=1e-11, equal_nan=True), (lowpass, name)
     assert np.mean(shares) < 0.8
