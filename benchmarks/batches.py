@@ -1,4 +1,4 @@
-"""Times batches of views beside the same views drawn one by one, and says what they differ by: nothing.
+"""Time batches of views and the same views rendered one by one, and check that they are bit-identical.
 
     python benchmarks/batches.py --device opencl [--rows scenes agents few] [--repeats 5] [--json FILE]
 
@@ -79,13 +79,13 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
 
     timer = Timer(draw, parts=lambda batch: batch.timings)
     for number in range(repeats + 2):
-        timer.run(counts=number > 1)
+        timer.run(timed=number > 1)
     batch = draw()
     some = np.linspace(0, row.views - 1, min(_ALONE, row.views)).astype(int)
     captures = [Views((capture,), pose_matrices("poses", poses[[k]])).capture(0) for k in some]
     alone = Timer(lambda: [renderer.render(resident, each) for each in captures][-1].wait())
     for number in range(3):
-        alone.run(counts=number > 0)
+        alone.run(timed=number > 0)
     for k, each in zip(some, captures, strict=True):
         frame, view = renderer.render(resident, each), batch.frame(int(k))
         assert all(np.array_equal(frame[output], view[output]) for output in row.outputs), k

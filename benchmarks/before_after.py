@@ -1,14 +1,13 @@
-"""A commit against this tree: frames of both in turns, each in a process of its own.
+"""Compare frame times of a commit and of this tree, interleaved, each in its own process.
 
     python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device D] [--repeats 15] [--cpu-time]
                                       [--json FILE]
 
-Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4, precise
-arithmetic), splats resident, the picture left on the device. One frame each, in turns, and which goes first
-changes from pair to pair; the figure is the median of the ratios of this tree's time to the commit's, with
-quartiles, and beside it the stages' medians by the device's clock. With --cpu-time a frame's time is what all
-threads of its process take of the cores, which other work changes less. So it is measured that the kernels of
-a scene without effects cost what they did before there were effects.
+Both processes render a scene of this tree with equal constants (alpha cut-off 1/255, stop 1e-4, precise
+arithmetic); splats and images stay on the device. The trees alternate frame by frame, and the first of a pair
+changes. Reported are the median and quartiles of the ratio of this tree's time to the commit's, and median
+stage times by the device clock. --cpu-time measures CPU time of all threads, which other processes disturb
+less.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ for line in sys.stdin:
 
 
 def saved_scene(name: str, file: Path) -> Path:
-    """A scene of `fidsplat bench` in a file that every commit can read."""
+    """Save a scene of `fidsplat bench` in a file that every commit can read."""
     cloud, camera = BENCH_SCENES[name].make()
     arrays = {field: getattr(cloud, field) for field in ARRAYS}
     if cloud.thickness is not None:
@@ -72,10 +71,10 @@ def saved_scene(name: str, file: Path) -> Path:
 
 
 class Tree:
-    """A process that draws with one tree's code."""
+    """Process that renders with the code of a tree."""
 
     def __init__(self, tree: Path, scene: Path, device: str, clock: str) -> None:
-        """clock: of the module `time`."""
+        """clock: function of the module `time`."""
         self.child = subprocess.Popen(
             [sys.executable, "-c", CHILD, str(scene), device, clock],
             stdin=subprocess.PIPE,
@@ -87,10 +86,10 @@ class Tree:
         self.device, self.clock = self._line(), Clock()
         self.picture = ""
         self.stages: list[dict[str, float]] = []
-        """milliseconds by stage, of each frame"""
+        """stage times of each frame in milliseconds"""
 
     def frame(self) -> None:
-        """One more frame; the clock goes on by what it took the process."""
+        """Render a frame; the clock advances by its time."""
         assert self.child.stdin is not None
         self.child.stdin.write("\n")
         self.child.stdin.flush()
@@ -102,11 +101,11 @@ class Tree:
         assert self.child.stdout is not None
         line = self.child.stdout.readline().strip()
         if not line:
-            raise SystemExit("a process that draws has failed; its message stands above")
+            raise SystemExit("a rendering process failed; its message is above")
         return line
 
     def medians(self) -> dict[str, float]:
-        """Milliseconds by stage."""
+        """Median stage times in milliseconds."""
         return {stage: float(np.median([one[stage] for one in self.stages])) for stage in self.stages[-1]}
 
     def close(self) -> None:
@@ -116,14 +115,14 @@ class Tree:
 
 
 def checked_out(commit: str, folder: Path) -> Path:
-    """A commit's files."""
+    """Extract the files of a commit."""
     archive = subprocess.run(["git", "archive", commit], cwd=ROOT, check=True, capture_output=True)
     subprocess.run(["tar", "-x", "-C", str(folder)], input=archive.stdout, check=True)
     return folder
 
 
 def measure(commit: str, scene: str, device: str, repeats: int, clock: str) -> dict:
-    """Both trees' times and the ratio of this tree's to the commit's."""
+    """Times of both trees and the ratio of this tree to the commit."""
     with tempfile.TemporaryDirectory() as folder:
         old = Path(commit).resolve() if Path(commit).is_dir() else checked_out(commit, Path(folder))
         file = saved_scene(scene, Path(folder) / "scene.npz")
@@ -155,7 +154,9 @@ def main() -> None:
     parser = options(__doc__, repeats=15)
     parser.add_argument("commit", help="any name that git knows, or a folder with its files")
     parser.add_argument("--scene", default="r1m_1080p", choices=BENCH_SCENES)
-    parser.add_argument("--cpu-time", action="store_true", help="of all threads, not the time that passes")
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="CPU time of all threads instead of wall time"
+    )
     asked = parser.parse_args()
     clock = "process_time" if asked.cpu_time else "perf_counter"
     row = measure(asked.commit, asked.scene, asked.device, max(asked.repeats, 2), clock)
@@ -167,7 +168,7 @@ def main() -> None:
         print(f"{name}:", ", ".join(f"{stage} {spent:.3f}" for stage, spent in stages.items()))
     print(
         "ratio {ratio:.3f}, quartiles {quartiles[0]:.3f} to {quartiles[1]:.3f}; ".format(**row)
-        + ("the same bits" if row["same_bits"] else "pictures differ")
+        + ("identical images" if row["same_bits"] else "images differ")
     )
 
 

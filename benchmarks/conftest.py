@@ -18,6 +18,7 @@ try:
 except ImportError:
     pytest.exit("these benchmarks need pytest-benchmark: pip install '.[bench]'", returncode=4)
 
+HEAVY = ("r5m_1080p", "r20m_4k")
 SMALL_MACHINE = 8
 """Compute units of a processor below which heavy scenes are left out."""
 
@@ -55,12 +56,12 @@ def device(pytestconfig) -> str:
 
 @pytest.fixture(scope="session", params=list(BENCH_SCENES))
 def run(request, device) -> SceneRun:
-    """A scene on the device, with its first frame drawn."""
+    """A scene on the device after its first frame."""
     scene = BENCH_SCENES[request.param]
     info = fs.Renderer(device).device
     small = info.kind == "cpu" and info.compute_units < SMALL_MACHINE
-    if scene.heavy and small and not request.config.getoption("--big"):
-        pytest.skip(f"{request.param} takes long on {info.compute_units} cores; --big draws it all the same")
+    if request.param in HEAVY and small and not request.config.getoption("--big"):
+        pytest.skip(f"{request.param} takes long on {info.compute_units} cores; --big renders it")
     made = SceneRun(request.param, device, None, *scene.make())
     assert not made.result.timer.error, made.result.timer.error
     return made

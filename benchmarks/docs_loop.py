@@ -1,4 +1,4 @@
-"""The loop at the head of the README: a flight past the demo's markers, as an animated WebP.
+"""Make the animation of the README: a flight past the markers of the demo, as a WebP file.
 
 pip install '.[video]' && PYTHONPATH=. python benchmarks/docs_loop.py docs/images/flight.webp
 """

@@ -1,4 +1,4 @@
-"""Makes docs/images/street.jpg again: a street of `fidsplat store demo --markers 1000`.
+"""Make docs/images/street.jpg: a street of `fidsplat store demo --markers 1000`.
 
 python benchmarks/docs_street.py [--splats 2e6]
 """

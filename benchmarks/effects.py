@@ -1,4 +1,4 @@
-"""What each effect costs: a standard random scene without and with it, in turns, splats resident.
+"""Measure the cost of each effect: a random scene with and without it, interleaved, splats uploaded.
 
     python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json FILE]
     python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effects.md

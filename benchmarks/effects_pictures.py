@@ -1,4 +1,4 @@
-"""Makes the pictures of effects in the pages and the README, but the low-passes' (filter_quality.py).
+"""Make the images of effects for the pages and the README, except the low-pass (filter_quality.py).
 
 python benchmarks/effects_pictures.py [--device opencl] [--out docs/images]
 """

@@ -1,4 +1,4 @@
-"""Derivatives: how far they are from the reference's, and how long they take (docs/gradients.md).
+"""Measure gradients: differences from the reference renderer, and time (docs/gradients.md).
 
     PYTHONPATH=.:tests python benchmarks/gradients.py [--device D] [--scenes 200] [--json FILE]
     PYTHONPATH=.:tests python benchmarks/gradients.py --time r100k_720p r1m_1080p [--quality surfel]

@@ -1,4 +1,4 @@
-"""Measures how frames grow with splats, pixels and overdraw, into a file of JSON lines.
+"""Measure frame times against splats, pixels and overdraw, as JSON lines.
 
     python benchmarks/growth.py growth.jsonl --device opencl
     python benchmarks/growth.py growth.jsonl more.jsonl --plot docs/images       plots what was measured

@@ -1,4 +1,4 @@
-"""What markers cost and how well they show: counts, seconds and PSNR of both mixtures.
+"""Measure markers of each mixture: splats, seconds and PSNR.
 
     python benchmarks/marker_quality.py [--device opencl] [--mixtures NAME ...] [--edge-px 480] [--repeats 7]
         [--json]

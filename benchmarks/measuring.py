@@ -1,4 +1,4 @@
-"""What the measuring scripts share: their options, facts of the device for every record, files and tables."""
+"""Shared parts of the measuring scripts: options, device facts, files and tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures a camera in a simulator: tag truth against poses that are read, and environments a second.
+"""Measure a camera in a simulator: pose errors of tags, and environments per second.
 
 python benchmarks/simulation.py                       the two tables of docs/simulation.md
 python benchmarks/simulation.py --device opencl:nvidia --environments 4096 --json figures.json

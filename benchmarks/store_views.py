@@ -1,4 +1,4 @@
-"""Pictures of stores: splats against time, error and memory.
+"""Measure frames of stores: splats read, time, error and memory.
 
     python benchmarks/store_views.py [--splats 20e6] [--places 1 5 50] [--errors 0.004 0.016] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""What compilation costs the first frame of a new process: caches empty, and filled by an earlier run."""
+"""Compilation time of the first frame in a new process, with empty and with filled caches."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Whole frames and single stages of each scene: splats resident, the picture left on the device."""
+"""Frame and stage times of each scene; splats and images stay on the device."""
 
 import pytest
 from conftest import CLOCK

@@ -1,4 +1,4 @@
-"""Making a marker: from its name to its splats."""
+"""Construction time of markers."""
 
 import random
 import string

@@ -1,4 +1,4 @@
-"""What a training step costs: standard random scenes, their splats trained on pictures of other ones.
+"""Measure a training step: random scenes trained on images of other random scenes.
 
     python benchmarks/training.py [SCENE ...] [--device opencl] [--degree 3] [--repeats 30] [--json FILE]
 

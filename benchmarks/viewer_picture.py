@@ -1,4 +1,4 @@
-"""The picture of the viewer in docs/viewer.md: the demo's scene in a headless Chromium.
+"""Make the image of the viewer in docs/viewer.md: the demo scene in a headless Chromium.
 
 fidsplat demo && PYTHONPATH=.:tools python benchmarks/viewer_picture.py fidsplat-demo/scene.toml
 docs/images/viewer.jpg"""

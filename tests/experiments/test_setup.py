@@ -76,7 +76,7 @@ def test_collections_grow_and_see_the_whole_plane():
     for few in COLLECTIONS:
         same = zip(training_cameras(few), every, strict=False)
         assert all(np.array_equal(a.world_to_camera, b.world_to_camera) for a, b in same)
-    with pytest.raises(fs.InputError, match="known: 3, 5, 9, 17"):
+    with pytest.raises(fs.InputError, match="must be 3, 5, 9 or 17, got"):
         training_cameras(4)
 
 

@@ -1,2 +1,1 @@
-"""What `fidsplat bench` and `fidsplat warm` do: scenes to draw, the loop that times them, and the model of
-what a frame must cost."""
+"""Benchmark of frame times, kernel compilation in advance, scenes, and the roofline model of a frame."""

@@ -1,4 +1,4 @@
-"""The scenes that are timed, by name."""
+"""Benchmark scenes by name."""
 
 from __future__ import annotations
 
@@ -19,28 +19,27 @@ from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError, unknown
 
 TIMED = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, arithmetic="precise")
-"""how scenes are timed: with the cut-off and the stop that all peers share, so that the work is the same"""
+"""quality of the benchmark: cut-off and stop of all peers, for equal work"""
 WALL_COLUMNS, WALL_ROWS = 20, 10
-_WALL_CODES = 10  # different ones; each hangs in as many places
+_WALL_CODES = 10  # number of different codes
 
 
 @dataclass(frozen=True)
 class BenchScene:
-    """One entry: what it is, and how it is made."""
+    """A benchmark scene: description and constructor."""
 
     about: str
     make: Callable[[], tuple[SplatCloud, Camera]]
 
 
 def tag() -> tuple[SplatCloud, Camera]:
-    """A single AprilTag, a third of the picture's height: what a frame costs when there is next to nothing to
-    draw."""
+    """A single AprilTag, a third of the image height: the fixed cost of a frame."""
     placed = PlacedMarker(marker("apriltag:36h11:5", size=0.16), rigid_matrix((0.0, 0.0, 0.55)))
     return Scene((), markers=(placed,)).cloud(), standard_camera(640, 480)
 
 
 def tag_in_million() -> tuple[SplatCloud, Camera]:
-    """An AprilTag of 0.4 m, 3 m from the camera, before the million splats of r1m_1080p."""
+    """An AprilTag of 0.4 m, 3 m from the camera, in front of the splats of r1m_1080p."""
     background, camera = load_scene("r1m_1080p")
     placed = PlacedMarker(marker("apriltag:36h11:5", size=0.4), rigid_matrix((0.0, 0.0, 3.0)))
     return Scene((background,), markers=(placed,)).cloud(), camera
@@ -48,7 +47,7 @@ def tag_in_million() -> tuple[SplatCloud, Camera]:
 
 def qr_wall() -> tuple[SplatCloud, Camera]:
     """200 QR codes of version 22 (1000 characters, level L) in 20 columns and 10 rows on a wall that fills
-    1920 x 1080 pixels; ten different codes take turns."""
+    1920 x 1080 pixels; ten different codes alternate."""
     letters = random.Random(0)
     texts = ("".join(letters.choices(string.ascii_letters, k=1000)) for _ in range(_WALL_CODES))
     codes = [marker(f"qr-v22-L:{text}", size=0.1) for text in texts]
@@ -74,15 +73,15 @@ BENCH_SCENES: dict[str, BenchScene] = {
     "qr_wall": BenchScene("200 QR codes of version 22 on a wall, 1920 x 1080", qr_wall),
     "tag_in_million": BenchScene("an AprilTag before 1,000,000 random splats, 1920 x 1080", tag_in_million),
 }
-"""In the order in which they are listed."""
+"""benchmark scenes in the order of listings"""
 
 MOST_VIEWS = 8
-"""of one's own scene, evenly spread over the cameras' trajectory"""
+"""maximum views of a user's scene, evenly spread over the trajectory"""
 
 
 def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, BenchScene]:
-    """Entries of one's own scene: from its camera, or from poses of a trajectory, camera to world, by names
-    such as `room.toml@2`. The splats are joined once.
+    """Benchmark scenes of a user's scene: its camera, or poses of a trajectory (camera to world), by names
+    such as `room.toml@2`.
 
     Raises InputError for a scene without a camera.
     """
@@ -104,14 +103,14 @@ def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, Be
 
 
 DEFAULT_SCENES = ("tag", "r100k_720p", "r1m_1080p", "tag_in_million")
-"""About a minute on two cores."""
+"""default scenes: about a minute on two cores"""
 
 
 def scene_names(words: Iterable[str]) -> tuple[str, ...]:
-    """Names from words: `all` is every scene, none the default; each once.
+    """Distinct scene names: `all` is every scene, none the default.
 
     Raises:
-        InputError: a name that no scene has.
+        InputError: an unknown scene.
     """
     names: list[str] = []
     for word in words:

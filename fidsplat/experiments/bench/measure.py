@@ -1,4 +1,4 @@
-"""Times frames on several devices, turn by turn, beside what each device can do at best."""
+"""Interleaved frame times of several devices, with the roofline of each device."""
 
 from __future__ import annotations
 
@@ -28,43 +28,43 @@ from fidsplat.util.timing import Timer, time_interleaved
 
 @dataclass
 class Result:
-    """One scene on one device; milliseconds, on an idle device, splats there, picture left there."""
+    """Result of a scene on a device, in milliseconds; splats and images stay on the device."""
 
     scene: str
     device: DeviceInfo
     width: int
     height: int
     timer: Timer
-    """wall times of frames, from the call until the device is done; its parts are the stages"""
+    """wall times of frames until the device is done; parts are stages"""
     rates: Rates | None = None
     renderer: str = "fidsplat"
-    """who draws; benchmarks/peers has others"""
+    """renderer; benchmarks/peers has others"""
     first_frame_ms: float = 0.0
-    """with compilation, or with what a kernel cache leaves of it"""
+    """time of the first frame, with compilation or a kernel cache"""
     counts: dict[str, int] = field(default_factory=dict)
-    """splats, visible, pairs as the frame tells, and fragments where the backend can count them"""
+    """splats, visible and pairs of the frame, and fragments if the backend counts them"""
     host_ms: list[float] = field(default_factory=list)
-    """of the same frames, the call alone, which returns while the device draws"""
+    """time of the call for the same frames, which returns before the device is done"""
     mean_rgb: float = 0.0
     memory_bytes: int | None = None
-    """held on the device: cloud, scratch buffers and the finished picture"""
+    """device memory in bytes: cloud, scratch buffers and image"""
     rooflines: dict[str, float] = field(default_factory=dict)
-    """least milliseconds by stage, where the device's rates are known"""
+    """roofline by stage in milliseconds, if device rates are known"""
 
     @property
     def times_roofline(self) -> dict[str, float]:
-        """How many times its least each stage takes, and `frame`; without what the model does not know."""
+        """Ratio to the roofline by stage, and of `frame`; without unknown ones."""
         taken = self.timer.part_medians | {"frame": self.timer.median}
         least = self.rooflines | ({"frame": sum(self.rooflines.values())} if self.rooflines else {})
         return {name: taken[name] / least[name] for name in taken if least.get(name, 0.0) > 0}
 
     @property
     def host(self) -> float:
-        """Median milliseconds of the frames that count until the call returns, while the device draws."""
+        """Median time of the call in milliseconds."""
         return float(np.median(self.host_ms[-len(self.timer.ms) :])) if self.host_ms else math.nan
 
     def as_dict(self) -> dict:
-        """For JSON: one flat record."""
+        """Flat record for JSON."""
         record = {
             "scene": self.scene,
             "renderer": self.renderer,
@@ -101,9 +101,9 @@ class Result:
 
 
 class Bench:
-    """Devices that draw the same scenes, frame by frame in turn, so that what disturbs one disturbs all.
+    """Interleaved benchmark of several devices, so that disturbances affect all.
 
-    `results` grows as frames are drawn, so that a run which is stopped keeps what it has.
+    `results` grows during the run, so an interrupted run keeps its results.
     """
 
     def __init__(
@@ -116,10 +116,10 @@ class Bench:
         """Opens the devices and measures their rates.
 
         Args:
-            devices: names as `Renderer` takes them.
+            devices: names of `Renderer`.
             tell: called with what is being done.
-            tick: is called after each frame that counts.
-            scenes: what `run` finds its scenes in.
+            tick: called after each timed frame.
+            scenes: catalogue of `run`.
 
         Raises:
             DeviceError, UnknownDeviceError: a device cannot be opened.
@@ -133,7 +133,7 @@ class Bench:
             self.devices[name] = backend.rates() if backend.traits.measures_rates else None
 
     def run(self, scene: str, repeats: int) -> None:
-        """Draw a scene `repeats` times on each device. What a device cannot draw stands in its result."""
+        """Render a scene `repeats` times on each device. Errors of a device are stored in its result."""
         self._tell(f"making {scene}")
         cloud, camera = self._scenes[scene].make()
         runs = []
@@ -146,7 +146,7 @@ class Bench:
 
 
 class SceneRun:
-    """One scene on one device. A renderer of its own, so that memory is that of this scene alone."""
+    """A scene on a device, with its own renderer so that memory is that of the scene."""
 
     def __init__(
         self, scene: str, device: str, rates: Rates | None, cloud: SplatCloud, camera: Camera
@@ -154,7 +154,7 @@ class SceneRun:
         self.renderer = Renderer(device)
         self.camera, self.capture = camera, Capture(camera, quality=TIMED)
         self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
-        """what was drawn, (h, w, 3)"""
+        """rendered image (h, w, 3)"""
         timer = Timer(self._whole, catch_errors=True, parts=lambda frame: frame.timings)
         self.result = Result(scene, self.renderer.device, camera.width, camera.height, timer, rates)
         try:
@@ -165,11 +165,11 @@ class SceneRun:
             timer.error = str(error)
 
     def draw(self) -> Frame:
-        """One frame."""
+        """Render a frame."""
         return self.renderer.render(self.resident, self.capture)
 
     def _whole(self) -> Frame:
-        """One frame until the device is done."""
+        """Render a frame and wait for the device."""
         begun = time.perf_counter()
         frame = self.draw()
         self.result.host_ms.append(1e3 * (time.perf_counter() - begun))
@@ -194,11 +194,10 @@ class SceneRun:
 
 
 def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, quality: Quality) -> np.ndarray:
-    """Fragments that each pixel draws, (h, w) int32, of all its samples together, as the kernels that draw
-    them count them.
+    """Number of fragments per pixel (h, w) int32 of all its samples, counted by the blending kernels.
 
     Raises:
-        FidsplatError: the device fails, or its backend has no such count.
+        FidsplatError: the device fails, or its backend does not count.
     """
     data = resident.data
     assert not isinstance(data, Residency), "of splats in memory"

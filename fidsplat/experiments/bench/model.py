@@ -1,7 +1,7 @@
-"""What a frame must at least cost: bytes and operations of each stage, counted from what there is to draw.
+"""Roofline model of a frame: minimum bytes and operations of each stage.
 
-devlog/roofline.md derives the numbers. They are of the method (2D splats, exact crossing, float32), not of
-our kernels: what one frame reads once is counted once, and of the fragments only those that are drawn.
+devlog/roofline.md derives the numbers. They describe the method (2D splats, exact intersection, float32), not
+our kernels: data is read once, and only composited fragments count.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 from fidsplat.backends.interface import Rates
 
-# bytes of one splat: position, scales and opacity decide whether it is seen; rotation and colour are needed
-# if it is
+# bytes of a splat: position, scales and opacity for culling; rotation and colour if it is visible
 _DECIDE, _ROTATION, _COLOR = 12 + 8 + 4, 16, 12
-RECORD = 64  # what the crossing and the colour of a splat take, as in splat.cl
-WINDOW = 8  # what says which tiles a splat can touch
+RECORD = 64  # intersection and colour of a splat, as in splat.cl
+WINDOW = 8  # tile range of a splat
 _KEY, _INDEX = 4, 4
 # operations that a multiply-add unit can do one of per cycle
 _DECIDE_FMA, _SET_UP_FMA, _SET_UP_DIVISIONS = 20, 160, 4
@@ -23,38 +22,38 @@ FRAGMENT_FMA = 30  # exp and division are counted apart
 
 @dataclass(frozen=True)
 class Counts:
-    """What there is to draw."""
+    """Counts of splats, pixels and fragments of a frame."""
 
     splats: int
     visible: int
     pairs: int
-    """of splats and tiles"""
+    """pairs of splats and tiles"""
     fragments: int
-    """drawn: within the splat's reach, in front of the near plane, the pixel not finished"""
+    """composited fragments"""
     pixels: int
     sh_coefficients: int = 0
-    """of each colour channel, beside the constant one; 0 for plain colours"""
+    """SH coefficients per channel without the constant one; 0 for plain colours"""
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a stage must do."""
+    """Minimum work of a stage."""
 
     bytes: float = 0.0
-    """read and written"""
+    """bytes read and written"""
     fma: float = 0.0
     exp: float = 0.0
     division: float = 0.0
 
     def ms(self, rates: Rates) -> float:
-        """The least time for it: memory and arithmetic may overlap, kinds of arithmetic share their units."""
+        """Minimum time: memory and arithmetic overlap, kinds of arithmetic share units."""
         memory = self.bytes / rates.copy_bytes
         arithmetic = self.fma / rates.fma + self.exp / rates.exp + self.division / rates.division
         return 1e3 * max(memory, arithmetic)
 
 
 def roofline_work(counts: Counts) -> dict[str, Work]:
-    """The least work by stage, in the order of the stages."""
+    """Minimum work by stage, in stage order."""
     n, visible, colors = counts.splats, counts.visible, 1 + counts.sh_coefficients
     return {
         "project": Work(
@@ -75,5 +74,5 @@ def roofline_work(counts: Counts) -> dict[str, Work]:
 
 
 def roofline_ms(counts: Counts, rates: Rates) -> dict[str, float]:
-    """The least milliseconds by stage on a device of these rates."""
+    """Roofline by stage in milliseconds for device rates."""
     return {stage: work.ms(rates) for stage, work in roofline_work(counts).items()}

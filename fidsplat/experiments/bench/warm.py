@@ -1,6 +1,5 @@
-"""Compiles in advance what scenes commonly call for, by drawing small pictures: a driver for processors
-compiles each kernel only when it is first launched, and once more for launches of more than 65,535
-work-items."""
+"""Kernel compilation in advance, by rendering small frames: CPU drivers compile a kernel at its first launch,
+and again for launches of more than 65,535 work-items."""
 
 from __future__ import annotations
 
@@ -29,25 +28,25 @@ MARKER, DISKS, CAPTURE = "a marker", "disks", "a capture"
 
 @dataclass(frozen=True)
 class Recipe:
-    """One set of kernels."""
+    """A set of kernels to compile."""
 
     sh_degree: int
-    """-1: plain colours"""
+    """SH degree; -1: plain colours"""
     kinds: tuple[str, ...]
-    """what stands in the scene: any of `MARKER`, `DISKS` and `CAPTURE`, each with as many splats"""
+    """kinds of splats: any of `MARKER`, `DISKS` and `CAPTURE`, in equal numbers"""
     outputs: tuple[str, ...]
     quality: Quality = _STANDARD
 
     @property
     def words(self) -> str:
-        """For people."""
+        """Readable description."""
         colors = "plain colours" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
         quality = "" if self.quality == _STANDARD else "; no low-pass, 3 x 3 samples"
         return f"{' and '.join(self.kinds)}, {colors}: {', '.join(self.outputs)}{quality}"
 
 
 def recipes() -> list[Recipe]:
-    """What scenes commonly call for, the commonest first."""
+    """Recipes of common scenes, the most common first."""
     common = [
         *((-1, kinds) for kinds in ((MARKER,), (MARKER, DISKS), (DISKS,))),
         *((3, kinds) for kinds in ((CAPTURE,), (MARKER, CAPTURE))),
@@ -79,7 +78,7 @@ def warm(renderer: Renderer, wanted: list[Recipe]) -> Iterator[tuple[Recipe, flo
 
 
 def _cloud(recipe: Recipe, count: int) -> SplatCloud:
-    """`count` small splats that are all in view; at least one of each kind."""
+    """`count` small visible splats, at least one of each kind."""
     degree = None if recipe.sh_degree < 0 else recipe.sh_degree
     count = max(count, len(recipe.kinds))
     flat = random_splats(count, 0, depth=(1.0, 2.0), scale=(0.002, 0.003), across=0.3, sh_degree=degree)
