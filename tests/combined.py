@@ -181,7 +181,11 @@ def assert_drawn(renderer: fs.Renderer, names: Iterable[str]) -> None:
     frame = renderer.render(asked.cloud, asked.capture)
     view = view_of(asked.capture, asked.cloud.origin)
     reference = ReferenceBackend()
-    truth = reference.pipeline(asked.features("alpha")).render(reference.upload(asked.cloud), view).images
+    truth = (
+        reference.pipeline(asked.features("alpha"))
+        .render_view(reference.upload(asked.cloud), view)
+        .arrays_of(0)
+    )
     differences = compare(frame, truth, frame.outputs)
     if any(SWITCHES[name].kind in COARSE for name in names):
         assert all(one.finite for one in differences)

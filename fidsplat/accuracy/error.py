@@ -140,5 +140,5 @@ def reference_image(
     """
     frame = renderer.render(scene, full_precision(capture.with_(outputs=output), renderer))
     if renderer.device.always_float64:  # other reads round to float32
-        return frame._images.read_float64(output)
+        return frame._images.read_float64(output, 0)
     return np.asarray(frame[output], np.float64)

@@ -1,4 +1,4 @@
-"""Many views of one size in one: their uniforms stacked, for pictures that are drawn together."""
+"""Views that are rendered together: their uniforms, stacked."""
 
 from __future__ import annotations
 
@@ -14,82 +14,78 @@ _SHARED = (
     *("fog_density", "surroundings", "external_depth", "along_ray", "parallel"),
 )
 _OWN = ("focal_x", "focal_y", "center_x", "center_y", "near", "far", "slopes")
+_FIRST = np.zeros(1, np.uint32)
+_FIRST.flags.writeable = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ViewBatch:
-    """What a backend is asked to draw of a batch."""
+    """Views of one size that are rendered together; a single view is a batch of one.
 
-    views: Sequence[View] | ViewStack
-    """those that are drawn, stacked where they have enough in common"""
-    slots: np.ndarray
-    """(views drawn,) uint32: which of the batch each is"""
-    total: int
-    """views of the batch, those that are masked out among them"""
-    size: tuple[int, int]
-    """rows and columns of pixels"""
-
-    def one(self, number: int) -> View:
-        """A view that is drawn."""
-        return self.views.one(number) if isinstance(self.views, ViewStack) else self.views[number]
-
-    def part(self, first: int, end: int) -> ViewStack:
-        """Views [first, end) that are drawn, which are stacked unless it is one."""
-        if isinstance(self.views, ViewStack) and end - first > 1:
-            return self.views.part(first, end)
-        return ViewStack.alone(self.one(first))
-
-
-@dataclass(frozen=True)
-class ViewStack:
-    """Views that differ in where cameras and groups of splats are, and perhaps in a camera's own numbers.
-
-    g groups of splats move by themselves, those of the labels of `view.groups`; index 0 is all that stands.
+    v views are rendered, of `total`: the others are masked out. g groups of splats move, those of the labels
+    of `view.groups`; index 0 of the poses is for all other splats.
     """
 
     view: View
-    """the first, which has all that they have in common"""
+    """the first view, with all that the views have in common"""
     rotation: np.ndarray
-    """(g + 1, views, 3, 3) float64, world to camera"""
+    """(g + 1, v, 3, 3) float64, world to camera"""
     translation: np.ndarray
-    """(g + 1, views, 3) float64 metres"""
+    """(g + 1, v, 3) float64 metres"""
     eye: np.ndarray
-    """(g + 1, views, 3) float64 metres"""
+    """(g + 1, v, 3) float64 metres"""
     numbers: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """(views,) or (views, k) float64 by the name in View: of the camera's own numbers those that differ"""
+    """(v,) or (v, k) float64: numbers of the camera that differ, by their names in View"""
+    batch_indices: np.ndarray = field(default_factory=lambda: _FIRST)
+    """(v,) uint32: position of each view in the batch"""
+    total: int = 1
+    """views of the batch, with those that are masked out"""
+    views: tuple[View, ...] = ()
+    """the views, unless they are poses of `view`"""
+    stacked: bool = True
+    """whether views differ in poses and `numbers` only; otherwise they are rendered one by one"""
 
     def __len__(self) -> int:
-        """Views."""
-        return self.translation.shape[1]
+        """Number of views that are rendered."""
+        return len(self.batch_indices)
+
+    @property
+    def is_single(self) -> bool:
+        """Whether it is one view."""
+        return self.total == 1 == len(self)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of pixels."""
+        return self.view.height // self.view.samples, self.view.width // self.view.samples
 
     @staticmethod
-    def of(views: Sequence[View]) -> ViewStack | None:
-        """The views as a stack; None if they have too little in common, or one is made of several poses."""
+    def single(view: View) -> ViewBatch:
+        """A batch of one."""
+        if view.groups:
+            return _stacked((view,), {}, _FIRST, 1)
+        poses = view.rotation[None, None], view.translation[None, None], view.eye[None, None]
+        return ViewBatch(view, *poses, views=(view,))
+
+    @staticmethod
+    def of(views: Sequence[View], batch_indices: np.ndarray, total: int) -> ViewBatch:
+        """A batch of these views, at least one."""
         first = views[0]
         labels = [label for label, _ in first.groups]
         for view in views:
             alike = all(getattr(view, name) == getattr(first, name) for name in _SHARED)
             alike = alike and view.raster is first.raster and not view.sub_frames
             if not alike or [label for label, _ in view.groups] != labels:
-                return None
+                return replace(
+                    ViewBatch.single(first),
+                    batch_indices=batch_indices,
+                    total=total,
+                    views=tuple(views),
+                    stacked=False,
+                )
         numbers = {name: np.array([getattr(view, name) for view in views], np.float64) for name in _OWN}
-        return ViewStack._of(views, {name: each for name, each in numbers.items() if (each != each[0]).any()})
-
-    @staticmethod
-    def alone(view: View) -> ViewStack:
-        """A stack of one."""
-        if view.groups:
-            return ViewStack._of([view], {})
-        return ViewStack(view, view.rotation[None, None], view.translation[None, None], view.eye[None, None])
-
-    @staticmethod
-    def _of(views: Sequence[View], numbers: Mapping[str, np.ndarray]) -> ViewStack:
-        own = [[view, *(moved for _, moved in view.groups)] for view in views]
-
-        def stacked(name: str) -> np.ndarray:
-            return np.stack([[getattr(group, name) for group in each] for each in own], axis=1)
-
-        return ViewStack(views[0], stacked("rotation"), stacked("translation"), stacked("eye"), numbers)
+        numbers = {name: each for name, each in numbers.items() if (each != each[0]).any()}
+        return _stacked(views, numbers, batch_indices, total)
 
     @staticmethod
     def of_poses(
@@ -97,16 +93,17 @@ class ViewStack:
         origin: np.ndarray,
         poses: np.ndarray | None,
         groups: Mapping[int, np.ndarray],
-        count: int,
-    ) -> ViewStack:
-        """A view from many places: what `View.of` and motions make of each, bit for bit.
+        batch_indices: np.ndarray,
+        total: int,
+    ) -> ViewBatch:
+        """One view from v poses, bit-identical to `View.of` of each.
 
         Args:
-            view: one of them.
             origin: (3,) of the cloud.
-            poses: (count, 4, 4) camera to world; None: all where `view` is.
-            groups: label, in their order: (count, 4, 4) motion of the world.
+            poses: (v, 4, 4) camera to world; None: the pose of `view`.
+            groups: by label, in their order: (v, 4, 4) motion of the world.
         """
+        count = len(batch_indices)
         if poses is None:
             rotation = np.broadcast_to(view.rotation, (count, 3, 3))
             translation = np.broadcast_to(view.translation, (count, 3))
@@ -128,20 +125,29 @@ class ViewStack:
             rotations.append(turned)
             translations.append(moved)
             eyes.append(own - FAR_EYE * turned[:, 2] if view.parallel else own)
-        return ViewStack(view, np.stack(rotations), np.stack(translations), np.stack(eyes))
+        arrays = np.stack(rotations), np.stack(translations), np.stack(eyes)
+        return ViewBatch(view, *arrays, batch_indices=batch_indices, total=total)
 
-    def part(self, first: int, end: int) -> ViewStack:
-        """Views [first, end)."""
-        return ViewStack(
+    def part(self, first: int, end: int) -> ViewBatch:
+        """The rendered views [first, end); one of them if they are not stacked."""
+        indices = self.batch_indices[first:end].copy()
+        if end - first == 1:
+            return replace(ViewBatch.single(self.one(first)), batch_indices=indices, total=self.total)
+        return ViewBatch(
             self.view,
             self.rotation[:, first:end],
             self.translation[:, first:end],
             self.eye[:, first:end],
             {name: each[first:end] for name, each in self.numbers.items()},
+            indices,
+            self.total,
+            self.views[first:end],
         )
 
     def one(self, number: int) -> View:
-        """A view alone."""
+        """A rendered view."""
+        if self.views:
+            return self.views[number]
         own = {name: _plain(each[number]) for name, each in self.numbers.items()}
 
         def at(view: View, group: int) -> View:
@@ -152,8 +158,19 @@ class ViewStack:
         return replace(at(self.view, 0), groups=groups)
 
 
+def _stacked(
+    views: Sequence[View], numbers: Mapping[str, np.ndarray], batch_indices: np.ndarray, total: int
+) -> ViewBatch:
+    own = [[view, *(moved for _, moved in view.groups)] for view in views]
+    rotation, translation, eye = (
+        np.stack([[getattr(group, name) for group in each] for each in own], axis=1)
+        for name in ("rotation", "translation", "eye")
+    )
+    return ViewBatch(views[0], rotation, translation, eye, numbers, batch_indices, total, views=tuple(views))
+
+
 def _applied(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Of each matrix (n, 3, 3) with its vector (n, 3), as `matrix @ vector` rounds it."""
+    """The product of each matrix (n, 3, 3) and its vector (n, 3), rounded as `matrix @ vector`."""
     return (matrices @ vectors[..., None])[..., 0]
 
 

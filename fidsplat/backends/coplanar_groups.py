@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import quaternion_to_matrix
@@ -65,7 +65,7 @@ class PlaneTable:
         )
         return self._keys_of(view, axes, depths, eyes)[0].copy()
 
-    def keys_of(self, stack: ViewStack) -> np.ndarray:
+    def keys_of(self, stack: ViewBatch) -> np.ndarray:
         """(views, p) float32: the keys of each view."""
         axes, depths = stack.rotation[:, :, 2], stack.translation[:, :, 2]
         return self._keys_of(stack.view, axes, depths, stack.eye)

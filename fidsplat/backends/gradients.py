@@ -37,9 +37,9 @@ class DifferentiableImages:
         """Whether the device has started no other frame since."""
         return self.frame.workspace.frames == self._number
 
-    def read(self, name: str) -> np.ndarray:
-        """The image as a NumPy array of its own."""
-        return self.images.read(name)
+    def read(self, name: str, index: int | None = None) -> np.ndarray:
+        """Copy an image to the host, as `Images.read`."""
+        return self.images.read(name, index)
 
     @property
     def timings(self) -> Mapping[str, float]:

@@ -18,7 +18,7 @@ from fidsplat.backends.probing import Probe
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
-from fidsplat.effects import OUTPUTS, FeatureSet
+from fidsplat.effects import FeatureSet, declared_output
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import DeviceError, InputError
 
@@ -157,39 +157,45 @@ class ChunkCache(ABC):
 
 
 class Images:
-    """Output images of one view, on the device until they are read."""
+    """Output images of one or several views, on the device until they are read.
 
+    Views that are masked out hold `Output.blank`.
+    """
+
+    views: int = 1
+    """with those that are masked out"""
     timings: Mapping[str, float]
-    """milliseconds on the device by stage, in their order"""
+    """milliseconds on the device by stage, in their order; of several views the sums"""
     stats: Mapping[str, int]
-    """splats, visible, pairs"""
+    """splats of the cloud; visible and pairs, of several views the sums"""
     shares_arrays: bool = False
-    """whether `device_array` is available"""
+    """whether arrays of `device_array` can be exchanged by DLPack"""
 
-    def read(self, name: str) -> np.ndarray:
-        """Copy an image to the host, in the type of `OUTPUTS[name]`."""
+    def read(self, name: str, index: int | None = None) -> np.ndarray:
+        """Copy images to the host, in the type of `OUTPUTS[name]`: (views, h, w) or (views, h, w, channels);
+        with an index the image of this view, (h, w) or (h, w, channels)."""
         raise NotImplementedError
 
-    def read_float64(self, name: str) -> np.ndarray:
-        """Copy an image to the host in float64, not rounded where it was computed so."""
-        return self.read(name).astype(np.float64)
+    def read_float64(self, name: str, index: int | None = None) -> np.ndarray:
+        """Copy images to the host in float64, not rounded where they were computed so."""
+        return self.read(name, index).astype(np.float64)
 
-    def read_uint8(self, name: str) -> np.ndarray | None:
+    def read_uint8(self, name: str, index: int = 0) -> np.ndarray | None:
         """Copy an image of floats in [0, 1] to the host in 8 bits, converted by the device with the bits of
         `to_uint8` (fidsplat/images/files.py); None where the device does not convert."""
         return None
 
     def empty(self, name: str) -> np.ndarray:
-        """A host array for an image."""
-        return np.empty_like(self.read(name))
+        """A host array for the image of one view."""
+        return np.empty_like(self.read(name, 0))
 
-    def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
-        """Copy pixel rows [first, end) to the same rows of an array of the image's shape."""
+    def read_rows(self, name: str, first: int, end: int, into: np.ndarray, index: int = 0) -> None:
+        """Copy pixel rows [first, end) of a view to the same rows of an array of the image's shape."""
         if first < end:
-            into[first:end] = self.read(name)[first:end]
+            into[first:end] = self.read(name, index)[first:end]
 
-    def device_array(self, name: str) -> Any:
-        """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
+    def device_array(self, name: str, index: int | None = None) -> Any:
+        """The images as an array of the device, in the shape of `read`; no copy."""
         raise InputError(
             f"device_array must be of a device that shares its arrays, got {name} of one that does not; "
             "render with device='warp:cuda' or 'warp:cpu', or take frame[name], which is copied to the host"
@@ -199,38 +205,46 @@ class Images:
         """Wait until the device has rendered them."""
 
 
-class BatchImages(Images):
-    """Output images of several views, (views, h, w) or (views, h, w, channels); timings and stats are sums
-    over the views, but `splats`. Views that are masked out hold `Output.blank`."""
+class HostImages(Images):
+    """Images in host memory."""
 
-    views: int
-    """masked ones included"""
+    def __init__(
+        self, arrays: Mapping[str, np.ndarray], timings: Mapping[str, float], stats: Mapping[str, int]
+    ) -> None:
+        """arrays: (views, ...) by the names of outputs."""
+        self.arrays, self.timings, self.stats = arrays, timings, stats
+        self.views = len(next(iter(arrays.values())))
 
-    def read_one(self, name: str, number: int) -> np.ndarray:
-        """Copy the image of one view to the host."""
-        raise NotImplementedError
+    def arrays_of(self, index: int) -> dict[str, np.ndarray]:
+        """The arrays of one view."""
+        return {name: images[index] for name, images in self.arrays.items()}
+
+    def read(self, name: str, index: int | None = None) -> np.ndarray:
+        return self.read_float64(name, index).astype(declared_output(name).dtype)
+
+    def read_float64(self, name: str, index: int | None = None) -> np.ndarray:
+        """The arrays as they were computed; integers too."""
+        return self.arrays[name] if index is None else self.arrays[name][index]
 
 
-class SeparateImages(BatchImages):
+class SeparateImages(Images):
     """Images of views that were rendered one after another."""
 
     def __init__(self, images: Mapping[int, Images], batch: ViewBatch, splats: int) -> None:
-        """images: of the views that were rendered, by their number. splats: in the cloud."""
+        """images: of the views that were rendered, by their position in the batch. splats: in the cloud."""
         self._images, self.views, self._size, self._splats = images, batch.total, batch.size, splats
 
-    def read(self, name: str) -> np.ndarray:
-        made = self._background(name, self.views)
+    def read(self, name: str, index: int | None = None) -> np.ndarray:
+        output = declared_output(name)
+        if index is not None and index in self._images:
+            return self._images[index].read(name, 0)
+        shape = self._size if output.channels == 1 else (*self._size, output.channels)
+        if index is not None:
+            return np.full(shape, output.blank, output.dtype)
+        made = np.full((self.views, *shape), output.blank, output.dtype)
         for number, images in self._images.items():
-            made[number] = images.read(name)
+            made[number] = images.read(name, 0)
         return made
-
-    def read_one(self, name: str, number: int) -> np.ndarray:
-        return self._images[number].read(name) if number in self._images else self._background(name)
-
-    def _background(self, name: str, *views: int) -> np.ndarray:
-        output = OUTPUTS[name]
-        shape = (*views, *self._size) if output.channels == 1 else (*views, *self._size, output.channels)
-        return np.full(shape, output.blank, output.dtype)
 
     def wait(self) -> None:
         for images in self._images.values():
@@ -255,17 +269,21 @@ def summed(counts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     return sums
 
 
-class Pipeline(ABC):
+class Pipeline:
     """The stages compiled for one FeatureSet."""
 
-    @abstractmethod
-    def render(self, resident: Any, view: View) -> Images:
-        """Render one view of an uploaded cloud."""
+    def render(self, resident: Any, views: ViewBatch) -> Images:
+        """Render the views of an uploaded cloud, each bit-identical to itself alone. By default one after
+        another."""
+        if views.is_single:
+            return self.render_view(resident, views.one(0))
+        each = enumerate(views.batch_indices.tolist())
+        rendered = {index: self.render_view(resident, views.one(number)) for number, index in each}
+        return SeparateImages(rendered, views, resident.count)
 
-    def render_batch(self, resident: Any, batch: ViewBatch) -> BatchImages:
-        """Render several views of an uploaded cloud, each bit-identical to `render`."""
-        images = {int(k): self.render(resident, batch.one(n)) for n, k in enumerate(batch.slots)}
-        return SeparateImages(images, batch, resident.count)
+    def render_view(self, resident: Any, view: View) -> Images:
+        """Render one view, on devices that render views one after another."""
+        raise NotImplementedError
 
     def render_every(
         self, resident: Any, view: View, step: int, tell: Callable[[float], object] | None = None

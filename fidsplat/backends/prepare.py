@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import FAR_EYE, SubFrame, View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import Views
@@ -55,19 +55,16 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
     Raises:
         InputError: as `prepare`; views that call for different effects.
     """
-    drawn = views.drawn
-    slots = np.array(drawn, np.uint32)
-    slots.flags.writeable = False
-    camera = views.captures[0].camera
-    size = (0, 0) if camera is None else (camera.height, camera.width)
+    rendered = views.drawn
+    indices = np.array(rendered, np.uint32)
+    indices.flags.writeable = False
     if len(views.captures) == 1 and views.captures[0].motion.is_still:
         features, view = prepare(cloud, views.capture(0))
-        numbers, groups = slots.astype(np.intp), sorted((views.groups or {}).items())
-        poses = None if views.poses is None else views.poses[numbers]
         if not view.sub_frames:
+            numbers, groups = indices.astype(np.intp), sorted((views.groups or {}).items())
+            poses = None if views.poses is None else views.poses[numbers]
             moved = {label: each[numbers] for label, each in groups}
-            stack = ViewStack.of_poses(view, cloud.origin, poses, moved, len(drawn))
-            return features, ViewBatch(stack, slots, len(views), size)
+            return features, ViewBatch.of_poses(view, cloud.origin, poses, moved, indices, len(views))
     own = [prepare(cloud, views.capture(number)) for number in range(len(views))]
     features = own[0][0]
     for number, (other, _) in enumerate(own):
@@ -77,9 +74,8 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
                 f"the views of a batch must have the same effects, but views 0 and {number} differ in "
                 f"{differing}; draw them in batches of their own"
             )
-    each = [own[number][1] for number in drawn]
-    stack = ViewStack.of(each) if each else None
-    return features, ViewBatch(each if stack is None else stack, slots, len(views), size)
+    every = [own[number][1] for number in rendered]
+    return features, ViewBatch.of(every or [own[0][1]], indices, len(views))
 
 
 def view_of(capture: Capture, origin: np.ndarray) -> View:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import BatchImages, Images
+from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.views import Views
 from fidsplat.render.frame import Frame, Ids, check_process, numbered, refuse_numbered
 from fidsplat.util.errors import InputError, MissingOutputError
@@ -24,7 +24,7 @@ class FrameBatch(Mapping):
     `detail_error` (`Renderer.render_batch`).
     """
 
-    def __init__(self, images: BatchImages, views: Views, ids: Ids = None) -> None:
+    def __init__(self, images: Images, views: Views, ids: Ids = None) -> None:
         """ids: as those of a Frame."""
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._views = views
@@ -71,7 +71,7 @@ class FrameBatch(Mapping):
             or not 0 <= number < self.views
         ):
             raise InputError(f"there is no view {number!r}; this batch has views 0 to {self.views - 1}")
-        return Frame(_OneOf(self._images, int(number)), self._views.capture(int(number)), self._ids)
+        return Frame(self._images, self._views.capture(int(number)), self._ids, index=int(number))
 
     def wait(self) -> FrameBatch:
         """This batch, once the device has drawn it; nothing is copied."""
@@ -106,36 +106,7 @@ class FrameBatch(Mapping):
         return self._images.stats
 
 
-class _KeptBatch(BatchImages):
-    """Images of a batch that are no longer on a device."""
-
-    def __init__(
-        self, arrays: dict[str, np.ndarray], timings: Mapping[str, float], stats: Mapping[str, int]
-    ) -> None:
-        self._arrays, self.timings, self.stats = arrays, timings, stats
-        self.views = len(next(iter(arrays.values())))
-
-    def read(self, name: str) -> np.ndarray:
-        return self._arrays[name]
-
-    def read_one(self, name: str, number: int) -> np.ndarray:
-        return self._arrays[name][number].copy()
-
-
-class _OneOf(Images):
-    """The images of one view of a batch."""
-
-    timings: Mapping[str, float] = {}
-    stats: Mapping[str, int] = {}
-
-    def __init__(self, images: BatchImages, number: int) -> None:
-        self._images, self._number = images, number
-
-    def read(self, name: str) -> np.ndarray:
-        return self._images.read_one(name, self._number)
-
-
 def _kept_batch(
     arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], views: Views
 ) -> FrameBatch:
-    return FrameBatch(_KeptBatch(arrays, timings, stats), views)
+    return FrameBatch(HostImages(arrays, timings, stats), views)

@@ -125,10 +125,10 @@ class ErrorImage:
 
     def read(self) -> np.ndarray:
         """(h, w) float32."""
-        measured = np.abs(self.rgb.read_float64("rgb") - self.ideal.read_float64("rgb")).max(axis=2)
+        measured = np.abs(self.rgb.read_float64("rgb", 0) - self.ideal.read_float64("rgb", 0)).max(axis=2)
         off = np.full(measured.shape, self.plan.off)
         if "rounding" in self.plan.features.outputs:
-            off += _SLACK * self.ideal.read("rounding")
+            off += _SLACK * self.ideal.read("rounding", 0)
         return np.nextafter((measured + self.plan.span * off).astype(np.float32), np.float32(np.inf))
 
     @property

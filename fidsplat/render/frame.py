@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from fidsplat.backends.interface import Images
+from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.capture import Capture
 from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, MissingOutputError
@@ -44,11 +43,16 @@ class Frame(Mapping):
     """
 
     def __init__(
-        self, images: Images, capture: Capture, ids: Ids = None, error: MadeImage | None = None
+        self,
+        images: Images,
+        capture: Capture,
+        ids: Ids = None,
+        error: MadeImage | None = None,
+        index: int = 0,
     ) -> None:
         """ids: the indices that `splat_id` shows for the rendered splats. error: the output `error`, if it is
-        requested."""
-        self._error = error
+        requested. index: of the view in `images`."""
+        self._error, self._index = error, index
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}
         self.capture = capture
@@ -61,7 +65,7 @@ class Frame(Mapping):
         if name not in self._arrays:
             check_process(self._process, "frame")
             made = self._error if name == "error" else None
-            image = self._images.read(name) if made is None else made.read()
+            image = self._images.read(name, self._index) if made is None else made.read()
             self._arrays[name] = image = numbered(name, image, self._ids)
             image.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
@@ -82,7 +86,7 @@ class Frame(Mapping):
             raise InputError(
                 "the output 'error' must be read on the host, got device_array; take frame['error']"
             )
-        return self._images.device_array(name)
+        return self._images.device_array(name, self._index)
 
     def to_uint8(self) -> np.ndarray:
         """`rgb` as files of 8 bits have it, (h, w, 3) uint8: clamped to [0, 1], times 255, rounded to the
@@ -95,7 +99,7 @@ class Frame(Mapping):
         self._check("rgb")
         if "rgb" not in self._arrays:
             check_process(self._process, "frame")
-            converted = self._images.read_uint8("rgb")
+            converted = self._images.read_uint8("rgb", self._index)
             if converted is not None:
                 return converted
         from fidsplat.images.files import to_uint8  # late: it brings OpenCV
@@ -202,14 +206,16 @@ class Frame(Mapping):
             InputError: rows that the picture does not have, or an array of another shape or type.
         """
         self._check(name)
-        images = self._images if name != "error" else _KeptImages({name: self[name]}, {}, {})
+        images, index = self._images, self._index
+        if name == "error":
+            images, index = HostImages({name: self[name][None]}, {}, {}), 0
         if into is None:
             into = images.empty(name)
         elif not isinstance(into, np.ndarray):
             raise invalid("into", "an array of the shape of the output", into)
         whole_number("the end of the rows", end, 0, len(into))
         whole_number("the first row", first, 0, end)
-        images.read_rows(name, first, end, into)
+        images.read_rows(name, first, end, into, index)
         if name == "splat_id":
             into[first:end] = numbered(name, into[first:end], self._ids)
         return into
@@ -222,6 +228,8 @@ class Frame(Mapping):
         On a GPU a frame of a kind that was drawn before is drawn once more for that, since taking the time of
         each launch would slow all frames down. Empty if its cloud is not on the device any more.
         """
+        if self._images.views > 1:
+            return {}
         if self._error is None:
             return self._images.timings
         return {**self._images.timings, **self._error.timings}
@@ -229,25 +237,14 @@ class Frame(Mapping):
     @property
     def stats(self) -> Mapping[str, int]:
         """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
-        return self._images.stats
-
-
-@dataclass(frozen=True)
-class _KeptImages(Images):
-    """Images that are no longer on a device."""
-
-    arrays: dict[str, np.ndarray]
-    timings: Mapping[str, float]
-    stats: Mapping[str, int]
-
-    def read(self, name: str) -> np.ndarray:
-        return self.arrays[name]
+        return self._images.stats if self._images.views == 1 else {}
 
 
 def _kept_frame(
     arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], capture: Capture
 ) -> Frame:
-    return Frame(_KeptImages(arrays, timings, stats), capture)
+    images = HostImages({name: image[None] for name, image in arrays.items()}, timings, stats)
+    return Frame(images, capture)
 
 
 class OfRows(Protocol):

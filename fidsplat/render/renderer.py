@@ -10,6 +10,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import DeviceInfo, Images, Pipeline
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import FIRST, open_backend
@@ -36,6 +37,10 @@ from fidsplat.util.arguments import whole_number
 from fidsplat.util.errors import InputError, unknown
 
 _PLAIN = Capture()
+
+
+def _render_view(pipeline: Pipeline, data: Any, view: View) -> Images:
+    return pipeline.render(data, ViewBatch.single(view))
 
 
 def default_device() -> str:
@@ -358,9 +363,9 @@ class Renderer:
         interrupts.check()
         features, batch = prepare_batch(resident.whole, views)
         with self._lock:
-            drawn = (batch.one(number) for number in range(len(batch.slots)))
-            data, ids = resident.seen(drawn, features, (capture.quality for capture in views.captures))
-            images = self.backend.pipeline(features).render_batch(data, batch)
+            rendered = (batch.one(number) for number in range(len(batch)))
+            data, ids = resident.seen(rendered, features, (capture.quality for capture in views.captures))
+            images = self.backend.pipeline(features).render(data, batch)
         return FrameBatch(images, views, ids)
 
     def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
@@ -376,9 +381,7 @@ class Renderer:
         self,
         resident: ResidentCloud,
         capture: Capture,
-        draw: Callable[[Pipeline, Any, View], Images] = lambda pipeline, data, view: pipeline.render(
-            data, view
-        ),
+        render: Callable[[Pipeline, Any, View], Images] = _render_view,
         band: tuple[int, int] | None = None,
     ) -> Frame:
         interrupts.check()
@@ -389,14 +392,14 @@ class Renderer:
             pipeline, data = self.backend.pipeline(features), resident.data
             if not isinstance(data, Residency):
                 error = None
-                images = draw(pipeline, data, view)
+                images = render(pipeline, data, view)
                 if plan is not None:
-                    ideal = draw(self.backend.pipeline(plan.features), data, _banded(plan.view, band))
+                    ideal = render(self.backend.pipeline(plan.features), data, _banded(plan.view, band))
                     error = ErrorImage(images, ideal, plan)
                 return Frame(images, capture, error=error)
 
             def part(one: BandData) -> Frame:
-                images = one.images or draw(pipeline, one.data, one.view)
+                images = one.images or render(pipeline, one.data, one.view)
                 return Frame(images, capture, one.ids)
 
             return stacked(data.bands(view, features, capture.quality, pipeline), part)

@@ -108,7 +108,7 @@ def reference_images(
     pipeline, resident = reference.pipeline(features), reference.upload(spec.cloud)
     if pixels is not None:
         return pipeline.pixels(resident, view, *pixels)
-    return pipeline.render(resident, view).images
+    return pipeline.render_view(resident, view).arrays_of(0)
 
 
 def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:

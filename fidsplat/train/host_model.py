@@ -66,17 +66,18 @@ class HostModel:
         """A function that returns the loss of a rendered view, and the gradient (h, w, 3)."""
         of = self._views[view]
         target = of.image * np.float32(1 / 255)
-        loss, gradient = image_loss(images.read("rgb"), target, of.mask, self._settings.dssim_weight)
+        loss, gradient = image_loss(images.read("rgb", 0), target, of.mask, self._settings.dssim_weight)
         return lambda: loss, gradient
 
     def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
         """Gradients of the weighted normal loss by `depth` and `normal`."""
         of = self._views[view]
-        camera, weights = of.camera, np.float32(weight) * images.read("alpha")
+        camera, weights = of.camera, np.float32(weight) * images.read("alpha", 0)
         if of.mask is not None:
             weights *= of.mask
         lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
-        _, by_depth, by_normal = normal_loss(images.read("depth"), images.read("normal"), weights, *lens)
+        depth, normal = images.read("depth", 0), images.read("normal", 0)
+        _, by_depth, by_normal = normal_loss(depth, normal, weights, *lens)
         return {"depth": by_depth, "normal": by_normal}
 
     def backward_to_tiles(

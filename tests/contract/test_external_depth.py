@@ -8,6 +8,7 @@ from agreement import compare, random_splats
 from sampling import in_turn
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.backends.prepare import prepare
@@ -53,11 +54,11 @@ CASES = {
 def differences(pipeline, resident, cloud, capture):
     """A picture of a pipeline against the reference's."""
     _, view = prepare(resident, capture)
-    images = pipeline.render(resident, view)
+    images = pipeline.render(resident, ViewBatch.single(view))
     reference = ReferenceBackend()
     truth = reference.pipeline(select(cloud, capture.with_(outputs=(*capture.outputs, "alpha"))))
-    found = {name: images.read(name) for name in capture.outputs}
-    return compare(found, truth.render(reference.upload(cloud), view).images, capture.outputs)
+    found = {name: images.read(name, 0) for name in capture.outputs}
+    return compare(found, truth.render_view(reference.upload(cloud), view).arrays_of(0), capture.outputs)
 
 
 @in_turn()

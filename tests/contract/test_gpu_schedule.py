@@ -14,6 +14,7 @@ from sampling import in_turn
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.effects import OUTPUTS
 from fidsplat.selftest.agreement import FrameSpec, compare
@@ -68,9 +69,9 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     backend, cloud = renderer.backend, picture.cloud
     features, view = prepare(cloud, picture.capture)
     images = backend.pipeline(features, backend.shapes("schedule")["groups"]).render(
-        backend.upload(cloud), view
+        backend.upload(cloud), ViewBatch.single(view)
     )
-    drawn = {output: images.read(output) for output in picture.outputs}
+    drawn = {output: images.read(output, 0) for output in picture.outputs}
     differences = compare(drawn, reference_images(picture), picture.outputs)
     assert all(difference.agrees for difference in differences), differences
     assert drawn["rgb"].std() > 0.05
@@ -107,4 +108,4 @@ def draw_with_guarded_rays():
     picture = PICTURES["distortion"]()
     features, view = prepare(picture.cloud, picture.capture)
     pipeline = backend.pipeline(features, backend.shapes("schedule")["groups"])
-    pipeline.render(backend.upload(picture.cloud), view).read("rgb")
+    pipeline.render(backend.upload(picture.cloud), ViewBatch.single(view)).read("rgb", 0)

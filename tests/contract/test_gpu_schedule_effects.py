@@ -7,6 +7,7 @@ from agreement import compare, random_splats, some_thick
 from combined import LENSES, SIZE, Combination, combination, everything, sliding, turning
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import OUTPUTS
@@ -54,9 +55,13 @@ def test_it_agrees_with_the_reference(renderer, name):
     backend, reference = renderer.backend, ReferenceBackend()
     features, view = prepare(asked.cloud, asked.capture)
     groups = backend.shapes("schedule")["groups"]
-    images = backend.pipeline(features, groups).render(backend.upload(asked.cloud), view)
-    drawn = {output: images.read(output) for output in asked.capture.outputs}
-    truth = reference.pipeline(asked.features("alpha")).render(reference.upload(asked.cloud), view).images
+    images = backend.pipeline(features, groups).render(backend.upload(asked.cloud), ViewBatch.single(view))
+    drawn = {output: images.read(output, 0) for output in asked.capture.outputs}
+    truth = (
+        reference.pipeline(asked.features("alpha"))
+        .render_view(reference.upload(asked.cloud), view)
+        .arrays_of(0)
+    )
     differences = compare(drawn, truth, asked.capture.outputs)
     # of so few pixels a single one that is hard is too large a share
     wrong = [one for one in differences if not (one.finite and one.excess <= 0)]

@@ -88,7 +88,9 @@ def test_distortions_and_their_derivatives_are_the_references(backend):
         assert_same(backend, cloud, capture, by_distortion)
         features, view = prepare(cloud, capture)
         found, wanted = (
-            each.differentiate(with_distortion(features)).forward(each.upload(cloud), view).read("distortion")
+            each.differentiate(with_distortion(features))
+            .forward(each.upload(cloud), view)
+            .read("distortion", 0)
             for each in (backend, ReferenceBackend())
         )
         assert wanted.max() > 0
@@ -130,7 +132,7 @@ def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
         assert array.tobytes() == again[name].tobytes(), name
     features, view = prepare(cloud, capture)
     images = backend.differentiate(with_distortion(features)).forward(backend.upload(cloud), view)
-    drawn = {name: images.read(name) for name in capture.outputs}
+    drawn = {name: images.read(name, 0) for name in capture.outputs}
     frame = renderer.render(cloud, capture)
     assert all(np.array_equal(drawn[name], frame[name]) for name in drawn)
 

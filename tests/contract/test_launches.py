@@ -142,5 +142,5 @@ def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine
 
 def test_a_batch_whose_images_are_too_many_is_an_error(opencl):
     own, poses = own_device(opencl, 2**23), np.tile([0, 0, 0, 1, 0, 0, 0.0], (400, 1))
-    with pytest.raises(fs.DeviceError, match=r"images of 400 views take .* draw fewer views"):
+    with pytest.raises(fs.DeviceError, match=r"images of 400 views must be .* render fewer views"):
         own.render_batch(random_splats(10, seed=1), CAMERA, poses=poses)

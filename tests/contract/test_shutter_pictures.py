@@ -11,6 +11,7 @@ from sampling import SAMPLES, alternate, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.capture.quality import Quality
@@ -57,7 +58,7 @@ def truth(cloud, camera, quality, outputs, motion, shutter):
     capture = fs.Capture(camera, (*outputs, "alpha"), quality, BACKGROUND, motion, shutter)
     features, view = prepare(cloud, capture)
     reference = ReferenceBackend()
-    return reference.pipeline(features).render(reference.upload(cloud), view).images
+    return reference.pipeline(features).render_view(reference.upload(cloud), view).arrays_of(0)
 
 
 def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outputs=ALL_OUTPUTS):
@@ -174,7 +175,10 @@ def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpas
     assert "shutter_rows" in features.names
     without = replace(features, slots=tuple(name for name in features.slots if name != "shutter_rows"))
     backend = renderer.backend
-    one, other = (backend.pipeline(each).render(backend.upload(cloud), view) for each in (features, without))
+    one, other = (
+        backend.pipeline(each).render(backend.upload(cloud), ViewBatch.single(view))
+        for each in (features, without)
+    )
     for name in ALL_OUTPUTS:
         assert np.array_equal(one.read(name), other.read(name)), name
 

@@ -119,5 +119,5 @@ def distortion_of(trainer):
         capture = fs.Capture(view.camera, quality="surfel")
         features, seen = prepare(resident, capture)
         pipeline = backend.differentiate(with_distortion(features))
-        found.append(pipeline.forward(resident, seen).read("distortion").mean())
+        found.append(pipeline.forward(resident, seen).read("distortion", 0).mean())
     return np.mean(found)

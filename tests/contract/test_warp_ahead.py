@@ -9,6 +9,7 @@ import pytest
 from derivative_errors import random_picture
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.warp import memory_plan, runtime
 from fidsplat.backends.warp.frame import DeviceFrame
@@ -110,13 +111,13 @@ def test_images_that_nobody_reads_leave_at_once(ahead):
     resident = ahead.upload(CLOUD)
     features, view = prepare(resident, CAPTURE)
     pipeline = ahead.pipeline(features)
-    pipeline.render(resident, view)
-    images = pipeline.render(resident, view)
+    pipeline.render(resident, ViewBatch.single(view))
+    images = pipeline.render(resident, ViewBatch.single(view))
     assert images.settle
     array = weakref.ref(images.arrays["rgb"])
     gc.disable()
     try:
-        images = pipeline.render(resident, view)  # whose launches take the place of the others'
+        images = pipeline.render(resident, ViewBatch.single(view))
         assert array() is None
     finally:
         gc.enable()
@@ -293,10 +294,10 @@ def test_views_together_in_blocks_of_threads(renderer):
     resident, captures = backend.upload(CLOUD), [CAPTURE.with_(camera=camera) for camera in CROSSING[:3]]
     features, views = prepare_batch(resident, views_of(captures, None, None, None))
     pipeline = backend.pipeline(features, WarpShape("group", 8, 8))
-    whole = pipeline.render_batch(resident, views).read("rgb")
+    whole = pipeline.render(resident, views).read("rgb")
     before, backend.pair_budget = backend.pair_budget, 4000
     try:
-        banded = pipeline.render_batch(resident, views).read("rgb")
+        banded = pipeline.render(resident, views).read("rgb")
     finally:
         backend.pair_budget = before
     for k, wanted in enumerate(waiting(renderer, CROSSING[:3])):

@@ -8,6 +8,7 @@ from agreement import ALL_OUTPUTS, random_splats
 from traces import CAMERA, CULLED, listing, traced
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.view import View
@@ -57,7 +58,7 @@ def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budge
     features, batch = prepare_batch(cloud, views_of(captures))
     shape = listing(backend, "tiled" if lists == "local" else lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
-    alone = [pipeline.render(resident, prepare(cloud, capture)[1]) for capture in captures]
+    alone = [pipeline.render(resident, ViewBatch.single(prepare(cloud, capture)[1])) for capture in captures]
     original = tiling.launch_local
     launched = []
 
@@ -69,12 +70,12 @@ def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budge
     if lists == "tiled":
         monkeypatch.setattr(tiling, "LOCAL_TILES", 0)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
-    batch_images = pipeline.render_batch(resident, batch)
+    batch_images = pipeline.render(resident, batch)
     assert (launched.count("emit_local") > (2 if budget else 0)) == (lists == "local")
     for name in ("visible", "pairs"):
         assert batch_images.stats[name] == sum(images.stats[name] for images in alone)
     for images, own in zip(batch_images.read("rgb"), alone, strict=True):
-        assert np.array_equal(images, own.read("rgb"))
+        assert np.array_equal(images, own.read("rgb", 0))
 
 
 @pytest.mark.parametrize("budget", [0, 5000])
@@ -91,7 +92,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     capture = fs.Capture(camera, ALL_OUTPUTS, fs.Quality(lowpass="none"))
     features, view = prepare(cloud, capture)
     pipeline, resident = backend.pipeline(features, listing(backend, "tiled")), backend.upload(cloud)
-    expected = pipeline.render(resident, view)
+    expected = pipeline.render(resident, ViewBatch.single(view))
     assert 1000 < expected.stats["visible"] < 2.2 * 4096
     original, launched = tiling.launch_local, []
 
@@ -104,17 +105,17 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     resident = backend.upload(cloud)
     resident.coherent = True
     for _ in range(3):
-        images = pipeline.render(resident, view)
+        images = pipeline.render(resident, ViewBatch.single(view))
         assert images.stats == expected.stats
         for name in ALL_OUTPUTS:
             assert np.array_equal(images.read(name), expected.read(name)), name
     # in bands each time; else twice, then replayed
     assert launched.count("tally_local") == (3 if budget else 2)
     moved = replace(capture, camera=fs.Camera.look_at(641, 549, 1.0, (0.3, 0.0, 0.0), (0.0, 0.0, 3.0)))
-    batch_images = pipeline.render_batch(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
-    other = pipeline.render(backend.upload(cloud), prepare(cloud, moved)[1])
+    batch_images = pipeline.render(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
+    other = pipeline.render(backend.upload(cloud), ViewBatch.single(prepare(cloud, moved)[1]))
     for images, own in zip(batch_images.read("rgb"), (other, expected), strict=True):
-        assert np.array_equal(images, own.read("rgb"))
+        assert np.array_equal(images, own.read("rgb", 0))
     assert launched.count("tally_local") > (3 if budget else 2)
 
 
@@ -127,12 +128,12 @@ def test_lists_that_overflow_are_made_again(backend):
     view = View.of(fs.Capture(camera, quality=quality), few.origin)
     backend = type(backend)(backend.device)  # with new buffers
     pipeline = backend.pipeline(features, groups)
-    fresh = pipeline.render(backend.upload(many), view)
+    fresh = pipeline.render(backend.upload(many), ViewBatch.single(view))
     expected = {name: fresh.read(name) for name in ALL_OUTPUTS}
     backend = type(backend)(backend.device)
     pipeline = backend.pipeline(features, groups)
-    pipeline.render(backend.upload(few), view)
-    repeated = pipeline.render(backend.upload(many), view)
+    pipeline.render(backend.upload(few), ViewBatch.single(view))
+    repeated = pipeline.render(backend.upload(many), ViewBatch.single(view))
     assert repeated.stats == fresh.stats
     assert repeated.stats["pairs"] > 1e5
     for name in ALL_OUTPUTS:
@@ -152,7 +153,8 @@ def test_a_capacity_of_exactly_the_pairs_of_a_frame(backend, spare):
             pairs = rendered[0].stats["pairs"] + extra
             own.pool.scratch("lists", 4 * pairs)
             own.pool.scratch("pairs", 8 * pairs)
-        rendered.append(own.pipeline(features, groups).render(own.upload(cloud), view))
+        views = ViewBatch.single(view)
+        rendered.append(own.pipeline(features, groups).render(own.upload(cloud), views))
         grown = own.pool.size("pairs") > 8 * (rendered[0].stats["pairs"] + spare)
         assert extra is None or grown == (spare < 0)
     assert rendered[0].stats == rendered[1].stats
@@ -226,10 +228,10 @@ def test_a_small_pair_budget_is_bit_identical(backend, monkeypatch, budget, list
     # the shape of a CPU for its own strategy, which uses bands most often
     shape = backend.shape if lists == "ordered" else listing(backend, lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
-    whole = pipeline.render(resident, view)
+    whole = pipeline.render(resident, ViewBatch.single(view))
     assert whole.stats["pairs"] > 1000
     monkeypatch.setattr(backend, "pair_budget", budget)
-    banded = pipeline.render(resident, view)
+    banded = pipeline.render(resident, ViewBatch.single(view))
     assert banded.stats == whole.stats
     for name in ALL_OUTPUTS:
         assert np.array_equal(banded.read(name), whole.read(name)), name

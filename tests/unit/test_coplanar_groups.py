@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.prepare import view_of as moved_view_of
 from fidsplat.backends.view import View
@@ -108,6 +108,6 @@ def test_keys_of_many_views_are_those_of_each(camera):
     poses = np.random.default_rng(1).normal(0, 0.3, (20, 7)) + np.eye(7)[3]
     views = views_of([fs.Capture(camera)], poses, {1: poses[::-1].copy()})
     each = [moved_view_of(views.capture(k), cloud.origin) for k in range(20)]
-    stack = ViewStack.of_poses(each[0], cloud.origin, views.poses, views.groups, 20)
+    stack = ViewBatch.of_poses(each[0], cloud.origin, views.poses, views.groups, np.arange(20), 20)
     table = PlaneTable(cloud)
     assert np.array_equal(table.keys_of(stack), [table.keys(view) for view in each])

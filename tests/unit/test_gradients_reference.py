@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.backends.reference.gradients import FrozenFrame
@@ -78,11 +79,11 @@ def weights_of(images, seed=0):
 def test_frozen_pictures_are_the_references(name):
     cloud, features, view = pictured(name)
     backend = ReferenceBackend()
-    drawn = backend.pipeline(features).render(backend.upload(cloud), view)
+    drawn = backend.pipeline(features).render(backend.upload(cloud), ViewBatch.single(view))
     frozen = FrozenFrame(cloud, view, features)
     images = frozen.images(frozen.parameters)
     for output in OUTPUTS:
-        assert np.allclose(images[output], drawn.read_float64(output), rtol=1e-9, atol=1e-9), output
+        assert np.allclose(images[output], drawn.read_float64(output, 0), rtol=1e-9, atol=1e-9), output
     assert images["alpha"].max() > 0.1
 
 

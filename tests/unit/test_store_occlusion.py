@@ -8,6 +8,7 @@ from agreement import ALL_OUTPUTS
 from store_views import TURNED, look, made_store, splats
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.effects.select import with_termination_depths
@@ -292,12 +293,14 @@ def test_tiles_terminate_where_all_pixels_are_opaque(order, schedule):
     camera = fs.Camera.pinhole(96, 64, 60.0, 60.0, 48.0, 32.0)
     capture = fs.Capture(camera, outputs=("alpha", "depth"), quality=f"lowpass=none,order={order}")
     features, shot = prepare(cloud, capture)
-    images = backend.pipeline(with_termination_depths(features)).render(backend.upload(cloud), shot)
+    images = backend.pipeline(with_termination_depths(features)).render(
+        backend.upload(cloud), ViewBatch.single(shot)
+    )
     found = backend.termination_depths(images)
     height, width = found.tile
     rows, columns = found.depths.shape
     tiles = [(row, column) for row in range(rows) for column in range(columns)]
-    alpha, depth = (images.read(name).reshape(64, 96) for name in ("alpha", "depth"))
+    alpha, depth = (images.read(name, 0).reshape(64, 96) for name in ("alpha", "depth"))
     finished = np.zeros((rows, columns), bool)
     for row, column in tiles:
         own = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]

@@ -53,7 +53,7 @@ class Backend(interface.Backend):
 
 
 class Pipeline(interface.Pipeline):
-    def render(self, resident, view):
+    def render_view(self, resident, view):
         return Images(view, resident.count)
 
 
@@ -61,8 +61,9 @@ class Images(interface.Images):
     def __init__(self, view, count):
         self.view, self.timings, self.stats = view, {"toy": 0.0}, {"splats": count, "visible": 0, "pairs": 0}
 
-    def read(self, name):
+    def read(self, name, index=None):
         shape = self.view.height // self.view.samples, self.view.width // self.view.samples
+        shape = shape if index is not None else (1, *shape)
         if name == "rgb":
             return np.full((*shape, 3), self.view.background, OUTPUTS[name].dtype)
         return np.zeros(shape, OUTPUTS[name].dtype)

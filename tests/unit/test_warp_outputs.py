@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.backends.warp import runtime
 from fidsplat.effects import CATALOGUE, FeatureSet, Output
@@ -101,8 +102,8 @@ def drawn(outputs, posts):
     cloud = two_splats()
     pipeline = backend.pipeline(FeatureSet(SLOTS, outputs, 0, 1, "float64", posts))
     view = View.of(fs.Capture(CAMERA), cloud.origin)
-    images = pipeline.render(backend.upload(cloud), view)
-    return {name: images.read(name) for name in ("rgb", *outputs)}
+    images = pipeline.render(backend.upload(cloud), ViewBatch.single(view))
+    return {name: images.read(name, 0) for name in ("rgb", *outputs)}
 
 
 def make_anew(stage, monkeypatch):

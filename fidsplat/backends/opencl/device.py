@@ -119,7 +119,7 @@ class OpenCLBackend(Workspace, Backend):
 
     def copy_tiles(self, images: OpenCLImages, other: OpenCLImages, tiles: np.ndarray) -> None:
         """Copy tiles of another frame of the same view into a frame."""
-        images.take_tiles(other, tiles)
+        images.copy_tiles(other, tiles)
 
     def unsupported(self, features: FeatureSet) -> str:
         """Blending in float64 where the device has none; empty for all else."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import Capacity, Counts
@@ -24,7 +24,6 @@ from fidsplat.effects.catalogue import Output
 
 _GRID = (16, 4)
 """the work-group of kernels over pixels or samples"""
-_FIRST = frozen(np.zeros(1, np.uint32))
 
 
 @dataclass(init=False)
@@ -91,24 +90,24 @@ class DeviceFrame:
         commands: CommandList,
         shape: DeviceShape,
         resident: Resident,
-        view: View,
+        views: ViewBatch,
         plan: MemoryPlan,
         *,
-        stack: ViewStack | None = None,
         replay_queue: cl.CommandQueue | None = None,
         pair_limit: int = 0,
     ) -> None:
         """
         Args:
             commands: records the launches.
-            stack: the views of a batch; `view` then has what they have in common.
             replay_queue: the queue of a frame that is recorded for replay: the host does not wait for its
                 counts.
             pair_limit: largest capacity of the lists of a recorded frame; 0 for no limit.
         """
         self.workspace, self.commands, self.shape = workspace, commands, shape
-        self.resident, self.view, self.plan = resident, view, plan
-        self.stack, self.views = stack, 1 if stack is None else len(stack)
+        self.resident, self.plan = resident, plan
+        self.batch, self.views = views, len(views)
+        self.view = view = views.view
+        """the view, or what the views have in common"""
         self.recorded, self.pair_limit = replay_queue is not None, pair_limit
         self.queue = workspace.switch_to(workspace.queue) if replay_queue is None else replay_queue
         self.pool = workspace.pool
@@ -157,7 +156,8 @@ class DeviceFrame:
 
     def sub_frame(self, view: View) -> DeviceFrame:
         """The frame of one pose of a shutter."""
-        frame = DeviceFrame(self.workspace, self.commands, self.shape, self.resident, view, self.plan)
+        views = ViewBatch.single(view)
+        frame = DeviceFrame(self.workspace, self.commands, self.shape, self.resident, views, self.plan)
         frame.is_sub_frame = True
         return frame
 
@@ -281,12 +281,12 @@ class DeviceFrame:
         pixels = (view.height // view.samples) * (view.width // view.samples)
         for output in outputs:
             self.lease(f"{output.name}_out", 4 * pixels * output.channels)
-        self.put("slots", _FIRST)
+        self.put("slots", self.batch.batch_indices)
 
-    def bind_images(self, images: dict[str, cl.Buffer], indices: np.ndarray) -> None:
-        """Bind the output images of a batch. indices: (views,) uint32, of these views in the batch."""
+    def bind_images(self, images: dict[str, cl.Buffer]) -> None:
+        """Bind the output images of the batch of which these views are a part."""
         self.named |= images
-        self.put("slots", indices)
+        self.put("slots", self.batch.batch_indices)
 
     def put_view(self, row: int, end: int) -> None:
         """Copy the uniforms of the projection for the requested ones of rows of samples [row, end)."""
@@ -299,9 +299,9 @@ class DeviceFrame:
             moving = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
             self.put("moving", frozen(moving))
         if self.resident.group_table is not None:
-            table, stack = self.resident.group_table, self.stack
+            table = self.resident.group_table
             # a copy, since it must own its memory to be recognised
-            keys = table.keys(view) if stack is None else table.keys_of(stack).T.copy()
+            keys = table.keys(view) if self.views == 1 else table.keys_of(self.batch).T.copy()
             self.put("plane_keys", frozen(keys))
 
     def put_arrays(self) -> None:
@@ -320,7 +320,7 @@ class DeviceFrame:
 
     def record(self, row: int, end: int) -> np.ndarray:
         """The records `View` for rows of samples [row, end)."""
-        return view_records(self.stack or self.view, row, end, self.source.records["View"])
+        return view_records(self.batch, row, end, self.source.records["View"])
 
     def is_of_view(self, argument: Argument) -> bool:
         """Whether an argument is a number that changes with the view."""

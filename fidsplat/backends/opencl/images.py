@@ -5,21 +5,24 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.interface import Images
+from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.interface import Images, summed
 from fidsplat.backends.opencl.counts import Counts
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.recorded_frame import RecordedFrame
 from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.uint8 import read_uint8
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
+from fidsplat.util.errors import DeviceError, bytes_words
 
 
 @dataclass
@@ -56,14 +59,12 @@ class Rendered:
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage."""
         self.queue.finish()
-        return _milliseconds(self.events or ())
+        return milliseconds(self.events or ())
 
 
-def _milliseconds(
-    events: Iterable[tuple[str, cl.Event]], earlier: Mapping[str, float] | None = None
-) -> dict[str, float]:
-    """The time of completed launches by stage, added to that of earlier ones."""
-    timings = dict(earlier or {})
+def milliseconds(events: Iterable[tuple[str, cl.Event]]) -> dict[str, float]:
+    """The time of completed launches by stage."""
+    timings: dict[str, float] = {}
     for stage, event in events:
         timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
     return timings
@@ -114,139 +115,203 @@ class Replay:
         return {} if resident is None else self._pipeline.profile(resident, self._view, self._recorded)
 
 
+def lease_images(
+    workspace: Workspace, outputs: tuple[Output, ...], views: ViewBatch
+) -> list[tuple[str, cl.Buffer]]:
+    """Buffers for the output images of a batch, (views, h, w, channels) each, by the names of the kernel
+    arguments. Views that are masked out are blank.
+
+    Raises:
+        DeviceError: they exceed the memory budget, or one exceeds the largest buffer of the device.
+    """
+    pixels = views.total * views.size[0] * views.size[1]
+    bytes_of = {one.name: 4 * pixels * one.channels for one in outputs}
+    largest = max(bytes_of, key=bytes_of.__getitem__)
+    if bytes_of[largest] > workspace.largest_buffer:
+        raise DeviceError(
+            f"{largest} of {views.total} views must be at most {bytes_words(workspace.largest_buffer)}, the "
+            f"largest buffer of the device, got {bytes_words(bytes_of[largest])}; render fewer views at once"
+        )
+    if sum(bytes_of.values()) > workspace.memory_budget:
+        raise DeviceError(
+            f"the images of {views.total} views must be at most {bytes_words(workspace.memory_budget)}, the "
+            f"memory budget, got {bytes_words(sum(bytes_of.values()))}; render fewer views or outputs at once"
+        )
+    leased = []
+    for output in outputs:
+        name = f"{output.name} of views"  # single frames do not take the buffers of batches
+        buffer = workspace.pool.lease(name, bytes_of[output.name])
+        leased.append((name, buffer))
+        if len(views) < views.total:
+            blank = np.full(1, output.blank, output.dtype)
+            cl.enqueue_fill_buffer(workspace.queue, buffer, blank, 0, bytes_of[output.name])
+    return leased
+
+
 class OpenCLImages(Images):
-    """The output images of one picture. Their buffers go back to the pool when nobody holds them any more."""
+    """Output images on an OpenCL device. Their buffers return to the pool when the object is released."""
 
     def __init__(
         self,
         workspace: Workspace,
         outputs: tuple[Output, ...],
-        size: tuple[int, int],
-        rendered: Rendered,
+        views: ViewBatch,
+        shape: DeviceShape,
+        rendered: list[Rendered],
+        splats: int,
+        leased: list[tuple[str, cl.Buffer]] | None = None,
         replay: Replay | None = None,
-        tiles: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0)),
-        samples: int = 1,
     ) -> None:
-        """size: rows and columns of pixels. tiles: rows and columns of them, and samples of one. samples:
-        of a pixel, across."""
-        self._workspace, self._size, self._rendered, self._replay = workspace, size, rendered, replay
+        """leased: the images of a batch; None if they belong to the one frame in `rendered`."""
+        self._workspace, self.views, self._size, self._splats = workspace, views.total, views.size, splats
+        self._rendered, self._replay = rendered, replay
         self._outputs = {output.name: output for output in outputs}
+        self._batch = None if leased is None else dict(zip(self._outputs, leased, strict=True))
         self._timings: dict[str, float] = {}
-        self._tiles, self._samples = tiles, samples
-        self._added: list[tuple[dict[str, int], list[tuple[str, cl.Event]]]] = []
-        """counts and launches of the pictures of which tiles were taken"""
-        self._leased = rendered.leased
+        self._samples, self._tile = views.view.samples, (shape.tile_height, shape.tile_width)
+        self._grid = -(-views.view.height // self._tile[0]), -(-views.view.width // self._tile[1])
+        self._copied: list[tuple[dict[str, int], list[tuple[str, cl.Event]]]] = []
+        """counts and launches of the frames from which tiles were copied"""
+        self._leased = [*(leased or ()), *(buffer for one in rendered for buffer in one.leased)]
         weakref.finalize(self, workspace.pool.give_back, self._leased)
 
-    def read(self, name: str) -> np.ndarray:
-        """The image on the host; waits for the device.
+    def read(self, name: str, index: int | None = None) -> np.ndarray:
+        """Copy images to the host; waits for the device.
 
         Raises:
-            DeviceError: the device has failed, in this or while it was drawing.
+            DeviceError: the device has failed, now or while it was rendering.
         """
-        image = self.empty(name)
-        self.read_rows(name, 0, len(image), image)
-        return image
+        if index is not None:
+            images = self.empty(name)
+            self._copy(name, images, index * images.nbytes)
+            return images
+        shape = self.views, *self._shape(name)
+        images = self._workspace.host_memory.empty(shape, self._outputs[name].dtype)
+        self._copy(name, images, 0)
+        return images
 
     def empty(self, name: str) -> np.ndarray:
-        """A host array for an image, in memory that copies fast."""
+        """A host array for the image of one view, in memory that copies fast."""
         return self._workspace.host_memory.empty(self._shape(name), self._outputs[name].dtype)
 
+    def read_rows(self, name: str, first: int, end: int, into: np.ndarray, index: int = 0) -> None:
+        """Copy pixel rows [first, end) alone. Raises DeviceError as `read`."""
+        if first < end:
+            self._copy(name, into[first:end], (index * len(into) + first) * into[:1].nbytes)
+
+    def _copy(self, name: str, into: np.ndarray, offset: int) -> None:
+        with self._workspace.failing(f"rendering {name}"):
+            after = self._done()
+            # not on the queue of frames, where it would wait for the next one
+            queue, image = self._workspace.read_queue, self._buffer(name)
+            cl.enqueue_copy(queue, into, image, src_offset=offset, wait_for=after)
+
     def _shape(self, name: str) -> tuple[int, ...]:
+        """Of the image of one view."""
         channels = self._outputs[name].channels
         return self._size if channels == 1 else (*self._size, channels)
 
-    def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
-        """Copy pixel rows [first, end) alone. Raises DeviceError as `read`."""
-        if first == end:
-            return
-        with self._workspace.failing(f"rendering {name}"):
-            rendered, above = self.settle(), first * into[:1].nbytes
-            # beside what was put on its queue since: the next picture, say
-            queue, image = self._workspace.read_queue, rendered.buffer(f"{name}_out")
-            cl.enqueue_copy(queue, into[first:end], image, src_offset=above, wait_for=rendered.done())
+    def _buffer(self, name: str) -> cl.Buffer:
+        """The images of all views."""
+        return self.complete()[0].buffer(f"{name}_out") if self._batch is None else self._batch[name][1]
 
-    def read_uint8(self, name: str) -> np.ndarray:
-        """Copy an image in 8 bits. Raises DeviceError as `read`."""
+    def _done(self) -> list[cl.Event]:
+        """Events after which the images are complete."""
+        if not self._rendered:  # all views are masked out
+            self._workspace.queue.finish()
+        return [event for one in self.complete() for event in one.done()]
+
+    def read_uint8(self, name: str, index: int = 0) -> np.ndarray | None:
+        """Copy an image in 8 bits; None of a batch. Raises DeviceError as `read`."""
+        if self._batch is not None:
+            return None
         with self._workspace.failing(f"rendering {name}"):
-            rendered = self.settle()
-            image = rendered.buffer(f"{name}_out")
-            return read_uint8(self._workspace, image, self._shape(name), rendered.done())
+            return read_uint8(self._workspace, self._buffer(name), self._shape(name), self._done())
+
+    def device_array(self, name: str, index: int | None = None) -> Any:
+        """The images as a pyopencl.array.Array (views, h, w) or (views, h, w, channels); no copy."""
+        if index is not None:
+            return super().device_array(name, index)
+        from pyopencl.array import Array
+
+        shape, dtype = (self.views, *self._shape(name)), np.dtype(self._outputs[name].dtype)
+        buffer: Any = cl.MemoryObject.from_int_ptr(self._buffer(name).int_ptr)
+        # an array or a part of it keeps these images, so that the pool does not reuse their buffers
+        buffer.images = self
+        return Array(self._workspace.queue, shape, dtype, data=buffer)
+
+    def wait(self) -> None:
+        """Wait until the device has rendered them. Raises DeviceError as `read`."""
+        with self._workspace.failing("rendering"):
+            for one in self.complete():
+                one.queue.finish()
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds by stage. A replayed frame is rendered once more, with profiling, when they are first
+        read."""
+        with self._workspace.failing("rendering"):
+            rendered = self.complete()
+            if self._replay is not None and rendered[0].events is None:
+                with self._workspace.lock:
+                    self._timings = self._timings or self._replay.timings()
+                return self._timings
+            copied = [event for _, events in self._copied for event in events]
+            return summed([*(one.timings() for one in rendered), milliseconds(copied)])
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats of the cloud; visible and pairs of all views."""
+        with self._workspace.failing("rendering"):
+            stats = summed(one.stats() for one in self.complete())
+            stats = {"splats": 0, "visible": 0, "pairs": 0} | stats | {"splats": self._splats}
+            return summed([stats, *(copied for copied, _ in self._copied)])
+
+    def complete(self) -> list[Rendered]:
+        """The rendered parts; a replayed frame that exceeded its capacity is rendered again."""
+        if self._replay is not None:
+            with self._workspace.lock:
+                again = self._replay.overflow(self._rendered[0])
+                if again is not None:
+                    self._leased.extend(again.leased)
+                    self._rendered = [again]
+        return self._rendered
 
     def termination_depths(self) -> TerminationDepths:
         """Termination depths of a frame with that effect. Raises DeviceError as `read`."""
         with self._workspace.failing("rendering"):
-            rendered, (grid, tile) = self.settle(), self._tiles
-            keys = np.empty(grid, np.uint32)
-            queue = self._workspace.read_queue
-            cl.enqueue_copy(queue, keys, rendered.buffer("termination_depths"), wait_for=rendered.done())
-        return TerminationDepths.of_keys(keys, tile)
+            keys = np.empty(self._grid, np.uint32)
+            (rendered,) = self.complete()
+            queue, buffer = self._workspace.read_queue, rendered.buffer("termination_depths")
+            cl.enqueue_copy(queue, keys, buffer, wait_for=rendered.done())
+        return TerminationDepths.of_keys(keys, self._tile)
 
-    def take_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
+    def copy_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
         """Copy tiles of another frame of the same view. Raises DeviceError as `read`."""
         with self._workspace.failing("rendering"):
-            own, others = self.settle(), other.settle()
-            queue, copied = self._workspace.read_queue, None
-            after = [*own.done(), *others.done()]
+            after, copied = [*self._done(), *other._done()], None
             for output in self._outputs.values():
                 width = 4 * output.channels  # bytes of a pixel
                 row_bytes = self._size[1] * width
-                source, target = (one.buffer(f"{output.name}_out") for one in (others, own))
-                for top, bottom, left, right in self._pixels_of(tiles):
+                source, target = other._buffer(output.name), self._buffer(output.name)
+                for top, bottom, left, right in self._rectangles(tiles):
                     region, corner = ((right - left) * width, bottom - top, 1), (left * width, top, 0)
                     pitches = (row_bytes, row_bytes * self._size[0])
                     copied = cl.enqueue_copy(
-                        *(queue, target, source),
+                        *(self._workspace.read_queue, target, source),
                         **{"src_origin": corner, "dst_origin": corner, "region": region},
                         **{"src_pitches": pitches, "dst_pitches": pitches, "wait_for": after},
                     )
             if copied is not None:
-                copied.wait()  # the other's buffers may be the next picture's
-            self._added.append((dict(others.stats()), others.events or []))
+                copied.wait()  # the next frame may be rendered into the buffers of the other
+            (rendered,) = other.complete()
+            self._copied.append((dict(rendered.stats()), rendered.events or []))
 
-    def _pixels_of(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
-        """Rectangles [top, bottom) x [left, right) of pixels that together are some tiles, row by row."""
-        (rows, columns), (height, width) = self._size, (side // self._samples for side in self._tiles[1])
-        for row, wanted in enumerate(tiles):
-            sides = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]]).astype(np.int8)))
+    def _rectangles(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
+        """Rectangles [top, bottom) x [left, right) of pixels that cover tiles (rows, columns) bool, row by
+        row."""
+        (rows, columns), (height, width) = self._size, (side // self._samples for side in self._tile)
+        for row, chosen in enumerate(tiles):
+            sides = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
             for first, end in sides.reshape(-1, 2).tolist():
                 yield row * height, min((row + 1) * height, rows), first * width, min(end * width, columns)
-
-    def wait(self) -> None:
-        """Until the device has drawn it.
-
-        Raises:
-            DeviceError: as `read`.
-        """
-        with self._workspace.failing("rendering"):
-            self.settle().queue.finish()
-
-    @property
-    def timings(self) -> dict[str, float]:
-        """Milliseconds by stage. A picture that was launched again, by which nobody has taken the time, is
-        drawn once more for that; the first time that they are asked for."""
-        with self._workspace.failing("rendering"):
-            rendered = self.settle()
-            if rendered.events is not None or self._replay is None:
-                return _milliseconds((one for _, events in self._added for one in events), rendered.timings())
-            with self._workspace.lock:
-                self._timings = self._timings or self._replay.timings()
-            return self._timings
-
-    @property
-    def stats(self) -> Mapping[str, int]:
-        with self._workspace.failing("rendering"):
-            stats = dict(self.settle().stats())
-            for added, _ in self._added:
-                stats = {name: number + added[name] for name, number in stats.items()}
-            return stats
-
-    def settle(self) -> Rendered:
-        """What is drawn, for certain with room for all of it."""
-        if self._replay is not None:
-            with self._workspace.lock:
-                again = self._replay.overflow(self._rendered)
-                if again is not None:
-                    self._leased.extend(again.leased)  # given back together
-                    self._rendered = again
-        return self._rendered

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple, Protocol
 
-from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.buffers import RayBuffers
 from fidsplat.backends.opencl.resident import Resident
@@ -109,8 +109,7 @@ class MemoryPlanner:
         fixed += BIG * (4 + self._source.records["Bounds"].itemsize)
         # sub-frames have samples of their own
         fixed += 4 * samples * self._channels * (2 if view.sub_frames else 1)
-        pixels = view.width * view.height // view.samples**2
-        fixed += 4 * pixels * sum(output.channels for output in self._features.images)
+        fixed += self._image_bytes(view)
         fixed += sum(view.array(name).nbytes for name in self._view_arrays)
         if view.raster is not None:
             rasters = {view.raster, *(one.view.raster for one in view.sub_frames if one.view.raster)}
@@ -120,15 +119,16 @@ class MemoryPlanner:
         budget, largest = self._device.memory_budget, self._device.largest_buffer
         return plan_of(resident.capacity, record, upload, fixed, shape.lists, budget, largest)
 
-    def parts(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[Part]:
-        """The parts of a batch. reserved: bytes of all output images."""
-        count, views = len(batch.slots), batch.views
+    def parts(self, resident: Resident, views: ViewBatch) -> Iterator[Part]:
+        """The parts of a batch."""
+        count, others = len(views), (views.total - 1) * self._image_bytes(views.view)
         if not count:
             return
-        plan = self.frame(resident, batch.one(0), reserved)
-        if plan.chunk or not (isinstance(views, ViewStack) and self._goes_together(resident, views)):
+        plan = self.frame(resident, views.one(0), others)
+        together = views.stacked and not (resident.streamed or self._separate)
+        if plan.chunk or not together or (views.numbers and self._of_cameras):
             for k in range(count):
-                yield Part(k, k + 1, self.frame(resident, batch.one(k), reserved))
+                yield Part(k, k + 1, self.frame(resident, views.one(k), others))
             return
         samples, tables = self._samples_and_tables(views.view)
         splat = self._source.records["Splat"].itemsize + KEYS + WINDOWS
@@ -136,15 +136,16 @@ class MemoryPlanner:
         each = resident.capacity * splat + tables + 4 * self._channels * samples
         free = min(self._device.memory_budget - plan.held + each, self._device.largest_buffer)
         most = min(free, PART_BYTES.get(self._device.kind, OTHER_PART_BYTES)) // each
-        together = max(1, min(most, _PART_SAMPLES // samples))
+        most = max(1, min(most, _PART_SAMPLES // samples))
         # parts of equal size have buffers of equal size
-        parts = -(-count // together)
+        parts = -(-count // most)
         for first, end in pairwise(count * k // parts for k in range(parts + 1)):
             yield Part(first, end, MemoryPlan(0, resident.count, plan.held + (end - first - 1) * each))
 
-    def _goes_together(self, resident: Resident, stack: ViewStack) -> bool:
-        """Whether views differ in the record `View` only."""
-        return not (resident.streamed or self._separate or (stack.numbers and self._of_cameras))
+    def _image_bytes(self, view: View) -> int:
+        """Bytes of the output images of a view."""
+        pixels = view.width * view.height // view.samples**2
+        return 4 * pixels * sum(output.channels for output in self._features.images)
 
     def _samples_and_tables(self, view: View) -> tuple[int, int]:
         """Samples of whole tiles, and bytes of the tables of tile binning."""

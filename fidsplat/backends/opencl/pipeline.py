@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.assemble import Source
-from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.frame import render
-from fidsplat.backends.opencl.images import OpenCLImages, Rendered, Replay
+from fidsplat.backends.opencl.images import OpenCLImages, Rendered, Replay, lease_images
 from fidsplat.backends.opencl.memory_plan import MemoryPlan, MemoryPlanner
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.recorded_frame import RecordedFrame
@@ -68,28 +67,51 @@ class OpenCLPipeline(Pipeline):
         self._planner = MemoryPlanner(workspace, source, features, shape)
         self._other = other
 
-    def render(self, resident: Resident, view: View) -> OpenCLImages:
-        """Render one frame. A frame of a kind that was rendered before is replayed, without waiting for the
-        device.
+    def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
+        """Render views, as many at once as memory holds. A single frame of a kind that was rendered before is
+        replayed, without waiting for the device.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.rendering():
-            key = self._key(view) if view.band is None else None
-            cached = resident.cached_frames.get(key)
-            if cached is not None and (images := self._replay(resident, view, cached)) is not None:
-                return images
-            if resident.coherent and self.shape.lists == "tiled":
-                return self._listing("local").render(resident, view)
-            plan = self._planner.frame(resident, view)
-            if plan.chunk and self.shape.lists != "ordered":
-                # chunks are rendered by one strategy only: where memory is short, sorting is fastest
-                return self._listing("ordered").render(resident, view)
-            frame = self._render_planned(resident, view, plan)
-            if key is not None and self._is_replayable(frame):
-                self._cache(resident, key, frame)
-            return self.images_of(frame)
+            if views.is_single:
+                return self._render_single(resident, views)
+            return self._render_parts(resident, views)
+
+    def _render_single(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
+        view = views.view
+        key = self._key(view) if view.band is None else None
+        cached = resident.cached_frames.get(key)
+        if cached is not None and (images := self._replay(resident, views, cached)) is not None:
+            return images
+        if resident.coherent and self.shape.lists == "tiled":
+            return self._listing("local").render(resident, views)
+        plan = self._planner.frame(resident, view)
+        if plan.chunk and self.shape.lists != "ordered":
+            # chunks are rendered by one strategy only: where memory is short, sorting is fastest
+            return self._listing("ordered").render(resident, views)
+        frame = self._render_planned(resident, view, plan)
+        if key is not None and self._is_replayable(frame):
+            self._cache(resident, key, frame)
+        return self.images_of(frame)
+
+    def _render_parts(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
+        workspace, rendered = self.workspace, []
+        workspace.switch_to(workspace.queue)
+        leased = lease_images(workspace, self.features.images, views)
+        names = [f"{output.name}_out" for output in self.features.images]
+        images = dict(zip(names, (buffer for _, buffer in leased), strict=True))
+        for first, end, plan in self._planner.parts(resident, views):
+            part = views.part(first, end)
+            pipeline = self._for_part(resident, plan, part)
+            kind = pipeline, "views", resident.capacity, plan
+            workspace.pool.make_way(kind, workspace.memory_budget - plan.held)
+            frame = DeviceFrame(workspace, pipeline._commands, pipeline.shape, resident, part, plan)
+            frame.bind_images(images)
+            render(frame)
+            rendered.append(Rendered.of(frame))
+        return self._images(views, rendered, resident, leased)
 
     def fits(self, resident: Resident, view: View) -> bool:
         """Whether the frame is rendered at once; otherwise the cloud is projected for each of its parts."""
@@ -146,7 +168,7 @@ class OpenCLPipeline(Pipeline):
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:
         """The output images of a frame."""
-        return self._images(frame.view, Rendered.of(frame))
+        return self._images(frame.batch, [Rendered.of(frame)], frame.resident)
 
     def render_again(self, resident: Resident, view: View) -> Rendered:
         """A frame whose replay exceeded its capacity, with the buffers that it requires."""
@@ -169,9 +191,9 @@ class OpenCLPipeline(Pipeline):
             workspace.pool.give_back(rendered.leased)
         return rendered.timings()
 
-    def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
+    def _replay(self, resident: Resident, views: ViewBatch, cached: CachedFrame) -> OpenCLImages | None:
         """The next frame of a kind; None if the buffers of the last were released."""
-        workspace, recorded = self.workspace, cached.recorded
+        workspace, view, recorded = self.workspace, views.view, cached.recorded
         workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.held, resident.capacity)
         if not tiling.pair_capacity(workspace):
             return None
@@ -191,9 +213,9 @@ class OpenCLPipeline(Pipeline):
             render(frame)
             rendered = Rendered.of(frame, timed=False)
             cached.recorded = recorded = RecordedFrame(frame)
-        images = self._images(view, rendered, Replay(self, resident, view, recorded))
+        images = self._images(views, [rendered], resident, replay=Replay(self, resident, view, recorded))
         if not resident.immutable:
-            images.settle()
+            images.complete()
         return images
 
     def _ready(self, recorded: RecordedFrame, resident: Resident, view: View, queue: cl.CommandQueue) -> bool:
@@ -215,7 +237,7 @@ class OpenCLPipeline(Pipeline):
         pair_limit: int = 0,
     ) -> DeviceFrame:
         return DeviceFrame(
-            *(self.workspace, commands, self.shape, resident, view, plan),
+            *(self.workspace, commands, self.shape, resident, ViewBatch.single(view), plan),
             **{"replay_queue": replay_queue, "pair_limit": pair_limit},
         )
 
@@ -259,49 +281,30 @@ class OpenCLPipeline(Pipeline):
         budgets = self.workspace.memory_budget, self.workspace.pair_budget
         return self, view.width, view.height, view.raster, labels, budgets
 
-    def _images(self, view: View, rendered: Rendered, replay: Replay | None = None) -> OpenCLImages:
-        size = view.height // view.samples, view.width // view.samples
-        tile = self.shape.tile_height, self.shape.tile_width
-        tiles = (-(-view.height // tile[0]), -(-view.width // tile[1])), tile
+    def _images(
+        self,
+        views: ViewBatch,
+        rendered: list[Rendered],
+        resident: Resident,
+        leased: list[tuple[str, cl.Buffer]] | None = None,
+        replay: Replay | None = None,
+    ) -> OpenCLImages:
         outputs = self.features.images
-        return OpenCLImages(self.workspace, outputs, size, rendered, replay, tiles, view.samples)
+        return OpenCLImages(
+            self.workspace, outputs, views, self.shape, rendered, resident.count, leased, replay
+        )
 
     def _listing(self, lists: str) -> OpenCLPipeline:
         """The pipeline with another tile-binning strategy."""
         return self._other(self.features, replace(self.shape, lists=lists))
 
-    def render_batch(self, resident: Resident, batch: ViewBatch) -> OpenCLBatch:
-        """Render many views, as many at once as memory holds.
-
-        Raises:
-            DeviceError: the device runs out of memory or fails.
-        """
-        workspace, rendered = self.workspace, []
-        with workspace.rendering():
-            workspace.switch_to(workspace.queue)
-            buffers = OutputBuffers(workspace, self.features.images, batch)
-            for first, end, plan in self._planner.parts(resident, batch, buffers.nbytes):
-                views = batch.views
-                stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
-                pipeline = self._for_part(resident, plan, stack)
-                kind = pipeline, "views", resident.capacity, plan
-                workspace.pool.make_way(kind, workspace.memory_budget - plan.held)
-                frame = DeviceFrame(
-                    *(workspace, pipeline._commands, pipeline.shape, resident, batch.one(first), plan),
-                    stack=stack,
-                )
-                frame.bind_images(buffers.held(), batch.slots[first:end].copy())
-                render(frame)
-                rendered.append(Rendered.of(frame))
-            return OpenCLBatch(workspace, buffers, rendered, resident.count)
-
-    def _for_part(self, resident: Resident, plan: MemoryPlan, stack: ViewStack | None) -> OpenCLPipeline:
+    def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
         """The pipeline that bins a part of a batch in the shortest time."""
         if self.shape.lists != "tiled":
             return self
         if plan.chunk:
             return self._listing("ordered")  # as `render`
-        few = stack is not None and self._planner.tiles(stack.view) <= tiling.LOCAL_TILES
+        few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
         return self._listing("local") if few or resident.coherent else self
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
@@ -323,5 +326,5 @@ class OpenCLPipeline(Pipeline):
             "lists": frame.read("lists", np.uint32, (images.stats["pairs"],)),
             "records": frame.read("splats", self.source.records["Splat"], (resident.count,)),
             "raw": frame.read("raw", np.float32, (4, frame.rows, frame.stride)),
-            **{output.name: images.read(output.name) for output in self.features.images},
+            **{output.name: images.read(output.name, 0) for output in self.features.images},
         }

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 
 
@@ -26,12 +26,12 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def view_records(views: View | ViewStack, row: int, end: int, record: np.dtype) -> np.ndarray:
+def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.ndarray:
     """(moving groups + 1, views) of the record `View` (layout.py) for rows of samples [row, end); the numbers
     of a single view are in one row."""
     real = record[0].base  # all members have one type
-    if isinstance(views, View):
-        every = [views, *(of for _, of in views.groups)]
+    if len(views) == 1:
+        every = [views.view, *(moved for _, moved in views.view.groups)]
         return np.array([number for each in every for number in _numbers(each, row, end, record)], real)
     made = np.empty(views.translation.shape[:2], record)
     made[:] = np.array(_numbers(views.view, row, end, record), real).view(record)

@@ -5,19 +5,19 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits, Images, Pipeline, ResidentData
+from fidsplat.backends.interface import Backend, DeviceInfo, DeviceTraits, HostImages, Pipeline, ResidentData
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.culling import may_contribute
 from fidsplat.backends.reference.gradients import ReferenceGradients
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
-from fidsplat.effects import IMAGES, FeatureSet
+from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import color_range
@@ -101,30 +101,13 @@ class ReferenceCloud(ResidentData):
         return color_range(self.cloud.plain_colors, self.cloud.sh)
 
 
-@dataclass
-class ReferenceImages(Images):
-    """Output images in host memory."""
-
-    images: dict[str, np.ndarray]
-    timings: Mapping[str, float]
-    stats: Mapping[str, int]
-
-    def read(self, name: str) -> np.ndarray:
-        """The image in the type that every device gives."""
-        return self.images[name].astype(IMAGES[name].dtype)
-
-    def read_float64(self, name: str) -> np.ndarray:
-        """The image as it was computed; label and splat_id are integers all the same."""
-        return self.images[name]
-
-
 class ReferencePipeline(Pipeline):
     """Draws whole pictures (`render`) or chosen pixels (`pixels`)."""
 
     def __init__(self, features: FeatureSet) -> None:
         self.features, self._progress = features, _Progress()
 
-    def render(self, resident: ReferenceCloud, view: View) -> ReferenceImages:
+    def render_view(self, resident: ReferenceCloud, view: View) -> HostImages:
         """Draw every pixel, in float64."""
         return self.render_every(resident, view, 1)
 
@@ -134,7 +117,7 @@ class ReferencePipeline(Pipeline):
         view: View,
         step: int,
         tell: Callable[[float], object] | None = None,
-    ) -> ReferenceImages:
+    ) -> HostImages:
         """Render every step-th pixel in both directions."""
         rows, columns = np.mgrid[
             0 : view.height // view.samples : step, 0 : view.width // view.samples : step
@@ -143,15 +126,16 @@ class ReferencePipeline(Pipeline):
         self._progress = _Progress(tell, rows.size * view.samples**2)
         # tiles as those of a whole picture: the same splats, added up alike
         flat = self.pixels(resident, view, rows.ravel(), columns.ravel(), widest=_TILE)
-        images = {name: image.reshape(*rows.shape, *image.shape[1:]) for name, image in flat.items()}
+        images = {name: image.reshape(1, *rows.shape, *image.shape[1:]) for name, image in flat.items()}
         took = (time.perf_counter() - start) * 1e3
         count = len(resident.cloud)
-        return ReferenceImages(images, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
+        return HostImages(images, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
 
     def trace(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
         """The depth order, the float32 keys, and the finished images with the certificate."""
         splats = Setup(resident.cloud, view, self.features)
-        return {"order": splats.order, "keys": splats.key, **self.render(resident, view).images}
+        images = self.render_view(resident, view).arrays_of(0)
+        return {"order": splats.order, "keys": splats.key, **images}
 
     def pixels(
         self,

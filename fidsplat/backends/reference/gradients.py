@@ -29,7 +29,7 @@ class ReferenceGradients(GradientPipeline):
 
     def forward(self, resident: Any, view: View, waits: bool = True) -> Images:
         """Render one view."""
-        images = self._pipeline.render(resident, view)
+        images = self._pipeline.render_view(resident, view)
         self._last = images, FrozenFrame(resident.cloud, view, self._features)
         return images
 

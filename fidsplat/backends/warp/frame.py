@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fidsplat.backends.bands import split_by_cost
-from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import SubFrame
 from fidsplat.backends.warp.command_list import BLOCK, Launcher
 from fidsplat.backends.warp.memory_plan import MemoryPlanner
@@ -64,7 +64,7 @@ class DeviceFrame:
         program: Program,
         workspace: Workspace,
         resident: Resident,
-        stack: ViewStack,
+        stack: ViewBatch,
         launcher: Launcher,
         reserved: int = 0,
         capacity: Capacity | None = None,
@@ -95,7 +95,7 @@ class DeviceFrame:
         self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
         self.set_views(stack)
 
-    def set_views(self, stack: ViewStack) -> None:
+    def set_views(self, stack: ViewBatch) -> None:
         """Fill the arrays and structs of other views of the same kind."""
         program, inputs, view = self.program, self.inputs, stack.view
         self.stack, self.view = stack, view
@@ -124,7 +124,7 @@ class DeviceFrame:
         exposed = self._samples("exposed")
         reserved = self.reserved + self.planner.sample_bytes(self.view)
         for sub_frame in self.view.sub_frames:
-            stack = ViewStack.alone(sub_frame.view)
+            stack = ViewBatch.single(sub_frame.view)
             part = DeviceFrame(self.program, self.workspace, self.resident, stack, self.launcher, reserved)
             samples = part._render_pose()
             self.launcher.stage("expose")

@@ -38,7 +38,7 @@ class WarpDifferentiable(DifferentiableImages):
 
     def device_array(self, name: str) -> Any:
         """The image as a wp.array; no copy."""
-        return self.images.device_array(name)
+        return self.images.device_array(name, 0)
 
     def wait(self) -> None:
         """Wait until the device has rendered it."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.interface import BatchImages, Images, summed
+from fidsplat.backends.interface import Images, summed
 from fidsplat.backends.warp.command_list import Launcher
 from fidsplat.backends.warp.frame import ImageArrays
 from fidsplat.backends.warp.runtime import kernels, load, quiet
@@ -61,20 +61,22 @@ class WarpImages(Images):
         """Arrays of the images, complete or not."""
         return self.into.arrays
 
-    def device_array(self, name: str) -> Any:
-        """The image as a wp.array (h, w) or (h, w, 3) on the device; no copy."""
+    def device_array(self, name: str, index: int | None = None) -> Any:
+        """The image as a wp.array (1, h, w) or (1, h, w, 3), with an index without the first dimension, on
+        the device; no copy."""
         self._settled()
         output, array = self._outputs[name], self.into.arrays[name]
-        return array.reshape(self._size if output.channels == 1 else (*self._size, output.channels))
+        shape = self._size if output.channels == 1 else (*self._size, output.channels)
+        return array.reshape((1, *shape) if index is None else shape)
 
-    def read(self, name: str) -> np.ndarray:
-        """Copy an image to the host."""
+    def read(self, name: str, index: int | None = None) -> np.ndarray:
+        """Copy the image to the host."""
         # a CPU array's numpy() is its own memory, which device_array shares
-        return np.array(self.device_array(name).numpy())
+        return np.array(self.device_array(name, index).numpy())
 
-    def read_uint8(self, name: str) -> np.ndarray:
-        """Copy an image to the host in 8 bits, converted on the device."""
-        image = self.device_array(name)
+    def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
+        """Copy the image to the host in 8 bits, converted on the device."""
+        image = self.device_array(name, index)
         made = load().empty(image.size, dtype=load().uint8, device=image.device)
         given = [image.flatten(), made]
         with _CONVERTING, quiet():  # images are read in any thread, and the first read compiles
@@ -96,7 +98,7 @@ class WarpImages(Images):
         return self.profile() if self.profile else self._launcher.timings()
 
 
-class WarpBatch(BatchImages):
+class WarpBatch(Images):
     """Output images of all views of a batch."""
 
     shares_arrays = True
@@ -120,7 +122,7 @@ class WarpBatch(BatchImages):
         for output in outputs:
             size, dtype = batch.total * height * width * output.channels, getattr(load(), output.dtype)
             array = workspace.pool.fresh(f"{output.name} of {batch.total} views", size, dtype)
-            if len(batch.slots) < batch.total:
+            if len(batch) < batch.total:
                 array.fill_(output.blank)
             self._images[output.name] = output, array
         self._parts: list[WarpImages] = []
@@ -139,24 +141,20 @@ class WarpBatch(BatchImages):
         for images in self._parts:
             images.wait()
 
-    def device_array(self, name: str) -> Any:
-        """The images as a wp.array (views, h, w) or (views, h, w, 3) on the device; no copy."""
-        self._settle()
-        output, array = self._images[name]
-        shape = self.views, *self._size
-        return array.reshape(shape if output.channels == 1 else (*shape, output.channels))
-
-    def read(self, name: str) -> np.ndarray:
-        """Copy the images of all views to the host."""
-        return np.array(self.device_array(name).numpy())
-
-    def read_one(self, name: str, number: int) -> np.ndarray:
-        """Copy the image of one view to the host."""
+    def device_array(self, name: str, index: int | None = None) -> Any:
+        """The images as a wp.array (views, h, w) or (views, h, w, 3), with an index that of one view, on the
+        device; no copy."""
         self._settle()
         output, array = self._images[name]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
+        if index is None:
+            return array.reshape((self.views, *shape))
         size = math.prod(shape)
-        return np.array(array[number * size : (number + 1) * size].numpy()).reshape(shape)
+        return array[index * size : (index + 1) * size].reshape(shape)
+
+    def read(self, name: str, index: int | None = None) -> np.ndarray:
+        """Copy the images of all views, or of one, to the host."""
+        return np.array(self.device_array(name, index).numpy())
 
     def wait(self) -> None:
         """Wait until the device has rendered all views."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 
-from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
@@ -45,7 +45,7 @@ class MemoryPlanner:
         columns, rows = -(-view.width // self._tile_width), -(-view.height // self._tile_height)
         return rows * columns * self._tile_width * self._tile_height
 
-    def max_pairs(self, resident: Resident, stack: ViewStack, visible: int, reserved: int) -> int:
+    def max_pairs(self, resident: Resident, stack: ViewBatch, visible: int, reserved: int) -> int:
         """Number of pairs that may be listed at once. reserved: bytes of other arrays.
 
         Raises:
@@ -65,14 +65,14 @@ class MemoryPlanner:
 
     def parts(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[tuple[int, int]]:
         """Ranges [first, end) of views that are rendered together. reserved: bytes of all their images."""
-        count, views, workspace = len(batch.slots), batch.views, self._workspace
-        if not count or not isinstance(views, ViewStack) or (self._same_settings and views.numbers):
+        count, workspace = len(batch), self._workspace
+        if not count or not batch.stacked or (self._same_settings and batch.numbers):
             return iter([(k, k + 1) for k in range(count)])
-        each = resident.count * (self._splat_bytes + _VISIBLE) + self.sample_bytes(views.view)
+        each = resident.count * (self._splat_bytes + _VISIBLE) + self.sample_bytes(batch.view)
         free = workspace.memory_budget - resident.memory_bytes - reserved
         # half is for the lists
         fitting = min(free // 2, _MAX_PART_BYTES[workspace.device.is_cuda]) // each
-        numbered = _MAX_NUMBERED // max(self._samples(views.view), resident.count * self._lines)
+        numbered = _MAX_NUMBERED // max(self._samples(batch.view), resident.count * self._lines)
         together = max(1, min(fitting, numbered))
         # of equal size, so that parts have the same launches
         parts = -(-count // together)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewBatch, ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.command_list import LaunchCache
@@ -25,14 +25,20 @@ class WarpPipeline(Pipeline):
         self._renderer = FrameRenderer(program, workspace, launches)
         self._planner = MemoryPlanner(program, workspace)
 
-    def render(self, resident: Resident, view: View) -> WarpImages:
-        """Render one view.
+    def render(self, resident: Resident, views: ViewBatch) -> WarpImages | WarpBatch:
+        """Render views, as many at once as memory holds.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.working("while rendering"):
-            return self._renderer.render(resident, ViewStack.alone(view))
+            if views.is_single:
+                return self._renderer.render(resident, views)
+            images = WarpBatch(self.workspace, self.program.images, views, resident.count)
+            for first, end in self._planner.parts(resident, views, images.nbytes):
+                into = images.arrays_of(views.batch_indices[first:end])
+                images.add(self._renderer.render(resident, views.part(first, end), into, images.nbytes))
+            return images
 
     def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
         """Render one view; its frame, whose arrays are valid until another is rendered, and its images.
@@ -41,20 +47,7 @@ class WarpPipeline(Pipeline):
             DeviceError: as `render`.
         """
         with self.workspace.working("while rendering"):
-            return self._renderer.render_counted(resident, ViewStack.alone(view))
-
-    def render_batch(self, resident: Resident, batch: ViewBatch) -> WarpBatch:
-        """Render many views, as many at once as memory holds.
-
-        Raises:
-            DeviceError: the device runs out of memory or fails.
-        """
-        with self.workspace.working("while rendering"):
-            images = WarpBatch(self.workspace, self.program.images, batch, resident.count)
-            for first, end in self._planner.parts(resident, batch, images.nbytes):
-                into = images.arrays_of(batch.slots[first:end])
-                images.add(self._renderer.render(resident, batch.part(first, end), into, images.nbytes))
-            return images
+            return self._renderer.render_counted(resident, ViewBatch.single(view))
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view and return the data between the stages.
@@ -75,5 +68,5 @@ class WarpPipeline(Pipeline):
             "lists": named["lists"].numpy()[: stats["pairs"]].astype(np.uint32),
             "records": lines.reshape(n, -1).copy(),
             "raw": raw.reshape(rows, stride, 4).transpose(2, 0, 1).copy(),
-            **{output.name: images.read(output.name) for output in self.program.images},
+            **{output.name: images.read(output.name, 0) for output in self.program.images},
         }

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.command_list import CommandList, LaunchCache, Launcher
 from fidsplat.backends.warp.frame import Capacity, DeviceFrame, ImageArrays
@@ -47,7 +47,7 @@ class RecordedFrame:
         frame.launcher = before
         return None if commands is None else RecordedFrame(frame, token, commands)
 
-    def replay(self, stack: ViewStack) -> None:
+    def replay(self, stack: ViewBatch) -> None:
         """Run all stages but the last for other views."""
         if len(stack) > 1 or stack.view is not self.frame.view:
             self.frame.set_views(stack)
@@ -81,7 +81,7 @@ class FrameRenderer:
         )
 
     def render_counted(
-        self, resident: Resident, stack: ViewStack, into: ImageArrays | None = None, reserved: int = 0
+        self, resident: Resident, stack: ViewBatch, into: ImageArrays | None = None, reserved: int = 0
     ) -> tuple[DeviceFrame, WarpImages]:
         """Render views, waiting for their counts.
 
@@ -98,7 +98,7 @@ class FrameRenderer:
         return frame, self._resolved(frame, launcher, frame.stats, into)
 
     def render(
-        self, resident: Resident, stack: ViewStack, into: ImageArrays | None = None, reserved: int = 0
+        self, resident: Resident, stack: ViewBatch, into: ImageArrays | None = None, reserved: int = 0
     ) -> WarpImages:
         """Render views without waiting where a frame of their kind was rendered before."""
         workspace, view = self._workspace, stack.view
@@ -130,7 +130,7 @@ class FrameRenderer:
     def _pending(
         self,
         resident: Resident,
-        stack: ViewStack,
+        stack: ViewBatch,
         capacity: Capacity,
         frame: DeviceFrame,
         launcher: Launcher,
@@ -163,7 +163,7 @@ class FrameRenderer:
         return images
 
     def _profiler(
-        self, resident: Resident, stack: ViewStack, arrays: ImageArrays
+        self, resident: Resident, stack: ViewBatch, arrays: ImageArrays
     ) -> Callable[[], dict[str, float]]:
         """A function that measures the stages of a replayed frame by rendering it again, a batch into the
         same images."""
@@ -217,7 +217,7 @@ class FrameRenderer:
         pixels = view.width * view.height // view.samples**2
         return 4 * pixels * sum(output.channels for output in self.program.images)
 
-    def _update_capacity(self, resident: Resident, stack: ViewStack, visible: int, pairs: int) -> None:
+    def _update_capacity(self, resident: Resident, stack: ViewBatch, visible: int, pairs: int) -> None:
         kinds, kind = self._cached.setdefault(resident, {}), _kind(stack)
         if kind not in kinds and len(kinds) >= _MAX_KINDS:
             kinds.clear()
@@ -231,5 +231,5 @@ class FrameRenderer:
             )
 
 
-def _kind(stack: ViewStack) -> tuple[int, int, int]:
+def _kind(stack: ViewBatch) -> tuple[int, int, int]:
     return stack.view.width, stack.view.height, len(stack)

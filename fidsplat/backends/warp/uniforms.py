@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewStack
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
@@ -36,7 +36,7 @@ def _record() -> Any:
     return np.dtype(kernels("common").View.numpy_dtype())
 
 
-def uniforms(stack: ViewStack, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
+def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
     """(views,) of the struct `View`, of pictures in tiles of this shape. splats: of the cloud. sloped: its
     kernels read rays' derivatives."""
     view = stack.view
@@ -95,7 +95,7 @@ def rays_of(
     return rays
 
 
-def array_of(stack: ViewStack, name: str) -> np.ndarray:
+def array_of(stack: ViewBatch, name: str) -> np.ndarray:
     """An array of an effect, which all views have in common, or the rows of one view after the other's."""
     view = stack.view
     if name != "row_rotations" or len(stack) == 1:
@@ -124,7 +124,7 @@ def lens_of(view: View, workspace: Workspace) -> Any:
     return lens
 
 
-def moving_of(resident: Resident, stack: ViewStack, inputs: ArrayPool) -> Any:
+def moving_of(resident: Resident, stack: ViewBatch, inputs: ArrayPool) -> Any:
     """The struct `Moving` of a picture; an empty one if nothing moves. inputs: of its arrays."""
     declared, groups = kernels("motion"), stack.view.groups
     kind = declared.make_motion(bool(groups)).Moving

@@ -10,6 +10,7 @@ from datetime import date
 
 import numpy as np
 
+from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import DeviceInfo, Rates
 from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
@@ -203,4 +204,4 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
     assert not isinstance(data, Residency), "of splats in memory"
     features, view = prepare(data, Capture(camera, quality=quality))
     features = replace(features, outputs=("overdraw",))
-    return renderer.backend.pipeline(features).render(data, view).read("overdraw")
+    return renderer.backend.pipeline(features).render(data, ViewBatch.single(view)).read("overdraw", 0)
