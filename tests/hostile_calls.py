@@ -242,8 +242,8 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "RigImages.placed": lambda _: (_pictures().placed, {"environment": 0}, None),
     "RigImages[]": lambda _: (_pictures().__getitem__, {"name": "rgb"}, None),
     "read_description": lambda folder: (read_description, {"path": folder / "none.sdf", "models": ()}, None),
-    "read_back": lambda _: (read_back, {"picture": np.zeros((16, 24, 3), np.uint8), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),
-    "truth_of": lambda _: (truth_of, {"picture": _frame(), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),
+    "read_back": lambda _: (read_back, {"frame": np.zeros((16, 24, 3), np.uint8), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),
+    "truth_of": lambda _: (truth_of, {"frame": _frame(), "scene": fs.Scene(markers=[PlacedMarker(TAG)]), "camera": CAMERA}, None),
     "points_of": lambda _: (points_of, {"depth": np.ones((16, 24)), "camera": CAMERA}, None),
     "optical_flow": lambda _: (
         optical_flow, {"depth": np.ones((16, 24)), "before": CAMERA, "after": CAMERA, "label": None, "motions": None}, None
