@@ -1,4 +1,4 @@
-"""The numbers of one picture: what a camera, a quality and a scene's surroundings mean to the kernels."""
+"""View: the uniforms of a frame, from a camera, a quality and a background."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.util.errors import InputError
 
 FAR_EYE = 1e9
-"""metres: where the eye of a parallel projection is taken to be"""
+"""metres: distance of the eye of a parallel projection"""
 NO_CAMERA = "no camera: pass camera=fs.Camera... or give the scene a [camera] table"
 MAX_GRID = 32767
 """Largest side of the sample grid: anchors and rows are kept in 16 bits."""
@@ -26,7 +26,7 @@ _NO_SENSOR = Sensor()
 
 @dataclass(frozen=True)
 class View:
-    """The uniforms of one picture: numbers that change from view to view, in float64.
+    """The uniforms of a frame, in float64.
 
     The sample grid is the picture with `samples` x `samples` samples in each pixel.
     """
@@ -38,16 +38,16 @@ class View:
     samples: int
     """per pixel and axis"""
     focal_x: float
-    """samples per unit of what the lens makes of a direction: of x / z for a pinhole, of radians for a
-    panorama, of metres where rays are parallel. A camera's fx is that in pixels"""
+    """samples per unit of x / z of a pinhole, per radian of a panorama, per metre of parallel rays; fx of a
+    camera is in pixels"""
     focal_y: float
     center_x: float
-    """samples: where the optical axis meets the picture, as center_y"""
+    """samples: principal point"""
     center_y: float
     rotation: np.ndarray
     """(3, 3) world to camera"""
     translation: np.ndarray
-    """(3,) metres: where the cloud's origin lies in the camera frame"""
+    """(3,) metres: the cloud's origin in the camera frame"""
     eye: np.ndarray
     """(3,) metres: the camera's centre relative to the cloud's origin, world axes; far behind it for parallel
     rays"""
@@ -58,9 +58,9 @@ class View:
     ceiling: float
     stop: float
     background: tuple[float, float, float]
-    """the fog's colour where there is fog"""
+    """with fog, its colour"""
     first_light: float
-    """transmittance that is left behind a first hit"""
+    """transmittance behind a first hit"""
     sensor: Sensor = _NO_SENSOR
     fog_density: float = 0.0
     """1 / metres"""
@@ -73,19 +73,19 @@ class View:
     along_ray: bool = False
     """whether near, far, sort keys and depths are distances from the camera's centre; else along z"""
     slopes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """of rays, -x, x, -y, y: EWA takes a pinhole's derivatives there where a centre lies further out"""
+    """limits of -x, x, -y, y at z = 1, to which EWA clamps the point of its derivatives"""
     parallel: bool = False
     """whether all rays are parallel to z; focal_x and focal_y are samples per metre then"""
     groups: tuple[tuple[int, View], ...] = ()
-    """(label, the view that its splats have), for splats that move by themselves"""
+    """(label, view of its splats), for moving groups of splats"""
     sub_frames: tuple[SubFrame, ...] = ()
-    """the sub-pictures of which this picture is made; none: it is one"""
+    """the sub-frames of an exposure; none for a single pose"""
     band: tuple[int, int] | None = None
-    """rows of samples [first, end) that are wanted, with the bits of the whole; None: all"""
+    """rows of samples [first, end) that are rendered, bit-identical to the complete frame; None: all"""
 
     @property
     def lens(self) -> Lens | None:
-        """What stands before a pinhole; None for a pinhole."""
+        """The lens; None for a pinhole."""
         if self.raster is not None:
             return self.raster.lens
         return Orthographic() if self.parallel else None
@@ -101,7 +101,7 @@ class View:
         return rotations
 
     def rows(self, top: int, end: int) -> View:
-        """The view of rows of samples [top, end) alone."""
+        """The view restricted to rows of samples [top, end)."""
         if (top, end) == (0, self.height):
             return self
         return replace(
@@ -113,7 +113,7 @@ class View:
         )
 
     def uniform(self, name: str) -> tuple[Any, ...]:
-        """Numbers of an effect, by the name of their group, in an order that all kernels know."""
+        """Numbers of an effect, by the name of their group."""
         around = self.surroundings
         match name:
             case "ray" if self.along_ray or self.parallel:
@@ -163,7 +163,7 @@ class View:
         if max(camera.width, camera.height) * n > MAX_GRID:
             raise InputError(
                 f"{camera.width} x {camera.height} pixels with {n} x {n} samples each is too large: at most "
-                f"{MAX_GRID} samples along a side; use fewer samples or a smaller picture"
+                f"{MAX_GRID} samples along a side; use fewer samples or a smaller image"
             )
         external = capture.external_depth
         if external is not None and external.depth.shape != (camera.height, camera.width):
@@ -178,7 +178,7 @@ class View:
         lens, grid = camera.lens, (camera.width * n, camera.height * n)
         intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n
         parallel = isinstance(lens, Orthographic)
-        # 3DGS and gsplat: 0.3 half pictures outside the picture
+        # 3DGS and gsplat: 0.3 half images outside the image
         beyond = [0.15 * size / f for size, f in zip(grid, intrinsics[:2], strict=True)]
         slopes = (
             intrinsics[2] / intrinsics[0] + beyond[0],
@@ -197,7 +197,7 @@ class View:
             center_y=intrinsics[3],
             rotation=rotation,
             translation=-rotation @ eye,
-            # colours that depend on the view see parallel rays come from very far away
+            # view-dependent colours of parallel rays are those of a distant eye
             eye=eye - FAR_EYE * rotation[2] if parallel else eye,
             near=camera.near,
             far=camera.far,

@@ -1,4 +1,4 @@
-"""The kernels of one feature set, made and compiled for one Warp device."""
+"""The kernels of a feature set, compiled for a Warp device."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ SLOTS = frozenset(
     | {"footprint_gaussian", "footprint_box", "footprint_mixed"}
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure", "external_depth"}
-    # they change no picture, and nothing here
+    # without effect on images
     | {"shutter_rows", "ellipsoids_only"}
 )
-"""effects of slots that the kernels have; outputs and steps after blending are those that have a file"""
-# what depends on an effect: a stage is compiled once for all feature sets that mean the same to it
+"""supported features; supported outputs and post-processing steps have a file each"""
+# effects that a stage depends on; it is compiled once for all feature sets with the same
 _RECORD = (
     *("lowpass_screen", "rays", "camera_orthographic", "ray_depth"),
     *("compose_pixel", "compose_coplanar", "footprint_box", "footprint_mixed", "ellipsoid_exact"),
@@ -41,27 +41,26 @@ _SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length", "extern
 
 
 def known() -> frozenset[str]:
-    """All effects that the Warp kernels have."""
+    """All supported effects."""
     return SLOTS | kernels("output").known() | kernels("post").known()
 
 
 def unsupported(features: FeatureSet, name: str) -> str:
-    """What of these features the Warp kernels have not, as the message of an error; empty if they have all.
-    name: of the device."""
+    """Error message naming unsupported effects; empty if there are none. name: of the device."""
     lacking = ", ".join(sorted({*features.slots, *features.outputs, *features.posts} - known()))
     return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
 
 
 @dataclass(frozen=True)
 class _Needs:
-    """What the stages of a feature set depend on."""
+    """Requirements of a feature set."""
 
     effects: frozenset[str]
-    """slots, and what the kernels call for because of them and of outputs"""
+    """features, and effects that they and outputs imply"""
     outputs: tuple[str, ...]
-    """files of kernels/warp/output: the images', and all that these need"""
+    """files of kernels/warp/output, dependencies included"""
     blending: tuple[str, ...]
-    """those that blending has to do with"""
+    """those that take part in blending"""
     steps: tuple[str, ...]
     """files of kernels/warp/post, in their order"""
 
@@ -86,22 +85,22 @@ class _Needs:
         return cls(frozenset(effects), outputs, blending, steps)
 
     def among(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Those of these effects that are needed."""
+        """The required effects of `names`."""
         return tuple(name for name in names if name in self.effects)
 
 
 _MAKING = threading.RLock()
-"""kernels and structs are cached by their arguments; two threads that miss at once would make two of one"""
+"""held while kernels and structs are made: their caches are not thread-safe"""
 
 
 class Program:
-    """The stages' kernels, and what the host must know of them."""
+    """Compiled kernels of all stages, and their struct types."""
 
     def __init__(self, device: Any, name: str, features: FeatureSet, shape: WarpShape) -> None:
         """name: of the device, for errors.
 
         Raises:
-            DeviceError: what is `unsupported`, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler fails.
         """
         if why := unsupported(features, name):
             raise DeviceError(why)
@@ -142,29 +141,29 @@ class Program:
         self.sloped = boxes and "rays" in needs.effects
         """whether blending reads the derivatives of a lens's rays"""
         self.opaque = "external_depth" in needs.effects
-        """whether it reads a layer of another renderer"""
+        """whether it reads an external depth image"""
         grouped = self.shape.schedule == "group"
         self.blend, self.state, self.blend_block = kernels("blend").make_blend(
             needs.among(_SAMPLE), blending, grouped, self.tile_area, self.shape.k_buffer_size
         )
-        """its kernel, the struct of a sample, and the threads that draw a tile on a GPU"""
+        """the kernel, the struct of a sample, and the threads of a tile on a GPU"""
         self.sample_fields = buffers.sample_fields(blending)
         """sample buffers: type of an element"""
         self.samples_type = buffers.make_samples(tuple(self.sample_fields.items()))
         light = buffers.light_of(blending) if "shutter_exposure" in needs.effects else ()
         self.expose = {name: kernels("shutter").make_expose(self.sample_fields[name]) for name in light}
-        """kernels that gather sample buffers of several poses, by the buffer's name"""
+        """kernels that accumulate sample buffers of sub-frames, by the buffer's name"""
 
     def _make_resolve(self, features: FeatureSet, needs: _Needs) -> None:
         output, behind = kernels("output"), kernels("background")
         kinds = [kind for kind in behind.KINDS if f"background_{kind}" in needs.effects]
         self.backdrop = behind.make_backdrop(kinds[0], "rays" in needs.effects) if kinds else None
-        """the kernel of what is seen behind everything; None where that is of one colour"""
+        """the kernel of the background; None for a constant one"""
         images = tuple((image.name, getattr(load(), image.dtype)) for image in self.images)
         self.images_type = kernels("buffers").make_images(images, needs.outputs)
         self.cloud_arrays = output.fields(needs.outputs, "cloud_arrays")
         self.view_arrays = output.fields(needs.outputs, "view_arrays")
-        """what resolving reads besides: type of an element"""
+        """further arrays that resolving reads: type of an element"""
         self.stretched = "camera_brown_conrady" in needs.effects and bool(
             output.having(features.outputs, "length")
         )
@@ -189,14 +188,14 @@ class Program:
             raise DeviceError(f"{self._name} cannot compile {kernel.key}; Warp says more on stderr")
 
     def load_banding(self) -> None:
-        """Compile what only a picture with more pairs than the budget needs."""
+        """Compile the kernels of frames with several bands."""
         with _MAKING, quiet():
             self.compile(self.lists.histogram)
             self.compile(self.lists.count)
 
 
 class GradientKernels:
-    """The kernels of derivatives, compiled when they are asked for."""
+    """The kernels of the backward pass, compiled on first use."""
 
     def __init__(self, program: Program) -> None:
         """
@@ -223,7 +222,7 @@ class GradientKernels:
 
 
 class SensorKernel:
-    """The kernel of the sensor's steps, which runs after resolving, and what it reads."""
+    """The kernel of the sensor's steps, after resolving, and its settings."""
 
     def __init__(self, steps: tuple[str, ...]) -> None:
         self._steps = [kernels("post").declared(name) for name in steps]

@@ -1,4 +1,4 @@
-"""Clouds on a Warp device: uploaded, or arrays that are there already."""
+"""Clouds on a Warp device: uploaded, or adopted arrays."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Resident(ResidentData):
         )
         self.footprint, self.ellipsoids = footprint, ellipsoids
         self.adopted = False
-        """whether somebody else may change the arrays"""
+        """whether the caller may change the arrays"""
 
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel, from any direction, of the current values."""
@@ -48,12 +48,12 @@ class Resident(ResidentData):
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the device that the splats take; adopted arrays are among them."""
+        """Bytes of the splats, including adopted arrays."""
         return sum(map(nbytes, self.arrays.values()))
 
     @classmethod
     def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
-        """The cloud on the device."""
+        """Upload a cloud."""
         colors = cloud.plain_colors
         if colors is None and cloud.sh is not None:
             colors = cloud.sh.reshape(-1, 3)
@@ -78,16 +78,16 @@ class Resident(ResidentData):
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:
-        """Arrays that are on the device already, or NumPy's; no copy where none is needed.
+        """Adopt arrays of the device or of NumPy, without a copy where possible.
 
         Raises:
-            InputError: an array has the wrong shape or type, or lies on another device.
+            InputError: an array has the wrong shape or type, or is on another device.
         """
         arrays, ellipsoids = {name: _adopted(name, value, pool) for name, value in given.items()}, "none"
         count = arrays["means"].size
         if count and arrays["scales"].dtype is load().vec3:
             arrays |= _apart(arrays["scales"])
-            ellipsoids = "some"  # which are, the arrays say when a picture is drawn
+            ellipsoids = "some"  # decided per splat when a frame is rendered
         terms = 0
         if "sh" in arrays:
             arrays["colors"] = arrays.pop("sh")
@@ -128,14 +128,14 @@ def _dtype(name: str) -> Any:
 
 
 def _apart(scales: Any) -> dict[str, Any]:
-    """Scales and thickness, as the kernels read them, on the memory of an array of all three."""
+    """Split an array of three scales into views of scales and thickness."""
     wp = load()
 
     def part(first: int, dtype: Any) -> Any:
         at = scales.ptr + first * wp.types.type_size_in_bytes(wp.float32)
         shape, strides = scales.shape, scales.strides
         view = wp.array(ptr=at, dtype=dtype, shape=shape, strides=strides, device=scales.device)
-        view._ref = scales  # which it must not outlive
+        view._ref = scales  # keeps the memory alive
         return view
 
     return {"scales": part(0, wp.vec2), "thickness": part(2, wp.float32)}
@@ -157,7 +157,7 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool, dtype: Any = None) 
 
 
 def _is_thick(scales: Any) -> bool:
-    """Whether an array of any kind has three scales for each splat."""
+    """Whether an array of any library has three scales per splat."""
     wp = load()
     if isinstance(scales, wp.array) and scales.ndim == 1:
         return wp.types.type_size(scales.dtype) == 3
@@ -166,7 +166,7 @@ def _is_thick(scales: Any) -> bool:
 
 
 def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
-    """One array of elements as the kernels read them, on the memory of `value` wherever it can be."""
+    """One array in the element type of the kernels, on the memory of `value` where possible."""
     wp = load()
 
     dtype = wp.vec3 if name == "scales" and _is_thick(value) else _dtype(name)

@@ -1,4 +1,4 @@
-"""Warp itself: imported on first use, without a word on stdout, and the kernel package beside it."""
+"""Warp and the kernel package, imported on first use."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fidsplat.util.streams import without_stderr
 MISSING = "Warp is not installed; install it with: pip install 'fidsplat[warp]' (or pip install warp-lang)"
 _PACKAGE = "fidsplat_warp_kernels"
 _LOADED = (".o", ".cubin", ".ptx", ".meta")
-"""ends of the names of compiled kernels in Warp's cache"""
+"""suffixes of compiled kernels in Warp's cache"""
 
 
 def installed() -> bool:
@@ -49,7 +49,7 @@ def load() -> ModuleType:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Within it Warp tells warnings only: what it says of modules would stand amid a command's output."""
+    """A context in which Warp logs warnings only, not the loading of modules."""
     import warp
 
     level, warp.config.log_level = warp.config.log_level, warp.LOG_WARNING

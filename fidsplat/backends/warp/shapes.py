@@ -1,4 +1,4 @@
-"""How pictures are cut for a device, and other ways that tests compare with it."""
+"""Build constants of kernels for a device, and others for tests."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class WarpShape:
-    """How pictures are cut for a device."""
+    """Build constants of the kernels."""
 
     schedule: str
-    """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
+    """`tiles`: a thread renders a tile (CPU). `group`: a block of threads renders a tile (CUDA)."""
     tile_width: int
     """samples: 8, 16 or 32, as its height"""
     tile_height: int
@@ -20,7 +20,7 @@ class WarpShape:
 
 
 def shape_for(device: Any) -> WarpShape:
-    """The device's own."""
+    """The shape for a device."""
     return WarpShape("group" if device.is_cuda else "tiles", 16, 16)
 
 

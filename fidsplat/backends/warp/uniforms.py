@@ -1,5 +1,7 @@
-"""The structs of kernels/warp that a picture's view fills: its numbers, its lens, what moves, and what lies
-behind the splats. Arrays of lenses and panoramas are kept as long as these are."""
+"""The structs of kernels/warp that hold a view: its numbers, lens, moving groups, and background.
+
+Arrays of lenses and panoramas are cached as long as the host refers to them.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +28,9 @@ _DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
     "tiles_y": lambda view, shape: -(-view.height // shape.tile_height),
     "per_pixel": lambda view, shape: 1.0 / view.samples**2,
 }
-"""fields that a view does not have by their names"""
+"""fields that are derived from a view"""
 _LATER = frozenset({"per_focal_x", "per_focal_y", "per_near", "ray", "ray_step", "splats"})
-"""those that follow from others, or from what a view does not know"""
+"""fields that are filled separately"""
 
 
 @cache
@@ -37,8 +39,8 @@ def _record() -> Any:
 
 
 def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
-    """(views,) of the struct `View`, of pictures in tiles of this shape. splats: of the cloud. sloped: its
-    kernels read rays' derivatives."""
+    """Fill the struct `View` (views,) for tiles of this shape. splats: of the cloud. sloped: whether kernels
+    read derivatives of rays."""
     view = stack.view
     filled: Any = np.zeros(len(stack), _record())
     for name in filled.dtype.names:
@@ -51,12 +53,12 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
         filled[name] = numbers
     for name in ("focal_x", "focal_y", "near"):
         filled[f"per_{name}"] = 1.0 / filled[name]
-    if not (view.along_ray or view.parallel):  # else depths are distances already, and the ray is 0
+    if not (view.along_ray or view.parallel):  # else depths are distances, and the ray is 0
         own = (filled["per_focal_x"], filled["per_focal_y"], filled["center_x"], filled["center_y"])
         filled["ray"] = np.stack(own, axis=1)
     filled["splats"] = splats
     if sloped and view.raster:
-        filled["ray_step"] = view.raster.step  # of which it takes long to ask
+        filled["ray_step"] = view.raster.step
     return filled
 
 
@@ -72,7 +74,7 @@ def rays_of(
     it has no raster, or unless `bent`. inputs: of the layer.
 
     Raises:
-        DeviceError: the device has no memory for them.
+        DeviceError: the device has too little memory.
     """
     wp, raster = load(), view.raster if bent else None
     kind = kernels("rays").struct_of_rays(raster is not None, raster is not None and sloped, opaque)
@@ -96,7 +98,7 @@ def rays_of(
 
 
 def array_of(stack: ViewBatch, name: str) -> np.ndarray:
-    """An array of an effect, which all views have in common, or the rows of one view after the other's."""
+    """An array of an effect: shared by all views, or their rows concatenated."""
     view = stack.view
     if name != "row_rotations" or len(stack) == 1:
         return view.array(name)
@@ -107,7 +109,7 @@ def lens_of(view: View, workspace: Workspace) -> Any:
     """The struct `Lens` of a view; an empty one if it has no raster.
 
     Raises:
-        DeviceError: the device has no memory for its arrays.
+        DeviceError: the device has too little memory.
     """
     wp, declared, raster = load(), kernels("lens"), view.raster
     if raster is None:
@@ -125,34 +127,33 @@ def lens_of(view: View, workspace: Workspace) -> Any:
 
 
 def moving_of(resident: Resident, stack: ViewBatch, inputs: ArrayPool) -> Any:
-    """The struct `Moving` of a picture; an empty one if nothing moves. inputs: of its arrays."""
+    """The struct `Moving` of a frame; empty if nothing moves. inputs: pool of its arrays."""
     declared, groups = kernels("motion"), stack.view.groups
     kind = declared.make_motion(bool(groups)).Moving
     if not groups:
         return _empty(kind)
-    held = kind()
+    cached = kind()
     labels = np.array([label for label, _ in groups], np.int32)
     poses: Any = np.zeros((len(stack), len(groups)), declared.Pose.numpy_dtype())
     for name in ("rotation", "translation", "eye"):
         poses[name] = np.swapaxes(getattr(stack, name)[1:], 0, 1)
-    held.labels = resident.arrays["labels"]
-    held.groups = inputs.filled("groups", labels, load().int32)
-    held.poses = inputs.filled("poses", poses.ravel(), declared.Pose)
-    return held
+    cached.labels = resident.arrays["labels"]
+    cached.groups = inputs.filled("groups", labels, load().int32)
+    cached.poses = inputs.filled("poses", poses.ravel(), declared.Pose)
+    return cached
 
 
 @cache
 def _empty(kind: Any) -> Any:
-    """A struct without arrays: the same from picture to picture, so that no launch packs it again."""
+    """A struct without arrays, shared by all frames so that it is packed once."""
     return kind()
 
 
 def surroundings_of(view: View, workspace: Workspace) -> Any:
-    """The struct `Surroundings` of a view whose background is not of one colour. A panorama stays on the
-    device as long as it lives.
+    """The struct `Surroundings` of a gradient or panorama.
 
     Raises:
-        DeviceError: there is no room for the panorama.
+        DeviceError: the device has too little memory for the panorama.
     """
     wp, behind = load(), view.surroundings
     kind = "gradient" if isinstance(behind, Gradient) else "panorama"
@@ -166,41 +167,41 @@ def surroundings_of(view: View, workspace: Workspace) -> Any:
 
 
 def memory_bytes(view: View, workspace: Workspace) -> int:
-    """Bytes that the arrays of a view's lens, panorama and external depth image take on the device."""
+    """Bytes of the arrays of a view's lens, panorama and external depth image."""
     around, raster, external = view.surroundings, view.raster, view.external_depth
-    held = {} if raster is None else workspace.lenses.get(raster.whole or raster, {})
+    cached = {} if raster is None else workspace.lenses.get(raster.whole or raster, {})
     taken = [around.image] if isinstance(around, Panorama) else []
     taken += [] if external is None else [external.rgb, external.depth, external.label]
-    return sum(map(nbytes, held.values())) + sum(array.nbytes for array in taken)
+    return sum(map(nbytes, cached.values())) + sum(array.nbytes for array in taken)
 
 
 def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:
-    """Of the whole raster."""
+    """Device arrays of a complete raster."""
     wp, raster = load(), raster.whole or raster
-    held = workspace.lenses.setdefault(raster, {})
-    if not held:
-        held["rays"] = _fresh("rays", raster.rays.reshape(-1, 3), wp.vec3, workspace)
+    cached = workspace.lenses.setdefault(raster, {})
+    if not cached:
+        cached["rays"] = _fresh("rays", raster.rays.reshape(-1, 3), wp.vec3, workspace)
         if raster.lens.kind != "equirectangular":
-            held["cells"] = _fresh("ray map", raster.map[0], wp.vec4s, workspace)
-    return held
+            cached["cells"] = _fresh("ray map", raster.map[0], wp.vec4s, workspace)
+    return cached
 
 
 def _fresh(name: str, array: np.ndarray, dtype: Any, workspace: Workspace) -> Any:
     wp = load()
-    held = workspace.pool.fresh(name, len(array), dtype)
-    wp.copy(held, wp.array(array, dtype=dtype, device="cpu"))
-    return held
+    cached = workspace.pool.fresh(name, len(array), dtype)
+    wp.copy(cached, wp.array(array, dtype=dtype, device="cpu"))
+    return cached
 
 
 def _panorama(panorama: Panorama, workspace: Workspace) -> Any:
-    wp, held = load(), workspace.panoramas
-    if panorama not in held:
+    wp, cached = load(), workspace.panoramas
+    if panorama not in cached:
         image = panorama.image
         try:
-            held[panorama] = wp.array(image, dtype=wp.vec3, device=workspace.device)
+            cached[panorama] = wp.array(image, dtype=wp.vec3, device=workspace.device)
         except (RuntimeError, MemoryError) as error:
             raise DeviceError(
                 f"the panorama needs {bytes_words(image.nbytes)}, which {workspace.device} has not; use a "
                 "smaller one"
             ) from error
-    return held[panorama]
+    return cached[panorama]
