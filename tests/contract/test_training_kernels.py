@@ -266,9 +266,9 @@ def test_a_step_by_a_picture_that_was_followed_is_refused(renderer, views, works
     resident = device.resident(2, np.zeros(3))
     late, last = (taken_back(renderer, device, views[2], resident, 0) for _ in range(2))
     kept = device.read().values["means"].tobytes()
-    with pytest.raises(InputError, match="before the next picture"):
+    with pytest.raises(InputError, match="before the next frame"):
         device.step(late, learning_rates(TrainSettings(), 100, 1.5), 1, None, np.zeros(3))
-    with pytest.raises(InputError, match="before the next picture"):
+    with pytest.raises(InputError, match="before the next frame"):
         late.gradients()
     assert device.read().values["means"].tobytes() == kept
     assert last.gradients()["means"].get().any()

@@ -1,5 +1,4 @@
-"""A step's launches are kept from the last, and losses are asked for when others have followed: the bits are
-those of steps of which each is planned and waited for."""
+"""Replayed steps and deferred losses: bit-identical to steps that are recorded and waited for."""
 
 import math
 import threading
@@ -42,8 +41,8 @@ def splats_of(trainer):
     return {name: array.tobytes() for name, array in trainer._model.read().values.items()}
 
 
-def test_steps_are_launched_again_with_the_same_bits(on_groups, dataset, monkeypatch):
-    """Also where pictures of another kind come in between, and where their buffers are let go."""
+def test_replayed_steps_are_bit_identical(on_groups, dataset, monkeypatch):
+    """Also after frames of another kind, and after their buffers are released."""
     again, planned = (Trainer(dataset, on_groups, **STEADY) for _ in range(2))
     launched = []
     for _ in range(8):
@@ -87,8 +86,8 @@ def set_all(self, values):
     set_changed(self, values)
 
 
-def test_a_picture_with_more_pairs_than_there_is_room_for_is_not_launched_as_the_last(on_groups, monkeypatch):
-    """Splats that have grown since fill more tiles: the kept launches say so, and it is drawn with room."""
+def test_a_replayed_frame_that_exceeds_its_capacity_is_rendered_again(on_groups, monkeypatch):
+    """Larger splats cover more tiles: the replay exceeds its capacity, and the frame is rendered again."""
     wide, losses, refused = scene(size=(80, 64)), [], []
     check_capacity = OpenCLGradients._check_capacity
 
@@ -110,13 +109,13 @@ def test_a_picture_with_more_pairs_than_there_is_room_for_is_not_launched_as_the
         for _ in range(6):
             trainer.step()
         large = np.exp(trainer._model.read().values["log_scales"] + np.float32(2.5))
-        cl.enqueue_copy(on_groups.backend.queue, kernels._held["activated_scales"], large)
+        cl.enqueue_copy(on_groups.backend.queue, kernels._bound["activated_scales"], large)
         losses.append([trainer.step().loss for _ in range(3)])
         assert len(refused) == 1
     assert losses[0] == losses[1]
 
 
-def test_steps_are_those_of_a_run_that_tells_them_later(renderer, dataset):
+def test_steps_are_the_same_if_they_are_reported_later(renderer, dataset):
     """At the end of a run all are told, in their order."""
     settings = {**QUICK, "iterations": 40}
     prompt, late, at_once = (Trainer(dataset, renderer, **settings) for _ in range(3))
@@ -162,7 +161,7 @@ def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoi
     assert again.iteration == 1
 
 
-def test_an_interrupt_while_the_step_is_compiled_counts_nobody_twice(renderer, dataset, monkeypatch):
+def test_an_interrupt_during_compilation_leaves_the_statistics_unchanged(renderer, dataset, monkeypatch):
     whole, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
     whole.step()
 
@@ -180,7 +179,7 @@ def test_an_interrupt_while_the_step_is_compiled_counts_nobody_twice(renderer, d
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_no_memory_while_splats_are_made(renderer, dataset, tmp_path, monkeypatch, strategy):
+def test_a_failed_densification_keeps_the_checkpoint(renderer, dataset, tmp_path, monkeypatch, strategy):
     """Arrays of two lengths are neither drawn nor kept: the last checkpoint stays, and gives the same run."""
     settings = {**QUICK, "iterations": 24, "sh_degree": 1, "strategy": strategy, "growth": 1.5}
     file, pool = tmp_path / "run.training.npz", renderer.backend.pool
@@ -211,7 +210,7 @@ def test_no_memory_while_splats_are_made(renderer, dataset, tmp_path, monkeypatc
     assert splats_of(again) == splats_of(whole)
 
 
-def test_an_interrupt_keeps_the_losses_that_nobody_has_asked_for(renderer, dataset, monkeypatch):
+def test_an_interrupt_keeps_pending_losses(renderer, dataset, monkeypatch):
     whole, stopped = (Trainer(dataset, renderer, **STEADY) for _ in range(2))
     whole.run()
     monkeypatch.setattr("fidsplat.train.trainer._READ_SECONDS", 60.0)
@@ -232,7 +231,7 @@ def test_an_interrupt_keeps_the_losses_that_nobody_has_asked_for(renderer, datas
 
 
 @pytest.mark.parametrize("losses", [{}, {"normal_from": 24, "distortion_from": 30, "distortion_weight": 1.0}])
-def test_what_a_run_draws_next_is_compiled_meanwhile(renderer, dataset, monkeypatch, losses):
+def test_upcoming_kernels_are_compiled_in_the_background(renderer, dataset, monkeypatch, losses):
     """Each set of kernels before the first iteration that draws by it, and all that are drawn by."""
     begun, drawn = [], []
     backend = renderer.backend
@@ -251,7 +250,7 @@ def test_what_a_run_draws_next_is_compiled_meanwhile(renderer, dataset, monkeypa
     assert [iteration for iteration, _ in begun] == changes
 
 
-def test_compiling_in_the_background_gives_what_is_asked_for_and_its_errors(renderer, dataset, monkeypatch):
+def test_background_compilation_returns_kernels_and_errors(renderer, dataset, monkeypatch):
     """What fails there is an error where it is needed."""
     backend = renderer.backend
     capture = fs.Capture(dataset.views[0].camera, quality="surfel")

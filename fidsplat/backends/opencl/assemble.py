@@ -129,7 +129,7 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
 
 
 def _parts_of(names: Iterable[str]) -> set[str]:
-    """What layouts need, and what that needs."""
+    """The parts that layouts require, directly or through other parts."""
     parts: set[str] = set()
     chosen = list(names)
     todo = chosen.copy()
@@ -389,7 +389,7 @@ class Declarations:
 
 @cache
 def _shown(file: str) -> str:
-    """What `#line` calls a file: its path below kernels/, or its name if it is not from there."""
+    """The file name for `#line`: the path below kernels/, or the name of a file from elsewhere."""
     return f'"{Path(file).name}"' if Path(file).is_absolute() else f'"opencl/{file}"'
 
 

@@ -99,7 +99,8 @@ class OpenCLTraining(TrainingKernels):
         self._program = Program(workspace, source)
         self._commands = CommandList(self._program)
         """of kernels that are not replayed"""
-        self._held: dict[str, Any] = {}
+        self._bound: dict[str, Any] = {}
+        """buffers and numbers of the splats by kernel argument"""
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._count = 0
         self._resident: tuple[int, ResidentArrays] | None = None
@@ -126,22 +127,24 @@ class OpenCLTraining(TrainingKernels):
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Set arrays of the splats."""
         for name, array in arrays.items():
-            self._held[name] = self._put(f"the splats' {name}", array)
+            self._bound[name] = self._put(f"the splats' {name}", array)
             self._shapes[name] = array.shape
         self._splats_changed()
 
     def gather_rows(self, rows: np.ndarray, remaining: int) -> None:
         """Replace the splats by rows of them."""
-        self._held["rows"], self._count = self._put("rows", rows), len(rows)
+        self._bound["rows"], self._count = self._put("rows", rows), len(rows)
         for name, shape in self._shapes.items():
             made = len(rows), *shape[1:]
             gathered = self._workspace.pool.fresh(f"the splats' {name}", 4 * math.prod(made))
             moments = name.startswith(_MOMENTS)
             given = {"row": math.prod(shape[1:]), "copied": remaining if moments else len(rows)}
             self._launch(
-                "gather_rows", math.prod(made), given | {"source": self._held[name], "gathered": gathered}
+                "gather_rows",
+                math.prod(made),
+                given | {"source": self._bound[name], "gathered": gathered},
             )
-            self._held[name], self._shapes[name] = gathered, made
+            self._bound[name], self._shapes[name] = gathered, made
         self._splats_changed()
 
     def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
@@ -149,13 +152,13 @@ class OpenCLTraining(TrainingKernels):
         for name, array in arrays.items():
             above = first * 4 * math.prod(self._shapes[name][1:])
             if array.nbytes:
-                cl.enqueue_copy(self._queue, self._held[name], np.ascontiguousarray(array), dst_offset=above)
+                cl.enqueue_copy(self._queue, self._bound[name], np.ascontiguousarray(array), dst_offset=above)
 
     def clear(self, names: Sequence[str]) -> None:
         """Fill arrays with zeros."""
         for name in names:
             if size := 4 * math.prod(self._shapes[name]):
-                cl.enqueue_fill_buffer(self._queue, self._held[name], np.zeros(1, np.float32), 0, size)
+                cl.enqueue_fill_buffer(self._queue, self._bound[name], np.zeros(1, np.float32), 0, size)
 
     def _splats_changed(self) -> None:
         """Forget what depends on the buffers of the splats."""
@@ -171,7 +174,7 @@ class OpenCLTraining(TrainingKernels):
         found = {}
         for name in self._shapes if names is None else names:
             found[name] = np.empty(self._shapes[name], np.float32)
-            cl.enqueue_copy(self._queue, found[name], self._held[name])
+            cl.enqueue_copy(self._queue, found[name], self._bound[name])
         return found
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
@@ -182,16 +185,16 @@ class OpenCLTraining(TrainingKernels):
             sizes = {"quats": 4, "scales": 2, "opacities": 1} | ({} if shared else {"sh": 3 * rendered})
             for name, floats in sizes.items():
                 size = 4 * count * floats
-                self._held[f"activated_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
-            self._held |= {"rendered": rendered, "all": every, "plain": int(degree == 0)}
+                self._bound[f"activated_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
+            self._bound |= {"rendered": rendered, "all": every, "plain": int(degree == 0)}
             self._launch("activate", count)
             if shared:
-                self._held["activated_sh"] = self._held["sh"]
+                self._bound["activated_sh"] = self._bound["sh"]
             else:
                 self._launch("activate_sh", 3 * count * rendered)
-            buffers = {name: self._held[f"activated_{name}"] for name in ("quats", "scales", "opacities")}
-            buffers["means"] = self._held["means"]
-            buffers["colors" if degree == 0 else "sh"] = self._held["activated_sh"]
+            buffers = {name: self._bound[f"activated_{name}"] for name in ("quats", "scales", "opacities")}
+            buffers["means"] = self._bound["means"]
+            buffers["colors" if degree == 0 else "sh"] = self._bound["activated_sh"]
             self._resident, self._version = (degree, ResidentArrays(buffers, count, degree, origin)), object()
         return self._resident[1]
 
@@ -279,7 +282,7 @@ class OpenCLTraining(TrainingKernels):
         taken.compile_step()  # takes seconds once; an interrupt there leaves the statistics unchanged
         if camera is not None:
             self._count_visible(camera, origin)
-        taken.step({**self._held, **given, "counted": int(camera is not None)})
+        taken.step({**self._bound, **given, "counted": int(camera is not None)})
 
     def _count_visible(self, camera: Camera, origin: np.ndarray) -> None:
         """Count the visible splats before the step."""
@@ -315,7 +318,7 @@ class OpenCLTraining(TrainingKernels):
         self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
     ) -> Launch:
         """A launch with the given arguments, and those of the splats."""
-        every = {**self._held, "count": self._count, **given}
+        every = {**self._bound, "count": self._count, **given}
         return kernel, size, group, [every[one.name] for one in self._program.source.arguments[kernel]]
 
     def _enqueue(self, launch: Launch) -> None:
