@@ -18,7 +18,7 @@ try:
 except ImportError:
     pytest.exit("these benchmarks need pytest-benchmark: pip install '.[bench]'", returncode=4)
 
-HEAVY = ("r5m_1080p", "r20m_4k")
+HEAVY = ("r5m_1080p", "r5m_1080p_3d", "r20m_4k", "qr_wall")
 SMALL_MACHINE = 8
 """Compute units of a processor below which heavy scenes are left out."""
 

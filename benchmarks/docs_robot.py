@@ -40,10 +40,10 @@ def main(out: str) -> None:
         marks = [(code.corners, str(code.id)) for code in codes]
         pictures.append(shrunk(outlined(picture, marks, thickness=2, size=0.6), WIDTH))
         sightings.append(codes)
-        print(f"{len(pictures)} of {len(asked.shots(run))}", end="\r", file=sys.stderr)
+        print(f"{len(pictures)} of {len(asked.image_indices(run))}", end="\r", file=sys.stderr)
     ways = [run.poses, *(asked.localised(run, seen, asked.camera)[0].poses for seen in (None, sightings))]
     with tempfile.TemporaryDirectory() as folder:
-        for number, (picture, k) in enumerate(zip(pictures, asked.shots(run).tolist(), strict=True)):
+        for number, (picture, k) in enumerate(zip(pictures, asked.image_indices(run).tolist(), strict=True)):
             sheet = floor_plan(asked, [way[: k + 1, :2, 3] for way in ways], picture.shape[0])
             write_png(Path(folder) / f"{number:06d}.png", np.concatenate([picture, sheet], axis=1))
         words = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]

@@ -121,7 +121,7 @@ class Drive:
             path += [(x, y) for x in (ends if aisle % 2 == 0 else ends[::-1])]
         return drive(self.house.mjcf(BODY), np.array(path), speed or self.speed, Errors(seed=self.seed))
 
-    def shots(self, run: Run) -> np.ndarray:
+    def image_indices(self, run: Run) -> np.ndarray:
         """Indices of the poses with images."""
         return np.unique(np.searchsorted(run.times, np.arange(1 / RATE, run.times[-1], 1 / RATE)))
 
@@ -136,7 +136,7 @@ class Drive:
             motion=Motion(run.camera.inverse()),
         )
         captures = []
-        for k in self.shots(run):
+        for k in self.image_indices(run):
             shutter = Shutter(
                 float(run.times[k]), variant.exposure_time, 5, variant.readout, rows_per_band=30
             )
@@ -144,7 +144,7 @@ class Drive:
             captures.append(plain.with_(shutter=shutter, sensor=sensor))
         splats, tags = renderer.upload(scene), self.tags
         for capture, k, frame in zip(
-            captures, self.shots(run), renderer.render_views(splats, captures), strict=True
+            captures, self.image_indices(run), renderer.render_views(splats, captures), strict=True
         ):
             if variant.texture:
                 ideal = tag_depth_image(tags.values(), camera_at(self.camera, run.poses[k]), frame["rgb"])
@@ -181,7 +181,7 @@ class Drive:
         first = run.poses[0]
         filtered = Localiser(np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]), noise)
         tags = self.tags
-        at = {} if sightings is None else dict(zip(self.shots(run).tolist(), sightings, strict=True))
+        at = {} if sightings is None else dict(zip(self.image_indices(run).tolist(), sightings, strict=True))
         standing = partial(camera_at, camera)
         poses, seen = [first], 0
         for k in range(1, len(run.times)):
@@ -197,7 +197,7 @@ class Drive:
     def ideal(self, run: Run, sightings: list[list[Detection]]) -> list[list[Detection]]:
         """The detected tags with ideal corners."""
         tags, found = self.tags, []
-        for k, codes in zip(self.shots(run).tolist(), sightings, strict=True):
+        for k, codes in zip(self.image_indices(run).tolist(), sightings, strict=True):
             camera = camera_at(self.camera, run.poses[k])
             known = [(code, tags[code.id]) for code in codes if code.id is not None and code.id in tags]
             found.append([replace(code, corners=camera.project(tag.corners)) for code, tag in known])
@@ -209,7 +209,7 @@ class Drive:
         """Number of detected tags and median corner error (root mean square per tag, pixels) by bin of
         `DISTANCES`."""
         tags, found = self.tags, []
-        for k, codes in zip(self.shots(run).tolist(), sightings, strict=True):
+        for k, codes in zip(self.image_indices(run).tolist(), sightings, strict=True):
             standing = camera_at(camera, run.poses[k])
             for code in codes:
                 if code.id in tags:
@@ -260,10 +260,10 @@ def write_log(
     if variant.mixture is None:
         raise InputError(f"a logged variant must have images, e.g. exact, got {name!r}")
     run = asked.run()
-    shots, camera = asked.shots(run), replace(asked.camera, lens=variant.lens)
+    indices, camera = asked.image_indices(run), replace(asked.camera, lens=variant.lens)
     sightings = []
     with RobotLog(path, overwrite=overwrite, source=source) as log:
-        for k, picture in zip(shots.tolist(), asked.pictures(variant, run, renderer), strict=True):
+        for k, picture in zip(indices.tolist(), asked.pictures(variant, run, renderer), strict=True):
             time, codes = float(run.times[k]), detect(picture, (FAMILY,), qr=False)
             sightings.append(codes)
             log.image(time, CAMERA, picture, compress="jpeg")

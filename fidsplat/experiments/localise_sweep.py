@@ -90,7 +90,7 @@ class _Drive:
 
     def _sightings(self, name: str, taken: Variant, run: Run) -> list[list[Detection]]:
         if taken not in self._seen:
-            found, count = [], len(self._asked.shots(run))
+            found, count = [], len(self._asked.image_indices(run))
             for codes in self._asked.sightings(taken, run, self._renderer):
                 found.append(codes)
                 self._tell(name, len(found) / count)

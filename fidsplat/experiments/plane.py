@@ -25,9 +25,12 @@ def plane_picture(
 ) -> np.ndarray:
     """Ideal image of a plane with square modules, centred on the world origin in z = 0, x right, y down.
 
-    Args: grid: (h, w) uint8, 1 = dark, quiet zone included. module: edge of a module in metres. camera: the
-        complete plane must be beyond its near distance. dark, light, background: values of dark modules,
-        light modules and the background, which are averaged: display values or linear light.
+    Args:
+        grid: (h, w) uint8, 1 = dark, quiet zone included.
+        module: edge of a module in metres.
+        camera: the complete plane must be beyond its near distance.
+        dark, light, background: values of dark modules, light modules and the background, which are averaged:
+            display values or linear light.
 
     Returns (height, width) float64.
 

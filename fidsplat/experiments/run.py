@@ -118,8 +118,8 @@ def _measure(
     if name == views.NAME:
         assert isinstance(options, ViewSettings)
         perceptual = None if options.lpips is None else load_lpips(options.lpips)
-        kept = views.Kept()
+        cache = views.ImageCache()
         return lambda part: views.measure_views(
-            part, painter, seed, options.blender_folder, pool, perceptual, kept
+            part, painter, seed, options.blender_folder, pool, perceptual, cache
         )
     return lambda part: angles.measure_angles(part, painter, seed, pool, options.workers)

@@ -103,7 +103,7 @@ def baseline_sweeps(wanted: BaselineSettings, renderer: Renderer) -> Iterator[li
             f"{trainings.file} holds trainings of {min(other)} iterations, not {wanted.iterations}; give "
             "another folder with -o, or --overwrite to train again"
         )
-    pool, kept = ThreadPoolExecutor(wanted.workers), views.Kept()
+    pool, cache = ThreadPoolExecutor(wanted.workers), views.ImageCache()
     train = partial(
         train_marker,
         folder=wanted.dataset,
@@ -113,7 +113,7 @@ def baseline_sweeps(wanted: BaselineSettings, renderer: Renderer) -> Iterator[li
         restart=wanted.overwrite,
     )
     look = partial(
-        views.measure_views, painter=painter, seed=wanted.seed, blender=Path(), pool=pool, kept=kept
+        views.measure_views, painter=painter, seed=wanted.seed, blender=Path(), pool=pool, cache=cache
     )
     scan = partial(
         angles.measure_angles, painter=painter, seed=wanted.seed, pool=pool, workers=wanted.workers

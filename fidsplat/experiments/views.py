@@ -80,7 +80,7 @@ def views_points(
     return points
 
 
-class Kept:
+class ImageCache:
     """Cache of 8-bit images for the following points."""
 
     def __init__(self) -> None:
@@ -107,12 +107,13 @@ def measure_views(
     blender: Path,
     pool: ThreadPoolExecutor,
     lpips: Perceptual | None = None,
-    kept: Kept | None = None,
+    cache: ImageCache | None = None,
 ) -> dict:
     """Compare the 8-bit images of a marker with the ground truth.
 
-    Args: kept: cache of the run: images of a method are rendered once for all ground truths, and the exact
-        ground truth of a marker once for all methods.
+    Args:
+        cache: cache of the run: images of a method are rendered once for all ground truths, and the exact
+            ground truth of a marker once for all methods.
 
     Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for an unavailable
     metric, and for the PSNR of equal images.
@@ -120,7 +121,7 @@ def measure_views(
     category = CATEGORIES[point["category"]]
     spec = category.spec(point["index"], seed)
     module = PROTOCOLS["fixed-plane"].module(plain_marker(spec).grid.shape[0])
-    kept = kept or Kept()
+    cache = cache or ImageCache()
     marker = (point["category"], point["index"], seed)
     opened: list[Draw] = []
 
@@ -133,7 +134,7 @@ def measure_views(
     def true(number: int, camera: Camera) -> np.ndarray:
         kind = point["truth"]
         if kind.startswith("exact"):
-            return kept.get(kind, marker, number, lambda: exact_view(spec, camera, kind == "exact-linear"))
+            return cache.get(kind, marker, number, lambda: exact_view(spec, camera, kind == "exact-linear"))
         view = kind.removeprefix("blender-")
         return read_image(novel_picture(blender, view, category.name, point["index"], number))[:, :, 0]
 
@@ -153,7 +154,7 @@ def measure_views(
     cameras = novel_cameras(category, point["index"], seed)[: point["views"]]
     about = (*marker, point["method"])
     waiting = [
-        pool.submit(compare, i, camera, kept.get("drawn", about, i, partial(draw, camera)))
+        pool.submit(compare, i, camera, cache.get("drawn", about, i, partial(draw, camera)))
         for i, camera in enumerate(cameras)
     ]
     measured = [interrupts.result_of(future) for future in waiting]

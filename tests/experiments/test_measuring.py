@@ -173,12 +173,12 @@ def test_pictures_are_drawn_once_for_all_truths(pool, tmp_path):
 
             return counted
 
-    kept = views.Kept()
+    cache = views.ImageCache()
     for index, truths in ((0, ("exact", "exact-linear", "exact")), (1, ("exact-linear", "exact"))):
         for truth in truths:
             point = part_of(IDEAL, truth) | {"index": index, "flip": False}
             alone = views.measure_views(point, CEILING, 0, tmp_path, pool)
-            assert views.measure_views(point, Counting(None), 0, tmp_path, pool, kept=kept) == alone
+            assert views.measure_views(point, Counting(None), 0, tmp_path, pool, cache=cache) == alone
     assert drawn == ["small-0", "small-0", "small-1", "small-1"]
 
 

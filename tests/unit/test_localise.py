@@ -213,7 +213,7 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
     monkeypatch.setattr("fidsplat.experiments.localise.RATE", 0.5)
     grey = np.full((480, 640, 3), 128, np.uint8)
     monkeypatch.setattr(
-        Drive, "pictures", lambda self, variant, run, renderer: (grey for _ in self.shots(run))
+        Drive, "pictures", lambda self, variant, run, renderer: (grey for _ in self.image_indices(run))
     )
     asked = Drive(1, 1)
     pictures = list(write_log(asked, "exact", None, str(tmp_path / "run.mcap"), False))
@@ -246,7 +246,7 @@ def test_with_ideal_corners_it_knows_its_way():
     from fidsplat.vision.visible import visible
 
     sightings = []
-    for k in asked.shots(moved):
+    for k in asked.image_indices(moved):
         camera = camera_at(asked.camera, moved.poses[k])
         tags = [p for p in house.markers if p.marker.kind == "apriltag" and visible(p, camera).share > 0.99]
         near = [p for p in tags if np.linalg.norm(p.pose[:3, 3] - camera.position) < 1.5]
