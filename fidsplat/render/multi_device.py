@@ -231,11 +231,11 @@ class _Banded(Images):
     bands: list[tuple[int, int]]
     pool: ThreadPoolExecutor
 
-    def read(self, name: str) -> np.ndarray:
+    def read(self, name: str, index: int | None = None) -> np.ndarray:
         """The rows of all bands, one below the other."""
         whole = self.frames[0].read_rows(name, 0, 0)
         list(self.pool.map(lambda frame, band: frame.read_rows(name, *band, whole), self.frames, self.bands))
-        return whole
+        return whole[None] if index is None else whole
 
     @property
     def timings(self) -> dict[str, float]:
