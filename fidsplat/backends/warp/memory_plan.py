@@ -58,8 +58,8 @@ class MemoryPlanner:
         if pairs < 1:
             raise DeviceError(
                 f"a memory budget of {bytes_words(workspace.memory_budget)} is too small for "
-                f"{resident.count} splats in this picture, which take {bytes_words(fixed)} before their "
-                "lists; raise memory_budget, or use an OpenCL device, which draws a cloud in chunks"
+                f"{resident.count} splats in this frame, which take {bytes_words(fixed)} before their "
+                "lists; raise memory_budget, or use an OpenCL device, which renders a cloud in chunks"
             )
         return min(workspace.pair_budget, pairs)
 

@@ -78,7 +78,7 @@ class WarpProbe(Probe):
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:
-        """Within it, every array that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
+        """A context in which arrays are first filled with 0xFF: NaN, or -1."""
         pool = self._workspace.pool
         self._workspace.pool = PoisonedPool(self._workspace.device)
         try:

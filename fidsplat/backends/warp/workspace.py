@@ -89,7 +89,7 @@ class ArrayPool:
         except (RuntimeError, MemoryError, ValueError) as error:  # the last: 2^31 elements and more
             raise DeviceError(
                 f"{name} needs {bytes_words(size * wp.types.type_size_in_bytes(dtype))}, which "
-                f"{self.device} has not; use fewer splats or a smaller picture"
+                f"{self.device} has not; use fewer splats or a smaller image"
             ) from error
 
 
