@@ -122,7 +122,7 @@ def test_a_robot(tmp_path):
         ('attached_to="pole"', 'attached_to="top"', "'top' is relative to itself"),
         ("<width>64</width>", "<width>64.5</width>", "no whole numbers of pixels"),
         ("<width>64</width>", "<width>wide</width>", "'wide' must be 1 finite number"),
-        ("<horizontal_fov>1.2<", "<horizontal_fov>3.2<", "depth/camera: camera fov_x must lie between"),
+        ("<horizontal_fov>1.2<", "<horizontal_fov>3.2<", "depth/camera: camera fov_x must be between"),
         (
             'name="depth"',
             'name="front"',
