@@ -1,4 +1,4 @@
-"""FrameBatch: the finished pictures of many views."""
+"""FrameBatch: the images of many views."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fidsplat.util.errors import InputError, MissingOutputError
 
 
 class FrameBatch(Mapping):
-    """Finished pictures of many views: a mapping from an output's name to a read-only NumPy array
+    """Rendered views: a mapping from an output's name to a read-only NumPy array
     (views, h, w) or (views, h, w, channels), copied from the device on first use.
 
     Names, types and units are those of Frame. Views that were masked out hold -1 in `label` and `splat_id`
@@ -30,7 +30,7 @@ class FrameBatch(Mapping):
         self._views = views
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = views.captures[0].outputs
-        """Names of the images, in the order in which they were asked for."""
+        """Names of the images, in the requested order."""
 
     @property
     def views(self) -> int:
@@ -42,17 +42,17 @@ class FrameBatch(Mapping):
         if name not in self._arrays:
             check_process(self._process, "batch")
             self._arrays[name] = images = numbered(name, self._images.read(name), self._ids)
-            images.flags.writeable = False  # what is kept is what was drawn
+            images.flags.writeable = False  # cached
         return self._arrays[name]
 
     def device_array(self, name: str) -> Any:
-        """The images where they were drawn, without a copy, (views, h, w) or (views, h, w, channels): by
+        """The images on their device, without a copy, (views, h, w) or (views, h, w, channels): by
         OpenCL a pyopencl.array.Array, on a Warp device a wp.array, from which DLPack makes a tensor.
 
-        They belong to this batch: the next is drawn into other arrays.
+        They belong to this batch: the next has other arrays.
 
         Raises:
-            InputError: an output that was not asked for, or the backend has no arrays to give.
+            InputError: an output that was not requested, or the backend shares no arrays.
         """
         self._check(name)
         check_process(self._process, "batch")
@@ -74,7 +74,7 @@ class FrameBatch(Mapping):
         return Frame(self._images, self._views.capture(int(number)), self._ids, index=int(number))
 
     def wait(self) -> FrameBatch:
-        """This batch, once the device has drawn it; nothing is copied."""
+        """Wait until the device has rendered this batch; nothing is copied."""
         self._images.wait()
         return self
 

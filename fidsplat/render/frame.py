@@ -1,4 +1,4 @@
-"""Frame: one finished picture."""
+"""Frame: the images of one view."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, MissingOutputError
 
 Ids = Callable[[], np.ndarray] | None
-"""gives the indices (n,) int32 of the splats that were drawn in the whole scene; None: these themselves"""
+"""returns the indices (n,) int32 of the rendered splats in the complete scene; None: no other indices"""
 
 
 class MadeImage(Protocol):
@@ -31,7 +31,7 @@ class MadeImage(Protocol):
 
 
 class Frame(Mapping):
-    """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
+    """A rendered frame: a mapping from an output's name to a read-only NumPy array, copied from the
     device on first use.
 
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
@@ -58,7 +58,7 @@ class Frame(Mapping):
         self.capture = capture
         """The capture that made it. `read_back` and `truth_of` use its camera, shutter and motion."""
         self.outputs = capture.outputs
-        """Names of the images, in the order in which they were asked for."""
+        """Names of the images, in the requested order."""
 
     def __getitem__(self, name: str) -> np.ndarray:
         self._check(name)
@@ -67,17 +67,17 @@ class Frame(Mapping):
             made = self._error if name == "error" else None
             image = self._images.read(name, self._index) if made is None else made.read()
             self._arrays[name] = image = numbered(name, image, self._ids)
-            image.flags.writeable = False  # what is kept is what was drawn
+            image.flags.writeable = False  # cached
         return self._arrays[name]
 
     def device_array(self, name: str) -> Any:
-        """The image where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
+        """The image on its device, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
 
-        It belongs to this frame: the next picture is drawn into another array. `wp.to_torch`, DLPack and
+        It belongs to this frame: the next frame has another array. `wp.to_torch`, DLPack and
         `__cuda_array_interface__` make a tensor of it on the same device.
 
         Raises:
-            InputError: an output that was not asked for, or the backend has no arrays to give.
+            InputError: an output that was not requested, or the backend shares no arrays.
         """
         self._check(name)
         check_process(self._process, "frame")
@@ -94,7 +94,7 @@ class Frame(Mapping):
         copied; the same bits on the host of `frame["rgb"]`, where that has been read.
 
         Raises:
-            InputError: `rgb` was not asked for.
+            InputError: `rgb` was not requested.
         """
         self._check("rgb")
         if "rgb" not in self._arrays:
@@ -111,7 +111,7 @@ class Frame(Mapping):
         give (`device_array`), else copied to the host.
 
         Raises:
-            InputError: an output that was not asked for, or torch is not installed.
+            InputError: an output that was not requested, or torch is not installed.
         """
         self._check(name)
         try:
@@ -147,7 +147,7 @@ class Frame(Mapping):
         return self[name].copy()  # what is read-only cannot be given away
 
     def _stays(self, name: str) -> bool:
-        """Whether the device has an array of this image to give."""
+        """Whether the device shares an array of this image."""
         made = name == "error" or (name == "splat_id" and self._ids is not None)
         return self._images.shares_arrays and not made
 
@@ -186,11 +186,11 @@ class Frame(Mapping):
         return len(self.outputs)
 
     def __reduce__(self):
-        """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
+        """Pickled and copied as NumPy arrays: arrays of `device_array` are not included."""
         return _kept_frame, (dict(self), dict(self.timings), dict(self.stats), self.capture.picklable())
 
     def wait(self) -> Frame:
-        """This frame, once the device has drawn it; nothing is copied.
+        """Wait until the device has rendered this frame; nothing is copied.
 
         Raises:
             DeviceError: the device has failed while it was drawing.
@@ -203,7 +203,7 @@ class Frame(Mapping):
         picture: they alone are copied where the device can do that.
 
         Raises:
-            InputError: rows that the picture does not have, or an array of another shape or type.
+            InputError: rows outside the frame, or an array of another shape or type.
         """
         self._check(name)
         images, index = self._images, self._index
@@ -248,7 +248,7 @@ def _kept_frame(
 
 
 class OfRows(Protocol):
-    """A part of a picture."""
+    """A band of rows of a frame."""
 
     @property
     def rows(self) -> tuple[int, int]:
@@ -259,9 +259,9 @@ class OfRows(Protocol):
 P = TypeVar("P", bound=OfRows)
 
 
-def stacked(parts: Iterable[P], draw: Callable[[P], Frame]) -> Frame:
-    """The picture whose bands of rows these are: drawn one after the other, so that a device holds what one
-    is drawn of, and brought to the host, each while the next is drawn. A single one stays where it is."""
+def stacked(parts: Iterable[P], render: Callable[[P], Frame]) -> Frame:
+    """The frame of bands of rows. They are rendered one after another, so that the device holds the splats of
+    one; each is copied to the host while the next is rendered. A single band stays on the device."""
     arrays: dict[str, np.ndarray] = {}
     timings: dict[str, float] = {}
     stats: dict[str, int] = {}
@@ -281,11 +281,11 @@ def stacked(parts: Iterable[P], draw: Callable[[P], Frame]) -> Frame:
     for part in parts:
         if last is not None:
             finish(last[0])
-        frame = draw(part)
+        frame = render(part)
         if last is not None:
             take(*last)
         last = frame, part.rows
-    assert last is not None  # a picture has rows
+    assert last is not None  # a frame has rows
     if not arrays:
         return last[0]
     finish(last[0])
@@ -294,14 +294,14 @@ def stacked(parts: Iterable[P], draw: Callable[[P], Frame]) -> Frame:
 
 
 def numbered(name: str, image: np.ndarray, ids: Ids) -> np.ndarray:
-    """An image with the whole scene's indices (n,) in the place of those of its part; -1 stays."""
+    """An image of `splat_id` with indices in the complete scene; -1 is unchanged."""
     if name != "splat_id" or ids is None:
         return image
     return np.append(ids(), np.int32(-1))[image]
 
 
 def refuse_numbered(name: str, ids: Ids) -> None:
-    """Raises InputError for indices of a part on a device, which the whole's are not."""
+    """Raise InputError for `splat_id` on a device if its indices must be converted on the host."""
     if name == "splat_id" and ids is not None:
         raise InputError(
             "splat_id of a store is numbered on the host; take frame['splat_id'], which is copied there"

@@ -49,18 +49,18 @@ def default_device() -> str:
 
 
 class Renderer:
-    """Draws splats on one device. Compiled pipelines and scratch buffers are kept from picture to picture.
+    """Renders splats on one device. Compiled pipelines and scratch buffers are reused from frame to frame.
 
-    Threads may share one, whose pictures are then drawn one after another; a process that was forked opens
-    its own.
+    Threads may share a renderer, which renders their frames one after another; a forked process opens its
+    own.
 
     Args:
         device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or a GPU's name, or
             cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), "reference" (NumPy, float64, slow), or "auto"
-            ("opencl", else "warp" with a warning). None: what FIDSPLAT_DEVICE says, else "auto".
-        memory_budget: bytes of the device that a picture and its cloud may take; by default nine tenths of
-            what the device says it has. What needs more is drawn in bands of the picture and, by OpenCL,
-            chunks of the cloud, which takes longer and gives the same bits.
+            ("opencl", else "warp" with a warning). None: the variable FIDSPLAT_DEVICE, else "auto".
+        memory_budget: bytes of device memory for a frame and its cloud; by default nine tenths of the
+            device's memory. Larger frames are rendered in bands of rows and, by OpenCL, in chunks of the
+            cloud: slower, with bit-identical images.
 
     Raises:
         DeviceError: the device cannot be used; UnknownDeviceError: there is no such device.
@@ -85,12 +85,12 @@ class Renderer:
 
     @property
     def device(self) -> DeviceInfo:
-        """The device that draws."""
+        """The device of this renderer."""
         return self.backend.info
 
     def upload(self, scene: Scene | SplatCloud | Store) -> ResidentCloud:
-        """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept. Of stores
-        nothing is read before a view needs it."""
+        """Copy a scene's splats to the device, to render them many times. The result has the scene's capture.
+        Stores are read when a view needs them."""
         check_process(self._process, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _PLAIN
         stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
@@ -114,17 +114,16 @@ class Renderer:
         labels: Any = None,
         origin: Iterable[float] = (0.0, 0.0, 0.0),
     ) -> ResidentCloud:
-        """Splats in arrays that are on the device already: drawn where they lie, without a copy.
+        """Splats in arrays of the device, which are rendered without a copy.
 
-        Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack
-        (torch, CuPy, JAX); NumPy arrays are copied. With scales (n, 3) splats are 3D Gaussians, those whose
-        third is 0 disks. What is in the arrays when a picture is drawn is what it shows, so a simulation may
-        move the splats between pictures. Quaternions need no unit length; a splat that cannot be drawn (a
-        value that is not finite, a scale below 0) is left out of the picture without a word. `origin` (3,):
-        world position of the means' zero.
+        Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or objects with DLPack
+        (torch, CuPy, JAX); NumPy arrays are copied. With scales (n, 3) splats are 3D Gaussians, disks where
+        the third is 0. Arrays are read when a frame is rendered, so a simulation may move the splats
+        between frames. Quaternions need no unit length; invalid splats (a value that is not finite, a scale
+        below 0) are not rendered. `origin` (3,): world position of the means' zero.
 
         Raises:
-            InputError: the backend takes no arrays, or one has the wrong shape, type or device.
+            InputError: the backend adopts no arrays, or one has the wrong shape, type or device.
         """
         check_process(self._process, "Renderer")
         if (colors is None) == (sh is None):
@@ -144,21 +143,21 @@ class Renderer:
         quality: Quality | str | None = None,
         **parts: Unpack[CaptureParts],
     ) -> Frame:
-        """Draw one picture: `render(scene, Capture(camera, ...))`, or the parts of a capture as arguments.
+        """Render one frame: `render(scene, Capture(camera, ...))`, or the parts of a capture as arguments.
 
         Args:
-            scene: what to draw.
-            capture: how; or a camera alone. Without a Capture a Scene's own is taken, which its ResidentCloud
-                has too.
-            outputs, quality, and by name the other parts (`CaptureParts`): take the place of the capture's.
+            scene: splats to render.
+            capture: camera and settings, or only a camera. Without a Capture the scene's own is used, which
+                its ResidentCloud has too.
+            outputs, quality, and by name the other parts (`CaptureParts`): replace those of the capture.
 
         Raises:
-            InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
+            InputError: no camera, an unknown output or preset, a frame that is too large, a cloud uploaded
                 elsewhere.
             DeviceError: the device fails or lacks memory.
         """
-        asked = _asked(scene, capture, outputs=outputs, quality=quality, **parts)
-        return self._draw(self._resident(scene), asked)
+        requested = _requested(scene, capture, outputs=outputs, quality=quality, **parts)
+        return self._render(self._resident(scene), requested)
 
     def render_differentiable(
         self,
@@ -189,7 +188,7 @@ class Renderer:
             InputError: as `render`; an effect or an output without a gradient.
             DeviceError: the device has no gradients, fails, or lacks the memory to render in one piece.
         """
-        asked = _asked(scene, capture, outputs=outputs, quality=quality, **parts)
+        requested = _requested(scene, capture, outputs=outputs, quality=quality, **parts)
         resident = self._resident(scene)
         if isinstance(resident.data, Residency):
             raise InputError(
@@ -197,12 +196,12 @@ class Renderer:
                 "load its splats first"
             )
         interrupts.check()
-        features, view = prepare(resident.data, asked)
-        check_gradients(features, asked.outputs)
+        features, view = prepare(resident.data, requested)
+        check_gradients(features, requested.outputs)
         with self._lock:
             pipeline = self.backend.differentiate(with_distortion(features) if distortion else features)
             images = pipeline.forward(resident.data, view)
-        return DifferentiableFrame(images, asked, pipeline, self._lock, distortion)
+        return DifferentiableFrame(images, requested, pipeline, self._lock, distortion)
 
     def render_every(
         self,
@@ -213,28 +212,28 @@ class Renderer:
         quality: Quality | str | None = None,
         tell: Callable[[float], object] | None = None,
     ) -> Frame:
-        """Every step-th pixel of a picture, in both directions: what `render` gives those pixels, in a share
-        of the time. The reference alone draws so.
+        """Render every step-th pixel in both directions, bit-identical to those pixels of `render`. Only the
+        reference does this.
 
         Args:
             step: 1 or more.
             scene, capture, outputs, quality: as `render`.
-            tell: called meanwhile with the share that is done, 0 to 1.
+            tell: called with the completed share, 0 to 1.
 
         Raises:
-            InputError: as `render`; the device draws whole pictures only.
+            InputError: as `render`; the device renders complete frames only.
         """
         whole_number("step", step, 1, 2**31 - 1)
-        asked = _asked(scene, capture, outputs=outputs, quality=quality)
+        requested = _requested(scene, capture, outputs=outputs, quality=quality)
 
-        def draw(pipeline: Pipeline, data: Any, view: View) -> Images:
+        def render_subset(pipeline: Pipeline, data: Any, view: View) -> Images:
             if not self.backend.traits.renders_pixel_subsets:
                 raise InputError(
                     self.backend.lacks("render subsets of pixels", "use device='reference', or render")
                 )
             return pipeline.render_every(data, view, step, tell)
 
-        return self._draw(self._resident(scene), asked, draw)
+        return self._render(self._resident(scene), requested, render_subset)
 
     def render_band(
         self,
@@ -244,21 +243,21 @@ class Renderer:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
     ) -> Frame:
-        """A picture of which rows of pixels [first, end) alone are wanted: they have the bits of the whole
-        picture, and of the other rows nothing is promised. `fs.SeveralDevices` puts pictures together so.
+        """Render rows of pixels [first, end), bit-identical to those of `render`; the other rows of the frame
+        are undefined. `fs.SeveralDevices` combines such frames.
 
         Raises:
-            InputError: as `render`; rows that the picture does not have.
+            InputError: as `render`; rows outside the frame.
         """
-        asked = _asked(scene, capture, outputs=outputs, quality=quality)
-        rows = asked.camera.height if asked.camera is not None else 0
+        requested = _requested(scene, capture, outputs=outputs, quality=quality)
+        rows = requested.camera.height if requested.camera is not None else 0
         try:
             first, end = band
         except (TypeError, ValueError):
             raise InputError(f"band is {band!r}; it must be two rows, the first and the end") from None
         whole_number("the first row of a band", first, 0, rows - 1)
         whole_number("the end of a band", end, first + 1, rows)
-        return self._draw(self._resident(scene), asked, band=band)
+        return self._render(self._resident(scene), requested, band=band)
 
     def render_views(
         self,
@@ -268,12 +267,11 @@ class Renderer:
         quality: Quality | str | None = None,
         **parts: Unpack[CaptureParts],
     ) -> Iterator[Frame]:
-        """Draw one cloud many times, one Frame for each capture or camera, in their order.
+        """Render one cloud many times, one Frame for each capture or camera, in their order.
 
-        The cloud is uploaded once, kernels and buffers are used again, and on a device that works beside the
-        host the next picture is under way while the caller has the last. Arguments and errors: as `render`
-        (a motion of the camera takes the place of each camera's pose); an error comes after the pictures of
-        the captures before it.
+        The cloud is uploaded once, kernels and buffers are reused, and an asynchronous device renders the
+        next frame while the caller uses the last. Arguments and errors: as `render` (a motion of the camera
+        replaces each camera's pose); an error is raised after the frames of the captures before it.
         """
         outputs = None if outputs is None else output_names(outputs)  # an iterator would end with the first
         background = parts.get("background")
@@ -284,14 +282,14 @@ class Renderer:
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
         resident = self._resident(scene)
-        asked = (_asked(scene, one, outputs=outputs, quality=quality, **parts) for one in rest)
+        requested = (_requested(scene, one, outputs=outputs, quality=quality, **parts) for one in rest)
         if isinstance(resident.data, Residency):
-            asked = resident.data.prefetched(asked)
+            requested = resident.data.prefetched(requested)
         waiting: Frame | None = None
         failure: Exception | None = None
         while True:
             try:
-                frame = self._draw(resident, next(asked))
+                frame = self._render(resident, next(requested))
             except StopIteration:
                 break
             except Exception as error:
@@ -320,19 +318,19 @@ class Renderer:
         selects the levels of detail of all views.
 
         Args:
-            scene: what to draw; a ResidentCloud transfers no splat.
+            scene: splats to render; a ResidentCloud transfers none.
             captures: one Capture or Camera for each view, of one size and the same effects; or one for all
-                views. A Camera is taken with the scene's own capture, as in `render`.
+                views. A Camera is used with the scene's own capture, as in `render`.
             poses: (views, 7) float64, camera to world: x y z in metres and a quaternion w x y z of any length
-                but 0. They take the place of the cameras' own poses.
-            groups: {label: (views, 7)}: the splats of that label make this motion of the world, from where
-                their cloud has them (`Motion.groups`).
-            mask: (views,) bool: a view that is False is not drawn, and costs nothing; its images hold 0, and
-                -1 in `label` and `splat_id`.
+                but 0. They replace the cameras' own poses.
+            groups: {label: (views, 7)}: motion of the splats of that label in the world, relative to their
+                positions in the cloud (`Motion.groups`).
+            mask: (views,) bool: a view that is False is not rendered; its images are 0, and -1 in `label`
+                and `splat_id`.
 
         Raises:
             InputError: as `render`; numbers of views, sizes, outputs or effects that differ; arrays of
-                another shape; what is no pose; a label that no splat has.
+                another shape; an invalid pose; a label that no splat has.
             DeviceError: the device fails or lacks memory.
         """
         resident = self._resident(scene)
@@ -341,7 +339,7 @@ class Renderer:
             each = list(given)
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
-        plain = [_asked(scene, one) for one in each]
+        plain = [_requested(scene, one) for one in each]
         if any("error" in one.outputs for one in plain):
             raise InputError(
                 f"the output 'error' must be rendered one capture at a time, got a batch of {len(plain)}; "
@@ -349,7 +347,7 @@ class Renderer:
             )
         views = views_of(plain, poses, groups, mask)
         self._refuse_unknown_labels(resident, views)
-        return self._draw_batch(resident, views)
+        return self._render_batch(resident, views)
 
     def _refuse_unknown_labels(self, resident: ResidentCloud, views: Views) -> None:
         if views.groups and resident.labels is not None:
@@ -359,7 +357,7 @@ class Renderer:
                         unknown("label of splats", str(label), map(str, sorted(resident.labels)))
                     )
 
-    def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
+    def _render_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
         interrupts.check()
         features, batch = prepare_batch(resident.whole, views)
         with self._lock:
@@ -377,7 +375,7 @@ class Renderer:
             )
         return resident
 
-    def _draw(
+    def _render(
         self,
         resident: ResidentCloud,
         capture: Capture,
@@ -388,7 +386,7 @@ class Renderer:
         features, view = prepare(resident.whole, capture)
         view = _banded(view, band)
         plan = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None
-        with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
+        with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
             pipeline, data = self.backend.pipeline(features), resident.data
             if not isinstance(data, Residency):
                 error = None
@@ -406,12 +404,12 @@ class Renderer:
 
 
 def _banded(view: View, band: tuple[int, int] | None) -> View:
-    """The view of which only these rows of pixels are wanted."""
+    """The view restricted to these rows of pixels."""
     return view if band is None else replace(view, band=(band[0] * view.samples, band[1] * view.samples))
 
 
-def _asked(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
-    """The capture that is given or the scene's own, changed by the parts that are given beside it.
+def _requested(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
+    """The given capture or the scene's own, with the given parts replaced.
 
     Raises:
         InputError: an unknown part, one of the wrong kind, or no camera.
@@ -420,7 +418,7 @@ def _asked(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Captur
         if capture is not None:
             parts["camera"] = capture
         capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _PLAIN
-    asked = capture.with_(**parts)
-    if asked.camera is None:
+    requested = capture.with_(**parts)
+    if requested.camera is None:
         raise InputError(NO_CAMERA)
-    return asked
+    return requested
