@@ -106,12 +106,12 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
 def main() -> None:
     parser = options(__doc__, repeats=5)
     parser.add_argument("--rows", nargs="*", default=["few"], choices=[*ROWS], metavar="ROW")
-    asked = parser.parse_args()
-    renderer, rows = fs.Renderer(asked.device), []
-    for name in asked.rows:
+    arguments = parser.parse_args()
+    renderer, rows = fs.Renderer(arguments.device), []
+    for name in arguments.rows:
         with PROGRESS.status(f"drawing {name}"):
-            rows.append(measure(renderer, name, max(asked.repeats, 1)))
-    if keep(rows, asked.json):
+            rows.append(measure(renderer, name, max(arguments.repeats, 1)))
+    if keep(rows, arguments.json):
         return
 
     def cells(row: dict) -> tuple[str, ...]:

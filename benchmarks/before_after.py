@@ -157,14 +157,14 @@ def main() -> None:
     parser.add_argument(
         "--cpu-time", action="store_true", help="CPU time of all threads instead of wall time"
     )
-    asked = parser.parse_args()
-    clock = "process_time" if asked.cpu_time else "perf_counter"
-    row = measure(asked.commit, asked.scene, asked.device, max(asked.repeats, 2), clock)
-    if keep(row, asked.json):
+    arguments = parser.parse_args()
+    clock = "process_time" if arguments.cpu_time else "perf_counter"
+    row = measure(arguments.commit, arguments.scene, arguments.device, max(arguments.repeats, 2), clock)
+    if keep(row, arguments.json):
         return
     print("{scene} on {device}, {date}, {pairs} pairs".format(**row))
     print("{commit} {before_ms:.2f} ms, now {now_ms:.2f} ms".format(**row))
-    for name, stages in zip((asked.commit, "now"), row["stages_ms"], strict=True):
+    for name, stages in zip((arguments.commit, "now"), row["stages_ms"], strict=True):
         print(f"{name}:", ", ".join(f"{stage} {spent:.3f}" for stage, spent in stages.items()))
     print(
         "ratio {ratio:.3f}, quartiles {quartiles[0]:.3f} to {quartiles[1]:.3f}; ".format(**row)

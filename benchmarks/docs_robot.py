@@ -31,29 +31,34 @@ WAYS = {"as it was": (150, 150, 150), "by wheels and gyroscope": (209, 73, 91), 
 
 def main(out: str) -> None:
     """Draw it and write the file."""
-    asked, whole, renderer = Drive(), Drive().run(), fs.Renderer()
+    arguments, whole, renderer = Drive(), Drive().run(), fs.Renderer()
     part = slice(*np.searchsorted(whole.times, (START, END)).tolist())
     run = Run(whole.times[part], whole.poses[part], whole.wheels[part], whole.gyro[part])
     pictures, sightings = [], []
-    for picture in asked.pictures(VARIANTS["exact"], run, renderer):
+    for picture in arguments.pictures(VARIANTS["exact"], run, renderer):
         codes = detect(picture, (FAMILY,), qr=False)
         marks = [(code.corners, str(code.id)) for code in codes]
         pictures.append(shrunk(outlined(picture, marks, thickness=2, size=0.6), WIDTH))
         sightings.append(codes)
-        print(f"{len(pictures)} of {len(asked.image_indices(run))}", end="\r", file=sys.stderr)
-    ways = [run.poses, *(asked.localised(run, seen, asked.camera)[0].poses for seen in (None, sightings))]
+        print(f"{len(pictures)} of {len(arguments.image_indices(run))}", end="\r", file=sys.stderr)
+    ways = [
+        run.poses,
+        *(arguments.localised(run, seen, arguments.camera)[0].poses for seen in (None, sightings)),
+    ]
     with tempfile.TemporaryDirectory() as folder:
-        for number, (picture, k) in enumerate(zip(pictures, asked.image_indices(run).tolist(), strict=True)):
-            sheet = floor_plan(asked, [way[: k + 1, :2, 3] for way in ways], picture.shape[0])
+        for number, (picture, k) in enumerate(
+            zip(pictures, arguments.image_indices(run).tolist(), strict=True)
+        ):
+            sheet = floor_plan(arguments, [way[: k + 1, :2, 3] for way in ways], picture.shape[0])
             write_png(Path(folder) / f"{number:06d}.png", np.concatenate([picture, sheet], axis=1))
         words = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
         words += ["-framerate", str(FASTER * RATE), "-i", f"{folder}/%06d.png"]
         subprocess.run([*words, "-c:v", "libwebp_anim", "-quality", "55", "-loop", "0", out], check=True)
 
 
-def floor_plan(asked: Drive, ways: list[np.ndarray], height: int) -> np.ndarray:
+def floor_plan(arguments: Drive, ways: list[np.ndarray], height: int) -> np.ndarray:
     """The greenhouse from above with the ways (n, 2) [m] so far, (height, MAP, 3) uint8; x is up."""
-    house = asked.house
+    house = arguments.house
     sheet = np.full((height, MAP, 3), GROUND, np.uint8)
     scale = min((height - 90) / (house.length + 2), MAP / (house.middles[-1] + 2))
 
@@ -63,7 +68,7 @@ def floor_plan(asked: Drive, ways: list[np.ndarray], height: int) -> np.ndarray:
     for y in house.middles:
         half = BENCH[0] / 2
         cv2.rectangle(sheet, pixel(0, y + half), pixel(house.length, y - half), WOOD, -1)
-    for tag in asked.tags.values():
+    for tag in arguments.tags.values():
         cv2.circle(sheet, pixel(*tag.pose[:2, 3]), 2, TAG, -1, cv2.LINE_AA)
     for number, ((name, colour), way) in enumerate(zip(WAYS.items(), ways, strict=True)):
         points = np.array([pixel(x, y) for x, y in way[::5]], np.int32)

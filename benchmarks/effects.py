@@ -178,14 +178,14 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"default all of: {', '.join(known)}")
     parser.add_argument("--scene", default="r1m_1080p", choices=list(SCENES))
     parser.add_argument("--table", nargs="+", metavar="FILE", help="print results side by side instead")
-    asked = parser.parse_args()
-    if asked.table:
-        print(page_table(asked.table))
+    arguments = parser.parse_args()
+    if arguments.table:
+        print(page_table(arguments.table))
         return
-    if unknown := set(asked.names) - set(known):
+    if unknown := set(arguments.names) - set(known):
         parser.error(f"no effect is called {', '.join(sorted(unknown))}; there are: {', '.join(known)}")
-    rows = measure(asked.names, asked.scene, asked.device, max(asked.repeats, 2))
-    if keep(rows, asked.json):
+    rows = measure(arguments.names, arguments.scene, arguments.device, max(arguments.repeats, 2))
+    if keep(rows, arguments.json):
         return
     show(
         "{scene}, {device}, {driver}, {date}, {repeats} pairs".format(**rows[0]),

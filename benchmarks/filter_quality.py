@@ -59,8 +59,8 @@ def area_sampled(made: fs.Marker, px: float, camera: fs.Camera) -> np.ndarray:
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--picture", help="PNG file of crops")
-    asked = parser.parse_args()
-    renderer = fs.Renderer(asked.device)
+    arguments = parser.parse_args()
+    renderer = fs.Renderer(arguments.device)
     text = "".join(random.Random(0).choices(string.ascii_letters + string.digits, k=1000))
     markers = {mixture: fs.marker(f"qr-v22-L:{text}", mixture=mixture) for mixture in ("fitted", "exact")}
     rows: list[dict] = []
@@ -77,9 +77,9 @@ def main() -> None:
                 crop = to_uint8(rgb[6:46, 6:46])
                 crops.append((name, cv2.resize(crop, (240, 240), interpolation=cv2.INTER_NEAREST)))
         rows.append({"way": name, "psnr_db": row})
-    if asked.picture:
-        write_png(asked.picture, contact_sheet([crops[:4], crops[4:]], width=240) // 16 * 16)
-    if keep({**facts(renderer), "rows": rows}, asked.json):
+    if arguments.picture:
+        write_png(arguments.picture, contact_sheet([crops[:4], crops[4:]], width=240) // 16 * 16)
+    if keep({**facts(renderer), "rows": rows}, arguments.json):
         return
     heads = ("QR 22, PSNR in dB", *rows[0]["psnr_db"])
     cells = ((row["way"], *(f"{value:.1f}" for value in row["psnr_db"].values())) for row in rows)

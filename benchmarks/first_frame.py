@@ -112,9 +112,9 @@ def measure(scenes: list[str], device: str, repeats: int) -> list[dict]:
 def main() -> None:
     parser = options(__doc__, repeats=5)
     parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE")
-    asked = parser.parse_args()
-    records = measure(asked.scenes, asked.device, max(asked.repeats, 1))
-    if keep(records, asked.json):
+    arguments = parser.parse_args()
+    records = measure(arguments.scenes, arguments.device, max(arguments.repeats, 1))
+    if keep(records, arguments.json):
         return
 
     def cells(record: dict) -> tuple[str, ...]:
@@ -125,7 +125,7 @@ def main() -> None:
 
     warmed = f"fidsplat warm, with empty caches: {records[0]['warm_seconds']:.1f} s"
     heads = ("scene", "caches", "seconds", "range", *PARTS)
-    show(f"First frame on {asked.device}; {warmed}", heads, map(cells, records))
+    show(f"First frame on {arguments.device}; {warmed}", heads, map(cells, records))
 
 
 if __name__ == "__main__":

@@ -199,17 +199,19 @@ def main() -> None:
     parser.add_argument("files", nargs="+", type=Path, help="JSON lines; what is there is not measured again")
     parser.add_argument("--longest", type=float, default=2.0, metavar="S", help="seconds (default: 2)")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="measure nothing; plot what the files hold")
-    asked = parser.parse_args()
-    if asked.plot is not None:
-        records = [record.result for file in asked.files for record in read_records(file)]
+    arguments = parser.parse_args()
+    if arguments.plot is not None:
+        records = [record.result for file in arguments.files for record in read_records(file)]
         for series in dict.fromkeys(record["series"] for record in records):
-            plot(series, records, asked.plot / f"growth-{series}.png")
+            plot(series, records, arguments.plot / f"growth-{series}.png")
         return
     try:
-        records = run(points(), asked.device, max(asked.repeats, 1), asked.longest, asked.files[0])
+        records = run(
+            points(), arguments.device, max(arguments.repeats, 1), arguments.longest, arguments.files[0]
+        )
     except KeyboardInterrupt:
-        raise SystemExit(f"growth: stopped; {asked.files[0]} holds what was measured") from None
-    if keep(records, asked.json):
+        raise SystemExit(f"growth: stopped; {arguments.files[0]} holds what was measured") from None
+    if keep(records, arguments.json):
         return
     stages = list(dict.fromkeys(stage for record in records for stage in record.get("stages_ms", ())))
     rows = []

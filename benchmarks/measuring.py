@@ -39,7 +39,7 @@ def facts(renderer: fs.Renderer) -> dict[str, str]:
 
 
 def keep(figures: object, file: str | None) -> bool:
-    """Write figures as JSON where a file was asked for. Returns whether they went to stdout."""
+    """Write records to a JSON file, if one is given. Returns whether they went to stdout."""
     text = json.dumps(figures, indent=1) + "\n"
     if file == "-":
         print(text, end="")

@@ -154,17 +154,17 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--measured", type=int, default=60, help="scenes that are calibrated too")
     parser.add_argument("--timed", default=",".join(SCENES), help="bench scenes, or nothing")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that was measured before counts
-        renderer = fs.Renderer(asked.device)
+        renderer = fs.Renderer(arguments.device)
         found = {
             **facts(renderer),
-            "scenes": asked.scenes,
-            "errors": errors_kept(renderer, asked.scenes, asked.measured),
-            "times": times_kept(renderer, [name for name in asked.timed.split(",") if name]),
+            "scenes": arguments.scenes,
+            "errors": errors_kept(renderer, arguments.scenes, arguments.measured),
+            "times": times_kept(renderer, [name for name in arguments.timed.split(",") if name]),
         }
-    if keep(found, asked.json):
+    if keep(found, arguments.json):
         return
     heads = ("way", "error", "kept", "refused", "worst / bound", "median / bound")
     show("Errors", heads, map(error_cells, found["errors"]))

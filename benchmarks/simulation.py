@@ -93,30 +93,35 @@ def main() -> int:
     parser.add_argument("--quality", default="standard", help="of environments: standard,order=centre ...")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", default=None, help="file for the figures")
-    asked = parser.parse_args()
-    renderer = fs.Renderer(asked.device)
-    read = [one for one in readings(renderer, asked.tags) if one.position_error is not None]
+    arguments = parser.parse_args()
+    renderer = fs.Renderer(arguments.device)
+    read = [one for one in readings(renderer, arguments.tags) if one.position_error is not None]
     errors = np.array([(one.position_error, one.angle_error, one.corner_error) for one in read], float)
     rates = environments_a_second(
-        renderer, asked.environments, asked.side, asked.splats, asked.repeats, asked.quality
+        renderer,
+        arguments.environments,
+        arguments.side,
+        arguments.splats,
+        arguments.repeats,
+        arguments.quality,
     )
     facts = {
         "run": run_facts(renderer.device.title, 0),
-        "tags": asked.tags,
+        "tags": arguments.tags,
         "read": len(read),
         "position_mm": (errors[:, 0] * 1e3).mean(),
         "position_worst_mm": (errors[:, 0] * 1e3).max(),
         "share_of_distance_percent": 100 * (errors[:, 0] / DISTANCE).mean(),
         "angle_deg": np.degrees(errors[:, 1]).mean(),
         "corners_px": errors[:, 2].mean(),
-        "environments": asked.environments,
-        "side": asked.side,
-        "splats": asked.splats,
-        "quality": asked.quality,
+        "environments": arguments.environments,
+        "side": arguments.side,
+        "splats": arguments.splats,
+        "quality": arguments.quality,
         **rates,
     }
-    if asked.json:
-        with atomic_write(Path(asked.json)) as stream:
+    if arguments.json:
+        with atomic_write(Path(arguments.json)) as stream:
             stream.write(json.dumps(facts, indent=2, default=float).encode())
     for name, value in facts.items():
         print(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")

@@ -81,13 +81,13 @@ def timed(renderer: fs.Renderer, resident, capture: fs.Capture) -> tuple[np.ndar
     return pictures[0], seconds, dict(frame.stats)
 
 
-def along(store: fs.Store, renderer: fs.Renderer, asked, error: float) -> dict:
+def along(store: fs.Store, renderer: fs.Renderer, arguments, error: float) -> dict:
     """Milliseconds of each view of a path from above all to the street."""
-    width, height = map(int, asked.size.split("x"))
+    width, height = map(int, arguments.size.split("x"))
     size = width, height
     places = [camera.position for camera in views(store, size).values()]
     towards = np.mean(store.bounds(), axis=0)
-    shares = np.linspace(0, len(places) - 1, asked.path)
+    shares = np.linspace(0, len(places) - 1, arguments.path)
     steps = np.column_stack([np.interp(shares, range(len(places)), axis) for axis in np.transpose(places)])
     quality = fs.Quality(lowpass="pixel", alpha_cutoff=REFERENCE_CUTOFF, detail_error=error)
     cameras = [fs.Camera.look_at(*size, math.radians(60), at, towards) for at in steps]
@@ -101,15 +101,15 @@ def along(store: fs.Store, renderer: fs.Renderer, asked, error: float) -> dict:
     return {"error": error, "splats": len(store), "ms": times.tolist(), "drawn": splats.tolist()}
 
 
-def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
+def measure(store: fs.Store, renderer: fs.Renderer, arguments) -> list[dict]:
     """A row for each view and allowed error."""
     rows, splats = [], ChunkedSplats([store])
-    width, height = map(int, asked.size.split("x"))
+    width, height = map(int, arguments.size.split("x"))
     for name, camera in views(store, (width, height)).items():
-        if name not in asked.views:
+        if name not in arguments.views:
             continue
         exact = None
-        for error in ("standard", 0.0, *asked.errors):
+        for error in ("standard", 0.0, *arguments.errors):
             quality = fs.Quality()
             if error != "standard":
                 quality = fs.Quality(lowpass="pixel", alpha_cutoff=REFERENCE_CUTOFF, detail_error=error)
@@ -121,7 +121,7 @@ def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
             seen = sum(int(store.counts(np.array(nodes)).sum()) for nodes in selection.nodes if nodes)
             row = {"view": name, "splats": len(store), "error": error, "drawn": seen}
             row |= {"nodes": len(selection), "choose_s": chosen}
-            if seen <= asked.exact:
+            if seen <= arguments.exact:
                 resident = renderer.upload(store)
                 picture, row["s"], row["stats"] = timed(renderer, resident, capture)
                 row["device_bytes"] = resident.memory_bytes
@@ -146,11 +146,11 @@ def main() -> None:
     parser.add_argument("--measured", type=int, default=8, help="views that errors are measured with")
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--folder", default="fidsplat-stores", help="where stores are kept")
-    asked = parser.parse_args()
-    city, folder = City(int(asked.splats), asked.houses), Path(asked.folder)
+    arguments = parser.parse_args()
+    city, folder = City(int(arguments.splats), arguments.houses), Path(arguments.folder)
     folder.mkdir(parents=True, exist_ok=True)
     path, built = path_of(city, folder), None
-    renderer = fs.Renderer(asked.device)
+    renderer = fs.Renderer(arguments.device)
     if not path.exists():
         begun, cpu = time.perf_counter(), time.process_time()
         fs.build_store([city.source], path)
@@ -158,17 +158,17 @@ def main() -> None:
         PROGRESS.print(f"built: {built}")
     store = fs.Store(path)
     if not store.detail_errors:
-        measure_detail(store, renderer, asked.measured)
+        measure_detail(store, renderer, arguments.measured)
     rows, paths = [], []
-    about = {**facts(renderer), "built": built, "bytes": store.nbytes, "size": asked.size}
+    about = {**facts(renderer), "built": built, "bytes": store.nbytes, "size": arguments.size}
     about["details"] = [vars(one) for one in store.detail_errors]
-    for places in asked.places:
+    for places in arguments.places:
         whole = placed(store, city, places, folder)
-        rows += measure(whole, renderer, asked)
-        paths += [along(whole, renderer, asked, error) for error in asked.errors if asked.path]
-        keep({**about, "rows": rows, "paths": paths}, asked.json)
+        rows += measure(whole, renderer, arguments)
+        paths += [along(whole, renderer, arguments, error) for error in arguments.errors if arguments.path]
+        keep({**about, "rows": rows, "paths": paths}, arguments.json)
     show(
-        f"{about['device']}, {asked.size}",
+        f"{about['device']}, {arguments.size}",
         ("splats", "view", "error", "drawn", "first [s]", "next [s]", "same [s]", "off by", "device", "peak"),
         (
             (

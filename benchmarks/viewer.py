@@ -66,10 +66,10 @@ def main() -> None:
 
 def measured(session: Session, start: Viewpoint, rate: float, seconds: float) -> str:
     """A row of the table."""
-    latencies, sizes, scales, drawn, encoding, asked = [], [], [], [], [], 0.0
+    latencies, sizes, scales, drawn, encoding, arguments = [], [], [], [], [], 0.0
 
     def moving(viewpoint: Viewpoint, scale: float) -> Callable[[], None]:
-        begun = asked
+        begun = arguments
         image = session.render_moving(viewpoint, scale).to_uint8()
         drawn.append(time.perf_counter() - begun)
 
@@ -88,13 +88,13 @@ def measured(session: Session, start: Viewpoint, rate: float, seconds: float) ->
     stream = Stream(moving, rest, rate=rate)
     for warm in range(10):  # the scale finds its place
         stream.set_viewpoint(turned(start, -STEP * (warm + 1)))
-        asked = time.perf_counter()
+        arguments = time.perf_counter()
         stream.step()
     del latencies[:], sizes[:], scales[:], drawn[:], encoding[:]
     begun, worked = time.perf_counter(), time.process_time()
     while time.perf_counter() - begun < seconds:
         stream.set_viewpoint(turned(start, SWING * math.sin(STEP / SWING * len(drawn))))
-        asked = time.perf_counter()
+        arguments = time.perf_counter()
         stream.step()
     fps = len(drawn) / (time.perf_counter() - begun)
     work = 1e3 * (time.process_time() - worked) / len(drawn)

@@ -144,14 +144,14 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
 def main() -> None:
     parser = options(__doc__, "opencl:nvidia", repeats=5)
     parser.add_argument("--rows", nargs="*", default=["scenes"], choices=[*ROWS], metavar="ROW")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     if not torch.cuda.is_available():
         raise SystemExit("gsplat_batches: PyTorch sees no CUDA device; gsplat draws on nothing else")
-    renderer, records = fs.Renderer(asked.device), []
-    for name in asked.rows:
+    renderer, records = fs.Renderer(arguments.device), []
+    for name in arguments.rows:
         with PROGRESS.status(f"drawing {name}"):
-            records += measure(renderer, name, max(asked.repeats, 1))
-    if keep(records, asked.json):
+            records += measure(renderer, name, max(arguments.repeats, 1))
+    if keep(records, arguments.json):
         return
 
     def cells(record: dict) -> tuple[str, ...]:
