@@ -165,3 +165,13 @@ def test_iteration_can_stop_early(store, two):
     next(frames)
     frames.close()
     assert threading.active_count() <= before
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_scene_is_rendered_by_its_own_camera(count):
+    """Also by a single device."""
+    tag = fs.scenes.PlacedMarker(fs.marker("aruco:4x4_50:7", size=0.4))
+    scene = fs.Scene([], fs.Camera.look_at(24, 16, 1.0, (0.1, 0, -1), (0, 0, 0)), [tag])
+    several = fs.SeveralDevices(["reference"] * count)
+    wanted = fs.Renderer("reference").render(scene)["rgb"]
+    np.testing.assert_array_equal(several.render(scene, outputs=("rgb",))["rgb"], wanted)
