@@ -238,3 +238,26 @@ def test_the_same_bits_again_and_in_bands_of_tiles(renderer):
         assert all((a == b).all() for a, b in zip(first, draw(), strict=True))
     finally:
         renderer.backend.pair_budget = held
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_rolling_shutters_of_a_tall_field_of_view_lose_no_splat(renderer, up):
+    """Splats beyond the upper or lower border reach in along the depth, where rays are far from the axis."""
+    random = np.random.default_rng(4)
+    count, height = 600, 64
+    depth = random.uniform(0.8, 1.2, count)
+    slope = up * random.uniform(3.4, 5.0, count)  # the border is at 32 / 10
+    means = np.column_stack([random.uniform(-1, 1, count), slope * depth, depth])
+    shapes = random.normal(size=(count, 4)), np.full((count, 2), 0.1), np.full(count, 0.9)
+    cloud = fs.SplatCloud(means, *shapes, colors=random.random((count, 3)))
+    camera = fs.Camera.pinhole(24, height, 12.0, 10.0, 12.0, height / 2)
+    capture = fs.Capture(
+        camera, ("rgb", "alpha"), "alpha_cutoff=1e-6",
+        motion=fs.Motion(lambda time: np.eye(4) + 0.02 * time * np.eye(4, k=3)),
+        shutter=fs.Shutter(readout=0.5, rows_per_band=8),
+    )  # fmt: skip
+    wanted = fs.Renderer("reference").render(cloud, capture)
+    frame = renderer.render(cloud, capture)
+    assert wanted["alpha"].max() > 0.2
+    for output in ("rgb", "alpha"):
+        np.testing.assert_allclose(frame[output], wanted[output], atol=2e-4)
