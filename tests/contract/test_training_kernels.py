@@ -144,7 +144,7 @@ def test_loss_of_normals(renderer, views, works):
         shown = {name: array.astype(np.float32) for name, array in shown.items()}
         images = SimpleNamespace(
             device_array=lambda name, shown=shown: on_device(renderer, shown[name]),
-            read=lambda name, shown=shown: shown[name],
+            read=lambda name, view, shown=shown: shown[name],
         )
         found, wanted = (work.normal_loss_gradients(images, number, 0.3) for work in (device, host))
         for name, array in wanted.items():
