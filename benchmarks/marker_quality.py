@@ -67,7 +67,7 @@ def camera_at(made: Marker, edge_px: float, tilt: float) -> fs.Camera:
     return fs.Camera.pinhole(PICTURE, PICTURE, focal, focal, PICTURE / 2, PICTURE / 2, placed)
 
 
-def ideal_picture(made: Marker, camera: fs.Camera, background: float) -> tuple[np.ndarray, np.ndarray]:
+def ideal_image(made: Marker, camera: fs.Camera, background: float) -> tuple[np.ndarray, np.ndarray]:
     """The printed marker itself, (h, w) in [0, 1], and the mask of the pixels that count."""
     at = (np.arange(PICTURE * FINE) + 0.5) / FINE
     to_plane = np.linalg.inv(camera.matrix @ camera.world_to_camera[:3, [0, 1, 3]])
@@ -94,7 +94,7 @@ def measure(renderer: fs.Renderer, made: Marker, edge_px: float, background: flo
     for name, (order, tilt) in VIEWS.items():
         camera = camera_at(made, edge_px, tilt)
         if (made.spec, tilt) not in ideals:
-            ideals[made.spec, tilt] = ideal_picture(made, camera, background)
+            ideals[made.spec, tilt] = ideal_image(made, camera, background)
         ideal, counts = ideals[made.spec, tilt]
         quality = fs.Quality(alpha_cutoff=1 / 255, lowpass="none", samples=3, order=order)
         frame = renderer.render(made.cloud, camera, quality=quality, background=(background,) * 3)

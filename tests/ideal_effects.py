@@ -15,7 +15,7 @@ from fidsplat.backends.view import View
 from fidsplat.scenes import PlacedMarker
 
 
-def ideal_picture(
+def ideal_image(
     placed: PlacedMarker,
     camera: fs.Camera,
     samples: int,

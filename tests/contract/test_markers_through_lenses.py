@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from ideal_effects import assert_as_good, ideal_picture
+from ideal_effects import assert_as_good, ideal_image
 from sampling import alternate, in_turn
 
 import fidsplat as fs
@@ -54,7 +54,7 @@ def pictures(renderer, placed, camera, **effects):
     """What the splats show, and what the ideal plane does under the same effects."""
     scene = fs.Scene([], camera, [placed], background=GREY, quality=DENSE)
     drawn = renderer.render(scene, **effects)["rgb"]
-    ideal = ideal_picture(scene.markers[0], camera, DENSE.samples, GREY, **effects)
+    ideal = ideal_image(scene.markers[0], camera, DENSE.samples, GREY, **effects)
     return eight_bits(drawn), eight_bits(ideal)
 
 

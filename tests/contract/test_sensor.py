@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import against_reference, random_splats
-from ideal_effects import assert_as_good, ideal_picture
+from ideal_effects import assert_as_good, ideal_image
 from sampling import SAMPLES, alternate, in_turn
 
 import fidsplat as fs
@@ -248,7 +248,7 @@ def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
     distance = np.linalg.norm(pose[:3, 3])
     for fog in (None, fs.Fog(0.3, (0.5, 0.5, 0.5))):
         rgb = renderer.render(scene, quality=fs.Quality(lowpass="none", samples=2), fog=fog)["rgb"]
-        ideal = ideal_picture(placed, camera, 2, around, sensor=sensor, fog=fog)
+        ideal = ideal_image(placed, camera, 2, around, sensor=sensor, fog=fog)
         errors = []
         for picture in (rgb, ideal):
             (found,) = detect(to_uint8(picture), families=["36h11"], qr=False)

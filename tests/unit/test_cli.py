@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import fails, prints_json
-from ideal_picture import draw, photographed, pose, qr_bits, turned
+from ideal_image import draw, photographed, pose, qr_bits, turned
 from rich.console import Console
 
 import fidsplat as fs

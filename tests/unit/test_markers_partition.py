@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from holes import count_holes
+from euler_number import count_holes
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays

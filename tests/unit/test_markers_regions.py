@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import shapely
-from holes import count_holes
+from euler_number import count_holes
 
 from fidsplat.markers.regions import label_components, polygons
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from ideal_picture import draw, photographed, pose, qr_bits, turned
+from ideal_image import draw, photographed, pose, qr_bits, turned
 
 from fidsplat.cameras import Camera
 from fidsplat.images.tag_dictionaries import dictionary_bits, families, parse_family, predefined

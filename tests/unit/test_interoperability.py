@@ -1,4 +1,4 @@
-"""What frames, clouds and scenes are to notebooks and to other libraries."""
+"""Frames, clouds and scenes in notebooks and with other array libraries."""
 
 import sys
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""What OpenCL keeps from picture to picture, and what it lets go: images, views, lenses, times."""
+"""Caches of the OpenCL backend from frame to frame, and their release: images, views, lenses, times."""
 
 import gc
 import weakref

@@ -1,4 +1,4 @@
-"""How many holes the components of a grid have, by Euler's formula."""
+"""Number of holes of the components of a grid, by Euler's formula."""
 
 import numpy as np
 
@@ -15,8 +15,8 @@ def count_holes(labels: np.ndarray, count: int) -> np.ndarray:
     cells = [padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]]
     turns = np.zeros(count, np.int64)
     for i, own in enumerate(cells):
-        beside, over, across = (cells[i ^ 1] == own), (cells[i ^ 2] == own), (cells[i ^ 3] == own)
+        left_right, above, diagonal = (cells[i ^ 1] == own), (cells[i ^ 2] == own), (cells[i ^ 3] == own)
         inside = own >= 0
-        turns += np.bincount(own[inside & ~beside & ~over], minlength=count)
-        turns -= np.bincount(own[inside & beside & over & ~across], minlength=count)
+        turns += np.bincount(own[inside & ~left_right & ~above], minlength=count)
+        turns -= np.bincount(own[inside & left_right & above & ~diagonal], minlength=count)
     return 1 - turns // 4
