@@ -197,7 +197,7 @@ class Images:
     def device_array(self, name: str, index: int | None = None) -> Any:
         """The images as an array of the device, in the shape of `read`; no copy."""
         raise InputError(
-            f"device_array must be of a device that shares its arrays, got {name} of one that does not; "
+            f"device_array({name!r}) needs a device that shares its arrays, as Warp devices do; "
             "render with device='warp:cuda' or 'warp:cpu', or take frame[name], which is copied to the host"
         )
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.interface import Images
 from fidsplat.images.files import to_uint8
 from fidsplat.scenes import PlacedMarker
 
@@ -33,6 +34,19 @@ def test_a_frame_shows_itself():
     assert not deep[0, 0].any()
 
 
+class Shared(Images):
+    """Images of a device whose arrays others can use."""
+
+    shares_arrays = True
+    timings, stats = {}, {}
+
+    def __init__(self, arrays):
+        self.arrays = arrays
+
+    def device_array(self, name, index=None):
+        return self.arrays[name]
+
+
 def test_a_frame_of_one_output_is_an_array():
     one = frame("rgb")
     np.testing.assert_array_equal(np.asarray(one), one["rgb"])
@@ -52,8 +66,10 @@ def test_a_frame_becomes_a_tensor(monkeypatch):
     assert kind == "numpy"
     assert array.flags.writeable
     np.testing.assert_array_equal(array, drawn["label"])
-    images = SimpleNamespace(read=None, timings={}, stats={}, device_array=lambda name: f"{name} there")
-    assert fs.Frame(images, fs.Capture(outputs="rgb")).to_torch() == ("dlpack", "rgb there")
+    assert fs.Frame(Shared({"rgb": "rgb there"}), fs.Capture(outputs="rgb")).to_torch() == (
+        "dlpack",
+        "rgb there",
+    )
     with pytest.raises(fs.InputError, match="no 'depth'"):
         drawn.to_torch("depth")
     monkeypatch.setitem(sys.modules, "torch", None)
@@ -74,8 +90,8 @@ def test_a_frame_of_one_output_goes_through_dlpack():
     np.testing.assert_array_equal(there, one["label"])
     assert not np.shares_memory(there, one["label"])
     given = np.arange(6.0).reshape(2, 3)
-    images = SimpleNamespace(read=None, timings={}, stats={}, device_array=lambda name: given)
-    assert np.shares_memory(np.from_dlpack(fs.Frame(images, fs.Capture(outputs="depth"))), given)  # no copy
+    shared = fs.Frame(Shared({"depth": given}), fs.Capture(outputs="depth"))
+    assert np.shares_memory(np.from_dlpack(shared), given)  # no copy
     with pytest.raises(fs.InputError, match="this frame has 2 images"):
         np.from_dlpack(frame("rgb", "depth"))
 
