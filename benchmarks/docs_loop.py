@@ -36,7 +36,7 @@ def main(out: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         renderer = fs.Renderer()
         drawn = FlightFolder(folder, flight, renderer.device.title)
-        for number in drawn.draw(renderer):
+        for number in drawn.render(renderer):
             print(f"{number + 1} of {len(flight)}", end="\r", file=sys.stderr)
         words = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-framerate", str(RATE)]
         words += ["-i", f"{folder}/rgb/%06d.png", "-c:v", "libwebp_anim", "-quality", "60", "-loop", "0", out]

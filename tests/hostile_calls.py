@@ -148,7 +148,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         lambda external_depth: RENDERER.render(CLOUD, CAMERA, external_depth=external_depth),
     ),
     "Renderer.render_every": lambda _: (
-        RENDERER.render_every, {"step": 4, "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None, "tell": None}, None
+        RENDERER.render_every, {"step": 4, "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None, "progress": None}, None
     ),
     "Renderer.render_band": lambda _: (
         RENDERER.render_band, {"band": (2, 4), "scene": CLOUD, "capture": CAMERA, "outputs": ("rgb",), "quality": None}, None

@@ -286,10 +286,10 @@ class Pipeline:
         raise NotImplementedError
 
     def render_every(
-        self, resident: Any, view: View, step: int, tell: Callable[[float], object] | None = None
+        self, resident: Any, view: View, step: int, progress: Callable[[float], object] | None = None
     ) -> Images:
         """Render every step-th pixel in both directions, starting with the first: images of
-        (ceil(h / step), ceil(w / step)), bit-identical to those pixels of `render`. tell: called with the
+        (ceil(h / step), ceil(w / step)), bit-identical to those pixels of `render`. progress: called with the
         completed share, 0 to 1."""
         raise NotImplementedError
 

@@ -91,7 +91,7 @@ class Detect:
     def _images(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
         """Names, images, and the scene at the time of each."""
         from fidsplat.images.files import is_video, pictures
-        from fidsplat.render.flight import RECORD, seen_in_flight
+        from fidsplat.render.flight import RECORD, scene_of_frame
 
         if path.endswith(".mcap") or (path_of(path) / "metadata.yaml").is_file():
             yield from self._log_images(path, scene)
@@ -103,13 +103,13 @@ class Detect:
             )
         folder = path_of(path)
         for name, image in pictures(folder / "rgb" if (folder / RECORD).is_file() else path):
-            yield name, image, None if scene is None else seen_in_flight(scene, Path(name))
+            yield name, image, None if scene is None else scene_of_frame(scene, Path(name))
 
     def _log_images(
         self, path: str, scene: "Scene | None"
     ) -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
         from fidsplat.logs import log_images, log_poses
-        from fidsplat.render.flight import seen_from
+        from fidsplat.render.flight import scene_at
 
         poses = {} if scene is None else log_poses(path)
         for one in log_images(path, self.topic):
@@ -121,7 +121,7 @@ class Detect:
                         f"--scene needs a pose of {one.frame!r} in /tf at the time of {one.name}, which "
                         f"{path} lacks; detect without --scene"
                     )
-                then = seen_from(scene, pose, one.stamp / 1e9)
+                then = scene_at(scene, pose, one.stamp / 1e9)
             yield one.name, one.image, then
 
     def _detect(

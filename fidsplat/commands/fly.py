@@ -110,7 +110,7 @@ class Fly(RenderInput):
             log_is_complete = self._log_is_complete(flight.key(title))
             folder = FlightFolder(self.out, flight, title, self.overwrite, self.source)
             begun = time.perf_counter()
-            left = len(folder.left())
+            left = len(folder.remaining())
             list(show_progress("frames", render(folder), len(flight), len(flight) - left))
             seconds = time.perf_counter() - begun
         sheet = folder.write_sheet()
@@ -141,7 +141,7 @@ class Fly(RenderInput):
         if self.ray is None:
             with console(self.json).status("opening the device"):
                 renderer = Renderer(device, budget)
-            yield renderer.device.title, lambda folder: folder.draw(renderer)
+            yield renderer.device.title, lambda folder: folder.render(renderer)
             return
         from fidsplat.remote.flights import FlightWork, render_flight
         from fidsplat.remote.ray_engine import ray_engine

@@ -97,7 +97,7 @@ class FlightRenderer:
 def render_flight(folder: FlightFolder, engine: Engine, workers: int) -> Iterator[int]:
     """Render the missing frames of a flight on workers; yields the number of each frame once its files are
     complete here. Raises FidsplatError like `drain`."""
-    for k, files in drain(engine, folder.left(), workers):
+    for k, files in drain(engine, folder.remaining(), workers):
         for (name, suffix), content in _checked(files, k, folder.flight.capture.outputs).items():
             with atomic_write(folder.file(k, name, suffix)) as stream:
                 stream.write(content)

@@ -19,13 +19,13 @@ class FrameBatch(Mapping):
     """Rendered views: a mapping from an output's name to a read-only NumPy array
     (views, h, w) or (views, h, w, channels), copied from the device on first use.
 
-    Names, types and units are those of Frame. Views that were masked out hold -1 in `label` and `splat_id`
-    and 0 in all else. View i is bit-identical to `Renderer.render` alone, but for stores with
+    Names, types and units are those of Frame. Masked views are -1 in `label` and `splat_id`, and 0 in all
+    other outputs. View i is bit-identical to `Renderer.render` of that view, except for stores with
     `detail_error` (`Renderer.render_batch`).
     """
 
     def __init__(self, images: Images, views: Views, ids: Ids = None) -> None:
-        """ids: as those of a Frame."""
+        """ids: the indices that `splat_id` shows for the rendered splats."""
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._views = views
         self._arrays: dict[str, np.ndarray] = {}
@@ -34,7 +34,7 @@ class FrameBatch(Mapping):
 
     @property
     def views(self) -> int:
-        """How many there are, those that were masked out among them."""
+        """Number of views, including masked ones."""
         return self._images.views
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -49,7 +49,7 @@ class FrameBatch(Mapping):
         """The images on their device, without a copy, (views, h, w) or (views, h, w, channels): by
         OpenCL a pyopencl.array.Array, on a Warp device a wp.array, from which DLPack makes a tensor.
 
-        They belong to this batch: the next has other arrays.
+        The batch owns them: the next batch has other arrays.
 
         Raises:
             InputError: an output that was not requested, or the backend shares no arrays.
@@ -60,7 +60,7 @@ class FrameBatch(Mapping):
         return self._images.device_array(name)
 
     def frame(self, number: int) -> Frame:
-        """One view as a Frame, of which only what is read is copied; without timings and stats.
+        """One view as a Frame, without timings and stats. Images are copied to the host on first use.
 
         Raises:
             InputError: there is no such view.
@@ -70,7 +70,7 @@ class FrameBatch(Mapping):
             or not isinstance(number, (int, np.integer))
             or not 0 <= number < self.views
         ):
-            raise InputError(f"there is no view {number!r}; this batch has views 0 to {self.views - 1}")
+            raise InputError(f"the view must be a number from 0 to {self.views - 1}, got {number!r}")
         return Frame(self._images, self._views.capture(int(number)), self._ids, index=int(number))
 
     def wait(self) -> FrameBatch:
@@ -93,7 +93,7 @@ class FrameBatch(Mapping):
     def __reduce__(self):
         """Pickled and copied as NumPy arrays."""
         views = replace(self._views, captures=tuple(one.picklable() for one in self._views.captures))
-        return _kept_batch, (dict(self), dict(self.timings), dict(self.stats), views)
+        return _host_batch, (dict(self), dict(self.timings), dict(self.stats), views)
 
     @property
     def timings(self) -> Mapping[str, float]:
@@ -106,7 +106,7 @@ class FrameBatch(Mapping):
         return self._images.stats
 
 
-def _kept_batch(
+def _host_batch(
     arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], views: Views
 ) -> FrameBatch:
     return FrameBatch(HostImages(arrays, timings, stats), views)

@@ -81,7 +81,7 @@ _REQUESTED = {
     ),
     "blend_double": ("blend_precision='float64'", "blend_precision='float32'"),
 }
-"""prefix of an effect's name: what the user requested, and what to request instead"""
+"""option that requests an effect, and the supported alternative, by the prefix of the effect's name"""
 _SENSOR = {"noise": "full_well", "quantise": "bits", "response": "response"}
 """prefix of a sensor's step: the argument that requests it, where it has another name"""
 
@@ -105,7 +105,7 @@ def nothing_left_out(quality: Quality, cutoff: float) -> Quality:
 
 @dataclass(frozen=True)
 class Ideal:
-    """What to render for the ideal, and how far that may be off."""
+    """Features and view of the ideal's rendering, and its error bound."""
 
     features: FeatureSet
     view: View
@@ -117,7 +117,7 @@ class Ideal:
 
 @dataclass(frozen=True)
 class ErrorImage:
-    """The output `error` of a frame, made when it is read."""
+    """The output `error` of a frame, computed on first use."""
 
     rgb: Images
     ideal: Images
@@ -162,7 +162,8 @@ def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
 
 
 def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -> tuple[FeatureSet, View]:
-    """The ideal in float32 with its `rounding` where kernels have that, else in float64."""
+    """Features and view of the ideal: in float32 with the output `rounding` if kernels bound it, else in
+    float64."""
     plain = capture.with_(outputs=("rgb",), quality=quality)
     info = backend.info
     if info.always_float64:
@@ -177,7 +178,7 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         return replace(features, outputs=("rounding",)), view
     try:
         if any(name.startswith("background_") for name in unbounded):
-            raise InputError("its rays are held in float32")
+            raise InputError("its rays are stored in float32")
         double = prepare(data, replace(plain, quality=quality.with_(blend_precision="float64")))
         if why := backend.unsupported(double[0]):
             raise InputError(why)
@@ -192,7 +193,7 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
 
 
 def _requested(effect: str) -> tuple[str, str]:
-    """What requests an effect, in the user's terms, and what to request instead."""
+    """The option that requests an effect, and the supported alternative."""
     return next(
         (words for prefix, words in _REQUESTED.items() if effect.startswith(prefix)), (effect, "less")
     )
@@ -208,7 +209,7 @@ def _refuse_unbounded(capture: Capture) -> None:
         name = next((name for prefix, name in _SENSOR.items() if step.startswith(prefix)), step)
         effect, remedy = f"a sensor with {name}={getattr(capture.sensor, name)!r}", "with fs.Sensor()"
     elif camera is not None and math.isfinite(camera.far):
-        # what lies beyond it is left out by the radius of the cut-off
+        # splats are culled at `far` by the radius of the cut-off
         effect, remedy = f"a camera whose far is {camera.far:g} m", "with a camera whose far is infinite"
     else:
         return
@@ -219,7 +220,7 @@ def _refuse_unbounded(capture: Capture) -> None:
 
 
 def _colors_behind(view: View) -> list[Any]:
-    """Colours that are not of splats."""
+    """Colours of the background and of an external depth image."""
     match view.surroundings:
         case Gradient(top=top, bottom=bottom):
             behind = [top, bottom]

@@ -1,4 +1,4 @@
-"""Flights: a scene's pictures along a trajectory, as files that a run which was stopped goes on with."""
+"""Flights: frames of a scene along a trajectory, written as files by a run that can be resumed."""
 
 from __future__ import annotations
 
@@ -36,28 +36,31 @@ _COLUMNS, _ROWS = 4, 3
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """Pictures of a scene at times, from a camera that moves along a trajectory.
+    """Frames of a scene at given times, from a camera that moves along a trajectory.
 
-    What else moves in the scene moves by the same clock, and its shutter sees the camera move. Raises
-    InputError where there is no time, the times do not increase, or the scene has no camera.
+    Moving groups of the scene use the same clock. A shutter with an exposure time or a readout blurs or
+    skews the image by the camera's motion.
+
+    Raises:
+        InputError: no times, times that do not increase, or a scene without a camera.
     """
 
     scene: Scene
     trajectory: Trajectory
     """camera to world"""
     times: Sequence[float] | np.ndarray
-    """(n,) seconds on the trajectory's clock, increasing: one picture each"""
+    """(n,) seconds on the trajectory's clock, increasing: one frame each"""
     capture: Capture
-    """how pictures are taken, but for the camera's motion and the shutter's time"""
+    """capture of every frame; the camera's motion and the shutter's time are replaced"""
 
     def __post_init__(self) -> None:
         if self.capture.camera is None:
             raise InputError("the scene has no camera; its size and focal lengths are needed for a flight")
-        _ = self.path  # times that are none are refused here
+        _ = self.path  # raises for invalid times
 
     @cached_property
     def path(self) -> Trajectory:
-        """The pose of each picture, at the time of its middle row."""
+        """The camera pose of each frame, at the time of its middle row."""
         times = np.atleast_1d(real_array("the times of a flight", self.times, "numbers of seconds"))
         return Trajectory(times, [self.trajectory(time) for time in times])  # type: ignore[arg-type]
 
@@ -66,7 +69,7 @@ class Flight:
 
     @cached_property
     def captures(self) -> list[Capture]:
-        """How picture k is taken."""
+        """The capture of each frame."""
         motion = Motion(self.trajectory.inverse(), self.capture.motion.groups)
         shutter = self.capture.shutter
         return [
@@ -75,27 +78,29 @@ class Flight:
         ]
 
     def key(self, device: str) -> str:
-        """16 hexadecimal digits of all that its pictures depend on: splats, captures, device, version."""
+        """Hash of everything that its frames depend on: splats, captures, device, version; 16 hexadecimal
+        digits."""
         content = (self.scene.content, self.capture, self.trajectory, self.path, device, __version__)
         try:
             return digest_of(content)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise InputError(
-                f"a flight must be made of data, so that it can go on after a stop: {error}"
+                f"a flight must be picklable, so that it can be resumed after a stop: {error}"
             ) from None
 
 
 class FlightFolder:
-    """A folder with a flight's pictures: OUTPUT/000000.png and so on, as `fidsplat render` writes outputs;
-    their poses in trajectory.tum and, for a pinhole, transforms.json, which makes it a data set; and in
-    flight.json what they are of.
+    """Output folder of a flight: frames, camera poses and the record flight.json.
+
+    Frames are OUTPUT/000000.png and so on, in the formats of `fidsplat render`. Poses are in trajectory.tum
+    and, for a pinhole camera, in transforms.json, which makes the folder a training data set.
 
     Args:
-        overwrite: whether pictures of another flight are replaced.
-        source: file of what is drawn, of which the record tells `fidsplat view`.
+        overwrite: whether frames of another flight are replaced.
+        source: file of the scene, recorded for `fidsplat view`.
 
     Raises:
-        InputError: it holds another flight, or cannot be written.
+        InputError: the folder contains another flight, or cannot be written.
     """
 
     def __init__(
@@ -112,13 +117,13 @@ class FlightFolder:
         before = self._recorded()
         if before is not None and before.get("key") != self.key and not overwrite:
             raise InputError(
-                f"{self.folder} holds another flight, of {before.get('frames', 'some')} pictures; give "
-                "another folder, or --overwrite to draw over it"
+                f"{self.folder} must be empty or contain this flight, got another flight of "
+                f"{before.get('frames', 'some')} frames; give another folder, or --overwrite to replace it"
             )
-        if before is None and not overwrite and len(self.left()) < len(flight):
+        if before is None and not overwrite and len(self.remaining()) < len(flight):
             raise InputError(
-                f"{self.folder} holds pictures that no {RECORD} there tells of; give another folder, or "
-                "--overwrite to draw over them"
+                f"{self.folder} must be empty or contain this flight, got frames without {RECORD}; give "
+                "another folder, or --overwrite to replace them"
             )
         writable_folder(self.folder)
         for name in flight.capture.outputs:
@@ -128,8 +133,8 @@ class FlightFolder:
         self._write(RECORD, self._facts())
         self._save_poses()
 
-    def left(self) -> list[int]:
-        """Numbers of the pictures that are not whole yet."""
+    def remaining(self) -> list[int]:
+        """Numbers of the frames of which a file is missing."""
         outputs = self.flight.capture.outputs
         return [
             k
@@ -140,43 +145,43 @@ class FlightFolder:
         ]
 
     def file(self, k: int, name: str, suffix: str) -> Path:
-        """Where a file of picture k belongs."""
+        """Path of an output of frame k."""
         return self.folder / name / f"{k:06d}{suffix}"
 
-    def draw(self, renderer: Renderer) -> Iterator[int]:
-        """Draw what is left; yields the number of each picture once its files are whole."""
-        left = self.left()
-        if not left:
+    def render(self, renderer: Renderer) -> Iterator[int]:
+        """Render the remaining frames; yields the number of each after its files are written."""
+        remaining = self.remaining()
+        if not remaining:
             return
         resident = renderer.upload(self.flight.scene)
         bits = self.flight.capture.sensor.bits
-        frames = renderer.render_views(resident, [self.flight.captures[k] for k in left])
-        for k, frame in zip(left, frames, strict=True):
+        frames = renderer.render_views(resident, [self.flight.captures[k] for k in remaining])
+        for k, frame in zip(remaining, frames, strict=True):
             for name in frame.outputs:
                 image = frame.to_uint8() if name == "rgb" and bits != 16 else frame[name]
                 save_output(name, image, lambda output, suffix, k=k: self.file(k, output, suffix), bits)
             yield k
 
-    def pictures(self) -> list[Path]:
-        """One picture of each time that people can look at: of the first output."""
+    def previews(self) -> list[Path]:
+        """Files of the viewable images of all frames: of the first output."""
         name = self.flight.capture.outputs[0]
         return [self.file(k, name, suffixes_of(name)[-1]) for k in range(len(self.flight))]
 
     def write_sheet(self) -> Path:
-        """Twelve pictures, evenly spread over the flight, on one sheet."""
-        files = self.pictures()
+        """Write a contact sheet of twelve frames, evenly spread over the flight."""
+        files = self.previews()
         some = sorted({round(k) for k in np.linspace(0, len(files) - 1, min(len(files), _COLUMNS * _ROWS))})
         cells = [(f"{float(self.flight.path.times[k]):.2f} s", read_image(files[k])) for k in some]
         rows = [cells[start : start + _COLUMNS] for start in range(0, len(cells), _COLUMNS)]
         return write_png(self.folder / SHEET, contact_sheet(rows, width=320))
 
     def write_video(self, path: str | Path, rate: float) -> Iterator[int]:
-        """The pictures as a video; yields the number of each once it is in. Raises InputError without the
-        extra `video`."""
-        return write_video(path, (read_image(file) for file in self.pictures()), rate)
+        """Write the frames as a video; yields the number of each after it is encoded. Raises InputError
+        without the extra `video`."""
+        return write_video(path, (read_image(file) for file in self.previews()), rate)
 
     def _clear(self) -> None:
-        # what lies here under our names is not of this flight
+        # frames of another flight have the same file names
         for name in self.flight.capture.outputs:
             for suffix in suffixes_of(name):
                 for file in (self.folder / name).glob(f"[0-9][0-9][0-9][0-9][0-9][0-9]{suffix}"):
@@ -210,26 +215,26 @@ class FlightFolder:
 
     def _save_poses(self) -> None:
         save_trajectory(self.flight.path, self.folder / POSES)
-        camera, names = self.flight.capture.camera, self.pictures()
+        camera, names = self.flight.capture.camera, self.previews()
         if camera is not None and camera.lens is None:
             images = [str(file.relative_to(self.folder)) for file in names]
             save_trajectory(self.flight.path, self.folder / "transforms.json", camera, images)
 
 
-def seen_in_flight(scene: Scene, picture: Path) -> Scene:
-    """The scene with its camera and its clock as they were in a picture of a flight's folder; as it is for
-    any other picture."""
-    folder = picture.parent.parent
-    if not picture.stem.isdigit() or not (folder / RECORD).is_file():
+def scene_of_frame(scene: Scene, image: Path) -> Scene:
+    """The scene at the camera pose and time of an image file in a flight's folder; unchanged for any other
+    image file."""
+    folder = image.parent.parent
+    if not image.stem.isdigit() or not (folder / RECORD).is_file():
         return scene
-    path, number = load_trajectory(folder / POSES), int(picture.stem)
+    path, number = load_trajectory(folder / POSES), int(image.stem)
     if number >= len(path):
         return scene
     return _at(scene, path, float(path.times[number]))
 
 
-def seen_from(scene: Scene, pose: np.ndarray, time: float) -> Scene:
-    """The scene with its camera at a pose (4, 4), camera to world, and its clock at a time [s]."""
+def scene_at(scene: Scene, pose: np.ndarray, time: float) -> Scene:
+    """The scene with its camera at a pose (4, 4), camera to world, at a time [s]."""
     return _at(scene, Trajectory([time], pose[None]), time)
 
 

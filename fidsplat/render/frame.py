@@ -17,16 +17,16 @@ Ids = Callable[[], np.ndarray] | None
 """returns the indices (n,) int32 of the rendered splats in the complete scene; None: no other indices"""
 
 
-class MadeImage(Protocol):
-    """An image that is made from others when it is read."""
+class ComputedImage(Protocol):
+    """An output image that the host computes from other images on first use."""
 
     def read(self) -> np.ndarray:
-        """The image, an array of its own."""
+        """Compute the image; a new array."""
         ...
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage, of what only this image takes."""
+        """Milliseconds on the device by stage, for this image only."""
         ...
 
 
@@ -38,8 +38,8 @@ class Frame(Mapping):
     metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
     unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
     (h, w) int32; `blended` (h, w) int32; `error` (h, w), an upper bound of |rgb - ideal|
-    (fidsplat/render/certified_error.py). Where less than 1/255 is covered, or of first hits less than
-    `Quality.first_hit`, labels and ids are -1, the others of these 0.
+    (fidsplat/render/certified_error.py). In pixels with an alpha below 1/255 (`_first` outputs: below
+    `Quality.first_hit`) `label` and `splat_id` are -1, and depths, distances and normals are 0.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Frame(Mapping):
         images: Images,
         capture: Capture,
         ids: Ids = None,
-        error: MadeImage | None = None,
+        error: ComputedImage | None = None,
         index: int = 0,
     ) -> None:
         """ids: the indices that `splat_id` shows for the rendered splats. error: the output `error`, if it is
@@ -64,8 +64,8 @@ class Frame(Mapping):
         self._check(name)
         if name not in self._arrays:
             check_process(self._process, "frame")
-            made = self._error if name == "error" else None
-            image = self._images.read(name, self._index) if made is None else made.read()
+            computed = self._error if name == "error" else None
+            image = self._images.read(name, self._index) if computed is None else computed.read()
             self._arrays[name] = image = numbered(name, image, self._ids)
             image.flags.writeable = False  # cached
         return self._arrays[name]
@@ -73,8 +73,8 @@ class Frame(Mapping):
     def device_array(self, name: str) -> Any:
         """The image on its device, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
 
-        It belongs to this frame: the next frame has another array. `wp.to_torch`, DLPack and
-        `__cuda_array_interface__` make a tensor of it on the same device.
+        The frame owns it: the next frame has another array. `wp.to_torch`, DLPack and
+        `__cuda_array_interface__` convert it to a tensor on the same device.
 
         Raises:
             InputError: an output that was not requested, or the backend shares no arrays.
@@ -89,9 +89,9 @@ class Frame(Mapping):
         return self._images.device_array(name, self._index)
 
     def to_uint8(self) -> np.ndarray:
-        """`rgb` as files of 8 bits have it, (h, w, 3) uint8: clamped to [0, 1], times 255, rounded to the
-        nearest; 0 where it is no number. Made on the device where that can, so that a quarter of the bytes is
-        copied; the same bits on the host of `frame["rgb"]`, where that has been read.
+        """`rgb` as 8-bit colours, (h, w, 3) uint8: clamped to [0, 1], times 255, rounded to the nearest; NaN
+        becomes 0. It is converted on the device if possible, so that a quarter of the bytes is copied, and is
+        bit-identical to a conversion of `frame["rgb"]` on the host.
 
         Raises:
             InputError: `rgb` was not requested.
@@ -102,13 +102,13 @@ class Frame(Mapping):
             converted = self._images.read_uint8("rgb", self._index)
             if converted is not None:
                 return converted
-        from fidsplat.images.files import to_uint8  # late: it brings OpenCV
+        from fidsplat.images.files import to_uint8  # here, since it imports OpenCV
 
         return to_uint8(self["rgb"])
 
     def to_torch(self, name: str = "rgb") -> Any:
-        """The image as a torch tensor: without a copy on the device that drew it where that has arrays to
-        give (`device_array`), else copied to the host.
+        """The image as a torch tensor: on its device without a copy if the backend shares arrays
+        (`device_array`), else copied to the host.
 
         Raises:
             InputError: an output that was not requested, or torch is not installed.
@@ -117,46 +117,43 @@ class Frame(Mapping):
         try:
             import torch  # type: ignore[import-not-found]
         except ImportError:
-            raise InputError(
-                "to_torch makes tensors of torch, which is not installed; pip install torch"
-            ) from None
+            raise InputError("to_torch needs torch, which is not installed; pip install torch") from None
         if self._stays(name):
             return torch.from_dlpack(self.device_array(name))
-        return torch.from_numpy(self[name].copy())  # torch has no arrays that are read-only
+        return torch.from_numpy(self[name].copy())  # torch has no read-only tensors
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """The image of a frame with one output, as NumPy, PIL and OpenCV ask for it. Raises InputError where
-        there are several."""
+        """The image of a frame with one output, for NumPy, PIL and OpenCV. Raises InputError if there are
+        several."""
         image = self[self._only()]
         return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
 
     def __dlpack__(self, **words: Any) -> Any:
         """The image of a frame with one output, for `from_dlpack` of torch, CuPy, JAX and NumPy: without a
-        copy where the device has arrays to give, else copied to the host. Raises InputError where there are
-        several."""
+        copy if the backend shares arrays, else copied to the host. Raises InputError if there are several."""
         return self._exchanged().__dlpack__(**words)
 
     def __dlpack_device__(self) -> tuple[int, int]:
-        """Where that is, in DLPack's numbers."""
+        """DLPack's device type and id of the image."""
         return self._exchanged().__dlpack_device__()
 
     def _exchanged(self) -> Any:
         name = self._only()
         if self._stays(name):
             return self.device_array(name)
-        return self[name].copy()  # what is read-only cannot be given away
+        return self[name].copy()  # NumPy exports no read-only arrays by DLPack
 
     def _stays(self, name: str) -> bool:
         """Whether the device shares an array of this image."""
-        made = name == "error" or (name == "splat_id" and self._ids is not None)
-        return self._images.shares_arrays and not made
+        on_host = name == "error" or (name == "splat_id" and self._ids is not None)
+        return self._images.shares_arrays and not on_host
 
     def _only(self) -> str:
         """The name of the one output."""
         if len(self.outputs) != 1:
             raise InputError(
-                f"this frame has {len(self.outputs)} images ({', '.join(self.outputs)}); take one by its "
-                "name, frame['rgb'] say"
+                f"the frame must have one output, got {len(self.outputs)} ({', '.join(self.outputs)}); take "
+                "one by its name, for example frame['rgb']"
             )
         return self.outputs[0]
 
@@ -166,8 +163,8 @@ class Frame(Mapping):
         return f"Frame({', '.join(self.outputs)}{splats}, {took:.1f} ms)"
 
     def _repr_png_(self) -> bytes:
-        """What a notebook shows: rgb, or else the first output, in colours."""
-        from fidsplat.images.files import png_bytes  # late: it brings OpenCV
+        """PNG for notebooks: rgb, or else the first output in false colours."""
+        from fidsplat.images.files import png_bytes  # here, since it imports OpenCV
         from fidsplat.render.output_files import picture_of
 
         name = "rgb" if "rgb" in self.outputs else self.outputs[0]
@@ -187,20 +184,20 @@ class Frame(Mapping):
 
     def __reduce__(self):
         """Pickled and copied as NumPy arrays: arrays of `device_array` are not included."""
-        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats), self.capture.picklable())
+        return _host_frame, (dict(self), dict(self.timings), dict(self.stats), self.capture.picklable())
 
     def wait(self) -> Frame:
         """Wait until the device has rendered this frame; nothing is copied.
 
         Raises:
-            DeviceError: the device has failed while it was drawing.
+            DeviceError: the device has failed during rendering.
         """
         self._images.wait()
         return self
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray | None = None) -> np.ndarray:
-        """An array for an output, `into` or a new one, in which rows of pixels [first, end) are those of the
-        picture: they alone are copied where the device can do that.
+        """Copy rows of pixels [first, end) of an output into `into`, or into a new array of the complete
+        shape, and return it. Only these rows are transferred if the device supports that.
 
         Raises:
             InputError: rows outside the frame, or an array of another shape or type.
@@ -225,8 +222,8 @@ class Frame(Mapping):
         """Milliseconds on the device by stage: project, sort, bin, blend, resolve; error: all that the output
         `error` takes.
 
-        On a GPU a frame of a kind that was drawn before is drawn once more for that, since taking the time of
-        each launch would slow all frames down. Empty if its cloud is not on the device any more.
+        On a GPU a replayed frame is rendered again to measure them, since timing each launch would slow down
+        all frames. Empty if its cloud has been released.
         """
         if self._images.views > 1:
             return {}
@@ -240,23 +237,23 @@ class Frame(Mapping):
         return self._images.stats if self._images.views == 1 else {}
 
 
-def _kept_frame(
+def _host_frame(
     arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int], capture: Capture
 ) -> Frame:
     images = HostImages({name: image[None] for name, image in arrays.items()}, timings, stats)
     return Frame(images, capture)
 
 
-class OfRows(Protocol):
+class RowBand(Protocol):
     """A band of rows of a frame."""
 
     @property
     def rows(self) -> tuple[int, int]:
-        """Of pixels, [first, end)."""
+        """Rows of pixels [first, end)."""
         ...
 
 
-P = TypeVar("P", bound=OfRows)
+P = TypeVar("P", bound=RowBand)
 
 
 def stacked(parts: Iterable[P], render: Callable[[P], Frame]) -> Frame:
@@ -290,7 +287,7 @@ def stacked(parts: Iterable[P], render: Callable[[P], Frame]) -> Frame:
         return last[0]
     finish(last[0])
     take(*last)
-    return _kept_frame(arrays, timings, stats, last[0].capture)
+    return _host_frame(arrays, timings, stats, last[0].capture)
 
 
 def numbered(name: str, image: np.ndarray, ids: Ids) -> np.ndarray:
@@ -309,7 +306,7 @@ def refuse_numbered(name: str, ids: Ids) -> None:
 
 
 def check_process(opened_by: int, what: str) -> None:
-    """Raises InputError in a fork of the process that opened it, where its driver does not work."""
+    """Raise InputError in a fork of the process that opened it, since drivers do not work after a fork."""
     if opened_by != os.getpid():
         raise InputError(
             f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "

@@ -1,4 +1,4 @@
-"""One picture by several devices: each draws a band of its rows, from the splats that the band sees."""
+"""Multi-device rendering: each device renders a band of rows, from the splats that are visible there."""
 
 from __future__ import annotations
 
@@ -29,47 +29,47 @@ from fidsplat.util.arguments import invalid, items
 from fidsplat.util.errors import InputError
 
 _UNEVEN = 1.1
-"""how many times as long as the mean the slowest band may take before the bands are cut again"""
+"""largest ratio of the slowest band's time to the mean, above which bands are balanced again"""
 
 _AHEAD = 3
-"""pictures that each device is asked for before the first of them is waited for: one that is brought to the
-host, one that is drawn, and one whose chunks are fetched"""
+"""frames in flight per device: one that is copied to the host, one that is rendered, and one whose chunks are
+prefetched"""
 
 
 class SeveralDevices:
-    """Draws pictures with several devices of one kind, each a band of rows; a picture has the bits that one
-    device gives it.
+    """Renders frames with several devices of one kind, each a band of rows; frames are bit-identical to those
+    of one device.
 
-    Bands are cut so that all take as long, by the time that those of the last picture took. Of a store a
-    device holds the chunks that its band sees; of a cloud in memory each holds all.
+    Bands are balanced by the times of the previous frame. Of a store, a device caches the chunks that are
+    visible in its band; a cloud in memory is copied to every device.
 
     Args:
-        devices: names as of `fs.Renderer`, e.g. ["opencl:nvidia", "opencl:nvidia-2"]; one may stand there
-            twice.
-        memory_budget: bytes, of each device.
+        devices: names as for `fs.Renderer`, e.g. ["opencl:nvidia", "opencl:nvidia-2"]; a name may be
+            repeated.
+        memory_budget: bytes per device.
 
     Raises:
-        InputError: no device, or devices of different kinds, whose pictures differ in their last bits.
+        InputError: no device, or devices of different kinds, whose frames are not bit-identical.
         DeviceError: as `fs.Renderer`.
     """
 
     def __init__(self, devices: Iterable[str], memory_budget: int | None = None) -> None:
         names = items("devices", [devices] if isinstance(devices, str) else devices, str, "names of devices")
         if not names:
-            raise InputError("devices is empty; name one device at least, e.g. ['opencl']")
+            raise InputError("devices must be at least one device, got an empty list; give e.g. ['opencl']")
         self.renderers = [Renderer(name, memory_budget) for name in names]
         titles = {renderer.device.title for renderer in self.renderers}
         if len(titles) > 1:
             raise InputError(
-                f"devices are of different kinds ({', '.join(sorted(titles))}), whose pictures differ in "
-                "their last bits; name devices of one kind"
+                "devices must be of one kind, so that their frames are bit-identical, got "
+                f"{', '.join(sorted(titles))}; name devices of one kind"
             )
         self._shares = np.linspace(0.0, 1.0, len(names) + 1)
-        """where bands end, in parts of the picture's height"""
+        """ends of the bands as fractions of the frame's height"""
         self._pool = ThreadPoolExecutor(len(names), "fidsplat-device")
 
     def upload(self, scene: Scene | SplatCloud | Store) -> list[ResidentCloud]:
-        """A scene on all devices, for `render`."""
+        """Copy a scene to all devices, for `render`."""
         return list(self._pool.map(lambda renderer: renderer.upload(scene), self.renderers))
 
     def render(
@@ -79,8 +79,8 @@ class SeveralDevices:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
     ) -> Frame:
-        """Draw one picture. Arguments and errors as those of `Renderer.render`; scene: also what `upload` has
-        returned."""
+        """Render one frame. scene: as `Renderer.render`, or the result of `upload`. Other arguments and
+        errors are those of `Renderer.render`."""
         if capture is not None and not isinstance(capture, Capture | Camera):
             raise invalid("capture", "a Capture or a Camera", capture)
         given = self._given(scene)
@@ -91,15 +91,15 @@ class SeveralDevices:
         names = None if outputs is None else output_names(outputs)
         bands = self._bands(camera.height)
 
-        def draw(number: int) -> tuple[Frame, float]:
+        def render_band(number: int) -> tuple[Frame, float]:
             begun = time.perf_counter()
             frame = self.renderers[number].render_band(bands[number], given[number], capture, names, quality)
             return frame.wait(), time.perf_counter() - begun
 
-        made = list(self._pool.map(draw, range(len(bands))))
-        self._cut_anew([end - first for first, end in bands], [seconds for _, seconds in made])
-        frames = [frame for frame, _ in made]
-        return Frame(_Banded(frames, bands, self._pool), frames[0].capture)
+        rendered = list(self._pool.map(render_band, range(len(bands))))
+        self._balance([end - first for first, end in bands], [seconds for _, seconds in rendered])
+        frames = [frame for frame, _ in rendered]
+        return Frame(_BandImages(frames, bands, self._pool), frames[0].capture)
 
     def render_views(
         self,
@@ -108,55 +108,58 @@ class SeveralDevices:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
     ) -> Iterator[Frame]:
-        """Draw many pictures, each whole by one device, in their order: device k draws pictures k, k + n and
-        so on, of n devices, and brings each to the host while it draws the next. Arguments and errors as
-        those of `render`; an error, of `captures` too, comes after the pictures of the captures before it."""
+        """Render many frames in their order, each by one device, round robin. A frame is copied to the host
+        while its device renders the next. Arguments and errors: as `render`; an error, also of `captures`, is
+        raised after the frames of the captures before it."""
         given = self._given(scene)
         names = None if outputs is None else output_names(outputs)
         try:
             rest = iter(captures)
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
-        lines = [
-            _Line(partial(renderer.render_views, one, outputs=names, quality=quality))
+        workers = [
+            _Worker(partial(renderer.render_views, one, outputs=names, quality=quality))
             for renderer, one in zip(self.renderers, given, strict=True)
         ]
-        waiting: deque[_Line] = deque()
+        waiting: deque[_Worker] = deque()
         failure: Exception | None = None
         try:
-            for line in cycle(lines):
+            for worker in cycle(workers):
                 try:
-                    line.ask(next(rest))
+                    worker.submit(next(rest))
                 except StopIteration:
                     break
                 except Exception as error:
                     failure = error
                     break
-                waiting.append(line)
-                if len(waiting) > _AHEAD * len(lines):
+                waiting.append(worker)
+                if len(waiting) > _AHEAD * len(workers):
                     yield waiting.popleft().result()
-            for line in lines:
-                line.end()
+            for worker in workers:
+                worker.end()
             while waiting:
                 yield waiting.popleft().result()
         finally:
-            for line in lines:
-                line.stop()
+            for worker in workers:
+                worker.stop()
         if failure is not None:
             raise failure
 
     def _given(self, scene: Scene | SplatCloud | Store | Sequence[ResidentCloud]) -> Sequence[ResidentCloud]:
         """A scene on all devices."""
         if isinstance(scene, Sequence):
-            given = items("scene", scene, ResidentCloud, "a scene, or what `upload` has returned")
+            given = items("scene", scene, ResidentCloud, "a scene, or the result of `upload`")
         else:
             given = self.upload(scene)
         if len(given) != len(self.renderers):
-            raise InputError(f"a scene on {len(given)} devices was given to {len(self.renderers)}")
+            raise InputError(
+                f"scene must be uploaded to all {len(self.renderers)} devices, got {len(given)}; give the "
+                "result of `upload`"
+            )
         return given
 
     def _bands(self, height: int) -> list[tuple[int, int]]:
-        """Rows of each device, one at least; devices that find none draw none."""
+        """Rows [first, end) of each device, at least one; a frame of few rows uses fewer devices."""
         devices = min(len(self.renderers), height)
         shares = self._shares if devices == len(self.renderers) else np.linspace(0, 1, devices + 1)
         cuts = np.round(shares * height).astype(int)
@@ -164,8 +167,8 @@ class SeveralDevices:
             cuts[number] = min(max(cuts[number], cuts[number - 1] + 1), height - devices + number)
         return list(pairwise(cuts.tolist()))
 
-    def _cut_anew(self, rows: list[int], seconds: list[float]) -> None:
-        """Bands that would have taken as long as each other, if rows of a band take the same."""
+    def _balance(self, rows: list[int], seconds: list[float]) -> None:
+        """Move the ends of the bands to equalise their times, assuming equal times for the rows of a band."""
         if len(rows) < len(self.renderers) or max(seconds) <= _UNEVEN * np.mean(seconds):
             return
         spent = np.concatenate([[0.0], np.cumsum(seconds)])
@@ -173,59 +176,59 @@ class SeveralDevices:
         self._shares = np.interp(np.linspace(0.0, spent[-1], len(spent)), spent, ends)
 
 
-class _Line:
-    """One device's part of many pictures, on a thread of its own."""
+class _Worker:
+    """Worker thread of one device: a queue of captures and a queue of frames."""
 
     _END = object()
 
-    def __init__(self, draw: Callable[[Iterator[Any]], Iterator[Frame]]) -> None:
-        """draw: the pictures of captures, as `Renderer.render_views`."""
-        self._asked: SimpleQueue[Any] = SimpleQueue()
-        self._made: SimpleQueue[Frame | BaseException] = SimpleQueue()
+    def __init__(self, render: Callable[[Iterator[Any]], Iterator[Frame]]) -> None:
+        """render: renders captures, as `Renderer.render_views`."""
+        self._captures: SimpleQueue[Any] = SimpleQueue()
+        self._frames: SimpleQueue[Frame | BaseException] = SimpleQueue()
         self._stopped = False
-        self._thread = Thread(target=self._run, args=(draw,), name="fidsplat-device", daemon=True)
+        self._thread = Thread(target=self._run, args=(render,), name="fidsplat-device", daemon=True)
         self._thread.start()
 
-    def ask(self, capture: Any) -> None:
-        """For a picture; what is no capture is told by its `result`."""
-        self._asked.put(capture)
+    def submit(self, capture: Any) -> None:
+        """Queue a capture. `result` raises the error of an invalid one."""
+        self._captures.put(capture)
 
     def end(self) -> None:
-        """No more is asked for."""
-        self._asked.put(self._END)
+        """Mark the end of the captures."""
+        self._captures.put(self._END)
 
     def result(self) -> Frame:
-        """The next picture, once it is on the host. Raises what drawing it has raised."""
-        made = self._made.get()
-        if isinstance(made, BaseException):
-            raise made
-        return made
+        """Wait for the next frame and return it, copied to the host. Raises the error of its rendering."""
+        frame = self._frames.get()
+        if isinstance(frame, BaseException):
+            raise frame
+        return frame
 
     def stop(self) -> None:
-        """Draw nothing more, and wait for what is being drawn."""
+        """Cancel the queued captures, and wait for the current frame."""
         self._stopped = True
         self.end()
         self._thread.join()
 
-    def _captures(self) -> Iterator[Any]:
-        while (capture := self._asked.get()) is not self._END:
+    def _queued(self) -> Iterator[Any]:
+        while (capture := self._captures.get()) is not self._END:
             if self._stopped:
                 return
             yield capture
 
-    def _run(self, draw: Callable[[Iterator[Any]], Iterator[Frame]]) -> None:
+    def _run(self, render: Callable[[Iterator[Any]], Iterator[Frame]]) -> None:
         try:
-            for frame in draw(self._captures()):
+            for frame in render(self._queued()):
                 for name in frame.outputs:
                     _ = frame[name]
-                self._made.put(frame)
+                self._frames.put(frame)
         except BaseException as error:
-            self._made.put(error)
+            self._frames.put(error)
 
 
 @dataclass(frozen=True)
-class _Banded(Images):
-    """Images of bands as those of one picture."""
+class _BandImages(Images):
+    """Images of bands, stacked to those of one frame."""
 
     frames: list[Frame]
     bands: list[tuple[int, int]]
@@ -233,20 +236,20 @@ class _Banded(Images):
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
         """The rows of all bands, one below the other."""
-        whole = self.frames[0].read_rows(name, 0, 0)
-        list(self.pool.map(lambda frame, band: frame.read_rows(name, *band, whole), self.frames, self.bands))
-        return whole[None] if index is None else whole
+        image = self.frames[0].read_rows(name, 0, 0)
+        list(self.pool.map(lambda frame, band: frame.read_rows(name, *band, image), self.frames, self.bands))
+        return image[None] if index is None else image
 
     @property
     def timings(self) -> dict[str, float]:
-        """Of each stage the slowest device's."""
+        """Milliseconds of each stage on the slowest device."""
         each = [frame.timings for frame in self.frames]
         return {stage: max(one.get(stage, 0.0) for one in each) for stage in each[0]}
 
     @property
     def stats(self) -> dict[str, Any]:
-        """Of the device that has most splats; visible and pairs of all, which count twice what two bands
-        see."""
+        """splats: of the device with the most; visible, pairs: sums over the bands, which count a splat in
+        each band where it is visible."""
         each = [frame.stats for frame in self.frames]
         most = max(one["splats"] for one in each)
         return {"splats": most} | {name: sum(one[name] for one in each) for name in ("visible", "pairs")}

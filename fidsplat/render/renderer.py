@@ -1,4 +1,4 @@
-"""Renderer: the facade that people use."""
+"""Renderer: the public interface to rendering."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Renderer:
 
     Raises:
         DeviceError: the device cannot be used; UnknownDeviceError: there is no such device.
-        InputError: the memory budget is no positive number, or the device has none.
+        InputError: the memory budget is not a positive integer, or the device does not support one.
     """
 
     def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
@@ -73,7 +73,8 @@ class Renderer:
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
                 raise InputError(
-                    f"memory_budget is {memory_budget!r}; it must be a whole number of bytes, e.g. 2 * 2**30"
+                    f"memory_budget must be a positive whole number of bytes, got {memory_budget!r}; give "
+                    "for example 2 * 2**30"
                 )
             self.backend.limit_memory(memory_budget)
 
@@ -210,7 +211,7 @@ class Renderer:
         capture: Capture | Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        tell: Callable[[float], object] | None = None,
+        progress: Callable[[float], object] | None = None,
     ) -> Frame:
         """Render every step-th pixel in both directions, bit-identical to those pixels of `render`. Only the
         reference does this.
@@ -218,7 +219,7 @@ class Renderer:
         Args:
             step: 1 or more.
             scene, capture, outputs, quality: as `render`.
-            tell: called with the completed share, 0 to 1.
+            progress: called with the completed share, 0 to 1.
 
         Raises:
             InputError: as `render`; the device renders complete frames only.
@@ -231,7 +232,7 @@ class Renderer:
                 raise InputError(
                     self.backend.lacks("render subsets of pixels", "use device='reference', or render")
                 )
-            return pipeline.render_every(data, view, step, tell)
+            return pipeline.render_every(data, view, step, progress)
 
         return self._render(self._resident(scene), requested, render_subset)
 
@@ -254,7 +255,7 @@ class Renderer:
         try:
             first, end = band
         except (TypeError, ValueError):
-            raise InputError(f"band is {band!r}; it must be two rows, the first and the end") from None
+            raise InputError(f"band must be two rows, the first and the end, got {band!r}") from None
         whole_number("the first row of a band", first, 0, rows - 1)
         whole_number("the end of a band", end, first + 1, rows)
         return self._render(self._resident(scene), requested, band=band)
@@ -270,8 +271,8 @@ class Renderer:
         """Render one cloud many times, one Frame for each capture or camera, in their order.
 
         The cloud is uploaded once, kernels and buffers are reused, and an asynchronous device renders the
-        next frame while the caller uses the last. Arguments and errors: as `render` (a motion of the camera
-        replaces each camera's pose); an error is raised after the frames of the captures before it.
+        next frame while the caller uses the previous one. Arguments and errors: as `render` (a motion of the
+        camera replaces each camera's pose); an error is raised after the frames of the captures before it.
         """
         outputs = None if outputs is None else output_names(outputs)  # an iterator would end with the first
         background = parts.get("background")
@@ -362,7 +363,7 @@ class Renderer:
         features, batch = prepare_batch(resident.whole, views)
         with self._lock:
             rendered = (batch.one(number) for number in range(len(batch)))
-            data, ids = resident.seen(rendered, features, (capture.quality for capture in views.captures))
+            data, ids = resident.gather(rendered, features, (capture.quality for capture in views.captures))
             images = self.backend.pipeline(features).render(data, batch)
         return FrameBatch(images, views, ids)
 
@@ -371,7 +372,7 @@ class Renderer:
         check_process(self._process, "Renderer")
         if resident.backend is not self.backend:
             raise InputError(
-                "this cloud was uploaded by another Renderer; upload it with the one that draws it"
+                "this cloud was uploaded by another Renderer; upload it with the one that renders it"
             )
         return resident
 

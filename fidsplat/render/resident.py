@@ -1,4 +1,4 @@
-"""ResidentCloud: splats where a renderer draws them."""
+"""ResidentCloud: splats on the device of a renderer."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from fidsplat.util.errors import InputError
 
 
 class ResidentCloud:
-    """A cloud on a renderer's device; rendering it transfers no splat. Of a store, or a scene with stores,
-    what views need is brought there when they are drawn, and what the last one needed stays."""
+    """A cloud on a renderer's device; rendering it transfers no splat. Of stores, the chunks that a view
+    needs are copied to the device when it is rendered, and cached."""
 
     def __init__(
         self,
@@ -31,37 +31,37 @@ class ResidentCloud:
     ) -> None:
         self.backend, self.data, self._labels = backend, data, labels
         self.capture = capture
-        """how its pictures are taken unless `render` is given another: that of the scene it came from"""
+        """capture of the uploaded scene, which `render` uses by default"""
 
     def __len__(self) -> int:
         return self.data.count
 
     def __reduce__(self):
         raise InputError(
-            "a ResidentCloud is on a device and cannot be pickled or copied; take the SplatCloud, and upload "
-            "it there"
+            "a ResidentCloud is on a device and cannot be pickled or copied; pickle the SplatCloud, and "
+            "upload it in the other process"
         )
 
     @property
     def memory_bytes(self) -> int:
-        """Device memory that it takes; 0 where the device reads the host's own arrays, as OpenCL on a CPU."""
+        """Bytes of device memory; 0 if the device reads the host's arrays, such as OpenCL on a CPU."""
         return self.data.memory_bytes
 
     @cached_property
     def labels(self) -> frozenset[int] | None:
-        """The labels that its splats have; None where they are on the device, or on disk."""
+        """Labels of its splats; None if they are only on the device or on disk."""
         return None if self._labels is None else frozenset(np.unique(self._labels).tolist())
 
     @property
     def whole(self) -> Any:
-        """What a capture is prepared for: all splats, wherever they are."""
+        """All splats, in memory or in stores, for which captures are prepared."""
         return self.data.scene if isinstance(self.data, Residency) else self.data
 
-    def seen(
+    def gather(
         self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[Any, Ids]:
-        """The splats on the device that these views are drawn from, and their indices in the whole where
-        these are not their own."""
+        """The device splats for rendering these views, and their indices in the complete scene (None if equal
+        to their own)."""
         if isinstance(self.data, Residency):
             return self.data.gather(list(views), features, qualities)
         return self.data, None

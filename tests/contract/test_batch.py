@@ -114,7 +114,7 @@ def test_a_view_as_a_frame_and_a_batch_as_arrays(renderer, cloud):
     copy = pickle.loads(pickle.dumps(batch))
     assert np.array_equal(copy["rgb"], batch["rgb"])
     assert copy.views == batch.views == 3
-    with pytest.raises(fs.InputError, match="no view 3; this batch has views 0 to 2"):
+    with pytest.raises(fs.InputError, match="view must be a number from 0 to 2, got 3"):
         batch.frame(3)
     with pytest.raises(fs.InputError, match="no 'depth'; it was rendered with rgb"):
         batch["depth"]

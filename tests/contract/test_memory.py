@@ -186,7 +186,7 @@ def test_a_row_of_tiles_with_too_many_splats_is_an_error(opencl):
 
 @pytest.mark.parametrize("budget", [0, -1, 1.5e9, "2 GiB", True])
 def test_odd_budgets_are_refused(opencl, budget):
-    with pytest.raises(fs.InputError, match=r"memory_budget is .* whole number of bytes"):
+    with pytest.raises(fs.InputError, match=r"memory_budget must be a positive whole number of bytes, got"):
         fs.Renderer(opencl.device.name, memory_budget=budget)
 
 

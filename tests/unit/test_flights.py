@@ -187,17 +187,17 @@ def test_a_flight_that_was_stopped_after_its_log_goes_on(here, capsys, monkeypat
     assert _bytes_of(here / name) == first
 
 
-def test_what_is_drawn_is_not_mixed_with_another_flight(here, capsys):
+def test_frames_are_not_mixed_with_those_of_another_flight(here, capsys):
     assert fly("--times", "0,1") == 0
     (here / "poses.tum").write_text(POSES.replace("0.3", "0.2"))
     assert fly("--times", "0,1") == 2
-    assert "out holds another flight, of 2 pictures; give another folder" in capsys.readouterr().err
+    assert "got another flight of 2 frames; give another folder" in capsys.readouterr().err
     before = (here / "out" / "rgb" / "000001.png").read_bytes()
     assert fly("--times", "0,1", "--overwrite") == 0
     assert (here / "out" / "rgb" / "000001.png").read_bytes() != before
     (here / "out" / "flight.json").unlink()
     assert fly("--times", "0,1") == 2
-    assert "pictures that no flight.json there tells of" in capsys.readouterr().err
+    assert "got frames without flight.json" in capsys.readouterr().err
 
 
 def test_what_a_flight_is_of(here):
@@ -337,7 +337,7 @@ def test_pictures_that_are_not_whole_are_drawn_again(here):
     flight = small_flight(outputs=("depth",))
     renderer = fs.Renderer()
     folder = FlightFolder("d", flight, renderer.device.title)
-    assert list(folder.draw(renderer)) == [0, 1, 2]
-    assert folder.left() == []
+    assert list(folder.render(renderer)) == [0, 1, 2]
+    assert folder.remaining() == []
     folder.file(1, "depth", ".npy").unlink()
-    assert folder.left() == [1]
+    assert folder.remaining() == [1]

@@ -53,12 +53,14 @@ def test_a_frame_of_one_output_is_an_array():
     assert np.asarray(one, np.float64).dtype == np.float64
     assert np.array(one).flags.writeable  # a copy
     assert cv2.cvtColor(np.asarray(one), cv2.COLOR_RGB2GRAY).shape == (16, 24)
-    with pytest.raises(fs.InputError, match=r"this frame has 2 images \(rgb, depth\); take one by its name"):
+    with pytest.raises(
+        fs.InputError, match=r"must have one output, got 2 \(rgb, depth\); take one by its name"
+    ):
         np.asarray(frame("rgb", "depth"))
 
 
 def test_a_frame_becomes_a_tensor(monkeypatch):
-    """Of a device with arrays to give by DLPack, without a copy; else of a copy that may be written."""
+    """Without a copy by DLPack if the backend shares arrays; else a writable copy."""
     torch = SimpleNamespace(from_dlpack=lambda array: ("dlpack", array), from_numpy=lambda a: ("numpy", a))
     monkeypatch.setitem(sys.modules, "torch", torch)
     drawn = frame("rgb", "label")
@@ -92,7 +94,7 @@ def test_a_frame_of_one_output_goes_through_dlpack():
     given = np.arange(6.0).reshape(2, 3)
     shared = fs.Frame(Shared({"depth": given}), fs.Capture(outputs="depth"))
     assert np.shares_memory(np.from_dlpack(shared), given)  # no copy
-    with pytest.raises(fs.InputError, match="this frame has 2 images"):
+    with pytest.raises(fs.InputError, match="must have one output, got 2"):
         np.from_dlpack(frame("rgb", "depth"))
 
 

@@ -87,15 +87,15 @@ def test_every_third_pixel_is_that_of_the_whole_picture(monkeypatch, exposed):
         "samples=2",
         **({"motion": motion, "shutter": shutter} if exposed else {}),
     )
-    renderer, cloud, told = fs.Renderer("reference"), random_splats(40, 3), []
+    renderer, cloud, shares = fs.Renderer("reference"), random_splats(40, 3), []
     whole = renderer.render(cloud, capture)
-    some = renderer.render_every(3, cloud, capture, tell=told.append)
+    some = renderer.render_every(3, cloud, capture, progress=shares.append)
     for name in some.outputs:
         np.testing.assert_array_equal(some[name], whole[name][::3, ::3])
     assert some["rgb"].shape == (6, 7, 3)
-    assert told == sorted(told)
-    assert len(told) > 3
-    assert told[-1] == pytest.approx(1)
+    assert shares == sorted(shares)
+    assert len(shares) > 3
+    assert shares[-1] == pytest.approx(1)
     assert renderer.render_every(100, cloud, capture)["label"].shape == (1, 1)
 
 

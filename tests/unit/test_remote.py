@@ -93,7 +93,7 @@ def test_workers_return_the_files_that_one_process_writes(tmp_path):
     flown = flight(sensor=fs.Sensor(bits=16))
     renderer = fs.Renderer("reference")
     single = FlightFolder(tmp_path / "single", flown, renderer.device.title)
-    list(single.draw(renderer))
+    list(single.render(renderer))
     work = pickle.loads(pickle.dumps(FlightWork(flown, "reference")))()
     assert work.title == renderer.device.title
     folder = FlightFolder(tmp_path / "many", flown, work.title)

@@ -45,9 +45,9 @@ def test_a_worker_that_is_killed_costs_no_picture_and_none_is_drawn_twice(tmp_pa
                 ray.kill(engine._actors[0])
         assert len(engine._actors) == 4
     assert sorted(rendered) == list(range(VIEWS))
-    assert folder.left() == []
+    assert folder.remaining() == []
     single = FlightFolder(tmp_path / "single", flown, engine.title)
-    list(single.draw(fs.Renderer("reference")))
+    list(single.render(fs.Renderer("reference")))
     for k in range(VIEWS):
         assert folder.file(k, "rgb", ".png").read_bytes() == single.file(k, "rgb", ".png").read_bytes()
 

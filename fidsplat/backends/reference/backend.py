@@ -108,7 +108,7 @@ class ReferencePipeline(Pipeline):
         self.features, self._progress = features, _Progress()
 
     def render_view(self, resident: ReferenceCloud, view: View) -> HostImages:
-        """Draw every pixel, in float64."""
+        """Render every pixel, in float64."""
         return self.render_every(resident, view, 1)
 
     def render_every(
@@ -116,15 +116,15 @@ class ReferencePipeline(Pipeline):
         resident: ReferenceCloud,
         view: View,
         step: int,
-        tell: Callable[[float], object] | None = None,
+        progress: Callable[[float], object] | None = None,
     ) -> HostImages:
         """Render every step-th pixel in both directions."""
         rows, columns = np.mgrid[
             0 : view.height // view.samples : step, 0 : view.width // view.samples : step
         ]
         start = time.perf_counter()
-        self._progress = _Progress(tell, rows.size * view.samples**2)
-        # tiles as those of a whole picture: the same splats, added up alike
+        self._progress = _Progress(progress, rows.size * view.samples**2)
+        # tiles are those of the complete frame, so that sums have the same order
         flat = self.pixels(resident, view, rows.ravel(), columns.ravel(), widest=_TILE)
         images = {name: image.reshape(1, *rows.shape, *image.shape[1:]) for name, image in flat.items()}
         took = (time.perf_counter() - start) * 1e3
@@ -214,14 +214,14 @@ def _by_tile(view: View, x: np.ndarray, y: np.ndarray, widest: int) -> tuple[np.
 
 @dataclass
 class _Progress:
-    """How many samples of a picture are drawn."""
+    """Number of rendered samples of a frame, and its progress callback."""
 
-    tell: Callable[[float], object] | None = None
+    callback: Callable[[float], object] | None = None
     total: int = 1
     done: int = 0
 
     def add(self, count: int) -> None:
         interrupts.check()
         self.done += count
-        if self.tell is not None:
-            self.tell(self.done / self.total)
+        if self.callback is not None:
+            self.callback(self.done / self.total)
