@@ -263,8 +263,8 @@ class Equirectangular:
         return np.where(np.any(points != 0, axis=1)[:, None], image, np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3). At a pole, where the longitude
-        jumps, that of a point 1e-6 rad away from it towards z."""
+        """Jacobian (n, 2, 3) of the image coordinates by X, Y, Z, at points (n, 3). At a pole, where the
+        longitude jumps, it is the Jacobian of a point 1e-6 rad away towards z."""
         x, y, z = points.T
         far = np.linalg.norm(points, axis=1)
         polar = np.hypot(x, z) < 1e-6 * far
@@ -297,7 +297,7 @@ class Orthographic:
         return np.where(points[:, 2:] > 0, points[:, :2], np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3)."""
+        """Jacobian (n, 2, 3) of the image coordinates by X, Y, Z, at points (n, 3)."""
         return np.tile(np.eye(2, 3), (len(points), 1, 1))
 
 

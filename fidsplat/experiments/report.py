@@ -290,8 +290,8 @@ def _spread(rows: Frame) -> dict | None:
 
 
 def _enough(table: Frame) -> list[dict]:
-    """Of each category the fewest views on which a training reads as far tilted as the marker that is not
-    trained, or else those on which it comes nearest and how many degrees it ends `before`."""
+    """Per category, the fewest training views after which a marker is read to the same tilt as the
+    training-free one; if there are none, the views with the smallest difference in degrees, `before`."""
     ours, free, seconds = (
         pd.Series(pd.to_numeric(table[name], errors="coerce"))
         for name in ("read to, ours", "read to, training-free", "seconds, several at once")

@@ -27,7 +27,7 @@ _CHECKED = ("means", "quats", "scales", "opacities", "sh", "colors")
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows of a file that are meant as splats."""
+    """Rows of a file, one for each splat, before they are checked."""
 
     path: Path
     count: int
@@ -72,7 +72,7 @@ def collect(rows: Rows, progress: Progress | None = None) -> tuple[dict[str, np.
 
 
 def window(rows: Rows, first: int, end: int) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """As `collect`, of the rows [first, end) alone: for who cannot hold them all."""
+    """Checked splats of rows [first, end) and the number dropped by reason, for bounded memory."""
     count = end - first
     part = {name: np.empty((count, *shape), kind) for name, (shape, kind) in rows.splat_columns.items()}
     good, dropped = _filled(rows, first, part, np.empty((count, 3), np.float32) if rows.thick else None)

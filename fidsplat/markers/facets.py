@@ -80,11 +80,11 @@ def _lines(edge: int) -> np.ndarray:
 
 
 def _axis(edge: int, steepness: float) -> np.ndarray:
-    """Of the facets along an edge: middle, width, depth there and slope, (4, n), in modules.
+    """Middle, width, depth at the middle and slope of the facets along an edge, (4, n), in modules.
 
-    The parabola of mean 0 and that steepness, opening towards the viewer, on the lines where facets meet, and
-    straight between them. It is convex: of all its pieces, gone on beyond their ends, each is the nearest on
-    its own stretch.
+    The profile is a parabola of mean 0 and this steepness that opens towards the viewer, interpolated
+    linearly between the lines where facets meet. It is convex: if every facet were extended to a plane, each
+    would be the nearest one within its own width.
     """
     lines = _lines(edge)
     depth = steepness * (edge**2 / 12 - lines**2)

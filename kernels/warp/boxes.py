@@ -58,7 +58,7 @@ def make_boxes(real) -> SimpleNamespace:
 
     @wp.func
     def edges(d: vec2, n: vec2, scale: real) -> wp.vec2:
-        """Of the forms D + n, D - n with these gradients, times a factor: 1 / |gradient|."""
+        """Reciprocal gradient lengths of the forms D + n and D - n, divided by `scale`."""
         per = one / wp.abs(scale)
         return wp.vec2(
             float(per * per_gradient(d[0] + n[0], d[1] + n[1])),

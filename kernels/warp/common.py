@@ -74,7 +74,7 @@ def reread(number: int) -> int:
 
 @wp.func
 def locate_tile(tile: int, views: wp.array(dtype=View)):
-    """Of one of all views' tiles: its view, and the column and row of tiles in it."""
+    """View of a tile among the tiles of all views, and its column and row of tiles there."""
     view = views[0]
     row = tile / view.tiles_x
     return row / view.tiles_y, tile % view.tiles_x, row % view.tiles_y

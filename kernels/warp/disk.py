@@ -121,7 +121,7 @@ def make_disk(real) -> SimpleNamespace:
 
     @wp.func
     def perspective(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
-        """Bounds of a disk before a pinhole."""
+        """Bounds of a disk in the image of a pinhole camera."""
         if p[2] - reach >= real(view.near):
             return ellipse(a, b, p, radius, reach, view)
         return clipped(a, b, p, radius, reach, view)

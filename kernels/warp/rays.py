@@ -1,5 +1,5 @@
-"""What a sample reads of its place in the picture: its ray, which follows from the view, or which a lens
-gives each sample, and what a layer of another renderer has there."""
+"""Inputs of a sample by its position in the image: its ray, from the view or from the buffer of a lens, and
+the external depth image."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -14,33 +14,35 @@ SLOPES = wp.types.matrix((2, 3), wp.float32)
 
 @cache
 def struct_of_rays(bent: bool, sloped: bool = False, opaque: bool = False):
-    """The struct of what a sample reads: nothing, if all rays follow from the view; with their derivatives,
-    if `sloped`; with a layer, if `opaque`.
+    """The struct Rays: empty if all rays follow from the view; with the derivatives of rays if `sloped`; with
+    an external depth image if `opaque`.
     """
     fields = {}
-    if bent:  # X, Y, Z along the rows of samples; NaN where nothing is seen
+    if bent:  # X, Y, Z along the rows of samples; NaN outside of the field of view
         fields |= {"rays": wp.array(dtype=wp.vec3)}
         fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
     if opaque:  # of each pixel, row by row; a depth that is infinite where there is none
         fields |= {"external_depth": wp.array(dtype=wp.float32), "external_rgb": wp.array(dtype=wp.vec3)}
-    return struct_of("Rays", "The samples' rays, and a layer.", fields)
+    return struct_of("Rays", "The samples' rays, and an external depth image.", fields)
 
 
 @cache
 def make_rays(
     bent: bool, stretched: bool = False, sloped: bool = False, opaque: bool = False
 ) -> SimpleNamespace:
-    """Rays; ray_of(column, row, rays, view), NaN where nothing is seen; length_of(column, row, rays, view),
-    what turns depths there into distances, 1 where nothing is seen.
+    """Rays of samples: the struct Rays and its functions.
 
-    bent: rays are a lens's own. stretched: so are their lengths; else they follow from the view. sloped: Rays
-    has the rays' derivatives too. opaque: and a layer.
+    ray_of(column, row, rays, view): the ray, NaN outside of the field of view. length_of(column, row, rays,
+    view): the factor from depths to distances, 1 outside of the field of view.
+
+    bent: rays are read from the buffer of a lens. stretched: so are their lengths; else they follow from the
+    view. sloped: Rays has the derivatives of the rays. opaque: Rays has an external depth image.
     """
     Rays = struct_of_rays(bent, sloped, opaque)
 
     @wp.func
     def ray_in(column: int, row: int, view: View) -> wp.vec3:
-        """Of a length of 1 along z; straight ahead where all are parallel, or depths are distances."""
+        """Ray of a sample with length 1 along z; (0, 0, 1) for parallel rays, or if depths are distances."""
         ray = view.ray
         return wp.vec3((float(column) + 0.5 - ray[2]) * ray[0], (float(row) + 0.5 - ray[3]) * ray[1], 1.0)
 
@@ -55,7 +57,7 @@ def make_rays(
     def length_of(column: int, row: int, rays: Rays, view: View) -> float:
         if wp.static(stretched):
             length = float(1.0)
-            # a tile has samples beyond the picture too
+            # a tile can extend beyond the image
             if column < view.width and row < view.height:
                 own = wp.length(ray_of(column, row, rays, view))
                 if own == own:

@@ -145,21 +145,21 @@ def make_staging(layout: Layout, cells: int, items: int) -> SimpleNamespace:
         length: int,
         open: bool,
     ) -> bool:
-        """Brings the records of lists[first : first + length], at most STAGED; false, for the whole block, if
-        nobody in it is open.
+        """Copy the records of lists[first : first + length], at most STAGED, to shared memory. Returns false,
+        for the complete block, if no thread in it is open.
         """
         ...
 
     @wp.func_native(with_numbers(_MARK, numbers))
     def mark(pool: wp.uint64, word: int, group: int, cells: wp.uint32):
-        """Of the staged splats 32 word to 32 word + 31, one for each thread of a warp: which of the cells 32
-        group to 32 group + 31 they can touch.
+        """Bit mask of the cells 32 group to 32 group + 31 that a staged splat can touch, for splats 32 word
+        to 32 word + 31, one per thread of a warp.
         """
         ...
 
     @wp.func_native(with_numbers(_LISTED, numbers))
     def listed(pool: wp.uint64, length: int, cell: int) -> int:
-        """Once all are marked: how many of the batch can touch the cell, which is that of the thread."""
+        """Number of splats of the batch that can touch the thread's cell; call it after `mark`."""
         ...
 
     @wp.func_native(with_numbers(_PLACE, numbers))

@@ -207,7 +207,7 @@ class OpenCLImages(Images):
             cl.enqueue_copy(queue, into, image, src_offset=offset, wait_for=after)
 
     def _shape(self, name: str) -> tuple[int, ...]:
-        """Of the image of one view."""
+        """Array shape of the image of one view."""
         channels = self._outputs[name].channels
         return self._size if channels == 1 else (*self._size, channels)
 

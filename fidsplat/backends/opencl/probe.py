@@ -117,7 +117,7 @@ class OpenCLProbe(Probe):
         return evaluate(self._workspace, CONTRACTION, (a, b, a), types)
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
-        """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+        """NaN tests of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
         return evaluate(self._workspace, NOT_A_NUMBER, (x,), (np.int32,) * 4)
 
     def arithmetic(
@@ -183,13 +183,13 @@ class OpenCLProbe(Probe):
         return places, int(words[place]) | int(words[place + 1]) << 32
 
     def boxes(self, pipeline: OpenCLPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Of what `pipeline.trace` gave: the samples that each splat can touch, (n, 4) int, columns [x0, x1)
-        and rows [y0, y1); undefined for culled splats."""
+        """Bounding boxes of the splats in a result of `pipeline.trace`, in samples: (n, 4) int, columns
+        [x0, x1) and rows [y0, y1); undefined for culled splats."""
         return np.stack([trace["records"][name].astype(int) for name in ("x0", "x1", "y0", "y1")], 1)
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:
-        """Within it, every buffer that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
+        """Fill every buffer of a frame with 0xFF before its use: NaN, or the integer -1."""
         pool = self._workspace.pool
         self._workspace.pool = _PoisonedPool(self._workspace)
         try:

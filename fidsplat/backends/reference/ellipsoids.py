@@ -43,14 +43,17 @@ class Axes:
 
 
 def disks(unit_a: np.ndarray, unit_b: np.ndarray, scale: np.ndarray) -> Axes:
-    """Of disks with unit tangents (n, 3) and standard deviations (n, 2)."""
+    """Axes of disks with unit tangents (n, 3) and standard deviations (n, 2)."""
     n, area = len(scale), scale.prod(axis=1)
     a, b, normal = unit_a * scale[:, :1], unit_b * scale[:, 1:], np.cross(unit_a, unit_b)
     return Axes(a, b, normal, normal.copy(), area, np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros(n))
 
 
 def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Axes:
-    """Of 3D Gaussians with unit axes (n, 3, 3), in rows, standard deviations (n, 3) and centres p (n, 3)."""
+    """Axes of 3D Gaussians.
+
+    axes: unit axes (n, 3, 3), in rows. scales: standard deviations (n, 3). p: centres (n, 3).
+    """
     towards = np.broadcast_to([0.0, 0.0, 1.0], p.shape) if view.parallel else p
     white = np.einsum("nkc,nc->nk", axes, towards) / scales
     m = np.linalg.norm(white, axis=1)

@@ -20,7 +20,7 @@ from fidsplat.backends.view import View
 
 _ROUND = ROUND
 _WEIGHT = 2 * _ROUND  # relative, of half rho and of an opacity: a division, two products, exp
-_DEPTH = _ROUND  # relative, of a depth beside its denominator's: its numerator's, a division and a product
+_DEPTH = _ROUND  # relative, of a depth in addition to its denominator's: numerator, a division, a product
 STOP = 5e-5
 """relative, of a transmittance at a threshold"""
 
@@ -103,7 +103,7 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         high = np.where(s.box, np.where(may, highest, 0.0), high)
     z_low = np.where(d_low > 0, z_low, -np.inf)
     if s.screen:
-        # beyond the circle; where rounding decides what lies there, both, which are the same on the circle
+        # outside of the circle; both depths where rounding decides: they are equal on the circle
         circle = np.maximum(disc_low, HALF_RHO_OF_RANGE), np.maximum(disc_high, HALF_RHO_OF_RANGE)
         beyond = _of_mirrored_depth(s, (d_low, d_high), (q_low, q_high), (near_dz, far_dz), circle)
         may_plane = s.coplanar | (plane[0] * (1 - weight) <= circle[1] * (1 + weight))
@@ -216,14 +216,14 @@ def first_column(mask: np.ndarray, start: int) -> np.ndarray:
 
 
 def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
-    """Of things (k, m) sorted by depth, the span with transmittances in front that hold in every order which
-    rounding leaves open, and what other orders may change (k,) in colour, per unit of colour. lift (k, m): by
-    how much each counts as nearer.
+    """Bounds over all depth orders that rounding allows, of fragments or layers (k, m) sorted by depth.
 
-    Two neighbours that change places change a colour by the product of their opacities and the light in front
-    of them, at most; any order that is possible comes from such changes, of pairs whose depths meet. Those
-    that have one and the same depth, both of them exactly, are told apart by their places in the cloud: no
-    rounding changes that.
+    Returns the span with bounds of the transmittances in front, and the largest change of colour by a change
+    of order (k,), per unit of colour. lift (k, m): by how much each counts as nearer.
+
+    A swap of two neighbours changes a colour by at most the product of their opacities and the transmittance
+    in front of them. Every possible order results from swaps of pairs whose depth intervals overlap. Exactly
+    equal depths are ordered by the indices of the splats, which rounding does not change.
     """
     k, m = span.low.shape
     may = span.high > 0
@@ -264,7 +264,8 @@ def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndar
 
 
 def of_first(span: Span, light: float) -> np.ndarray:
-    """Whether another fragment (k,) may be the first behind which no more than `light` is left."""
+    """Whether rounding may change the first fragment behind which the transmittance is at most `light`; (k,)
+    bool."""
     high, low = span.high, span.low
     may = (high > 0) & (span.front_low * (1 - high) * (1 - STOP) <= light)
     sure = (low > 0) & (span.front_high * (1 - low) * (1 + STOP) <= light)

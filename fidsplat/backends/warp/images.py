@@ -168,6 +168,6 @@ class WarpBatch(Images):
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """Of all views together, but for the splats of the cloud."""
+        """visible and pairs, sums over all views; splats in the cloud."""
         none = {"splats": 0, "visible": 0, "pairs": 0}
         return summed([none, *(images.stats for images in self._parts)]) | {"splats": self._splats}

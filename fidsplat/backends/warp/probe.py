@@ -34,7 +34,7 @@ class WarpProbe(Probe):
         return run(self._workspace, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types])
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
-        """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+        """NaN tests of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
         (found,) = run(self._workspace, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
         return list(found)
 
@@ -70,8 +70,8 @@ class WarpProbe(Probe):
         return places.astype(np.uint32), int(places[-1])
 
     def boxes(self, pipeline: WarpPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Of what `pipeline.trace` gave: the samples that each splat can touch, (n, 4) int, columns [x0, x1)
-        and rows [y0, y1); undefined for culled splats."""
+        """Bounding boxes of the splats in a result of `pipeline.trace`, in samples: (n, 4) int, columns
+        [x0, x1) and rows [y0, y1); undefined for culled splats."""
         words = [pipeline.program.layout.word(name) for name in ("columns", "rows")]
         spans = trace["records"].view(np.uint32)[:, words].astype(int)
         return np.stack([spans & 0xFFFF, spans >> 16], 2).reshape(-1, 4)

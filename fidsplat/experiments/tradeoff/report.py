@@ -380,7 +380,8 @@ def _refused(device: Device):
 
 
 def _truth_error(device: Device) -> float:
-    """Of truths in the order of centres: by depth at each pixel, ties come out either way."""
+    """Largest error of the reference renderings with order `centre`; with `pixel`, ties may resolve either
+    way."""
     rows = device.summary.rows
     truths = rows[(rows["what"] == "truth") & ~rows["value"].str.endswith(", pixel", na=False)]
     worst = truths["maximum"].max()

@@ -1,5 +1,5 @@
-"""Fog: light fades with the distance along the ray, and the fog's colour shows in its place. No output image
-of its own: it changes rgb."""
+"""Fog: the colour of a fragment is blended with the fog's colour by its distance along the ray. It has no
+output image: it changes rgb."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def background_share(grid: PixelGrid, samples: Any) -> float:
-    """Fog is of one colour with what lies behind everything."""
+    """Share of the background in a pixel: fog has the background colour."""
     fogged = float(0.0)
     for k in range(grid.count):
         fogged += samples.fogged[sample_at(grid, k)]

@@ -64,7 +64,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def heaviest_of(grid: PixelGrid, samples: Any) -> int:
-    """Of all samples of the pixel: its index in the cloud."""
+    """Index in the cloud of the splat with the largest weight in any sample of the pixel."""
     weight = float(0.0)
     which = int(-1)
     for k in range(grid.count):

@@ -31,8 +31,8 @@ def pcg4d(x: wp.uint32, y: wp.uint32, z: wp.uint32, w: wp.uint32) -> _WORDS:
 
 @wp.func
 def variate(x: int, y: int, channel: int, seed: wp.uint32) -> float:
-    """Of mean 0 and variance 1: twelve even 16-bit numbers, summed as integers, so that each device has the
-    same.
+    """Approximately normal random number of mean 0 and variance 1: the sum of twelve uniform 16-bit numbers,
+    added as integers, so that all devices return the same.
     """
     total = int(0)
     for part in range(2):
