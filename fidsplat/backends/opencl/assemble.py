@@ -213,8 +213,8 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
 
 @cache
 def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
-    """The source of a training step's other kernels, for vectors of `lanes` floats; sums are in float64 where
-    the device has it."""
+    """Source of the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats. Sums are in
+    float64 if the device has it."""
     files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
     numbers = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "SETUP_FP64": int(float64)}
     declared = Declarations(Scalars("double" if float64 else "float", "float"))

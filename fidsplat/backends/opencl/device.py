@@ -45,7 +45,7 @@ _NO_PLATFORM = (
 
 
 def devices() -> list[DeviceInfo]:
-    """Every OpenCL device here, usable or not. An empty list if there is no platform."""
+    """All OpenCL devices of this machine, usable or not. An empty list if there is no platform."""
     return [_describe(device, name) for name, device in _named_devices().items()]
 
 
@@ -63,9 +63,9 @@ def open_device(selector: str = "") -> OpenCLBackend:
     found = _named_devices()
     if not found:
         raise DeviceError(_NO_PLATFORM)
-    wanted = selector.strip().lower()
-    numbered = found.get(f"opencl:{wanted}") if wanted[-1:].isdigit() else None
-    matching = [numbered] if numbered else _matching(found.values(), wanted)
+    requested = selector.strip().lower()
+    numbered = found.get(f"opencl:{requested}") if requested[-1:].isdigit() else None
+    matching = [numbered] if numbered else _matching(found.values(), requested)
     if not matching:
         known = "; ".join(f"{name}: {device.name}" for name, device in found.items())
         raise UnknownDeviceError(f"no OpenCL device matches {selector!r}; there are: {known}")
@@ -79,7 +79,7 @@ def open_device(selector: str = "") -> OpenCLBackend:
 
 
 class OpenCLBackend(Workspace, Backend):
-    """An open OpenCL device, and what is compiled for it."""
+    """An open OpenCL device and its compiled pipelines."""
 
     traits = DeviceTraits(
         caches_chunks=True,
@@ -96,14 +96,14 @@ class OpenCLBackend(Workspace, Backend):
             if _needs_patch(device):
                 target_patch.announce_once(pocl_folder(), _PATCHED)
             check_once(pocl_folder(), kernel_cache.is_loaded, kernel_cache.is_whole)
-        else:  # pyopencl keeps programs for drivers that have no cache of their own
+        else:  # pyopencl caches programs for drivers without a cache of their own
             check_once(user_cache() / "pyopencl", _PYOPENCL_FILES.__contains__, lambda _: True)
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
         self._ahead = Ahead()
         self._own: tuple[DeviceShape, dict[FeatureSet, OpenCLPipeline]] = self.shape, {}
-        """of the device's own shape, by what is asked for: found by the first look"""
+        """pipelines for the device's default shape by requested features; looked up before all others"""
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in device buffers."""
@@ -122,7 +122,8 @@ class OpenCLBackend(Workspace, Backend):
         images.copy_tiles(other, tiles)
 
     def unsupported(self, features: FeatureSet) -> str:
-        """Blending in float64 where the device has none; empty for all else."""
+        """Reason why the features cannot be rendered: float64 blending on a device without float64. Empty if
+        they can."""
         if self.info.float64 or "blend_double" not in features.slots:
             return ""
         return (
@@ -134,7 +135,7 @@ class OpenCLBackend(Workspace, Backend):
         """The stages compiled for these features; `shape` replaces the device's own build constants (tests).
 
         Raises:
-            DeviceError: the compiler refuses; its log is in the message. Or what is `unsupported`.
+            DeviceError: compilation fails, with the log in the message, or the features are `unsupported`.
         """
         if shape is None and self._own[0] is self.shape and (known := self._own[1].get(features)) is not None:
             return known
@@ -183,19 +184,19 @@ class OpenCLBackend(Workspace, Backend):
 
     @property
     def memory_bytes(self) -> int:
-        """Device memory that scratch buffers hold, and finished images that nobody has any more."""
+        """Bytes of scratch buffers and of released images in the buffer pool."""
         return self.pool.memory_bytes
 
     def release_scratch(self) -> None:
-        """Lets go of the scratch buffers; the next picture takes what it needs."""
+        """Release the scratch buffers; the next frame allocates new ones."""
         self.pool.clear()
 
     def rates(self) -> Rates:
-        """What the device can do at best; measured again at each call."""
+        """Measure the device's peak rates, for the roofline of `fidsplat bench`."""
         return measure_rates(self)
 
     def probe(self) -> OpenCLProbe:
-        """What tests look into the device with."""
+        """Access to intermediate buffers and device arithmetic, for tests."""
         return OpenCLProbe(self)
 
     def shapes(self, kind: str) -> dict[str, DeviceShape]:
@@ -211,7 +212,7 @@ def _all_devices() -> Iterator[cl.Device]:
     try:
         with intel_among_them():
             platforms = cl.get_platforms()
-    except cl.Error:  # the loader's way to say that there is none
+    except cl.Error:  # raised by the loader if there is no platform
         return
     for platform in platforms:
         try:
@@ -221,7 +222,7 @@ def _all_devices() -> Iterator[cl.Device]:
 
 
 def _named_devices() -> dict[str, cl.Device]:
-    """Devices by what to type for them; of several with the platform's name the later ones have a number."""
+    """Devices by their `--device` names; further devices of a platform have a number, from 2."""
     named: dict[str, cl.Device] = {}
     for device in _all_devices():
         platform = device.platform.name

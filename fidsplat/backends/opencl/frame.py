@@ -108,8 +108,8 @@ def complete_tiled(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None
         return
     tiling.start_lists(frame, _UNLIMITED)
     bands = tiling.unsorted_bands(frame, counts.pairs)
-    roomy = min(counts.pairs * 5 // 4, frame.workspace.pair_budget)
-    capacity = max(roomy, *(band.pairs for band in bands))
+    with_margin = min(counts.pairs * 5 // 4, frame.workspace.pair_budget)
+    capacity = max(with_margin, *(band.pairs for band in bands))
     for band in bands:
         tiling.list_and_sort(frame, band, capacity, first_band=band is bands[0])
         blend(frame, band)
@@ -117,8 +117,8 @@ def complete_tiled(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None
 
 
 def render_in_chunks(frame: DeviceFrame) -> None:
-    """The stages where memory is short: the cloud is projected a chunk at a time, and only visible splats are
-    kept. If these are still too many, the cloud is projected again for each band of rows of tiles."""
+    """The stages under a small memory budget: the cloud is projected in chunks, and only visible splats are
+    stored. If these exceed the capacity, the cloud is projected again for each band of rows of tiles."""
     rows = [(frame.first_tile // frame.tiles_x, frame.end_tile // frame.tiles_x)]
     visible = pairs = 0
     while rows:
@@ -146,7 +146,7 @@ def blend(frame: DeviceFrame, band: TileBand) -> None:
 
 
 def resolve(frame: DeviceFrame) -> None:
-    """Put the surroundings behind the splats, and turn samples into pixels, unless the blend stage has."""
+    """Composite the background behind the splats and average samples to pixels, unless fused into `blend`."""
     arguments, view = frame.source.arguments, frame.view
     if "backdrop" in arguments and not view.sub_frames:
         frame.launch_grid("resolve", "backdrop", view.width, view.height)

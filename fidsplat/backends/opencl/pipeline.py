@@ -132,7 +132,7 @@ class OpenCLPipeline(Pipeline):
                 frame = self._render_planned(resident, view, plan)
             if frame is None or frame.pairs > self.workspace.pair_budget:
                 raise DeviceError(
-                    "frames with derivatives must fit the memory budget at once, got chunks or bands of "
+                    "frames with derivatives must fit the memory budget without chunks or bands, got "
                     f"{resident.count:,} splats; raise memory_budget, or use fewer splats or smaller frames"
                 )
             return frame

@@ -22,7 +22,7 @@ from fidsplat.util import interrupts
 from fidsplat.util.errors import DeviceError
 
 in_background = threading.local()
-"""`on` in threads whose starter has filtered warnings for them: filters are the whole process's"""
+"""`on` in compile threads whose parent has set the warning filters, which are shared by all threads"""
 
 
 class _InvokerCache(dict[Any, Any]):
@@ -45,16 +45,16 @@ def load_invoker() -> None:
 
 
 def build_options(device: cl.Device) -> list[str]:
-    """What every program is compiled with: no option that lets go of IEEE arithmetic."""
+    """Compiler options of all programs, without options that relax IEEE arithmetic."""
     version, target = device.version, device.version
     if needs_correction(version):
         target = correct_target(device.int_ptr, version)
-    # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell processors
-    # apart
+    # the target's name is part of pyopencl's cache key, since PoCL's version string is the same for all
+    # processors
     target = "".join(c if c.isalnum() else "_" for c in target)
     options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
     if device.platform.name == "NVIDIA CUDA":
-        # the projection wants 98 registers; two fewer let a quarter more work-items run at once
+        # the projection uses 98 registers; with 96 the occupancy is a quarter higher
         options.append("-cl-nv-maxrregcount=96")
     return options
 
@@ -63,9 +63,8 @@ def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
     """A program from OpenCL C.
 
     Raises:
-        DeviceError: the compiler refuses; its log is in the message.
+        DeviceError: compilation fails; the message has the log.
     """
-
     all_options = (*build_options(workspace.device), *options)
 
     def compiled() -> cl.Program:
@@ -99,7 +98,7 @@ class Program:
         }
 
     def own_kernel(self, name: str) -> cl.Kernel:
-        """A new kernel object, whose arguments nobody else binds."""
+        """A new kernel object, not shared with other callers."""
         return cl.Kernel(self._kernels[name].program, name)
 
     def types(self, name: str) -> Sequence[Callable[[Any], Any] | None]:
@@ -110,11 +109,11 @@ class Program:
 def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
     """The kernels of a source.
 
-    PoCL's cache may give a program without kernels, where another process has died while it wrote or writes
-    just now. Another option makes another entry.
+    PoCL's cache may return a program without kernels if another process is writing the entry, or was killed
+    while writing it. A retry with another option uses another cache entry.
 
     Raises:
-        DeviceError: the compiler refuses, or gives no kernels again and again.
+        DeviceError: compilation fails, or returns no kernels three times.
     """
     load_invoker()
     for attempt in range(3):
@@ -124,19 +123,23 @@ def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
         if source.arguments.keys() <= kernels.keys():
             return kernels
     raise DeviceError(
-        f"{workspace.info.title} gives a program without its kernels; its cache of compiled kernels may be "
-        f"damaged: remove {pocl_folder()}"
+        f"{workspace.info.title} returned a program without its kernels; the cache of compiled kernels may "
+        f"be damaged; remove {pocl_folder()}"
     )
 
 
 def check_kernels(
     workspace: Workspace, file: str = "", text: str = "", lanes: int = 0, effects: Sequence[str] = ()
 ) -> dict[str, cl.Kernel]:
-    """The kernels of a file below kernels/opencl/, or of a text, compiled as the stages are: after prelude.cl
-    and math.cl, whose hooks the files `effects` fill. lanes: 0 for the device's own.
+    """Kernels of a file below kernels/opencl/ or of a text, compiled after prelude.cl and math.cl like the
+    stages of a frame.
+
+    Args:
+        lanes: SIMD width; 0 for the device's default.
+        effects: files that fill the hooks of prelude.cl and math.cl.
 
     Raises:
-        DeviceError: the compiler refuses.
+        DeviceError: compilation fails.
     """
     shape = replace(workspace.shape, lanes=lanes) if lanes else workspace.shape
     built = build(workspace, assemble_check(file, shape, workspace.info.float64, effects) + text)

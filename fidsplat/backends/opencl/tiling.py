@@ -27,7 +27,7 @@ from fidsplat.util.errors import DeviceError
 LOCAL_TILES = 4096
 """most tiles of a view that are counted in local memory (as in tile_lists_local.cl)"""
 _GROUP_SPLATS = 4096
-"""splats of a work-group there"""
+"""splats per work-group of the strategy `local`"""
 _ITEMS = 256
 """BIN_ITEMS and SORT_ITEMS"""
 # words of the buffer `tallies`, as in prelude.cl
@@ -156,7 +156,7 @@ def _prefix_sums(
     return starts
 
 
-# on CPUs, where memory is short: project a chunk of splats at a time, and keep the visible ones
+# on CPUs with a small memory budget: project in chunks, and store the visible splats only
 
 
 class Packed(NamedTuple):

@@ -333,9 +333,9 @@ class OpenCLTraining(TrainingKernels):
         given: Mapping[str, Any],
         launches: Callable[[], list[Launch]],
     ) -> list[cl.Event]:
-        """Submit a part of a step: replayed, if it differs from that of the last step in `given` only.
+        """Replay a command list of a training step, with the arguments `given`; record it again if necessary.
 
-        launches: called to record them, if the key, the splats or the buffers have changed.
+        launches: called to record the launches if the key, the splats or the buffers have changed.
         """
         commands = self._replayed.setdefault(name, CommandList(self._program))
         key = (*key, self._version, self._workspace.pool.state)
