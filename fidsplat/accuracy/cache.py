@@ -1,4 +1,4 @@
-"""Cache of measured choices in the user's cache folder."""
+"""Cache of the qualities that `fs.quality_within` has measured and chosen, in the user's cache folder."""
 
 from __future__ import annotations
 

@@ -171,8 +171,8 @@ def flight_source(folder: Path) -> tuple[str, str]:
         ) from None
     if not file.exists():
         raise InputError(
-            f"the scene {source} of the flight {folder} must exist; give its new place, with --trajectory "
-            f"{poses}"
+            f"the scene of the flight {folder} must exist, got {source}, which is missing; give its new "
+            f"path, with --trajectory {poses}"
         )
     return str(file), str(poses)
 

@@ -167,7 +167,7 @@ def _lines(file: Path, head: bytes) -> tuple[list[str], int]:
 
 def _count(file: Path, line: str, word: str) -> int:
     if not re.fullmatch(r"[0-9]{1,18}", word):
-        raise InputError(f"{file}: the PLY header's line {line[:60]!r} does not hold a count of 0 or more")
+        raise InputError(f"{file}: a count in the PLY header must be a whole number >= 0, got {line[:60]!r}")
     return int(word)
 
 

@@ -114,7 +114,8 @@ def _sqlite_messages(path: Path) -> Iterator[Message]:
         for topic, kind, time, data in cursor:
             if [type(value) for value in (topic, kind, time, data)] != [str, str, int, bytes]:
                 raise InputError(
-                    f"{path} must have messages of a topic, a type, a time and data, got {time!r}"
+                    f"a message of {path} must have a topic, a type, an integer timestamp and data, got "
+                    f"timestamp {time!r}"
                 )
             yield topic, kind, time, data
     finally:

@@ -22,7 +22,7 @@ MAX_TAGS = 64
 
 @dataclass(frozen=True, kw_only=True)
 class BoardSpec(Spec):
-    """A board's spec."""
+    """Spec of a board of markers: its columns and rows."""
 
     columns: int
     rows: int

@@ -131,7 +131,7 @@ class Marker(PickledByFields):
         )
         count = int(count_gaussians(aspect_of(printed.boxes), templates).sum())
         refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
-        return gaussian_cloud(printed, templates, fitted_growth(), _unseen)
+        return gaussian_cloud(printed, templates, fitted_growth(), _no_progress)
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
@@ -204,7 +204,7 @@ def marker(
             ``max_splats``, mostly before the work begins.
     """
     start = time.perf_counter()
-    progress = _unseen if progress is None else progress
+    progress = _no_progress if progress is None else progress
     max_splats = whole_number("max_splats", max_splats, 1, 2**31 - 1)
     parsed = parse_spec(spec)
     given = {"levels": levels, "density": density, "growth": growth, "template": template}
@@ -282,7 +282,7 @@ def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette:
     if parsed.regions is None:
         boxes = partition_colors(grid)
         return Printed(grid, boxes, grid[boxes[:, 1], boxes[:, 0]], None, None, module, palette)
-    from fidsplat.markers.cover import cover_all  # late, as shapely is
+    from fidsplat.markers.cover import cover_all  # here, since it imports shapely
     from fidsplat.markers.shapes import with_margin
 
     regions = with_margin(parsed.regions, quiet, grid.shape)
@@ -290,7 +290,7 @@ def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette:
     return Printed(grid, boxes, values, angles, regions, module, palette)
 
 
-def _unseen(words: str, share: float) -> None:
+def _no_progress(words: str, share: float) -> None:
     """Progress callback that does nothing."""
 
 
@@ -305,8 +305,8 @@ def _chosen(
     name = quality.mixture if mixture is None else text("mixture", mixture)
     if name == "refined":
         raise InputError(
-            "the mixture 'refined' is made on a device: give what is made as 'fitted' to fs.train.refine, or "
-            "write `fidsplat marker --mixture refined`"
+            "mixture must be computed without a device, got 'refined'; give a marker with the mixture "
+            "'fitted' to fs.train.refine, or run `fidsplat marker --mixture refined`"
         )
     if name not in MIXTURES:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
@@ -314,9 +314,14 @@ def _chosen(
     of_paper = [key for key in ("levels", "density") if key in given]
     of_paper += [] if duplicates is None else ["duplicates"]
     if of_paper and name != "paper":
-        raise InputError(f"{', '.join(of_paper)}: only the mixture 'paper' has this; write mixture='paper'")
+        raise InputError(
+            f"{', '.join(of_paper)} must be given with mixture='paper', got mixture={name!r}; write "
+            "mixture='paper'"
+        )
     if "template" in given and name == "paper":
-        raise InputError("template: the mixture 'paper' has levels and density instead")
+        raise InputError(
+            "template must be given with another mixture than 'paper'; give levels and density instead"
+        )
     if "template" in given and name == "facets":
         raise InputError("template: the mixture 'facets' has none; leave it out, or write mixture='fitted'")
     if "growth" in given and name in ("exact", "facets"):

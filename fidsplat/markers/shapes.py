@@ -85,10 +85,10 @@ def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
 def visible(
     shapes: Sequence[tuple[shapely.Geometry, int]], shape: tuple[int, int]
 ) -> tuple[shapely.MultiPolygon, ...]:
-    """Visible regions of shapes painted one over the other on a sheet of (h, w) modules: the region of
-    each value, the sheet's own being 0.
+    """Visible region of each value, for shapes painted one over the other on a sheet of (h, w) modules; the
+    value of the sheet is 0.
 
-    Raises InputError where too many shapes overlap."""
+    Raises InputError if too many shapes overlap."""
     geometries = np.array([painted for painted, _ in shapes], object)
     tree, sheet = shapely.STRtree(geometries), shapely.box(0, 0, shape[1], shape[0])
     if tree.query(geometries).shape[1] > 2 * MOST_OVERLAPS:

@@ -232,7 +232,7 @@ def _look(element: ElementTree.Element, tag: str, file: _File) -> dict[str, str]
         raise InputError(f"{file.name}: the style of <{tag}> has {error}, which is not understood") from None
     for key in (*_MOVES, *(() if tag in _GROUPS else _OF_SHAPES)):
         if key in said or (key == "transform-origin" and key in element.attrib):
-            raise InputError(f"{file.name}: <{tag}> has a {key} in its style; make it an attribute")
+            raise InputError(f"{file.name}: {key} of <{tag}> must be an attribute, got a style property")
     return element.attrib | said
 
 

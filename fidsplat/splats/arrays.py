@@ -1,5 +1,4 @@
-"""What the arrays of a SplatCloud are made of: checks of what users give, splats that cannot be drawn, types,
-origins, quaternions, clouds in one."""
+"""Arrays of a SplatCloud: input checks, invalid splats, types, origins, quaternions and concatenation."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,7 @@
 """Detection of AprilTag, ArUco and QR codes with off-the-shelf detectors: OpenCV's aruco module and
 zxing-cpp.
 
-They decide what is there; `align` then moves their corners onto the edges of the code that they read.
+The detectors find and decode the codes; `align` then refines the corners by the edges of the decoded code.
 """
 
 from collections.abc import Iterable

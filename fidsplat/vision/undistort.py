@@ -50,8 +50,8 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
         )
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
-            f"the image has {image.shape[1]} x {image.shape[0]} pixels, but its camera {camera.width} x "
-            f"{camera.height}"
+            f"the image must have the camera's size, {camera.width} x {camera.height} pixels, got "
+            f"{image.shape[1]} x {image.shape[0]}; give the camera that took the image"
         )
     if not np.allclose(pinhole.position, camera.position, rtol=0, atol=1e-9):
         raise InputError("undistort: the pinhole camera must have the position of the image's camera")

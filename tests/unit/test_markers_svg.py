@@ -167,8 +167,14 @@ def test_circles():
         ('<g transform="skewX(5 5)"/>', "skewX"),
         ('<g transform="rotate(45"/>', "rotate(45"),
         ('<g transform="rotate(45deg)"/>', "rotate(45deg)"),
-        ('<rect width="5" height="5" style="transform: scale(2)"/>', "a transform in its style"),
-        ('<style>rect { width: 9px }</style><rect width="5" height="5"/>', "a width in its style"),
+        (
+            '<rect width="5" height="5" style="transform: scale(2)"/>',
+            "transform of <rect> must be",
+        ),
+        (
+            '<style>rect { width: 9px }</style><rect width="5" height="5"/>',
+            "width of <rect> must be",
+        ),
         ("<style>g rect { fill: red }</style>", "style sheet has 'g rect'"),
         ('<style>@import "a.css";</style>', "style sheet has '@import"),
         ("<style>.a { fill: red !important }</style>", "style sheet has !important"),

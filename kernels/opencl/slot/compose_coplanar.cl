@@ -10,8 +10,8 @@
 //@ functions
 #define COPLANAR_RADIUS REAL(64.0)       // in standard deviations; for boxes in half sides
 //@ coplanar_depth_reach
-    // depths of the plane as far out as any alpha cut-off and low-pass renders: then a cut-off does not move layers, nor do boxes
-    // much smaller than a pixel
+    // depth range of the plane out to a fixed radius, beyond the reach of every alpha cut-off and low-pass: then the order of
+    // layers does not depend on the cut-off, nor on boxes much smaller than a pixel
     if (coplanar_groups[i] >= 0) depth_reach = reach * (BOX_HERE ? COPLANAR_RADIUS : COPLANAR_RADIUS / radius);
 //@ coplanar_nearest
     if (coplanar_groups[i] >= 0) record.nearest = (wide)plane_keys[coplanar_groups[i] * get_global_size(1) + number];

@@ -17,8 +17,8 @@ kernel void gather(global const uint *source, global const uint4 *pieces, uint w
 #if INSTANCED
 #define NOT_PLACED 0xffffffffu
 
-// Bit-identical to `moved` (fidsplat/store/subset.py), sum by sum. A pose: rotation by rows, translation of the origin of the
-// means, quaternion.
+// Bit-identical to `moved` (fidsplat/store/subset.py): sums have the same order. Words of a pose: rotation by rows, translation
+// of the origin of the means, quaternion.
 // Index space: (rows of the largest piece, pieces).
 kernel void gather_means(
     global const float *source, global const uint4 *pieces, global const double *poses, global float *target) {

@@ -22,7 +22,7 @@ def terms(form: wp.vec4, x: float, y: float) -> float:
 
 @wp.func
 def opacity_rounding(log_opacity: float, half_rho: float) -> float:
-    """What rounding changes in an opacity, relative: ln(opacity), rho, their difference, the exponential."""
+    """Relative rounding error of an opacity: of ln(opacity), rho, their difference and the exponential."""
     return UNIT * (16.0 + 2.0 * wp.abs(log_opacity) + 32.0 * wp.min(half_rho, 100.0))
 
 
