@@ -1,7 +1,8 @@
-"""Lenses whose samples each have a ray of their own, and where such a lens can see a splat.
+"""Lenses with a ray buffer: projection of points, and bounds of splats in the image.
 
-A map says which samples' rays lie in a cell of the lens's chart, so bounds hold whatever the rays are. The
-chart of a distorted picture is the ideal one, a fisheye's the stereographic one.
+Bounds are computed in a chart of directions: the undistorted image of a distorted camera, the stereographic
+projection of a fisheye. A map from the cells of the chart to samples converts them to bounds of samples, so
+that they hold for the rays in the buffer.
 """
 
 import math
@@ -17,15 +18,15 @@ COEFFICIENTS = {
     "camera_brown_conrady": wp.types.vector(12, wp.float64),  # k1 to k6, p1, p2, s1 to s4
     "camera_fisheye": wp.vec4d,  # k1 to k4
 }
-"""lenses that have some, and a map; they stand before the square of the fold, or the largest angle, that is
-seen
+"""distortion coefficients of the lenses that have a map; in uniforms they precede the limit of the field of
+view, the square of the fold's radius or the largest angle
 """
 LENSES = (*COEFFICIENTS, "camera_equirectangular")
 
 
 @cache
 def make_lens(camera: str | None):
-    """The struct of what the projection reads of a lens, or of none."""
+    """The struct Lens, the inputs of the projection; empty for cameras without a lens."""
     fields = {"rays": wp.array(dtype=wp.vec3)}
     if camera in COEFFICIENTS:
         fields |= {
@@ -36,31 +37,33 @@ def make_lens(camera: str | None):
             "side": wp.int32,  # cells
             "low": wp.vec2d,  # corner of the first cell
             "per_unit": wp.vec2d,  # cells
-            "top": wp.int32,  # row of the map's picture that is the first of this one
+            "top": wp.int32,  # row of the map's image that is the first row of this band
         }
-    return struct_of("Lens", "What the projection reads of a lens.", fields if camera else {})
+    return struct_of("Lens", "Inputs of the projection by a lens.", fields if camera else {})
 
 
 @cache
 def make_optics(camera: str, real) -> SimpleNamespace:
-    """image(p, view, lens): where a point falls, and whether it is seen; anchor(x, y, p, view, lens): the ray
-    about which a splat's forms are kept.
+    """Functions of a lens.
 
-    And for bounds: mapped(x0, x1, y0, y1, lens) of a box of the chart, or
-    enclose(a, b, p, radius, view, lens) of a disk.
+    image(p, view, lens): image coordinates of a point, and whether it is in the field of view. anchor(x, y,
+    p, view, lens): the ray to which a splat's forms are relative. Bounds in samples: mapped(x0, x1, y0, y1,
+    lens) of a box of the chart, enclose(a, b, p, radius, view, lens) of a disk.
     """
     Lens = make_lens(camera)
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
     zero, half, one, two, pi = real(0.0), real(0.5), real(1.0), real(2.0), real(math.pi)
-    # room for the rounding of rays and of the per-sample test: relative; radians, or of the chart; cells
-    more, pad, room = real(1.0002), real(1e-6), real(0.02)
+    # margins for the rounding of rays and of the per-sample test: relative; in radians or units of the chart;
+    # in cells
+    more, pad, margin = real(1.0002), real(1e-6), real(0.02)
 
     @wp.func
     def cone(a: vec3, b: vec3, p: vec3, radius: real) -> real:
-        """Half of the angle of a cone about p that holds the disk p + u a + v b, u^2 + v^2 <= radius^2; pi if
-        that is a right angle or more.
+        """Half angle of a cone around p that contains the disk p + u a + v b, u^2 + v^2 <= radius^2; pi if it
+        is a right angle or more.
 
-        |p x c| / (p c) is the tangent of the angle of c: what it is at most, over what it is at least.
+        |p x c| / (p c) is the tangent of the angle of a point c: the bound is the maximum of the numerator
+        over the minimum of the denominator.
         """
         across_a, across_b = wp.cross(p, a), wp.cross(p, b)
         aa, ab, bb = wp.dot(across_a, across_a), wp.dot(across_a, across_b), wp.dot(across_b, across_b)
@@ -73,23 +76,23 @@ def make_optics(camera: str, real) -> SimpleNamespace:
 
     @wp.func
     def mapped(x0: real, x1: real, y0: real, y1: real, lens: Lens):
-        """Bounds of the samples whose rays lie in [x0, x1] x [y0, y1] of the chart."""
+        """Bounds of the samples whose rays are in [x0, x1] x [y0, y1] of the chart."""
         side = lens.side
         end = real(side)
         low = vec2(
-            (x0 - real(lens.low[0])) * real(lens.per_unit[0]) - room,
-            (y0 - real(lens.low[1])) * real(lens.per_unit[1]) - room,
+            (x0 - real(lens.low[0])) * real(lens.per_unit[0]) - margin,
+            (y0 - real(lens.low[1])) * real(lens.per_unit[1]) - margin,
         )
         high = vec2(
-            (x1 - real(lens.low[0])) * real(lens.per_unit[0]) + room,
-            (y1 - real(lens.low[1])) * real(lens.per_unit[1]) + room,
+            (x1 - real(lens.low[0])) * real(lens.per_unit[0]) + margin,
+            (y1 - real(lens.low[1])) * real(lens.per_unit[1]) + margin,
         )
         left, right, top, bottom = int(32767), int(-1), int(32767), int(-1)
         if high[0] >= zero and low[0] <= end and high[1] >= zero and low[1] <= end:
             i0, i1 = cell(low[0], side), cell(high[0], side)
             j0, j1 = cell(low[1], side), cell(high[1], side)
             grid = int(0)
-            # to a grid in which they are few
+            # the coarser grid in which the box has fewer than 7 cells a side
             while i1 - i0 >= 6 or j1 - j0 >= 6:
                 grid += side * side
                 side = side / 2
@@ -99,7 +102,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
                     samples = lens.cells[grid + j * side + i]
                     left, right = wp.min(left, int(samples[0])), wp.max(right, int(samples[1]))
                     top, bottom = wp.min(top, int(samples[2])), wp.max(bottom, int(samples[3]))
-        # of none it is inside out, and reaches no sample
+        # without samples the box is inverted, which is empty
         return box_bounds(
             float(left) + 0.5, float(right) + 0.5, float(top - lens.top) + 0.5, float(bottom - lens.top) + 0.5
         )
@@ -142,8 +145,8 @@ def make_optics(camera: str, real) -> SimpleNamespace:
 
     @wp.func
     def extremes(above: vec3, below: vec3, radius: real) -> vec2:
-        """Least and greatest (above (u, v, 1)) / (below (u, v, 1)) with u^2 + v^2 <= radius^2, where the
-        divisor is above 0.
+        """Minimum and maximum of (above (u, v, 1)) / (below (u, v, 1)) with u^2 + v^2 <= radius^2, for a
+        divisor above 0.
         """
         middle = above[2] / below[2]
         slope = vec2(below[0], below[1])
@@ -156,8 +159,10 @@ def make_optics(camera: str, real) -> SimpleNamespace:
 
     @wp.func
     def enclose_fisheye(a: vec3, b: vec3, p: vec3, radius: real, view: View, lens: Lens):
-        """In the stereographic picture (X, Y) / (|r| + Z), with |r| between the part of r along p and that
-        over the cosine of the cone's angle: between them the quotient is largest and least at either.
+        """Bounds of a disk in a fisheye image, by the stereographic projection (X, Y) / (|r| + Z).
+
+        |r| is between the part of r along p and that part over the cosine of the cone's half angle. The
+        quotient is monotonic in |r|, so its extremes are at these two.
         """
         away, w = wp.length(p), cone(a, b, p, radius)
         x0, x1, y0, y1 = real(wp.inf), -real(wp.inf), real(wp.inf), -real(wp.inf)
@@ -166,7 +171,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
             below = vec3(
                 a[2] + per_away * wp.dot(a, p), b[2] + per_away * wp.dot(b, p), p[2] + per_away * away * away
             )
-            # else it may hold the direction -z, which lies at infinity
+            # else the disk may contain the direction -z, which is at infinity
             if (
                 w < real(1.5)
                 and below[2] - radius * wp.sqrt(below[0] * below[0] + below[1] * below[1]) > real(1e-3) * away
@@ -191,8 +196,10 @@ def make_optics(camera: str, real) -> SimpleNamespace:
 
     @wp.func
     def enclose_panorama(a: vec3, b: vec3, p: vec3, radius: real, view: View, lens: Lens):
-        """A cone of half angle w about latitude t reaches asin(sin w / cos t) of longitude to both sides; all
-        around, if it holds a pole or crosses the edge of longitudes.
+        """Bounds of a disk in a panorama.
+
+        A cone of half angle w around latitude t spans asin(sin w / cos t) of longitude to both sides; all
+        longitudes if it contains a pole or crosses the edge of the image.
         """
         longitude = wp.atan2(p[0], p[2])
         latitude = wp.atan2(p[1], wp.sqrt(p[0] * p[0] + p[2] * p[2]))
@@ -213,7 +220,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
 
     @wp.func
     def anchor(column: int, row: int, p: vec3, view: View, lens: Lens) -> wp.vec3:
-        """The ray of that sample; the direction of p where it sees nothing."""
+        """The ray of a sample; the direction of p outside of the field of view."""
         ray = lens.rays[row * view.width + column]
         if ray[0] != ray[0]:
             away = wp.length(p)
