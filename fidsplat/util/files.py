@@ -28,7 +28,7 @@ def path_of(path: str | os.PathLike[str]) -> Path:
         if not isinstance(name, str) or b"\0" in os.fsencode(name):
             raise ValueError
     except ValueError:  # also for half of a surrogate pair
-        raise InputError(f"a path must be text or a pathlib.Path, got {path!r}") from None
+        raise InputError(f"a path must be text without NUL, or a pathlib.Path, got {path!r}") from None
     if len(os.fsencode(name)) > MAX_PATH or any(
         len(os.fsencode(part)) > MAX_NAME for part in Path(name).parts
     ):

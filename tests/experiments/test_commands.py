@@ -147,7 +147,7 @@ def test_scenes_for_trainers(capsys, tmp_path):
         (["angles", "--mixture", "boxes"], "unknown mixture 'boxes'"),
         (["angles", "--protocol", "P*"], "unknown protocol 'P*'; known: fixed-plane, fixed-module"),
         (["angles", "--tilts", "0-90"], "first:last:step"),
-        (["angles", "--shard", "3/2", "--ideal"], "write i/n"),
+        (["angles", "--shard", "3/2", "--ideal"], "must be i/n"),
         (["angles", "--markers", "6"], "--markers must be 1 to 5, got 6"),
         (["angles", "--workers", "0"], "--workers must be at least 1 thread, got 0"),
         (
@@ -201,7 +201,7 @@ def test_what_is_wrong_with_the_last_experiment_is_shown_before_the_first(capsys
     (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04 a download that was cut short")
     status, _, err = run(capsys, *words, "--lpips", tmp_path / "cut.npz", "--overwrite")
     assert status == 2
-    assert "cut.npz is no .npz file with LPIPS weights" in err
+    assert "as LPIPS weights" in err
     assert read_records(tmp_path / "counts.jsonl") == []
     assert (tmp_path / "angles.jsonl").read_text() == old  # --overwrite drops nothing for it
 
@@ -245,7 +245,7 @@ def test_pictures_of_another_seed_are_not_the_truth(capsys, tmp_path):
         status, _, err = run(capsys, *words)
         assert status == 2
         assert "holds images of seed 0, not 1" in err
-    with pytest.raises(fs.InputError, match="pictures of samples 16, not 64; give another folder"):
+    with pytest.raises(fs.InputError, match="images of samples 16, not 64; give another folder"):
         note_pictures(tmp_path / "b", "raw", 0, 64)
     assert check_pictures(tmp_path / "b", "raw", 0) == {"seed": 0, "samples": 16}
     assert check_pictures(tmp_path / "b", "standard", 3) == {}

@@ -69,7 +69,7 @@ def test_a_marker_of_more_splats_than_allowed(capsys, tmp_path):
     spec = f"image:{write_png(tmp_path / 'noise.png', bits)}"
     status, line = fails(capsys, "marker", spec, "--mixture", "fitted")
     assert status == 2
-    assert "more than 1,000,000" in line
+    assert "at most 1,000,000 splats" in line
     assert "--max-splats" in line
     facts = prints_json(capsys, "marker", "qr:a", "--max-splats", "10000000")
     assert facts["splats"] > 0

@@ -87,7 +87,7 @@ def test_a_ply_file_has_no_boxes(tmp_path):
 def test_the_command_writes_gaussians_and_says_so(tmp_path, capsys):
     file = tmp_path / "tag.ply"
     assert main(["marker", "apriltag:36h11:5", "--mixture", "exact", "-o", str(file)]) == 0
-    assert "Gaussians (fitted): a PLY file has no boxes" in " ".join(capsys.readouterr().out.split())
+    assert "Gaussians (fitted), as a PLY file has no boxes" in " ".join(capsys.readouterr().out.split())
     again = ["-o", str(file), "--overwrite", "--json"]
     assert main(["marker", "apriltag:36h11:5", "--mixture", "exact", *again]) == 0
     facts = json.loads(capsys.readouterr().out)

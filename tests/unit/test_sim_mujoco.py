@@ -251,7 +251,7 @@ def test_the_ten_lines_of_the_pages_draw_a_tag_that_is_read():
     )
     assert readme == page
     exec(readme, names)
-    pictures = names["pictures"]
+    pictures = names["images"]
     (reading,) = read_back(pictures.of("eye").frame(0), names["rig"].scene).readings
     assert reading.position_error < 0.003  # 0.2 % of 1.4 m
 

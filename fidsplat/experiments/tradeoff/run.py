@@ -64,7 +64,7 @@ def prepared(
     renderer = Renderer(device)
     info = renderer.device
     if info.always_float64:
-        raise InputError(f"--device must be a device to measure, got {info.name}, the reference")
+        raise InputError(f"--device must not be the reference itself, got {info.name}; give another --device")
     writable_folder(out)
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(f"{info.title}, {info.version}", scenes.SEED, versions)
