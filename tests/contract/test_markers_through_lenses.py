@@ -219,7 +219,7 @@ def test_pictures_that_cannot_be_undistorted():
         undistort(np.zeros((360, 480), np.uint8), camera, elsewhere)
     with pytest.raises(fs.InputError, match="an orthographic camera has no pinhole"):
         undistort(np.zeros((48, 64), np.uint8), fs.Camera.orthographic(64, 48, 1.0), flat)
-    with pytest.raises(fs.InputError, match="up to 150"):
+    with pytest.raises(fs.InputError, match="at most 150"):
         pinhole_towards(camera, (0, 0, 1), 64, 48, 3.0)
     with pytest.raises(fs.InputError, match="no directions"):
         marker_pose(np.zeros((4, 2)), 0.1, fs.Camera.orthographic(64, 48, 1.0))
