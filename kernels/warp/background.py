@@ -21,7 +21,7 @@ KINDS = {
 @cache
 def struct_of_surroundings(kind: str):
     """The struct of the numbers of this kind of background."""
-    return struct_of("Surroundings", "What lies behind everything.", KINDS[kind])
+    return struct_of("Surroundings", "The background.", KINDS[kind])
 
 
 @cache
@@ -32,19 +32,19 @@ def make_backdrop(kind: str, bent: bool):
 
     @wp.func
     def gradient(surroundings: Surroundings, ray: wp.vec3) -> wp.vec3:
-        """By the sine of the ray's height above the horizon."""
+        """Gradient by the sine of the ray's elevation above the horizon."""
         share = wp.clamp(0.5 + 0.5 * wp.dot(ray, surroundings.up) / wp.length(ray), 0.0, 1.0)
         return surroundings.bottom + share * (surroundings.top - surroundings.bottom)
 
     @wp.func
     def pixel_of(surroundings: Surroundings, column: int, row: int) -> wp.vec3:
-        """Round the seam, and the first and last row for what lies beyond them."""
+        """Pixel of the panorama: columns wrap around, rows are clamped."""
         height, width = surroundings.image.shape[0], surroundings.image.shape[1]
         return surroundings.image[wp.clamp(row, 0, height - 1), (column + width) % width]
 
     @wp.func
     def panorama(surroundings: Surroundings, ray: wp.vec3) -> wp.vec3:
-        """Bilinear; the middle column lies towards +z, to the right of it is +x, the top row is -y."""
+        """Bilinear lookup; the middle column is +z, the column right of it towards +x, the top row is -y."""
         flat = wp.sqrt(fma(ray[0], ray[0], ray[2] * ray[2]))
         height, width = float(surroundings.image.shape[0]), float(surroundings.image.shape[1])
         u = fma(fma(wp.atan2(ray[0], ray[2]), TURN, 0.5), width, -0.5)

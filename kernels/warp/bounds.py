@@ -1,5 +1,5 @@
-"""What part of the picture a splat can touch: its ellipse, or a box where the disk crosses the near plane,
-and the low-pass disc. Of most splats a window says which tiles these are: 8 x 4 tiles as bits.
+"""Image bounds of splats: an ellipse, or a box if the disk crosses the near plane, and the low-pass disc. The
+tiles of most splats are stored as a window: a bit mask of 8 x 4 tiles.
 
 Everything here is conservative; the test of each sample decides.
 """
@@ -11,7 +11,7 @@ import warp as wp
 
 from .common import View, fma, population, to_sample
 
-# room for the rounding of the fields and of the per-sample test: samples, and relative
+# margins for the rounding of the fields and of the per-sample test: in samples, and relative
 PAD = wp.constant(0.02)
 PAD_RELATIVE = wp.constant(2e-4)
 WINDOW_W = 8

@@ -15,14 +15,15 @@ from .rays import SLOPES
 
 SQRT2 = wp.constant(wp.float32(2.0**0.5))
 LINES = wp.constant(10)
-"""what bounds a box in the picture: its edges, the horizon of its plane, the near plane, the picture"""
+"""lines that bound a box in the image: its edges, the horizon of its plane, the near plane, the image's
+sides"""
 ACUTE = wp.constant(0.1)
-"""sine of an angle below which a corner's tip may lie far away"""
+"""sine of an angle below which the tip of a corner may be far away"""
 
 
 @wp.func
 def between(d: float, n: float, edges: wp.vec2) -> float:
-    """Which share of a sample lies between two opposite edges; n: n_u or n_v over sqrt 2, as in a record."""
+    """Coverage of a sample between two opposite edges; n: n_u or n_v over sqrt 2, as in a record."""
     low = wp.clamp(fma(fma(SQRT2, n, d), edges[0], 0.5), 0.0, 1.0)
     high = wp.clamp(fma(fma(-SQRT2, n, d), edges[1], 0.5), 0.0, 1.0)
     return wp.max(low + high - 1.0, 0.0)
@@ -30,7 +31,7 @@ def between(d: float, n: float, edges: wp.vec2) -> float:
 
 @wp.func
 def ramp(form: float, gradient: wp.vec2) -> float:
-    """Which share of a sample lies on the side of an edge where its form is above 0."""
+    """Coverage of a sample on the side of an edge where its form is above 0."""
     steep = wp.sqrt(wp.max(fma(gradient[0], gradient[0], gradient[1] * gradient[1]), 1.0e-36))
     return wp.clamp(form / steep + 0.5, 0.0, 1.0)
 
@@ -45,8 +46,10 @@ def between_curves(d: float, n: float, of_d: wp.vec3, of_n: wp.vec3, slopes: SLO
 
 @cache
 def make_boxes(real) -> SimpleNamespace:
-    """edges: what turns a box's forms into distances from its edges; extent, parallel: what it can touch
-    before a pinhole and for parallel rays; spread: a rectangle whose image a lens may enclose instead.
+    """Functions for boxes.
+
+    edges: factors from the forms of a box to distances from its edges. extent, parallel: image bounds for
+    pinhole and orthographic cameras. spread: a rectangle around the box, for the bounds behind a lens.
     """
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
     lines_type = wp.types.matrix((int(LINES), 3), real)
@@ -117,8 +120,8 @@ def make_boxes(real) -> SimpleNamespace:
 
     @wp.func
     def extent(tangent_u: vec3, tangent_v: vec3, p: vec3, su: real, sv: real, clear: bool, view: View):
-        """Box x0, x1, y0, y1 of samples that a box may cover at all: up to half a sample outside its edges.
-        x0 > x1 if there are none. clear: it lies wholly beyond the near plane.
+        """Bounds x0, x1, y0, y1 of the samples that a box can cover: up to half a sample outside of its
+        edges. x0 > x1 if there are none. clear: whether it is completely beyond the near plane.
         """
         per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
         cx, cy = real(view.center_x), real(view.center_y)

@@ -60,7 +60,7 @@ def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
         """far_x, far_y: of the tile's samples from the anchor, at most."""
         h = s.half_r2
         if wp.static(thick):
-            # q <= h (D^2 + bulge q); near 1 the difference is rounding more than _SLACK has room for
+            # q <= h (D^2 + bulge q); near 1 the rounding of the difference exceeds _SLACK
             if s.bulge > 0.0:
                 if s.bulge * h < 0.95:
                     h = h / (1.0 - s.bulge * h)

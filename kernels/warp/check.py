@@ -1,5 +1,5 @@
-"""For the self-test alone (`fidsplat check`): what the device's own functions give, as the stages call
-them."""
+"""Arithmetic of the device for the self-test (`fidsplat check`): results of the functions that stages
+call."""
 
 import warp as wp
 

@@ -12,9 +12,9 @@ STRICT = {
 }
 
 CULLED = wp.constant(wp.uint32(0xFFFFFFFF))
-"""key of a splat that is not drawn"""
+"""key of a culled splat"""
 MIN_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
-"""less of a sample than this is nothing to label, depth, median depth and normal"""
+"""minimum coverage of a sample for label, depth, median depth and normal"""
 
 
 _SIGN = wp.constant(wp.uint32(0x80000000))
@@ -23,12 +23,12 @@ _NONE = wp.constant(wp.uint32(0))
 
 @wp.struct
 class View:
-    """Uniforms of one view. Lengths in metres, pixels are samples of the grid. Kernels have an array of them,
-    one for each view that is drawn: the integers are the same in all.
+    """Uniforms of one view. Lengths are in metres, pixels are samples of the grid. Kernels have an array with
+    one for each rendered view; the integers are the same in all.
     """
 
     rotation: wp.mat33d  # world to camera
-    translation: wp.vec3d  # where the cloud's origin lies in the camera frame
+    translation: wp.vec3d  # position of the cloud's origin in the camera frame
     eye: wp.vec3d  # the camera's centre relative to the cloud's origin, world axes
     focal_x: wp.float64  # samples; of parallel rays samples per metre
     focal_y: wp.float64

@@ -20,15 +20,15 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 
 
 NEARER = wp.constant(wp.float32(-(2.0**-16)))
-"""of a depth, by which a layer lies before what lies in its plane"""
+"""relative depth by which a layer counts as nearer than ungrouped splats in its plane"""
 
 
 def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """Layer, and what is known of it: accumulate, accumulate_box; nothing, depth, averaged."""
+    """The struct Layer and its functions: accumulate, accumulate_box; nothing, depth, averaged."""
     log = fast_log if "arithmetic_fast" in effects else wp.log
     accumulators, averages = (output.functions(outputs, part) for part in ("accumulate", "average"))
     # tau: optical depth; `mean`: sums over fragments, each times its optical depth; of boxes, its opacity
-    # place: of the first in the list; nearest: depth before which none lies
+    # place: of the first splat in the list; nearest: lower bound of the depths
     fields = {
         "plane": wp.int32,
         "place": wp.int32,
@@ -38,11 +38,11 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         "mean": Attributes,
     }
     fields |= output.fields(outputs, "layer")
-    Layer = struct_of("Layer", "What a sample attribute_readers of one plane; plane -1: nothing.", fields)
+    Layer = struct_of("Layer", "Fragments of one coplanar group at a sample; plane -1: none.", fields)
 
     @wp.func
     def empty_layer(plane: int, place: int, nearest: float):
-        """The layer of a plane before its first fragment, whose splat stands at this place of the list."""
+        """The layer of a plane before its first fragment, the splat at this place of the list."""
         layer = Layer()
         layer.plane = plane
         layer.place = place
@@ -55,15 +55,15 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
 
     @wp.func
     def depth(layer: Layer) -> float:
-        """The depth at which it waits: nearer by a little more than depths are rounded, so that it lies
-        before splats of no plane that lie in it.
+        """Sort depth of the layer, nearer by slightly more than the rounding of depths, so that it is in
+        front of ungrouped splats in its plane.
         """
         z = layer.mean.z / layer.tau
         return wp.max(fma(wp.abs(z), NEARER, z), layer.nearest)
 
     @wp.func
     def averaged(layer: Layer):
-        """What the layer shows as one thing."""
+        """Attributes of the layer as one fragment: means weighted by optical depth."""
         attributes = layer.mean
         attributes.rgb = layer.mean.rgb / layer.tau
         attributes.z = layer.mean.z / layer.tau

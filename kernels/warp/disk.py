@@ -1,4 +1,4 @@
-"""What the disk p + u a + v b, u^2 + v^2 <= radius^2, can touch of a picture."""
+"""Image bounds of a disk p + u a + v b, u^2 + v^2 <= radius^2."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -75,7 +75,7 @@ def make_disk(real) -> SimpleNamespace:
 
     @wp.func
     def ellipse(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
-        """Image of a disk that lies wholly beyond the near plane, from its dual conic about the projected
+        """Image of a disk that is completely beyond the near plane, from its dual conic about the projected
         centre.
         """
         fx, fy = real(view.focal_x), real(view.focal_y)
@@ -93,7 +93,7 @@ def make_disk(real) -> SimpleNamespace:
 
     @wp.func
     def parallel(a: vec3, b: vec3, x: real, y: real, radius: real, view: View):
-        """Bounds of a disk whose centre parallel rays show at (x, y)."""
+        """Bounds of a disk in an orthographic image, with the projected centre (x, y)."""
         fx, fy = real(view.focal_x), real(view.focal_y)
         across, down = vec2(fx * a[0], fx * b[0]) * radius, vec2(fy * a[1], fy * b[1]) * radius
         return conic(x, y, wp.dot(across, across), wp.dot(down, down), wp.dot(across, down))
@@ -104,7 +104,7 @@ def make_disk(real) -> SimpleNamespace:
         shear = zero
         if qyy > zero:
             shear = qxy / qyy
-        # the pad has room for float32's rounding
+        # the pad covers the rounding of float32
         half_x = wp.sqrt(float(qxx))
         tip = float(0.0)
         if half_x > 0.0:

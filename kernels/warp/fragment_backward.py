@@ -74,7 +74,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
 
     @wp.func
     def loss_at(x: int, y: int, by: By, samples: Samples, background: wp.vec3, view: View):
-        """A pixel's; nothing beyond the picture."""
+        """Loss gradients of a pixel; zeros outside of the image."""
         loss = Loss()
         if x < view.width and y < view.height:
             pixel = y * view.width + x
@@ -109,8 +109,8 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
 
     @wp.func
     def opacity_at(s: Splat, column: int, row: int, light: float, view: View) -> float:
-        """What is drawn of the splat at a sample that this much light comes to, with blending's decisions: 0
-        where nothing is; -1 where that ends the sample's list without being drawn."""
+        """Opacity of a splat at a sample with transmittance `light`, with the decisions of the forward pass:
+        0 if it is not blended, -1 if it ends the sample's list without being blended."""
         opacity = float(0.0)
         if light > view.stop:
             c = crossed(s, float(column) - s.d[3], float(row) - s.c[0], view)

@@ -144,10 +144,12 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     def depth_of(
         lines: wp.array(dtype=wp.vec4), index: int, s: Splat, c: Intersection, inverse_d: float, printed: bool
     ) -> float:
-        """Depth of ray and plane within the splat's own range; the centre's where the ray meets no plane
-        beyond `near`. What lies outside of the circle with the radius of the disc, at least
-        2 ln 255, is mirrored at that circle, unless the splat is `printed` on a plane: the way from the
-        centre's depth is multiplied by the ratio of their rho.
+        """Depth of the ray-plane intersection, clamped to the splat's depth range; the centre's depth if the
+        ray does not intersect the plane beyond `near`.
+
+        Outside of the circle rho = max(2 ln 255, rho of the low-pass disc) the intersection is reflected at
+        the circle: the difference from the centre's depth is multiplied by the ratio of their rho. printed:
+        whether the splat has a coplanar group, whose depths are not reflected.
         """
         at = index * each
         center = line_of(lines, at + zc_line)[zc_lane]

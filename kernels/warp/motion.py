@@ -10,18 +10,16 @@ from .common import struct_of
 
 @wp.struct
 class Pose:
-    """What a picture's `View` says of where splats stand, for one group."""
+    """Camera pose relative to one group of splats."""
 
     rotation: wp.mat33d  # to camera
-    translation: wp.vec3d  # where the cloud's origin lies in the camera frame [m]
+    translation: wp.vec3d  # position of the cloud's origin in the camera frame [m]
     eye: wp.vec3d  # the camera's centre relative to the cloud's origin, axes of the group [m]
 
 
 @cache
 def make_motion(moves: bool) -> SimpleNamespace:
-    """Moving, which holds nothing where nothing moves, and group_of(moving, i): the group of a splat, -1 for
-    none.
-    """
+    """The struct Moving, empty without motion, and group_of(moving, i): the group of a splat, -1 for none."""
     fields = {
         "labels": wp.array(dtype=wp.int32),  # (n)
         "groups": wp.array(dtype=wp.int32),  # (groups) their labels

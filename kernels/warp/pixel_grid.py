@@ -1,4 +1,4 @@
-"""The samples of a pixel of the picture, and where they lie in sample buffers."""
+"""The samples of a pixel, and their indices in sample buffers."""
 
 import warp as wp
 
@@ -20,5 +20,5 @@ class PixelGrid:
 
 @wp.func
 def sample_at(grid: PixelGrid, k: int) -> int:
-    """Where sample k, 0 to count - 1, lies in a buffer."""
+    """Index of sample k, 0 to count - 1, in a buffer."""
     return grid.first + k / grid.side * grid.stride + k % grid.side

@@ -71,7 +71,7 @@ def make_project(
     def bounds_of(
         a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens
     ):
-        """Bounds of a disk, or of what a lens takes for its picture; x, y: where parallel rays show p."""
+        """Image bounds of a disk by any camera; x, y: projected centre for parallel rays."""
         if wp.static(parallel):
             return disk.parallel(a, b, x, y, radius, view)
         elif wp.static(ray_depths):
@@ -110,7 +110,7 @@ def make_project(
         number = at / views[0].splats
         view = views[reread(number)]
         i = at - number * view.splats
-        # copied, so that all are asked for at once; before anything is stored that they might alias
+        # loaded together, before the first store, which the compiler assumes to alias them
         opacity, size = float(opacities[i]), wp.vec2(scales[i])
         quat, center = wp.vec4(quats[i]), wp.vec3(means[i])
         keys[at] = CULLED

@@ -1,4 +1,4 @@
-"""Where each number of a visible splat's record lies."""
+"""Memory layout of the records of visible splats."""
 
 from collections.abc import Iterable
 
@@ -30,13 +30,12 @@ class Layout:
     """A record as lines of four floats: `lines` of them, and the place of each number.
 
     nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples from the centre of the anchor sample
-    (ax, ay); D is at
-    most d_near beyond the near plane. disc_x, disc_y: projected centre from the anchor's; z_numerator / D is
-    the depth. columns and rows hold first and end, 16 bits each, of the box of samples that it can touch.
-    Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z), and boxed is 1 of a box,
-    0 of another splat. For parallel rays plane_z0 + plane_zx x + plane_zy y is D times the depth, which is at
-    least plane_near. bulge is 2 / m^2 of a 3D Gaussian (ellipsoids.py), 0 of another splat. At last stands
-    what outputs add.
+    (ax, ay); D is at most d_near beyond the near plane. disc_x, disc_y: projected centre from the anchor's;
+    z_numerator / D is the depth. columns and rows hold first and end, 16 bits each, of the box of samples
+    that it can touch. Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z), and
+    boxed is 1 of a box, 0 of another splat. For parallel rays plane_z0 + plane_zx x + plane_zy y is D times
+    the depth, with a minimum of plane_near. bulge is 2 / m^2 of a 3D Gaussian (ellipsoids.py), 0 of another
+    splat. The fields of outputs follow.
     """
 
     def __init__(self, effects: Iterable[str], outputs: Iterable[str] = ()) -> None:

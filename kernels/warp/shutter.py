@@ -1,4 +1,5 @@
-"""A picture of several poses: their samples are gathered in buffers of the whole picture."""
+"""Accumulation of sub-frames: samples of the poses of a shutter are added up in buffers of the complete
+frame."""
 
 from functools import cache
 
@@ -9,14 +10,14 @@ from .common import STRICT
 
 @cache
 def make_expose(dtype):
-    """The kernel that adds a sample buffer of light, weighted, to that of the picture."""
+    """The kernel that adds the weighted light of a sub-frame's sample buffer to that of the frame."""
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def expose(
         first: int,  # sample of thread 0
         weight: float,
-        fresh: int,  # 1: nothing is there yet
-        start: int,  # sample of the picture that is the first of these rows
+        fresh: int,  # 1: overwrite the buffer, for the first sub-frame
+        start: int,  # sample of the frame that is the first of these rows
         raw: wp.array(dtype=dtype),
         exposed: wp.array(dtype=dtype),  # in and out
     ):

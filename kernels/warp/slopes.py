@@ -1,4 +1,4 @@
-"""How a point's place in the picture moves with the point, for each camera."""
+"""Derivatives of the image coordinates of a point by its position, for each camera."""
 
 from functools import cache
 
@@ -32,7 +32,7 @@ def make_slopes(camera: str | None, real):
 
     @wp.func
     def slopes_distorted(p: vec3, view: View, lens: Lens):
-        """The image is (x, y) radial(q) + ..., q = x^2 + y^2 of the ideal picture (lens.py)."""
+        """Derivatives of (x, y) radial(q) + ..., q = x^2 + y^2 in the undistorted image (lens.py)."""
         x, y = p[0] / p[2], p[1] / p[2]
         q = x * x + y * y
         k1, k2, k3 = real(lens.k[0]), real(lens.k[1]), real(lens.k[2])
@@ -75,7 +75,8 @@ def make_slopes(camera: str | None, real):
 
     @wp.func
     def slopes_panorama(p: vec3, view: View, lens: Lens):
-        """At a pole, where the longitude jumps, those of a point beside it, towards z."""
+        """Derivatives of a panorama. At a pole, where the longitude jumps, those of a point next to it
+        towards z."""
         away2 = wp.dot(p, p)
         x, z = p[0], p[2]
         if x * x + z * z < polar * polar * away2:

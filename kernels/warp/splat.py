@@ -1,4 +1,4 @@
-"""What a sample reads of a splat: of its record, wherever that lies."""
+"""The struct Splat: the parts of a splat's record that samples read, from global or shared memory."""
 
 from functools import cache
 from types import SimpleNamespace

@@ -49,19 +49,19 @@ def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
 
     @wp.func
     def depth_range(depth: real, reach: real, radius: real, near: real, plane: int, boxed: bool):
-        """Middle and half of the range of a splat's depths as blending bounds them. reach: of what is drawn;
-        plane: -1 for none."""
+        """Middle and half of the depth range of a splat's fragments. reach: half range of the rendered part;
+        plane: coplanar group, -1 for none."""
         middle, found = depth, reach
         if wp.static(screen):
-            # what the disc shows, whatever the cut-off
+            # the low-pass disc, which does not depend on the cut-off
             if not boxed:
                 found = reach * wp.max(one, range_radius / radius)
         if wp.static(k_buffered):
-            # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same at
-            # every cut-off
+            # fragments below 1/255 of the splat's opacity are clamped to the range of the others, so that the
+            # order does not depend on the cut-off
             found = reach * (range_radius / radius)
             if wp.static(layers):
-                # on the plane wherever any cut-off and a low-pass let it be drawn
+                # the plane out to a radius beyond every cut-off and low-pass
                 if plane >= 0:
                     found = reach * (plane_radius / radius)
             if wp.static(boxes_too):

@@ -120,20 +120,22 @@ def with_numbers(text: str, numbers: dict[str, int]) -> str:
 
 @wp.func_native(_ALONE)
 def alone() -> bool:
-    """Whether a block is one thread, which is told of all cells."""
+    """Whether a block is a single thread, which processes all cells."""
     ...
 
 
 def make_staging(layout: Layout, cells: int, items: int) -> SimpleNamespace:
-    """pool; then, for each batch, stage, mark, listed; place and line. For records of this layout, of tiles
-    of so many cells, each drawn by so many threads of a warp.
+    """Functions that stage batches of records in shared memory: pool; for each batch stage, mark and listed;
+    place and line.
+
+    layout: of the records. cells: per tile. items: threads of a warp per cell.
     """
-    # lists lie in different banks, word by word
+    # words of a list are in different banks
     numbers = {"SPLATS": STAGED, "LINES": layout.lines, "CELLS": cells, "ITEMS": items, "STRIDE": STAGED + 4}
 
     @wp.func_native(with_numbers(_POOL, numbers))
     def pool() -> wp.uint64:
-        """Where all that is the block's lies in shared memory."""
+        """Address of the block's shared memory."""
         ...
 
     @wp.func_native(with_numbers(_STAGE, numbers))

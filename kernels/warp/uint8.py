@@ -1,4 +1,4 @@
-"""An image as 8 bits, when somebody reads it so: bit for bit `to_uint8` of fidsplat/images/files.py."""
+"""Conversion of an image to 8 bits on the device, bit-identical to `to_uint8` of fidsplat/images/files.py."""
 
 import warp as wp
 

@@ -1,5 +1,5 @@
-"""The splat of the largest weight, -1 for none, and where what has it is no splat: labels and splat ids are
-this one's. No output by itself."""
+"""The splat with the largest weight, read by `label` and `splat_id`; -1 for none, and if an external depth
+image has the largest weight. It has no output image."""
 
 from typing import Any
 

@@ -1,6 +1,6 @@
-"""Upper bound of what float32 changes in a pixel's colour, per unit of colour, of pictures without a
-transmittance stop: kernels/opencl/output/rounding.cl has the same, and
-fidsplat/render/certified_error.py the derivation."""
+"""Upper bound of the float32 rounding error of a pixel's colour, per unit of colour, in frames without a
+transmittance stop. kernels/opencl/output/rounding.cl is the same; fidsplat/render/certified_error.py has the
+derivation."""
 
 from typing import Any
 

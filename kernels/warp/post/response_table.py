@@ -1,4 +1,4 @@
-"""Response: straight lines between the values of a table, which stand at even steps of light from 0 to 1."""
+"""Response: linear interpolation in a table of values at equal steps of light from 0 to 1."""
 
 from typing import Any
 
