@@ -16,7 +16,7 @@ IMAGES = HERE.parent / "docs" / "images"
 
 
 def save(sheet: Path, name: str) -> None:
-    """As JPEG with its colours at full resolution, so that edges of markers stay sharp."""
+    """Write a JPEG without chroma subsampling, so that edges of markers stay sharp."""
     image = cv2.imread(str(sheet))
     assert image is not None
     wanted = [

@@ -64,7 +64,7 @@ def room(mixture: str) -> fs.Scene:
 
 
 def save(file: Path, image: np.ndarray) -> None:
-    """As JPEG with its colours at full resolution: edges of markers are what these pictures are about."""
+    """Write a JPEG without chroma subsampling, so that edges of markers stay sharp."""
     wanted = [
         cv2.IMWRITE_JPEG_QUALITY,
         88,

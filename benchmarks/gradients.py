@@ -36,7 +36,7 @@ from fidsplat.util.timing import Timer, time_interleaved
 
 
 def errors(backend: Backend, scenes: int) -> list[dict[str, float | str]]:
-    """Of each parameter the median and the largest error of all scenes."""
+    """Median and largest error of each parameter over all scenes."""
     reference, found, beyond = ReferenceBackend(), defaultdict(list), defaultdict(list)
     for seed in track(range(scenes), "Scenes", console=PROGRESS):
         cloud, capture = random_picture(seed)

@@ -57,7 +57,7 @@ def camera_of(view: int) -> fs.Camera:
 
 
 def digest(frame: fs.Frame) -> str:
-    """Of all images of a frame."""
+    """SHA-256 of all images of a frame."""
     state = hashlib.sha256()
     for name in frame:
         state.update(np.ascontiguousarray(frame[name]).tobytes())

@@ -39,7 +39,7 @@ ITS_OUTPUTS = "rgb", "alpha", "normal", "depth_median"
 
 
 def on_gpu(array: np.ndarray) -> torch.Tensor:
-    """As float32."""
+    """Convert to float32."""
     return torch.tensor(np.asarray(array, np.float32), device="cuda")
 
 

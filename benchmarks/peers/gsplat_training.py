@@ -136,7 +136,7 @@ class Peer:
 
 
 class AuthorsPeer(Peer):
-    """As `Peer`, drawn by the 2DGS authors' rasterizer; principal points are the pictures' middles there."""
+    """gsplat's training with the rasterizer of the 2DGS authors, whose principal points are image centres."""
 
     resets = True
 

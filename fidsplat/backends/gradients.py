@@ -43,12 +43,12 @@ class DifferentiableImages:
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds by stage, those of `backward` among them."""
+        """Milliseconds by stage, including the stages of `backward`."""
         return self.images.timings
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """As of every picture."""
+        """Numbers of splats, visible splats and pairs."""
         return self.images.stats
 
 
@@ -67,7 +67,7 @@ def check_shape(name: str, given: tuple[int, ...], view: View) -> None:
 
 
 def on_host(array: Any) -> np.ndarray:
-    """An array of a device as NumPy's float32, whose memory no later picture changes."""
+    """A device array as a float32 NumPy array that later frames do not overwrite."""
     if hasattr(array, "get"):
         return np.asarray(array.get(), np.float32)
     if hasattr(array, "numpy"):  # of a wp.array on the CPU that is its own memory

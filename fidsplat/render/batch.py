@@ -63,7 +63,7 @@ class FrameBatch(Mapping):
         """One view as a Frame, without timings and stats. Images are copied to the host on first use.
 
         Raises:
-            InputError: there is no such view.
+            InputError: the number of the view is out of range.
         """
         if (
             isinstance(number, bool)

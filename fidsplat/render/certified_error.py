@@ -11,15 +11,15 @@ ceiling and with a cut-off e of `UNLISTED` / n, n the number of splats. Then
 where the first term is measured, so that it holds whatever the quality leaves out, and the second is bounded:
 
 1. Compositing is affine in each opacity: d C / d alpha_k = T_k (c_k - B_k), with T_k the transmittance in
-   front of fragment k and B_k what lies behind it, a mean of colours and background. Replacing the opacities
+   front of fragment k and B_k the colour behind it, a mean of colours and background. Replacing the opacities
    of Q by exact ones, one after the other from the back, moves a colour by at most sum_k T_k |d alpha_k| R,
    with T_k of Q and R the range of the colours.
 2. A fragment that Q leaves out has an opacity below e. There are at most n: n e R = `UNLISTED` R. Footprints
-   grow with sqrt(ln(1 / e)) alone, so that Q has about twice the fragments of the default.
+   grow only with sqrt(ln(1 / e)), so that Q has about twice the fragments of the default.
 3. A fragment of Q has an opacity between those that interval arithmetic over the rounding of its forms gives,
-   also where rounding decides whether it is drawn at all (near plane, horizon, rim). Kernels add up T_k times
+   also where rounding decides whether it is rendered (near plane, horizon, rim). Kernels add up T_k times
    the distance to the further end: the output `rounding` (kernels/opencl/output/rounding.cl).
-4. Each product of a transmittance is rounded, which moves what lies behind it, at most 2^-24 T C, and each
+4. Each product of a transmittance is rounded, which changes the colour behind it, at most 2^-24 T C, and each
    sum of colours, at most 2^-24 (1 - T) C, C the largest absolute colour: 2^-24 C for each fragment, which
    `rounding` counts too. Resolving, and the colours of spherical harmonics, add `resolving` units.
 
@@ -110,7 +110,7 @@ class Ideal:
     features: FeatureSet
     view: View
     span: float
-    """range of all colours, and at least the largest absolute one"""
+    """range of all colours, or the largest absolute colour if that is larger"""
     off: float
     """bound per unit of colour, in addition to that of the output `rounding` where it is rendered"""
 

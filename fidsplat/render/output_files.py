@@ -25,11 +25,11 @@ _PICTURES = {
     "label": label_picture,
     "count": count_picture,
 }
-"""picture of an image, by `Output.display`"""
+"""8-bit visualisation of an output image, by `Output.display`"""
 
 
 def suffixes_of(name: str) -> tuple[str, ...]:
-    """File suffixes of an output, in the order in which `save_output` writes them; the last is a picture."""
+    """File suffixes of an output in the order of `save_output`; the last is a viewable PNG."""
     output = declared_output(name)
     if output.display == "depth":
         return (".npy", ".png", "-turbo.png")
@@ -71,7 +71,7 @@ def load_output(file: Path, shape: tuple[int, int]) -> np.ndarray:
 
 
 def picture_of(name: str, image: np.ndarray) -> np.ndarray:
-    """Picture of an output image, (h, w) or (h, w, 3)."""
+    """8-bit visualisation of an output image, (h, w) or (h, w, 3)."""
     return _PICTURES[declared_output(name).display](image)
 
 

@@ -63,7 +63,7 @@ class Renderer:
             cloud: slower, with bit-identical images.
 
     Raises:
-        DeviceError: the device cannot be used; UnknownDeviceError: there is no such device.
+        DeviceError: the device cannot be used; UnknownDeviceError: no device has this name.
         InputError: the memory budget is not a positive integer, or the device does not support one.
     """
 
@@ -313,7 +313,7 @@ class Renderer:
         groups: Mapping[int, Any] | None = None,
         mask: Any = None,
     ) -> FrameBatch:
-        """Render many views of one cloud at once. View i is bit-identical to `render` alone.
+        """Render many views of one cloud at once. View i is bit-identical to `render` of that view.
 
         The exception are stores with `Quality.detail_error` above 0: the view with the highest demand
         selects the levels of detail of all views.

@@ -52,7 +52,7 @@ class Detection:
 
     @property
     def name(self) -> str:
-        """As a marker spec says it: "apriltag:36h11:5", "qr:some text"."""
+        """Marker spec of the code: "apriltag:36h11:5", "qr:some text"."""
         return f"{self.kind}:{self.payload if self.id is None else f'{self.family}:{self.id}'}"
 
 

@@ -89,7 +89,7 @@ def test_depths_change_steadily_as_a_splat_turns_through_edge_on(renderer):
 
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 def test_fog_does_not_depend_on_the_cut_off(renderer, order):
-    """Of one splat the cut-off takes away at most itself, in fog as without."""
+    """The cut-off changes a single splat by at most the cut-off, with fog and without."""
     camera, cut_off = fs.Camera.pinhole(65, 49, 60.0, 60.0, 32.5, 24.5), 1e-4
     for tilt in (5e-9, 1e-5, 1e-3, 0.02):
         wide, narrow = (

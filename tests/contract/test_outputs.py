@@ -106,8 +106,8 @@ def test_ties_go_to_what_is_nearer(renderer):
 
 
 def test_a_pixel_ends_at_the_stop_whatever_its_neighbours_do(renderer):
-    """Of three layers that take half of the light each, the second covers the middle alone, which ends there
-    with exactly a quarter; the others go on to the third."""
+    """Three layers have an opacity of 1/2; the second covers only the middle pixel, which stops there at a
+    transmittance of exactly 1/4. The other pixels continue to the third."""
     quality = fs.Quality(opacity_ceiling=0.5, transmittance_stop=0.25, lowpass="none", alpha_cutoff=0.4)
     wide = layers_of([1, 1, 1])
     scales = wide.scales.copy()
@@ -267,7 +267,7 @@ def test_haze_is_told_of_once_it_covers_enough(renderer, opacity, count, seen):
 
 
 def test_faint_fragments_behind_do_not_move_the_median(renderer):
-    """Of half-transparent things the last that shows is the median, not a rim of 1/1000 far behind it."""
+    """The median is the last half-transparent layer, not a fragment of opacity 1/1000 far behind it."""
     cloud = layers_of([0.2, 0.1, 1e-3, 1e-3])
     frame = renderer.render(cloud, POINT, ALL)
     assert frame["blended"][2, 2] == 4

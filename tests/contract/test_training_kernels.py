@@ -30,7 +30,7 @@ ORIGIN = np.array([30.0, -20.0, 12.0])
 
 @pytest.fixture(scope="module")
 def views():
-    """Of three sizes, none a multiple of a vector; the second has a mask, the third is more than one piece on
+    """Views of three sizes, not multiples of a vector; the second has a mask, the third has several pieces on
     CPUs."""
     sizes = (11, 9), (31, 18), (53, 71)
     small, wide, large = (scene(views=2, held_out=0, size=size).views[0] for size in sizes)
@@ -89,7 +89,8 @@ def agree(device, host, rtol=2e-5, atol=2e-6):
 
 @pytest.mark.parametrize(("weight", "lanes"), [(0.0, 0), (0.2, 0), (1.0, 0), (0.2, 1)])
 def test_loss(renderer, views, works, weight, lanes):
-    """Of pictures of two sizes in turn, as planes are kept, against float64; also one by one, as on GPUs."""
+    """Compare with float64 for images of two alternating sizes, whose buffers are reused; lanes=1 as on
+    GPUs."""
     work, _ = works(lanes, dssim_weight=weight)
     random = np.random.default_rng(1)
     for number in (0, 1, 0, 2):

@@ -187,7 +187,8 @@ def pocl_that_mistakes(record):
 
 @pytest.fixture
 def record(monkeypatch):
-    """Of a PoCL that has taken the processor for none that it knows; and what it keeps alive."""
+    """Device record of a PoCL that does not recognise the processor; its attribute keeps the strings
+    alive."""
     words = [ctypes.create_string_buffer(text) for text in (b"x86_64-unknown-linux-gnu", b"generic")]
     made = (ctypes.c_uint64 * 512)(*map(ctypes.addressof, words))
     made.kept = words

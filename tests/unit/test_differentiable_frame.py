@@ -44,7 +44,7 @@ def screw(matrix):
 
 @pytest.mark.parametrize("pose", POSES)
 def test_derivatives_by_a_pose_are_those_of_central_differences(pose):
-    """Of what follows a motion, by the motion's own numbers."""
+    """Gradient by a pose offset that is applied after a motion, compared with central differences."""
     by_motion, step = np.array([0.3, -1.2, 0.7, 2.0, 0.5, -0.9]), 1e-6
     back = np.linalg.inv(motion(pose))
     for k, found in enumerate(offset_gradient(by_motion, pose)):

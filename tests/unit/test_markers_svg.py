@@ -234,7 +234,7 @@ def test_a_drawing_in_a_scene_file_is_beside_it(tmp_path):
 
 
 def test_shapes_that_touch_the_sheet_leave_no_lines(tmp_path):
-    """The first lies beside the sheet and shares an edge with it."""
+    """The first shape is outside of the sheet and shares an edge with it."""
     made = drawn(tmp_path, '<rect x="-5" width="5" height="9" fill="red"/><circle cx="9" cy="9" r="5"/>')
     assert set(map(tuple, made.cloud.colors[:, :3])) == {(0, 0, 0), (1, 1, 1)}
 
