@@ -78,7 +78,7 @@ def test_a_frame_is_its_arrays(way, renderer):
 @pytest.mark.parametrize("way", WAYS)
 def test_what_holds_a_device(way):
     renderer = fs.Renderer("reference")
-    for held, words in ((renderer, "a Renderer holds"), (renderer.upload(CLOUD), "pickle the SplatC")):
+    for held, words in ((renderer, "a Renderer holds"), (renderer.upload(CLOUD), "pickled or copied")):
         with pytest.raises(fs.InputError, match=words):
             WAYS[way](held)
 
