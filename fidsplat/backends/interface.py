@@ -519,7 +519,7 @@ class Backend(ABC):
         """Access to the device for tests."""
         raise DeviceError(self.lacks("have a probe", "use an OpenCL or Warp device"))
 
-    def geometry(self, kind: str) -> dict[str, Any]:
+    def shapes(self, kind: str) -> dict[str, Any]:
         """Other build constants, by name, for tests.
 
         kind: `tiles`, other tile sizes, bit-identical; `schedule`, the schedule of a GPU (on a GPU: other

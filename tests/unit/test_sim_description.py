@@ -154,7 +154,7 @@ def test_a_model_that_includes_itself(tmp_path):
 def test_files_that_are_not_there_and_xacro(tmp_path):
     with pytest.raises(fs.InputError, match=r"cannot read .*none\.sdf"):
         read_description(tmp_path / "none.sdf")
-    with pytest.raises(fs.InputError, match=r"a path must be text or a pathlib\.Path, got 5"):
+    with pytest.raises(fs.InputError, match=r"a path must be text without NUL, or a pathlib\.Path, got 5"):
         read_description(5)  # type: ignore[arg-type]
     (tmp_path / "r.xacro").write_text(
         '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="r"><xacro:property name="a"/></robot>'

@@ -81,7 +81,7 @@ def test_a_scene_file_that_is_edited_keeps_the_quality_that_was_given(flight, mo
 def test_what_is_no_run_is_said(flight, capsys):
     (flight.parents[1] / "scene.toml").unlink()
     for folder, words in (
-        (flight, "the scene ../../scene.toml of the flight"),
+        (flight, "the scene of the flight"),
         (flight.parent, "a folder to view must hold"),
     ):
         assert main(["view", str(folder)]) == 2
