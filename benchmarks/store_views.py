@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 import resource
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +64,7 @@ def further(camera: fs.Camera) -> fs.Camera:
     """The camera moved by 1 % of its distance from the ground."""
     pose = camera.world_to_camera.copy()
     pose[0, 3] += 0.01 * abs(camera.position[1])
-    return replace(camera, world_to_camera=pose, position=None)
+    return camera.with_pose(pose)
 
 
 def timed(renderer: fs.Renderer, resident, capture: fs.Capture) -> tuple[np.ndarray, list[float], dict]:

@@ -12,7 +12,6 @@ launches.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
@@ -35,7 +34,7 @@ def trainer_of(name: str, renderer: fs.Renderer, degree: int, steps: int) -> Tra
     aside[0, 3] = 0.1
     views = [
         TrainingView(f"{i}", each, to_uint8(renderer.render(other, each)["rgb"]))
-        for i, each in enumerate((camera, replace(camera, world_to_camera=aside, position=None)))
+        for i, each in enumerate((camera, camera.with_pose(aside)))
     ]
     points = np.array([[0.0, 0.0, 8.0]])
     dataset = Dataset(name, tuple(views), (), points, np.zeros((1, 3), np.uint8))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -122,7 +122,7 @@ class Motion:
         instance("the camera of a motion", camera, Camera)
         pose = self.camera_at(time)
         # the position follows from the pose
-        return camera if pose is None else replace(camera, world_to_camera=pose, position=None)
+        return camera if pose is None else camera.with_pose(pose)
 
     def groups_at(self, time: float) -> list[tuple[int, np.ndarray]]:
         """(label, motion (4, 4)) then, of each group."""

@@ -2,7 +2,7 @@
 
 import math
 import operator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -176,6 +176,32 @@ class Camera(PickledByFields):
         f = focal_length(width, fov_x)
         pose = look_at_matrix(position, target, up)
         return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, position)
+
+    def with_pose(self, world_to_camera=None, *, position=None, target=None, up=(0.0, -1.0, 0.0)) -> "Camera":
+        """The same camera (size, intrinsics, lens, near, far) at another pose.
+
+        Args:
+            world_to_camera: (4, 4), rigid. Instead of the others.
+            position: (3,) metres, centre of projection; by default the camera's own.
+            target: (3,) metres, a point on the new optical axis; without it the rotation stays.
+            up: (3,) world direction that points up in the image, with a target.
+
+        Raises:
+            InputError: no pose, two poses, or one that is not rigid.
+        """
+        if (world_to_camera is None) == (position is None and target is None):
+            raise InputError(
+                "the pose of a camera must be given as world_to_camera, or as position, target or both, got "
+                + ("none of them" if world_to_camera is None else "both")
+            )
+        if world_to_camera is not None:
+            return replace(self, world_to_camera=world_to_camera, position=None)
+        position = self.position if position is None else _vector("position", position)
+        if target is not None:
+            return replace(self, world_to_camera=look_at_matrix(position, target, up), position=position)
+        pose = self.world_to_camera.copy()
+        pose[:3, 3] = -pose[:3, :3] @ position
+        return replace(self, world_to_camera=pose, position=position)
 
     @property
     def matrix(self) -> np.ndarray:

@@ -59,7 +59,7 @@ def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, i
     seen = corners @ pose[:3, :3].T + pose[:3, 3]
     if seen[:, 2].min() <= camera.near or pose[:3, 2] @ pose[:3, 3] <= 0:
         return None
-    pixels = replace(camera, world_to_camera=np.eye(4), position=None).project(seen)
+    pixels = camera.with_pose(np.eye(4)).project(seen)
     low = np.maximum(np.floor(pixels.min(0)).astype(int), 0)
     high = np.minimum(np.ceil(pixels.max(0)).astype(int), (camera.width, camera.height))
     return (*low.tolist(), *high.tolist()) if (low < high).all() else None

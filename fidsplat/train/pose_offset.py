@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from fidsplat.cameras import Camera
@@ -17,7 +15,7 @@ def offset_camera(camera: Camera, offset: np.ndarray) -> Camera:
     """The camera after a motion (6,) in its own axes: rotation vector [rad], then translation [m]."""
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = _rotation(offset[:3]), offset[3:]
-    return replace(camera, world_to_camera=motion @ camera.world_to_camera, position=None)
+    return camera.with_pose(motion @ camera.world_to_camera)
 
 
 def offset_gradient(by_pose: np.ndarray, offset: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Boards of tags: one pose from all detected tags."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -58,7 +57,7 @@ def board_pose(
     pose = plane_pose(at, on, camera)
     if not np.isfinite(pose).all():
         return None, left
-    standing = replace(camera, world_to_camera=np.eye(4), position=None)
+    standing = camera.with_pose(np.eye(4))
     corners = standing.project(marker.corners @ pose[:3, :3].T + pose[:3, 3])
     text = f"{spec.columns}x{spec.rows}:{family}"
     return (Detection(spec.kind, family, None, text, corners), pose), left

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -99,7 +99,7 @@ def mount() -> np.ndarray:
 
 def camera_at(camera: Camera, robot: np.ndarray) -> Camera:
     """The camera for a pose of the robot."""
-    return replace(camera, world_to_camera=np.linalg.inv(robot @ mount()), position=None)
+    return camera.with_pose(np.linalg.inv(robot @ mount()))
 
 
 def drive(mjcf: str, path: np.ndarray, speed: float = 0.5, errors: Errors | None = None) -> Run:

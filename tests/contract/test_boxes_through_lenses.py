@@ -96,7 +96,7 @@ def seen_from(camera, tilt, distance, spin=20.0):
     target = np.array((0.11, 0.07, 0.0))
     away = np.array([math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), -math.cos(a)])
     pose = fs.Camera.look_at(64, 48, 1.0, target + distance * away, target + 0.1 * distance * np.eye(3)[0])
-    return replace(camera, world_to_camera=pose.world_to_camera, position=None)
+    return camera.with_pose(pose.world_to_camera)
 
 
 def widened(camera):

@@ -62,7 +62,7 @@ def test_measured_qualities_have_a_key_of_every_ingredient(renderer, monkeypatch
         "fx": {"capture": replace(CAMERA, fx=20.5)},
         "fy": {"capture": replace(CAMERA, fy=20.5)},
         "size": {"capture": replace(CAMERA, width=25)},
-        "pose": {"capture": replace(CAMERA, world_to_camera=np.eye(4) + np.eye(4, k=3), position=None)},
+        "pose": {"capture": CAMERA.with_pose(np.eye(4) + np.eye(4, k=3))},
         "near": {"capture": replace(CAMERA, near=0.5)},
         "lens": {"capture": replace(CAMERA, lens=fs.BrownConrady(k1=0.1))},
         "background": {"capture": capture.with_(background=(0.0, 0.0, 0.1))},

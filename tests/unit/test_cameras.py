@@ -105,6 +105,48 @@ def test_a_position_of_another_pose():
         fs.Camera.pinhole(64, 48, 50, 50, 32, 24, np.eye(4), position=(0, 0, 1))
 
 
+POSED = fs.Camera.pinhole(
+    64, 48, 90.0, 91.0, 20.0, 30.0, near=0.2, far=9.0, lens=fs.BrownConrady(k1=-0.1)
+).with_pose(position=(1, 2, -3), target=(0, 0, 0))
+
+
+def test_another_pose_by_a_matrix():
+    matrix = look_at_matrix((3, 1, 2), (0, 0, 1))
+    camera = POSED.with_pose(matrix)
+    assert (camera.world_to_camera == matrix).all()
+    np.testing.assert_allclose(camera.position, (3, 1, 2))
+    for name in ("width", "height", "fx", "fy", "cx", "cy", "near", "far", "lens"):
+        assert getattr(camera, name) == getattr(POSED, name)
+
+
+def test_another_pose_by_position_and_target():
+    far = (1e7 + 1 / 3, 5.0, -3.0)
+    camera = POSED.with_pose(position=far, target=(1e7, 0, 0), up=(0, 0, 1))
+    assert camera.position.tolist() == list(far)  # the pose has rounded it
+    np.testing.assert_allclose(camera.world_to_camera, look_at_matrix(far, (1e7, 0, 0), (0, 0, 1)))
+    moved = POSED.with_pose(position=(9, 9, 9))
+    assert (moved.world_to_camera[:3, :3] == POSED.world_to_camera[:3, :3]).all()
+    assert moved.position.tolist() == [9, 9, 9]
+    turned = POSED.with_pose(target=(5, 5, 5))
+    assert (turned.position == POSED.position).all()
+    np.testing.assert_allclose(turned.project([[5, 5, 5]]), [[POSED.cx, POSED.cy]])
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        ({}, "got none of them"),
+        ({"world_to_camera": np.eye(4), "position": (0, 0, 0)}, "got both"),
+        ({"world_to_camera": 2 * np.eye(4)}, "world_to_camera"),
+        ({"position": (0, 0)}, "camera position must be three numbers"),
+        ({"position": (0, 0, 1), "target": (0, 0, 1)}, "the same point"),
+    ],
+)
+def test_poses_that_are_refused(pose, words):
+    with pytest.raises(fs.InputError, match=words):
+        POSED.with_pose(**pose)
+
+
 def test_frozen():
     pose = np.eye(4)
     camera = fs.Camera.pinhole(4, 4, 1, 1, 2, 2, pose)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import string
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -95,7 +95,7 @@ def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, Be
         return {name: BenchScene(about, lambda: (scene.cloud(), camera))}
     poses = path.inverse().poses
     some = sorted({round(k) for k in np.linspace(0, len(poses) - 1, min(len(poses), MOST_VIEWS))})
-    views = {k: replace(camera, world_to_camera=poses[k], position=None) for k in some}
+    views = {k: camera.with_pose(poses[k]) for k in some}
     return {
         f"{name}@{k}": BenchScene(f"{about}, pose {k}", lambda view=view: (scene.cloud(), view))
         for k, view in views.items()
