@@ -65,7 +65,7 @@ class FrameBuffers:
     """words of `Counts`"""
     raw: cl.Buffer
     """samples (4, s) float32: r, g, b, transmittance"""
-    slots: cl.Buffer
+    batch_indices: cl.Buffer
     """index of each view in the output images (v) uint32"""
     termination_depths: cl.Buffer
     """termination depth of each tile (t) uint32"""
@@ -281,12 +281,12 @@ class DeviceFrame:
         pixels = (view.height // view.samples) * (view.width // view.samples)
         for output in outputs:
             self.lease(f"{output.name}_out", 4 * pixels * output.channels)
-        self.put("slots", self.batch.batch_indices)
+        self.put("batch_indices", self.batch.batch_indices)
 
     def bind_images(self, images: dict[str, cl.Buffer]) -> None:
         """Bind the output images of the batch of which these views are a part."""
         self.named |= images
-        self.put("slots", self.batch.batch_indices)
+        self.put("batch_indices", self.batch.batch_indices)
 
     def put_view(self, row: int, end: int) -> None:
         """Copy the uniforms of the projection for the requested ones of rows of samples [row, end)."""

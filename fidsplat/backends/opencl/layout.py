@@ -190,7 +190,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "int width height  // of the image",
         "int stride  // samples per row of raw",
         "uint channel_stride  // samples per channel of raw, of all views",
-        "in uint slots  // index of each view in the output images",
+        "in uint batch_indices  // index of each view in the output images",
         *("float background_r background_g background_b", "in float raw"),
     ),
     # derivatives

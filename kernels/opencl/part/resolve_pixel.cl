@@ -13,7 +13,7 @@
         }
     const float mean = 1.0f / (SAMPLES * SAMPLES);
     t *= mean;
-    size_t out = ((size_t)slots[number] * height + y) * width + x;
+    size_t out = ((size_t)batch_indices[number] * height + y) * width + x;
     rgb_out[3 * out] = FMA(t, background_r, r * mean);
     rgb_out[3 * out + 1] = FMA(t, background_g, g * mean);
     rgb_out[3 * out + 2] = FMA(t, background_b, b * mean);
