@@ -130,7 +130,6 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     import numpy as np
 
     import fidsplat as fs
-    from fidsplat.backends.batched_views import ViewBatch
     from fidsplat.backends.view import View
     from fidsplat.effects import select
     from fidsplat.scenes.random_clouds import random_splats
@@ -151,7 +150,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
             features = select(cloud, fs.Capture(outputs=outputs, quality=chosen))
             view = View.of(fs.Capture(view_from, quality=chosen, background=(0.1, 0.2, 0.3)), cloud.origin)
             backend.pair_budget, kept = budget or backend.pair_budget, backend.pair_budget
-            planes = backend.pipeline(features, shape).render(backend.upload(cloud), ViewBatch.single(view))
+            planes = backend.pipeline(features, shape).render_view(backend.upload(cloud), view)
             drawn = {name: planes.read(name, 0) for name in ("rgb", *features.outputs)}
             backend.pair_budget = kept
             truth = reference_images(FrameSpec(cloud, view_from, chosen, outputs))

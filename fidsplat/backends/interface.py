@@ -51,8 +51,6 @@ class DeviceTraits:
 
     adopts_arrays: bool = False
     """`Backend.adopt`"""
-    renders_pixel_subsets: bool = False
-    """`Pipeline.render_every`"""
     caches_chunks: bool = False
     """`Backend.chunk_cache`"""
     termination_depths: bool = False
@@ -156,7 +154,7 @@ class ChunkCache(ABC):
         another thread."""
 
 
-class Images:
+class Images(ABC):
     """Output images of one or several views, on the device until they are read.
 
     Views that are masked out hold `Output.blank`.
@@ -171,10 +169,10 @@ class Images:
     shares_arrays: bool = False
     """whether arrays of `device_array` can be exchanged by DLPack"""
 
+    @abstractmethod
     def read(self, name: str, index: int | None = None) -> np.ndarray:
         """Copy images to the host, in the type of `OUTPUTS[name]`: (views, h, w) or (views, h, w, channels);
         with an index the image of this view, (h, w) or (h, w, channels)."""
-        raise NotImplementedError
 
     def read_float64(self, name: str, index: int | None = None) -> np.ndarray:
         """Copy images to the host in float64, not rounded where they were computed so."""
@@ -201,7 +199,7 @@ class Images:
             "render with device='warp:cuda' or 'warp:cpu', or take frame[name], which is copied to the host"
         )
 
-    def wait(self) -> None:
+    def wait(self) -> None:  # noqa: B027 (optional)
         """Wait until the device has rendered them."""
 
 
@@ -269,37 +267,26 @@ def summed(counts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     return sums
 
 
-class Pipeline:
+class Pipeline(ABC):
     """The stages compiled for one FeatureSet."""
 
+    @abstractmethod
+    def render_view(self, resident: Any, view: View) -> Images:
+        """Render one view of an uploaded cloud."""
+
     def render(self, resident: Any, views: ViewBatch) -> Images:
-        """Render the views of an uploaded cloud, each bit-identical to itself alone. By default one after
-        another."""
-        if views.is_single:
-            return self.render_view(resident, views.one(0))
+        """Render several views, each bit-identical to itself alone. By default one after another."""
         each = enumerate(views.batch_indices.tolist())
         rendered = {index: self.render_view(resident, views.one(number)) for number, index in each}
         return SeparateImages(rendered, views, resident.count)
-
-    def render_view(self, resident: Any, view: View) -> Images:
-        """Render one view, on devices that render views one after another."""
-        raise NotImplementedError
-
-    def render_every(
-        self, resident: Any, view: View, step: int, progress: Callable[[float], object] | None = None
-    ) -> Images:
-        """Render every step-th pixel in both directions, starting with the first: images of
-        (ceil(h / step), ceil(w / step)), bit-identical to those pixels of `render`. progress: called with the
-        completed share, 0 to 1."""
-        raise NotImplementedError
 
     def fits(self, resident: Any, view: View) -> bool:
         """Whether the frame fits the memory budget without rendering the cloud in chunks."""
         return True
 
     def trace(self, resident: Any, view: View) -> dict[str, np.ndarray]:
-        """Render one view and return the data between the stages, for tests."""
-        raise NotImplementedError
+        """Render one view and return the data between the stages, for tests; empty by default."""
+        return {}
 
 
 class GradientPipeline(ABC):
@@ -348,9 +335,9 @@ class GradientPipeline(ABC):
         """
 
     def backward_to_tiles(self, images: Any, gradients: Mapping[str, Any]) -> Any:
-        """`backward` up to the sums over tiles, whose result `TrainingKernels.step` accepts; its method
-        `gradients` completes it. Only on devices that train."""
-        raise NotImplementedError
+        """Gradients in the form that `TrainingKernels.step` of the device accepts; by default those of
+        `backward`."""
+        return self.backward(images, gradients)
 
 
 class TrainingKernels(ABC):
@@ -463,6 +450,19 @@ class Backend(ABC):
         Raises:
             DeviceError: what is `unsupported`; or the compiler fails.
         """
+
+    def render_every(
+        self,
+        pipeline: Any,
+        resident: Any,
+        view: View,
+        step: int,
+        progress: Callable[[float], object] | None = None,
+    ) -> Images:
+        """Render every step-th pixel in both directions, starting with the first: images of
+        (ceil(h / step), ceil(w / step)), bit-identical to those pixels of a complete frame. progress: called
+        with the completed share, 0 to 1."""
+        raise InputError(self.lacks("render subsets of pixels", "use device='reference', or render"))
 
     def unsupported(self, features: FeatureSet) -> str:
         """Error message naming the features that the device cannot render; empty if it renders all."""

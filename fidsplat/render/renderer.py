@@ -10,7 +10,6 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import DeviceInfo, Images, Pipeline
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import FIRST, open_backend
@@ -40,7 +39,7 @@ _PLAIN = Capture()
 
 
 def _render_view(pipeline: Pipeline, data: Any, view: View) -> Images:
-    return pipeline.render(data, ViewBatch.single(view))
+    return pipeline.render_view(data, view)
 
 
 def default_device() -> str:
@@ -228,11 +227,7 @@ class Renderer:
         requested = _requested(scene, capture, outputs=outputs, quality=quality)
 
         def render_subset(pipeline: Pipeline, data: Any, view: View) -> Images:
-            if not self.backend.traits.renders_pixel_subsets:
-                raise InputError(
-                    self.backend.lacks("render subsets of pixels", "use device='reference', or render")
-                )
-            return pipeline.render_every(data, view, step, progress)
+            return self.backend.render_every(pipeline, data, view, step, progress)
 
         return self._render(self._resident(scene), requested, render_subset)
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
@@ -183,9 +182,9 @@ def f5(renderer: Renderer) -> Found:
     cloud = SplatCloud.concatenate([crowded, random_splats(60, 66, depth=(1.5, 6.0), scale=(0.05, 0.5))])
     features, view = prepare(cloud, Capture(VIEW, ALL_OUTPUTS, background=(0.1, 0.2, 0.3)))
     resident = backend.upload(cloud)
-    base = backend.pipeline(features).render(resident, ViewBatch.single(view))
+    base = backend.pipeline(features).render_view(resident, view)
     (schedule,) = backend.shapes("schedule").values()
-    other = backend.pipeline(features, schedule).render(resident, ViewBatch.single(view))
+    other = backend.pipeline(features, schedule).render_view(resident, view)
     for name in ("rgb", "alpha", "depth"):
         error = np.abs(other.read(name) - base.read(name)).max()
         yield Finding(f"{name}: difference between schedules", float(error), 5e-6)

@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Backend, Images, Pipeline, ResidentData
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.termination_depth import TerminationDepths
@@ -80,9 +79,7 @@ class Residency:
             culling_pipeline = backend.pipeline(with_termination_depths(features))
 
             def render_band(band: Band, first_id: int) -> tuple[Images, TerminationDepths]:
-                images = culling_pipeline.render(
-                    self._data(band.selection, first_id), ViewBatch.single(band.view)
-                )
+                images = culling_pipeline.render_view(self._data(band.selection, first_id), band.view)
                 return images, backend.termination_depths(images)
 
             rendered = self._occlusion.render(full, fits, render_band, backend.copy_tiles)

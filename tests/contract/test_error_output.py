@@ -11,7 +11,6 @@ import pytest
 from brute_force import ideal
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.effects.catalogue import CATALOGUE
 from fidsplat.render import certified_error
 from fidsplat.render.certified_error import UNLISTED, ideal_of
@@ -140,7 +139,7 @@ def test_the_schedule_of_gpus_bounds_the_same(renderer):
     data = backend.upload(cloud)
     plan = ideal_of(data, capture, backend)
     own, groups = (
-        backend.pipeline(plan.features, shape).render(data, ViewBatch.single(plan.view))
+        backend.pipeline(plan.features, shape).render_view(data, plan.view)
         for shape in (backend.shape, backend.shapes("schedule")["groups"])
     )
     assert groups.read("rgb") == pytest.approx(own.read("rgb"), rel=1e-5, abs=1e-5)

@@ -8,7 +8,6 @@ from agreement import compare, random_splats
 from sampling import in_turn
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.backends.prepare import prepare
@@ -54,7 +53,7 @@ CASES = {
 def differences(pipeline, resident, cloud, capture):
     """A picture of a pipeline against the reference's."""
     _, view = prepare(resident, capture)
-    images = pipeline.render(resident, ViewBatch.single(view))
+    images = pipeline.render_view(resident, view)
     reference = ReferenceBackend()
     truth = reference.pipeline(select(cloud, capture.with_(outputs=(*capture.outputs, "alpha"))))
     found = {name: images.read(name, 0) for name in capture.outputs}

@@ -14,7 +14,6 @@ from sampling import in_turn
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.effects import OUTPUTS
 from fidsplat.selftest.agreement import FrameSpec, compare
@@ -68,8 +67,8 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     picture = PICTURES[name]()
     backend, cloud = renderer.backend, picture.cloud
     features, view = prepare(cloud, picture.capture)
-    images = backend.pipeline(features, backend.shapes("schedule")["groups"]).render(
-        backend.upload(cloud), ViewBatch.single(view)
+    images = backend.pipeline(features, backend.shapes("schedule")["groups"]).render_view(
+        backend.upload(cloud), view
     )
     drawn = {output: images.read(output, 0) for output in picture.outputs}
     differences = compare(drawn, reference_images(picture), picture.outputs)
@@ -108,4 +107,4 @@ def draw_with_guarded_rays():
     picture = PICTURES["distortion"]()
     features, view = prepare(picture.cloud, picture.capture)
     pipeline = backend.pipeline(features, backend.shapes("schedule")["groups"])
-    pipeline.render(backend.upload(picture.cloud), ViewBatch.single(view)).read("rgb", 0)
+    pipeline.render_view(backend.upload(picture.cloud), view).read("rgb", 0)

@@ -7,7 +7,6 @@ from agreement import compare, random_splats, some_thick
 from combined import LENSES, SIZE, Combination, combination, everything, sliding, turning
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import OUTPUTS
@@ -55,7 +54,7 @@ def test_it_agrees_with_the_reference(renderer, name):
     backend, reference = renderer.backend, ReferenceBackend()
     features, view = prepare(asked.cloud, asked.capture)
     groups = backend.shapes("schedule")["groups"]
-    images = backend.pipeline(features, groups).render(backend.upload(asked.cloud), ViewBatch.single(view))
+    images = backend.pipeline(features, groups).render_view(backend.upload(asked.cloud), view)
     drawn = {output: images.read(output, 0) for output in asked.capture.outputs}
     truth = (
         reference.pipeline(asked.features("alpha"))

@@ -11,7 +11,6 @@ from sampling import SAMPLES, alternate, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.capture.quality import Quality
@@ -176,8 +175,7 @@ def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpas
     without = replace(features, slots=tuple(name for name in features.slots if name != "shutter_rows"))
     backend = renderer.backend
     one, other = (
-        backend.pipeline(each).render(backend.upload(cloud), ViewBatch.single(view))
-        for each in (features, without)
+        backend.pipeline(each).render_view(backend.upload(cloud), view) for each in (features, without)
     )
     for name in ALL_OUTPUTS:
         assert np.array_equal(one.read(name), other.read(name)), name

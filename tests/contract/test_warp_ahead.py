@@ -9,7 +9,6 @@ import pytest
 from derivative_errors import random_picture
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.warp import memory_plan, runtime
 from fidsplat.backends.warp.frame import DeviceFrame
@@ -111,13 +110,13 @@ def test_images_that_nobody_reads_leave_at_once(ahead):
     resident = ahead.upload(CLOUD)
     features, view = prepare(resident, CAPTURE)
     pipeline = ahead.pipeline(features)
-    pipeline.render(resident, ViewBatch.single(view))
-    images = pipeline.render(resident, ViewBatch.single(view))
+    pipeline.render_view(resident, view)
+    images = pipeline.render_view(resident, view)
     assert images.settle
     array = weakref.ref(images.arrays["rgb"])
     gc.disable()
     try:
-        images = pipeline.render(resident, ViewBatch.single(view))
+        images = pipeline.render_view(resident, view)
         assert array() is None
     finally:
         gc.enable()

@@ -58,7 +58,7 @@ def test_views_of_a_batch_have_separate_lists(backend, monkeypatch, lists, budge
     features, batch = prepare_batch(cloud, views_of(captures))
     shape = listing(backend, "tiled" if lists == "local" else lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
-    alone = [pipeline.render(resident, ViewBatch.single(prepare(cloud, capture)[1])) for capture in captures]
+    alone = [pipeline.render_view(resident, prepare(cloud, capture)[1]) for capture in captures]
     original = tiling.launch_local
     launched = []
 
@@ -92,7 +92,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     capture = fs.Capture(camera, ALL_OUTPUTS, fs.Quality(lowpass="none"))
     features, view = prepare(cloud, capture)
     pipeline, resident = backend.pipeline(features, listing(backend, "tiled")), backend.upload(cloud)
-    expected = pipeline.render(resident, ViewBatch.single(view))
+    expected = pipeline.render_view(resident, view)
     assert 1000 < expected.stats["visible"] < 2.2 * 4096
     original, launched = tiling.launch_local, []
 
@@ -105,7 +105,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     resident = backend.upload(cloud)
     resident.coherent = True
     for _ in range(3):
-        images = pipeline.render(resident, ViewBatch.single(view))
+        images = pipeline.render_view(resident, view)
         assert images.stats == expected.stats
         for name in ALL_OUTPUTS:
             assert np.array_equal(images.read(name), expected.read(name)), name
@@ -113,7 +113,7 @@ def test_stores_are_binned_in_local_memory(backend, monkeypatch, budget):
     assert launched.count("tally_local") == (3 if budget else 2)
     moved = replace(capture, camera=fs.Camera.look_at(641, 549, 1.0, (0.3, 0.0, 0.0), (0.0, 0.0, 3.0)))
     batch_images = pipeline.render(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
-    other = pipeline.render(backend.upload(cloud), ViewBatch.single(prepare(cloud, moved)[1]))
+    other = pipeline.render_view(backend.upload(cloud), prepare(cloud, moved)[1])
     for images, own in zip(batch_images.read("rgb"), (other, expected), strict=True):
         assert np.array_equal(images, own.read("rgb", 0))
     assert launched.count("tally_local") > (3 if budget else 2)
@@ -128,12 +128,12 @@ def test_lists_that_overflow_are_made_again(backend):
     view = View.of(fs.Capture(camera, quality=quality), few.origin)
     backend = type(backend)(backend.device)  # with new buffers
     pipeline = backend.pipeline(features, groups)
-    fresh = pipeline.render(backend.upload(many), ViewBatch.single(view))
+    fresh = pipeline.render_view(backend.upload(many), view)
     expected = {name: fresh.read(name) for name in ALL_OUTPUTS}
     backend = type(backend)(backend.device)
     pipeline = backend.pipeline(features, groups)
-    pipeline.render(backend.upload(few), ViewBatch.single(view))
-    repeated = pipeline.render(backend.upload(many), ViewBatch.single(view))
+    pipeline.render_view(backend.upload(few), view)
+    repeated = pipeline.render_view(backend.upload(many), view)
     assert repeated.stats == fresh.stats
     assert repeated.stats["pairs"] > 1e5
     for name in ALL_OUTPUTS:
@@ -228,10 +228,10 @@ def test_a_small_pair_budget_is_bit_identical(backend, monkeypatch, budget, list
     # the shape of a CPU for its own strategy, which uses bands most often
     shape = backend.shape if lists == "ordered" else listing(backend, lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
-    whole = pipeline.render(resident, ViewBatch.single(view))
+    whole = pipeline.render_view(resident, view)
     assert whole.stats["pairs"] > 1000
     monkeypatch.setattr(backend, "pair_budget", budget)
-    banded = pipeline.render(resident, ViewBatch.single(view))
+    banded = pipeline.render_view(resident, view)
     assert banded.stats == whole.stats
     for name in ALL_OUTPUTS:
         assert np.array_equal(banded.read(name), whole.read(name)), name

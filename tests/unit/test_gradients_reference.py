@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.backends.reference.gradients import FrozenFrame
@@ -79,7 +78,7 @@ def weights_of(images, seed=0):
 def test_frozen_pictures_are_the_references(name):
     cloud, features, view = pictured(name)
     backend = ReferenceBackend()
-    drawn = backend.pipeline(features).render(backend.upload(cloud), ViewBatch.single(view))
+    drawn = backend.pipeline(features).render_view(backend.upload(cloud), view)
     frozen = FrozenFrame(cloud, view, features)
     images = frozen.images(frozen.parameters)
     for output in OUTPUTS:

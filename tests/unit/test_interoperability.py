@@ -43,6 +43,9 @@ class Shared(Images):
     def __init__(self, arrays):
         self.arrays = arrays
 
+    def read(self, name, index=None):
+        return np.asarray(self.arrays[name])
+
     def device_array(self, name, index=None):
         return self.arrays[name]
 

@@ -8,7 +8,6 @@ from agreement import ALL_OUTPUTS
 from store_views import TURNED, look, made_store, splats
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.effects.select import with_termination_depths
@@ -293,9 +292,7 @@ def test_tiles_terminate_where_all_pixels_are_opaque(order, schedule):
     camera = fs.Camera.pinhole(96, 64, 60.0, 60.0, 48.0, 32.0)
     capture = fs.Capture(camera, outputs=("alpha", "depth"), quality=f"lowpass=none,order={order}")
     features, shot = prepare(cloud, capture)
-    images = backend.pipeline(with_termination_depths(features)).render(
-        backend.upload(cloud), ViewBatch.single(shot)
-    )
+    images = backend.pipeline(with_termination_depths(features)).render_view(backend.upload(cloud), shot)
     found = backend.termination_depths(images)
     height, width = found.tile
     rows, columns = found.depths.shape

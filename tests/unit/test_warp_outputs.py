@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.backends.warp import runtime
 from fidsplat.effects import CATALOGUE, FeatureSet, Output
@@ -102,7 +101,7 @@ def drawn(outputs, posts):
     cloud = two_splats()
     pipeline = backend.pipeline(FeatureSet(SLOTS, outputs, 0, 1, "float64", posts))
     view = View.of(fs.Capture(CAMERA), cloud.origin)
-    images = pipeline.render(backend.upload(cloud), ViewBatch.single(view))
+    images = pipeline.render_view(backend.upload(cloud), view)
     return {name: images.read(name, 0) for name in ("rgb", *outputs)}
 
 

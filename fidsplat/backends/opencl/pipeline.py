@@ -67,16 +67,21 @@ class OpenCLPipeline(Pipeline):
         self._planner = MemoryPlanner(workspace, source, features, shape)
         self._other = other
 
-    def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
-        """Render views, as many at once as memory holds. A single frame of a kind that was rendered before is
-        replayed, without waiting for the device.
+    def render_view(self, resident: Resident, view: View) -> OpenCLImages:
+        """Render one view. A frame of a kind that was rendered before is replayed, without waiting for the
+        device.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.rendering():
-            if views.is_single:
-                return self._render_single(resident, views)
+            return self._render_single(resident, ViewBatch.single(view))
+
+    def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
+        """Render views, as many at once as memory holds. Raises DeviceError as `render_view`."""
+        if views.is_single:
+            return self.render_view(resident, views.one(0))
+        with self.workspace.rendering():
             return self._render_parts(resident, views)
 
     def _render_single(self, resident: Resident, views: ViewBatch) -> OpenCLImages:

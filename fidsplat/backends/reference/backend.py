@@ -65,7 +65,7 @@ def open_device(selector: str = "") -> ReferenceBackend:
 class ReferenceBackend(Backend):
     """NumPy in float64."""
 
-    traits = DeviceTraits(renders_pixel_subsets=True, differentiates=True)
+    traits = DeviceTraits(differentiates=True)
 
     def __init__(self) -> None:
         self.info = devices()[0]
@@ -77,6 +77,17 @@ class ReferenceBackend(Backend):
     def pipeline(self, features: FeatureSet, shape: None = None) -> ReferencePipeline:
         """The pipeline for these features; nothing is compiled."""
         return ReferencePipeline(features)
+
+    def render_every(
+        self,
+        pipeline: ReferencePipeline,
+        resident: ReferenceCloud,
+        view: View,
+        step: int,
+        progress: Callable[[float], object] | None = None,
+    ) -> HostImages:
+        """Render every step-th pixel in both directions."""
+        return pipeline.render_every(resident, view, step, progress)
 
     def differentiate(self, features: FeatureSet, shape: None = None) -> ReferenceGradients:
         """The pipeline with derivatives."""

@@ -25,15 +25,20 @@ class WarpPipeline(Pipeline):
         self._renderer = FrameRenderer(program, workspace, launches)
         self._planner = MemoryPlanner(program, workspace)
 
-    def render(self, resident: Resident, views: ViewBatch) -> WarpImages | WarpBatch:
-        """Render views, as many at once as memory holds.
+    def render_view(self, resident: Resident, view: View) -> WarpImages:
+        """Render one view.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.working("while rendering"):
-            if views.is_single:
-                return self._renderer.render(resident, views)
+            return self._renderer.render(resident, ViewBatch.single(view))
+
+    def render(self, resident: Resident, views: ViewBatch) -> WarpImages | WarpBatch:
+        """Render views, as many at once as memory holds. Raises DeviceError as `render_view`."""
+        if views.is_single:
+            return self.render_view(resident, views.one(0))
+        with self.workspace.working("while rendering"):
             images = WarpBatch(self.workspace, self.program.images, views, resident.count)
             for first, end in self._planner.parts(resident, views, images.nbytes):
                 into = images.arrays_of(views.batch_indices[first:end])

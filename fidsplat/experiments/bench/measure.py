@@ -10,7 +10,6 @@ from datetime import date
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import DeviceInfo, Rates
 from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
@@ -204,4 +203,4 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
     assert not isinstance(data, Residency), "of splats in memory"
     features, view = prepare(data, Capture(camera, quality=quality))
     features = replace(features, outputs=("overdraw",))
-    return renderer.backend.pipeline(features).render(data, ViewBatch.single(view)).read("overdraw", 0)
+    return renderer.backend.pipeline(features).render_view(data, view).read("overdraw", 0)
