@@ -16,7 +16,7 @@ import numpy as np
 import fidsplat as fs
 from fidsplat.experiments.localise import FAMILY, RATE, VARIANTS, Drive
 from fidsplat.images.files import write_png
-from fidsplat.images.visualize import outlined, shrunk
+from fidsplat.images.visualize import draw_outlines, resize_to_width
 from fidsplat.vision.detect import detect
 from fidsplat.worlds.greenhouse import BENCH
 from fidsplat.worlds.robot import Run
@@ -38,7 +38,7 @@ def main(out: str) -> None:
     for picture in arguments.pictures(VARIANTS["exact"], run, renderer):
         codes = detect(picture, (FAMILY,), qr=False)
         marks = [(code.corners, str(code.id)) for code in codes]
-        pictures.append(shrunk(outlined(picture, marks, thickness=2, size=0.6), WIDTH))
+        pictures.append(resize_to_width(draw_outlines(picture, marks, thickness=2, size=0.6), WIDTH))
         sightings.append(codes)
         print(f"{len(pictures)} of {len(arguments.image_indices(run))}", end="\r", file=sys.stderr)
     ways = [

@@ -21,15 +21,15 @@ from rich.progress import track
 import fidsplat as fs
 from fidsplat.images.files import to_uint8
 from fidsplat.images.visualize import (
+    colour_counts,
+    colour_depth,
+    colour_labels,
+    colour_normals,
     contact_sheet,
     count_key,
-    count_picture,
     depth_key,
-    depth_picture,
     depth_span,
-    label_picture,
     normal_key,
-    normal_picture,
 )
 from fidsplat.scenes import PlacedMarker
 
@@ -152,9 +152,9 @@ def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
     depth, distance = frame["depth"], frame["distance"]
     span = depth_span([depth, distance])
     rows = [
-        [("rgb", to_uint8(frame["rgb"])), ("normal", normal_picture(frame["normal"]))],
-        [("depth", depth_picture(depth, span)), ("distance", depth_picture(distance, span))],
-        [("label", label_picture(frame["label"])), ("blended (splats)", count_picture(frame["blended"]))],
+        [("rgb", to_uint8(frame["rgb"])), ("normal", colour_normals(frame["normal"]))],
+        [("depth", colour_depth(depth, span)), ("distance", colour_depth(distance, span))],
+        [("label", colour_labels(frame["label"])), ("blended (splats)", colour_counts(frame["blended"]))],
     ]
     most = int(frame["blended"].max())
     keys = (normal_key, partial(depth_key, span), partial(count_key, most))

@@ -21,7 +21,7 @@ from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.images.files import to_uint8, write_png
-from fidsplat.images.visualize import contact_sheet, outlined
+from fidsplat.images.visualize import contact_sheet, draw_outlines
 from fidsplat.scenes import PlacedMarker
 from fidsplat.util.errors import FidsplatError
 from fidsplat.util.files import writable_folder
@@ -83,7 +83,7 @@ def run(file: str, folder: Path, device: str) -> int:
         readings, _ = read_back(image, scene, camera)
         reading_ms = 1e3 * (time.perf_counter() - begun)
         missed += sum(reading.detection is None for reading in readings)
-        marked = outlined(
+        marked = draw_outlines(
             image, [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
         )
         write_png(folder / f"{view.replace(' ', '-')}.png", image)

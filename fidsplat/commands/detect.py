@@ -90,7 +90,7 @@ class Detect:
 
     def _images(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":
         """Names, images, and the scene at the time of each."""
-        from fidsplat.images.files import is_video, pictures
+        from fidsplat.images.files import is_video, read_images
         from fidsplat.render.flight import RECORD, scene_of_frame
 
         if path.endswith(".mcap") or (path_of(path) / "metadata.yaml").is_file():
@@ -102,7 +102,7 @@ class Detect:
                 "folder of the flight, or its log"
             )
         folder = path_of(path)
-        for name, image in pictures(folder / "rgb" if (folder / RECORD).is_file() else path):
+        for name, image in read_images(folder / "rgb" if (folder / RECORD).is_file() else path):
             yield name, image, None if scene is None else scene_of_frame(scene, Path(name))
 
     def _log_images(

@@ -13,13 +13,13 @@ from fidsplat.experiments.demo_scene import OUTPUTS, demo_scene, demo_views
 from fidsplat.formats import save_ply
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.visualize import (
+    colour_depth,
+    colour_normals,
     contact_sheet,
     depth_key,
-    depth_picture,
     depth_span,
+    draw_outlines,
     normal_key,
-    normal_picture,
-    outlined,
 )
 from fidsplat.render.output_files import save_output
 from fidsplat.render.renderer import Renderer
@@ -153,7 +153,7 @@ def _draw(
 
 def _marked(image: np.ndarray, readings: list[Reading]) -> np.ndarray:
     found = [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
-    return outlined(image, found)
+    return draw_outlines(image, found)
 
 
 def _save(folder: Path, stem: str, images: dict[str, np.ndarray], marked: np.ndarray) -> list[Path]:
@@ -170,8 +170,8 @@ def _sheet(seen: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.nda
     span = depth_span(depth for _, depth, _ in seen.values())
     rows = [
         [(f"{view}: what was read", marked) for view, (marked, _, _) in seen.items()],
-        [(f"{view}: depth", depth_picture(depth, span)) for view, (_, depth, _) in seen.items()],
-        [(f"{view}: normals", normal_picture(normal)) for view, (_, _, normal) in seen.items()],
+        [(f"{view}: depth", colour_depth(depth, span)) for view, (_, depth, _) in seen.items()],
+        [(f"{view}: normals", colour_normals(normal)) for view, (_, _, normal) in seen.items()],
     ]
     keys = (lambda height: None, lambda height: depth_key(span, height), normal_key)
     return contact_sheet(rows, width=560, key=lambda row, height: keys[row](height))

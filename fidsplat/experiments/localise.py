@@ -188,10 +188,10 @@ class Drive:
             filtered.move(run.wheels[k], float(run.gyro[k]), float(run.times[k] - run.times[k - 1]))
             for tag in at.get(k, []):
                 if tag.id in tags and _away(tag, tags[tag.id], camera) <= reach:
-                    seen += filtered.see(tag.corners, tags[tag.id].corners, standing)
+                    seen += filtered.correct(tag.corners, tags[tag.id].corners, standing)
             poses.append(filtered.pose)
         facts = errors_of(run, np.array(poses))
-        facts |= {"tags": seen, "refused": filtered.refused}
+        facts |= {"tags": seen, "refused": filtered.rejected}
         return Trajectory(run.times, np.array(poses)), facts
 
     def ideal(self, run: Run, sightings: list[list[Detection]]) -> list[list[Detection]]:

@@ -1,4 +1,4 @@
-"""Image files in and out: RGB pictures, one-bit marker images, PNG of colours, depth and labels."""
+"""Reading and writing of image files: RGB images, one-bit marker images, PNG of colours, depth and labels."""
 
 import contextlib
 import os
@@ -14,28 +14,28 @@ from fidsplat.util.files import atomic_write, path_of, read_input, utf8_path
 from fidsplat.util.limits import check_expansion
 from fidsplat.util.streams import without_stderr
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
 
 _CONTAINERS = (
     *((4, kind) for kind in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")),
     (0, b"\x1aE\xdf\xa3"),
     (8, b"AVI "),
 )
-"""how MP4 and QuickTime, Matroska and WebM, and AVI files begin: place and bytes"""
+"""(offset, bytes) that MP4 and QuickTime, Matroska and WebM, and AVI files begin with"""
 
 _PIXEL = 8
-"""bytes of memory that a pixel takes while it is read"""
+"""bytes of memory for each pixel while an image is decoded"""
 MAX_BITS = 2**26
-"""values of a marker image that are looked at: four for each of 4096 x 4096 modules, which are most"""
+"""maximum number of values of a marker image: four channels of 4096 x 4096 modules"""
 
 
 def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
-    """Read a picture as (h, w, 3) RGB. Grey is repeated, alpha is dropped.
+    """Read an image as (h, w, 3) RGB. Grey is repeated, alpha is dropped.
 
-    deep: False gives uint8, 16 bits cut to 8; True uint8, uint16 or float32, as the file has it.
+    deep: False returns uint8, 16 bits cut to 8; True returns uint8, uint16 or float32, as in the file.
 
-    Raises InputError when the file is missing, is no picture that OpenCV reads, or has other pixels.
+    Raises InputError when the file is missing, is not an image that OpenCV reads, or has other pixels.
     """
     image = _decode(path, cv2.IMREAD_COLOR | (cv2.IMREAD_ANYDEPTH if deep else 0))
     if image.dtype not in (np.uint8, np.uint16, np.float32):
@@ -44,10 +44,10 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
 
 
 def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read a picture as (h, w, 4) uint8 RGBA, opaque where the file has no alpha.
+    """Read an image as (h, w, 4) uint8 RGBA, opaque where the file has no alpha.
 
-    Pixels are as they are stored, however EXIF would turn them; 16 bits are cut to 8.
-    Raises InputError when the file is missing, or is no picture of 8 or 16 bits.
+    The EXIF orientation is ignored; 16 bits are cut to 8.
+    Raises InputError when the file is missing, or is not an image of 8 or 16 bits.
     """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype not in (np.uint8, np.uint16):
@@ -60,9 +60,9 @@ def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA if channels == 1 else cv2.COLOR_BGR2RGBA)
 
 
-def read_over(path: str | os.PathLike[str], background: Sequence[float]) -> np.ndarray:
-    """Read a picture as (h, w, 3) uint8 RGB on a background of display values, which shows where it is clear.
-    Pixels and errors as `read_rgba`.
+def read_on_background(path: str | os.PathLike[str], background: Sequence[float]) -> np.ndarray:
+    """Read an image as (h, w, 3) uint8 RGB, blended over a background of display values where it is
+    transparent. Pixels and errors as `read_rgba`.
     """
     rgba = read_rgba(path)
     if rgba[:, :, 3].min() == 255:
@@ -73,21 +73,23 @@ def read_over(path: str | os.PathLike[str], background: Sequence[float]) -> np.n
 
 
 def is_video(path: str | os.PathLike[str]) -> bool:
-    """Whether a path is a video's, by its ending."""
+    """Whether a path is a video file, by its suffix."""
     file = path_of(path)
-    return file.suffix.lower() in VIDEOS and file.is_file()
+    return file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()
 
 
-def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and pictures (h, w, 3) uint8 RGB: of a file, of a folder's files by their names, of a video.
+def read_images(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and images (h, w, 3) uint8 RGB of a file, of a folder's files sorted by name, or of a video.
 
-    Raises InputError where there is none, or one cannot be read.
+    Raises InputError if there is no image or one cannot be read.
     """
     file = path_of(path)
     if file.is_dir():
-        names = sorted(name for name in file.iterdir() if name.suffix.lower() in PICTURES)
+        names = sorted(name for name in file.iterdir() if name.suffix.lower() in IMAGE_SUFFIXES)
         if not names:
-            raise InputError(f"{file} holds no picture; known are {', '.join(PICTURES)}")
+            raise InputError(
+                f"{file} must contain an image file, got none; known suffixes are {', '.join(IMAGE_SUFFIXES)}"
+            )
         for name in names:
             yield str(name), read_image(name)
     elif is_video(file):
@@ -97,10 +99,11 @@ def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _frames(file: Path) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and pictures of a video."""
+    """Names and frames of a video."""
     head = read_input(file, first=12)
     video = cv2.VideoCapture()
-    # FFmpeg goes by the content: playlists and scripts, whatever their name, open other files and addresses
+    # FFmpeg selects the demuxer by content, and playlists and scripts open other files and addresses
+    # whatever their suffix is: only known containers are opened
     if any(word == head[at : at + len(word)] for at, word in _CONTAINERS):
         with _silent_opencv(), utf8_path(file.absolute()) as name:
             video.open(str(name), cv2.CAP_FFMPEG)
@@ -114,15 +117,15 @@ def _frames(file: Path) -> Iterator[tuple[str, np.ndarray]]:
         number += 1
     if not number:
         raise InputError(
-            f"{file} is not a video that OpenCV can read; convert it to MP4 (H.264), or to pictures"
+            f"{file} is not a video that OpenCV can read; convert it to MP4 (H.264) or to image files"
         )
 
 
 def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read a one-bit image as (h, w) uint8, 1 = dark: any file whose pixels have at most two grey levels.
+    """Read an image with at most two grey levels as (h, w) uint8, 1 = dark.
 
-    The darker level is the dark one; a picture of a single level is dark when that is below half. Transparent
-    pixels count as white paper.
+    Of two levels the lower one is dark; a single level is dark if it is below half. Transparent pixels are
+    white.
 
     Raises InputError when the file cannot be read or has colours or more grey levels.
     """
@@ -154,26 +157,26 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def pixels_of(image: np.ndarray) -> np.ndarray:
-    """A picture as an array. Raises InputError for anything but real numbers."""
+    """Convert an image to an array. Raises InputError for anything but real numbers."""
     try:
         array = np.asarray(image)
     except ValueError:  # rows that differ in length
         array = np.empty(0, object)
     if array.dtype.kind not in "fiub":
-        raise InputError(f"a picture has rows of real numbers, not {array.dtype}")
+        raise InputError(f"an image must have rows of real numbers, got {array.dtype}")
     return array
 
 
-_PART = 1 << 14
-"""values that are converted at a time: few enough to stay in a core's cache from step to step"""
-_SHARE = 16 * _PART
-"""values that a thread takes at a time"""
-_FEW, _THREADS = 8, 4
-"""shares from which on threads are worth their start, as of 900 x 800 pixels; and how many threads"""
+_BLOCK = 1 << 14
+"""values of a block: few enough to stay in a core's cache between the steps"""
+_TASK = 16 * _BLOCK
+"""values of a thread's task"""
+_MIN_TASKS, _THREADS = 8, 4
+"""minimum number of tasks for which threads are faster (900 x 800 pixels); maximum number of threads"""
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """Floats in [0, 1] to uint8, clamped and rounded; uint8 as it is; bool to 0 and 255.
+    """Convert floats in [0, 1] to uint8, clamped and rounded; bool becomes 0 and 255, uint8 stays.
 
     Raises InputError for anything but numbers."""
     image = pixels_of(image)
@@ -181,33 +184,33 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
         return image
     if image.dtype == bool:
         return image.astype(np.uint8) * 255
-    made, values = np.empty(image.shape, np.uint8), image.reshape(-1)
-    flat = made.reshape(-1)
+    result, values = np.empty(image.shape, np.uint8), image.reshape(-1)
+    flat = result.reshape(-1)
 
     def convert(begin: int) -> None:
-        for first in range(begin, min(begin + _SHARE, len(values)), _PART):
-            part = np.clip(values[first : first + _PART], 0.0, 1.0)
+        for first in range(begin, min(begin + _TASK, len(values)), _BLOCK):
+            part = np.clip(values[first : first + _BLOCK], 0.0, 1.0)
             if np.isnan(part.sum()):  # NaN would become an undefined integer
                 part[np.isnan(part)] = 0.0
             part *= 255.0
-            flat[first : first + _PART] = np.rint(part, out=part)
+            flat[first : first + _BLOCK] = np.rint(part, out=part)
 
-    shares = range(0, len(values), _SHARE)
-    if len(shares) < _FEW:
-        for begin in shares:
+    tasks = range(0, len(values), _TASK)
+    if len(tasks) < _MIN_TASKS:
+        for begin in tasks:
             convert(begin)
     else:
         with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-            for _ in pool.map(convert, shares):  # raises what a share has raised
+            for _ in pool.map(convert, tasks):  # raises the error of a task
                 pass
-    return made
+    return result
 
 
 def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
-    """Write a PNG, whole or not at all.
+    """Write a PNG file atomically.
 
     Args:
-        path: where to; its folder must exist.
+        path: the file; its folder must exist.
         image: (h, w) or (h, w, 3) RGB; float in [0, 1] (clamped and rounded), uint8, or uint16 (16-bit PNG).
 
     Raises InputError when the folder cannot be written, and for another shape.
@@ -219,14 +222,14 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """A picture as a PNG file's content; shapes and errors as `write_png`."""
+    """Encode an image as a PNG file's content; shapes and errors as `write_png`."""
     array = pixels_of(image)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
-        raise InputError(f"a PNG needs (h, w) or (h, w, 3), not {array.shape}")
+        raise InputError(f"the image of a PNG must be (h, w) or (h, w, 3), got {array.shape}")
     pixels = array if array.dtype == np.uint16 else to_uint8(array)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    # OpenCV 5's own level makes files of flat colours four times as large
+    # OpenCV 5's default level makes files of flat colours four times as large
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not done:
         raise ValueError(f"OpenCV could not encode an image of shape {array.shape} as PNG")
@@ -234,8 +237,7 @@ def png_bytes(image: np.ndarray) -> bytes:
 
 
 def encoded(image: np.ndarray, kind: str, quality: int = 95) -> bytes:
-    """A picture (h, w, 3) RGB, float in [0, 1] or uint8, as the content of a "jpeg" (of this quality, 0 to
-    100) or "png" file."""
+    """Encode an image (h, w, 3) RGB, float in [0, 1] or uint8, as "jpeg" (quality 0 to 100) or "png"."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
     done, data = cv2.imencode(f".{kind}", cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2BGR), options)
     if not done:
@@ -287,15 +289,15 @@ def _tiff_pixels(data: bytes | np.ndarray) -> int:
     return sides.get(256, 0) * sides.get(257, 0)
 
 
-def _admit(data: bytes | np.ndarray, name: str | os.PathLike[str]) -> None:
+def _check_size(data: bytes | np.ndarray, name: str | os.PathLike[str]) -> None:
     """Raise InputError for an image that declares more pixels than `input_limit` allows, or for a PNG with a
-    chunk longer than the file, for which libpng would take the memory."""
+    chunk longer than the file, for which libpng would allocate memory."""
     at, png = 8, bytes(data[:8]) == b"\x89PNG\r\n\x1a\n"
     while png and at + 8 <= len(data) and bytes(data[at + 4 : at + 8]) != b"IEND":
         length = int.from_bytes(bytes(data[at : at + 4]), "big")
         if length > len(data):
             raise InputError(
-                f"{name} is not an image that can be read: it must have chunks within its {len(data):,} "
+                f"cannot read {name}: a PNG must have chunks within its {len(data):,} "
                 f"bytes, got one of {length:,}; give a whole PNG file"
             )
         at += 12 + length
@@ -304,36 +306,36 @@ def _admit(data: bytes | np.ndarray, name: str | os.PathLike[str]) -> None:
 
 
 def decoded(content: bytes) -> np.ndarray:
-    """The picture (h, w, 3) uint8 RGB of a file's content. Raises InputError for what is no picture, and
-    beyond `input_limit`."""
-    _admit(content, "a compressed picture")
+    """Decode a file's content to (h, w, 3) uint8 RGB. Raises InputError for content that is not an image or
+    exceeds `input_limit`."""
+    _check_size(content, "a compressed image")
     image = None
     with _silent_opencv(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
     if image is None:
-        raise InputError("a compressed picture cannot be read; JPEG and PNG can")
+        raise InputError("cannot decode a compressed image; it must be a JPEG or PNG")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def rgba_pixels(data: bytes, name: str) -> np.ndarray:
-    """(h, w, 4) uint8 of a picture file's content, alpha 255 where it has none.
+    """Decode an image file's content to (h, w, 4) uint8 RGBA, alpha 255 where it has none.
 
-    name: of the file, for errors. Raises InputError for anything but a picture of 8 bits, and beyond
+    name: the file's name in errors. Raises InputError for content that is not an image of 8 bits or exceeds
     `input_limit`.
     """
-    _admit(data, name)
+    _check_size(data, name)
     image = None
     with _silent_opencv(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None or image.dtype != np.uint8:
-        raise InputError(f"{name} is not a picture of 8 bits that can be read")
+        raise InputError(f"{name} cannot be read as an image of 8 bits")
     kinds = {2: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
     return cv2.cvtColor(image, kinds[2 if image.ndim == 2 else image.shape[2]])
 
 
 def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
     data = np.frombuffer(read_input(path), np.uint8)
-    _admit(data, path)
+    _check_size(data, path)
     image = None
     # OpenCV raises when there are more pixels than its limit
     with _silent_opencv(), contextlib.suppress(cv2.error):
@@ -345,7 +347,7 @@ def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
 
 @contextlib.contextmanager
 def _silent_opencv() -> Iterator[None]:
-    """Discard what OpenCV, libpng and FFmpeg write to stderr: a damaged file is one line, our error."""
+    """Discard what OpenCV, libpng and FFmpeg write to stderr about a damaged file; our error reports it."""
     if hasattr(cv2, "setLogLevel"):  # OpenCV 4
         read, write = cv2.getLogLevel, cv2.setLogLevel  # type: ignore[attr-defined]
     else:

@@ -1,4 +1,4 @@
-"""The bits of every tag that OpenCV's aruco module predefines: four AprilTag families and all ArUco ones."""
+"""Bits of the tags predefined by OpenCV's aruco module: four AprilTag families and all ArUco families."""
 
 from functools import cache
 from typing import NamedTuple
@@ -28,7 +28,7 @@ BORDER = 1
 
 
 def families(kind: str | None = None) -> dict[str, Family]:
-    """Every known family by its name, e.g. ``{"36h11": Family(size=8, count=587), ...}``.
+    """All known families by name, for example {"36h11": Family(size=8, count=587), ...}.
 
     Args:
         kind: "apriltag" or "aruco"; None for both (names are unique over both).
@@ -42,9 +42,9 @@ def families(kind: str | None = None) -> dict[str, Family]:
 
 
 def parse_family(text: str) -> tuple[str, str]:
-    """Split "apriltag:36h11", or "36h11" alone, into (kind, family).
+    """Split "apriltag:36h11", or just "36h11", into (kind, family).
 
-    Raises InputError that lists the families when there is none of this name.
+    Raises InputError with a list of the families for an unknown name.
     """
     kind, colon, name = str(text).rpartition(":")
     for known, names in _KINDS.items():
@@ -57,7 +57,7 @@ def parse_family(text: str) -> tuple[str, str]:
 def dictionary_bits(kind: str, family: str, tag_id: int) -> np.ndarray:
     """The modules of one tag, (size, size) uint8, 1 = dark, its one-module black border included.
 
-    Row 0 is the top of the picture that ``cv2.aruco.generateImageMarker`` prints.
+    Row 0 is the top of the image that ``cv2.aruco.generateImageMarker`` prints.
 
     Raises InputError for an unknown family or an id outside it.
     """
@@ -65,14 +65,14 @@ def dictionary_bits(kind: str, family: str, tag_id: int) -> np.ndarray:
         parse_family(f"{kind}:{family}")
     size, count = _family(kind, family)
     if not 0 <= tag_id < count:
-        raise InputError(f"{kind}:{family} has no id {tag_id}; its ids are 0 to {count - 1}")
+        raise InputError(f"{kind}:{family} ids must be 0 to {count - 1}, got {tag_id}")
     printed = cv2.aruco.generateImageMarker(predefined(kind, family), int(tag_id), size, borderBits=BORDER)
     return (printed == 0).astype(np.uint8)
 
 
 @cache
 def predefined(kind: str, family: str) -> cv2.aruco.Dictionary:
-    """OpenCV's own object for a known family."""
+    """OpenCV's dictionary of a known family."""
     prefix = "DICT_APRILTAG_" if kind == "apriltag" else "DICT_ARUCO_" if "x" not in family else "DICT_"
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, (prefix + family).upper()))
 

@@ -1,4 +1,4 @@
-"""Pictures as a video: H.264 in MP4, by the ffmpeg that imageio-ffmpeg brings."""
+"""Video writing: H.264 in MP4, with the ffmpeg of imageio-ffmpeg."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from fidsplat.util.files import atomic_path, ordinary_file, writable_folder
 
 
 def check_video(path: str | os.PathLike[str]) -> Path:
-    """The path of a video that can be written. Asked before long work.
+    """Check that a video can be written to a path, before long work.
 
     Raises:
-        InputError: another ending than .mp4, a folder that cannot be written, or the extra is missing.
+        InputError: a suffix other than .mp4, a folder that cannot be written, or imageio-ffmpeg is missing.
     """
     file = ordinary_file(path)
     if file.suffix.lower() != ".mp4":
-        raise InputError(f"videos are written as MP4: name {file.with_suffix('.mp4')}")
+        raise InputError(
+            f"a video file must have the suffix .mp4, got {file}; use {file.with_suffix('.mp4')}"
+        )
     writable_folder(file.parent)
     try:
         import imageio_ffmpeg  # type: ignore[import-not-found]  # noqa: F401
@@ -30,14 +32,14 @@ def check_video(path: str | os.PathLike[str]) -> Path:
     return file
 
 
-def write_video(path: str | os.PathLike[str], pictures: Iterable[np.ndarray], rate: float) -> Iterator[int]:
-    """Write pictures (h, w, 3) uint8 RGB of one size; yields the number of each once it is in.
+def write_video(path: str | os.PathLike[str], frames: Iterable[np.ndarray], rate: float) -> Iterator[int]:
+    """Write frames (h, w, 3) uint8 RGB of one size; yield the number of each once it is written.
 
-    The file is whole or not there. Odd sizes get one more row or column, a copy of the last, which H.264
-    wants even.
+    The file is written atomically. H.264 requires even sizes: the last row or column of an odd size is
+    repeated.
 
     Raises:
-        InputError: as `check_video`; no picture; ffmpeg cannot write, on a full disk say.
+        InputError: as `check_video`; there is no frame; ffmpeg cannot write, for example on a full disk.
     """
     file = check_video(path)
     import imageio_ffmpeg  # type: ignore[import-not-found]
@@ -45,8 +47,8 @@ def write_video(path: str | os.PathLike[str], pictures: Iterable[np.ndarray], ra
     with atomic_path(file, file.suffix) as part:
         writer, count = None, 0
         try:
-            for number, picture in enumerate(pictures):
-                even = np.pad(picture, ((0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)), "edge")
+            for number, frame in enumerate(frames):
+                even = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), "edge")
                 if writer is None:
                     size: Any = even.shape[1::-1]
                     encoding: Any = {"fps": rate, "codec": "libx264", "quality": 8, "macro_block_size": 2}
@@ -59,18 +61,18 @@ def write_video(path: str | os.PathLike[str], pictures: Iterable[np.ndarray], ra
             if writer is not None:
                 writer.close()
         if not count:
-            raise InputError(f"cannot write {file}: there is no picture")
-        if not _lasts(part, (count - 1) / rate):
+            raise InputError(f"a video must have at least one frame, got none for {file}")
+        if not _is_complete(part, (count - 1) / rate):
             raise InputError(f"cannot write {file}: ffmpeg stopped before its end; is the disk full?")
 
 
-def _lasts(file: Path, seconds: float) -> bool:
-    """Whether a video can be read and is longer than that: ffmpeg that fails at its end says nothing."""
+def _is_complete(file: Path, seconds: float) -> bool:
+    """Whether a video can be read and lasts this long: ffmpeg reports no failure at the end of a file."""
     import imageio_ffmpeg  # type: ignore[import-not-found]
 
     reader: Any = imageio_ffmpeg.read_frames(str(file))
     try:
-        return next(reader)["duration"] > seconds - 0.02  # it is said in hundredths
+        return next(reader)["duration"] > seconds - 0.02  # reported in hundredths of a second
     except (OSError, RuntimeError, IndexError, StopIteration):
         return False
     finally:

@@ -1,5 +1,4 @@
-"""Output images as pictures that people look at: depth, normals, labels, detections, with keys that say what
-their colours mean. uint8 RGB out."""
+"""Visualization of depth, normals, labels and detections as uint8 RGB, with colour keys."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -8,36 +7,36 @@ import cv2
 import numpy as np
 
 _BACKGROUND = (90, 90, 90)
-_SHIFT = 4  # OpenCV draws at sixteenths of a pixel
+_SHIFT = 4  # fractional bits of OpenCV's coordinates: sixteenths of a pixel
 _OUTLINE = (255, 60, 200)
-_SHEET = 28  # the grey of a sheet
-KEY_WIDTH = 132  # of a key beside the pictures of a sheet, pixels
+_SHEET = 28  # grey level of a sheet's background
+KEY_WIDTH = 132  # pixels of the colour key next to the images of a sheet
 
 
 def depth_span(depths: Iterable[np.ndarray]) -> tuple[float, float]:
-    """Nearest and furthest metres for the colours of these pictures, (h, w) each: the middle 98 % of their
-    depths, so that one stray splat does not use the colours up. (0, 0) where nothing was seen."""
-    seen = [depth[np.isfinite(depth) & (depth > 0)] for depth in depths]
-    every = np.concatenate(seen) if seen else np.zeros(0)
+    """Range of metres for the colours of depth images (h, w): percentiles 1 and 99, so that single splats
+    do not stretch it. (0, 0) if nothing is visible."""
+    valid = [depth[np.isfinite(depth) & (depth > 0)] for depth in depths]
+    every = np.concatenate(valid) if valid else np.zeros(0)
     if not every.size:
         return 0.0, 0.0
     low, high = np.percentile(every, (1, 99))
     return float(low), float(high)
 
 
-def depth_picture(depth: np.ndarray, span: tuple[float, float] | None = None) -> np.ndarray:
-    """Depth (h, w) in metres in the turbo colours, near red and far blue; black where it is 0 or not finite.
+def colour_depth(depth: np.ndarray, span: tuple[float, float] | None = None) -> np.ndarray:
+    """Colour a depth image (h, w) by the turbo map, near red and far blue; black where it is 0 or not finite.
 
-    span: metres of the first and the last colour (default: `depth_span` of this picture).
+    span: metres of the first and the last colour (default: `depth_span` of this image).
     """
-    seen = np.isfinite(depth) & (depth > 0)
+    valid = np.isfinite(depth) & (depth > 0)
     low, high = depth_span([depth]) if span is None else span
-    share = np.clip((high - np.where(seen, depth, high)) / max(high - low, 1e-9), 0, 1)
-    return np.where(seen[:, :, None], _turbo(share), 0).astype(np.uint8)
+    share = np.clip((high - np.where(valid, depth, high)) / max(high - low, 1e-9), 0, 1)
+    return np.where(valid[:, :, None], _turbo(share), 0).astype(np.uint8)
 
 
 def depth_key(span: tuple[float, float], height: int) -> np.ndarray:
-    """The colour bar of `depth_picture`, (height, KEY_WIDTH, 3), with its range in metres."""
+    """The colour bar of `colour_depth`, (height, KEY_WIDTH, 3), with its range in metres."""
     low, high = span
     digits = max(0, 2 - math.floor(math.log10(max(high, 1e-9))))
     words = [f"{low + share * (high - low):.{min(digits, 6)}f} m" for share in _TICKS]
@@ -45,21 +44,20 @@ def depth_key(span: tuple[float, float], height: int) -> np.ndarray:
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Depth (h, w) in metres as uint16 millimetres, as depth cameras store it; 0 for nothing, 65535 for
-    further."""
+    """Depth (h, w) in metres as uint16 millimetres, the format of depth cameras; 0 for no surface, at most
+    65535."""
     clean = np.nan_to_num(depth, nan=0.0, posinf=np.inf, neginf=0.0)
     return np.rint(np.clip(clean * 1000.0, 0, 65535)).astype(np.uint16)
 
 
-def normal_picture(normal: np.ndarray) -> np.ndarray:
-    """Unit normals (h, w, 3) as (n + 1) / 2; black where there is none."""
-    there = (normal != 0).any(axis=2, keepdims=True)
-    return np.rint(np.where(there, np.clip((normal + 1) / 2, 0, 1), 0) * 255).astype(np.uint8)
+def colour_normals(normal: np.ndarray) -> np.ndarray:
+    """Colour unit normals (h, w, 3) as (n + 1) / 2; black where there is none."""
+    valid = (normal != 0).any(axis=2, keepdims=True)
+    return np.rint(np.where(valid, np.clip((normal + 1) / 2, 0, 1), 0) * 255).astype(np.uint8)
 
 
 def normal_key(height: int) -> np.ndarray:
-    """A ball seen from the front, each point in the colour that `normal_picture` has for its normal,
-    (height, KEY_WIDTH, 3)."""
+    """The colour key of `colour_normals`: a sphere in the colours of its normals, (height, KEY_WIDTH, 3)."""
     key = np.full((height, KEY_WIDTH, 3), _SHEET, np.uint8)
     radius, middle = 34, (KEY_WIDTH // 2, height // 2)
     y, x = (np.mgrid[-radius : radius + 1, -radius : radius + 1]) / radius
@@ -67,7 +65,7 @@ def normal_key(height: int) -> np.ndarray:
     normal = np.stack([x, y, -np.sqrt(np.maximum(1 - x * x - y * y, 0))], -1)
     top, left = middle[1] - radius, middle[0] - radius
     ball = key[top : top + 2 * radius + 1, left : left + 2 * radius + 1]
-    ball[inside] = normal_picture(normal)[inside]
+    ball[inside] = colour_normals(normal)[inside]
     sides = (
         ("up", 0, -radius - 12),
         ("down", 0, radius + 14),
@@ -80,40 +78,40 @@ def normal_key(height: int) -> np.ndarray:
     return key
 
 
-def label_picture(label: np.ndarray) -> np.ndarray:
-    """Labels or ids (h, w): black for -1, grey for 0 and a colour of its own for each other one."""
+def colour_labels(label: np.ndarray) -> np.ndarray:
+    """Colour labels or ids (h, w): black for -1, grey for 0, a distinct colour for each other one."""
     values, which = np.unique(label, return_inverse=True)
     colours = _colours(values)
     colours[values < 0], colours[values == 0] = 0, _BACKGROUND
     return colours[which.reshape(label.shape)]
 
 
-def count_picture(count: np.ndarray) -> np.ndarray:
-    """Counts or errors (h, w) in the turbo colours from 0 (dark blue) to the greatest (red)."""
+def colour_counts(count: np.ndarray) -> np.ndarray:
+    """Colour counts or errors (h, w) by the turbo map, from 0 (dark blue) to the maximum (red)."""
     return _turbo(count / (count.max(initial=0) or 1))
 
 
-def count_key(most: int, height: int) -> np.ndarray:
-    """The colour bar of `count_picture` for a greatest count, (height, KEY_WIDTH, 3)."""
-    return _colour_bar(height, lambda share: share, [f"{round(s * most)}" for s in _TICKS])
+def count_key(maximum: int, height: int) -> np.ndarray:
+    """The colour bar of `colour_counts` up to a maximum count, (height, KEY_WIDTH, 3)."""
+    return _colour_bar(height, lambda share: share, [f"{round(s * maximum)}" for s in _TICKS])
 
 
-def outlined(
+def draw_outlines(
     image: np.ndarray, marks: Sequence[tuple[np.ndarray, str]], thickness: int = 2, size: float = 0.9
 ) -> np.ndarray:
-    """A copy of an image (h, w, 3) uint8 with quadrilaterals and, in dark boxes below them, captions.
+    """Copy an image (h, w, 3) uint8 and draw quadrilaterals with captions in dark boxes below them.
 
     Args:
         marks: (corners (4, 2), caption) each; the first corner gets a dot.
         thickness: of the lines, pixels.
         size: of the captions, in units of OpenCV's built-in font.
     """
-    drawn = np.ascontiguousarray(image).copy()
+    marked = np.ascontiguousarray(image).copy()
     for corners, _ in marks:
-        # OpenCV counts from the centre of the first pixel
+        # OpenCV's origin is the centre of the first pixel
         points = np.rint((corners - 0.5) * 2**_SHIFT).astype(np.int32)
-        cv2.polylines(drawn, [points.reshape(-1, 1, 2)], True, _OUTLINE, thickness, cv2.LINE_AA, _SHIFT)
-        cv2.circle(drawn, points[0].tolist(), (2 + thickness) * 2**_SHIFT, _OUTLINE, -1, cv2.LINE_AA, _SHIFT)
+        cv2.polylines(marked, [points.reshape(-1, 1, 2)], True, _OUTLINE, thickness, cv2.LINE_AA, _SHIFT)
+        cv2.circle(marked, points[0].tolist(), (2 + thickness) * 2**_SHIFT, _OUTLINE, -1, cv2.LINE_AA, _SHIFT)
     line, bottom = round(36 * size), image.shape[0] - 8
     taken = [(*corners.min(axis=0), *corners.max(axis=0)) for corners, _ in marks]  # left, top, right, foot
     for corners, text in sorted(marks, key=lambda mark: mark[0][:, 1].max()):
@@ -127,28 +125,29 @@ def outlined(
             foot += 1
         box = (left - 4, foot - line + 8, left + wide + 4, foot + 8)
         taken.append(box)
-        cv2.rectangle(drawn, box[:2], box[2:], (_SHEET,) * 3, -1)
-        write(drawn, text, (left, foot), size=size)
-    return drawn
+        cv2.rectangle(marked, box[:2], box[2:], (_SHEET,) * 3, -1)
+        write(marked, text, (left, foot), size=size)
+    return marked
 
 
 def write(
     image: np.ndarray, text: str, place: tuple[int, int], colour=(255, 255, 255), size: float = 0.5
 ) -> None:
-    """Put a line of text on an image, in place, its lower left corner at ``place`` (x, y), readable on any
-    ground."""
-    plain = text.encode("ascii", "replace").decode()  # all that every version's built-in font holds
+    """Write a line of text with a dark outline into an image, its lower left corner at `place` (x, y)."""
+    plain = text.encode(
+        "ascii", "replace"
+    ).decode()  # the built-in fonts of all OpenCV versions have only ASCII
     x, y = place
     width = max(1, round(2 * size))
-    # a thicker stroke under it would be a wider text in OpenCV 5, so the dark rim is the same text moved
+    # the dark outline is the same text shifted: a thicker stroke would widen the text in OpenCV 5
     for right, down in ((-1, 0), (1, 0), (0, -1), (0, 1), (0, 0)):
         shade = colour if (right, down) == (0, 0) else (0, 0, 0)
         at = (x + right, y + down)
         cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
 
 
-def shrunk(image: np.ndarray, width: int) -> np.ndarray:
-    """An image (h, w, 3) uint8 made ``width`` pixels wide, each the mean of what it covers."""
+def resize_to_width(image: np.ndarray, width: int) -> np.ndarray:
+    """Scale an image (h, w, 3) uint8 to a width in pixels by averaging areas."""
     height = max(1, round(image.shape[0] * width / image.shape[1]))
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
@@ -159,20 +158,20 @@ def contact_sheet(
     gap: int = 6,
     key: Callable[[int, int], np.ndarray | None] | None = None,
 ) -> np.ndarray:
-    """Titled pictures in rows on one dark sheet, (h, w, 3) uint8.
+    """Titled images in rows on one dark sheet, (h, w, 3) uint8.
 
     Args:
         rows: each a list of (title, image (h, w, 3) uint8); the images of a sheet have one shape.
-        width: of each picture on the sheet, pixels.
-        gap: pixels between pictures.
-        key: (row, height) -> what stands to the right of a row, (height, KEY_WIDTH, 3), or None for nothing.
+        width: of each image on the sheet, pixels.
+        gap: pixels between images.
+        key: (row, height) -> the image to the right of a row, (height, KEY_WIDTH, 3), or None for nothing.
     """
     title = 22
-    cells = [[(name, shrunk(image, width)) for name, image in row] for row in rows]
+    cells = [[(name, resize_to_width(image, width)) for name, image in row] for row in rows]
     height = max(image.shape[0] for row in cells for _, image in row)
     columns = max(len(row) for row in cells)
-    beside = gap + columns * (width + gap)
-    across = beside + (KEY_WIDTH + gap if key else 0)
+    key_left = gap + columns * (width + gap)
+    across = key_left + (KEY_WIDTH + gap if key else 0)
     sheet = np.full((gap + len(rows) * (title + height + gap), across, 3), _SHEET, np.uint8)
     for i, row in enumerate(cells):
         for j, (name, image) in enumerate(row):
@@ -182,15 +181,16 @@ def contact_sheet(
         strip = key(i, height) if key else None
         if strip is not None:
             y = gap + i * (title + height + gap) + title
-            sheet[y : y + height, beside : beside + KEY_WIDTH] = strip
+            sheet[y : y + height, key_left : key_left + KEY_WIDTH] = strip
     return sheet
 
 
-_TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of a colour bar, from its foot
+_TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)  # positions of a colour bar's ticks, from the bottom
 
 
 def _colour_bar(height: int, colour: Callable[[np.ndarray], np.ndarray], words: list[str]) -> np.ndarray:
-    """A bar with words at its ticks; colour: share of the bar from its foot -> share of the turbo colours."""
+    """A colour bar with labelled ticks. colour: maps positions, 0 at the bottom to 1, to the turbo map's [0,
+    1]."""
     key = np.full((height, KEY_WIDTH, 3), _SHEET, np.uint8)
     left, right, top, foot = 10, 34, 8, height - 9
     key[top : foot + 1, left:right] = _turbo(colour(np.linspace(1, 0, foot + 1 - top)))[:, None].reshape(
@@ -204,13 +204,13 @@ def _colour_bar(height: int, colour: Callable[[np.ndarray], np.ndarray], words: 
 
 
 def _turbo(share: np.ndarray) -> np.ndarray:
-    """Shares of 0 to 1 in the turbo colours, (..., 3) RGB."""
+    """Map values in [0, 1] to the turbo colours, (..., 3) RGB."""
     levels = np.rint(share * 255).astype(np.uint8)
     return cv2.applyColorMap(levels.reshape(-1, 1), cv2.COLORMAP_TURBO)[:, 0, ::-1].reshape(*share.shape, 3)
 
 
 def _colours(values: np.ndarray) -> np.ndarray:
-    # turning by the golden angle keeps neighbouring labels far apart on the colour circle
+    # steps of the golden angle give neighbouring labels very different hues
     hue = (values - 1.0) * 137.508 % 360 / 2
     pixels = np.stack([hue, np.full(hue.shape, 200.0), np.full(hue.shape, 255.0)], -1).astype(np.uint8)
     return cv2.cvtColor(pixels[None], cv2.COLOR_HSV2RGB)[0]

@@ -8,11 +8,11 @@ import numpy as np
 from fidsplat.effects import declared_output
 from fidsplat.images.files import write_png
 from fidsplat.images.visualize import (
-    count_picture,
+    colour_counts,
+    colour_depth,
+    colour_labels,
+    colour_normals,
     depth_millimetres,
-    depth_picture,
-    label_picture,
-    normal_picture,
 )
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
@@ -20,10 +20,10 @@ from fidsplat.util.npy import load_npy
 
 _PICTURES = {
     "color": lambda image: image,
-    "depth": depth_picture,
-    "normal": normal_picture,
-    "label": label_picture,
-    "count": count_picture,
+    "depth": colour_depth,
+    "normal": colour_normals,
+    "label": colour_labels,
+    "count": colour_counts,
 }
 """8-bit visualisation of an output image, by `Output.display`"""
 

@@ -1,4 +1,4 @@
-"""Cameras for simulators: splats, markers and cameras that hang on bodies, in many environments at once.
+"""Rendering for simulators: splats, markers and cameras attached to bodies, in many environments at once.
 
 `fidsplat.sim.mujoco` and `fidsplat.sim.gymnasium` need `pip install 'fidsplat[sim]'`.
 """

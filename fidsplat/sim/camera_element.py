@@ -1,4 +1,4 @@
-"""The XML that SDF and URDF share: numbers, poses, and SDF's `<camera>` element."""
+"""XML parsing shared by SDF and URDF: numbers, poses and SDF's `<camera>` element."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import open_input, path_of
 
 OPTICAL = np.array([0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5])
-"""sensor from camera: theirs looks along x with z up, ours along z with y down"""
+"""rotation sensor from camera: SDF sensors look along x with z up, our cameras along z with y down"""
 KINDS = {
     "camera": ("rgb",),
     "wideanglecamera": ("rgb",),
@@ -33,68 +33,70 @@ KINDS = {
 }
 """outputs of each type of sensor"""
 _WELL = 1e12
-"""electrons: so deep a well has no shot noise to speak of"""
+"""full well [electrons] that makes shot noise negligible"""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where in a file something stands, for errors."""
+    """Path of an element within a file, for error messages."""
 
     file: Path
     path: str = ""
 
     def within(self, name: str) -> Place:
-        """A part of it."""
+        """The path of a child element."""
         return Place(self.file, f"{self.path}/{name}" if self.path else name)
 
     def wrong(self, why: str) -> InputError:
-        """The error that says why it cannot be used."""
+        """Error with the file, the element and the reason."""
         return InputError(f"{self.file}: {self.path}: {why}" if self.path else f"{self.file}: {why}")
 
 
 def parse(path: str | os.PathLike[str]) -> tuple[ElementTree.Element, Place]:
-    """A file's root. Raises InputError for a file that cannot be read, or is no XML."""
+    """Root element of an XML file. Raises InputError for a file that cannot be read or parsed."""
     file = path_of(path)
     try:
         with open_input(file) as stream:
             root = ElementTree.parse(stream).getroot()
     except InputError:
         raise
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # or an encoding that nobody knows
-        raise InputError(f"{file} is no XML: {error}") from None
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # or an unknown encoding
+        raise InputError(f"cannot read {file} as XML: {error}") from None
     for element in root.iter():
         if "ros.org/wiki/xacro" in str(element.tag):
-            raise InputError(f"{file} is a xacro file; run `xacro {file.name} > out.urdf` and read that")
+            raise InputError(
+                f"{file} must be URDF, got xacro; run `xacro {file.name} > out.urdf` and read that"
+            )
     return root, Place(file)
 
 
 def name_of(element: ElementTree.Element, place: Place) -> str:
-    """The attribute `name`."""
+    """The required attribute `name` of an element."""
     name = element.get("name", "")
     if not name:
-        raise place.wrong(f"a <{element.tag}> has no name")
+        raise place.wrong(f"a <{element.tag}> must have a name, got none")
     return name
 
 
 def numbers(text: str | None, count: int, place: Place) -> list[float]:
-    """So many finite numbers of a text."""
+    """Parse a text of `count` finite numbers."""
     try:
         values = [float(word) for word in (text or "").split()]
     except ValueError:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise place.wrong(f"{text!r} must be {count} finite number{'s' if count > 1 else ''}")
+        raise place.wrong(f"the text must be {count} finite number{'s' if count > 1 else ''}, got {text!r}")
     return values
 
 
 def number(parent: ElementTree.Element, tag: str, default: float, place: Place) -> float:
-    """The number in a child element."""
+    """The number in an optional child element."""
     child = parent.find(tag)
     return default if child is None else numbers(child.text, 1, place.within(tag))[0]
 
 
 def pose_of_angles(position: list[float], angles: list[float]) -> np.ndarray:
-    """(7,) of x y z and roll, pitch, yaw in radians about the fixed axes x, y, z."""
+    """Pose (7,) from x y z and roll, pitch, yaw in radians about the fixed axes x, y, z."""
     turn = np.array([1.0, 0.0, 0.0, 0.0])
     for axis, angle in enumerate(angles):
         own = np.zeros(4)
@@ -104,7 +106,7 @@ def pose_of_angles(position: list[float], angles: list[float]) -> np.ndarray:
 
 
 def pose_element(parent: ElementTree.Element, place: Place) -> np.ndarray:
-    """The (7,) of a child `<pose>`; it stands still where there is none."""
+    """Pose (7,) of a child `<pose>`, by default the identity."""
     element, place = parent.find("pose"), place.within("pose")
     if element is None or not (element.text or "").strip():
         return IDENTITY
@@ -117,9 +119,9 @@ def pose_element(parent: ElementTree.Element, place: Place) -> np.ndarray:
 
 
 def camera_sensor(sensor: ElementTree.Element, body: str, at: np.ndarray, place: Place) -> RigCamera | None:
-    """The camera that an SDF `<sensor>` is; None for another sensor.
+    """Camera of an SDF `<sensor>`; None if the sensor is not a camera.
 
-    body: the link that carries it. at: (7,), link from sensor.
+    body: name of the sensor's link. at: (7,) link from sensor.
     """
     kind = sensor.get("type", "")
     element = sensor.find("camera")
@@ -141,7 +143,9 @@ def _camera(element: ElementTree.Element, place: Place) -> Camera:
     sizes = [("width", 320), ("height", 240)]
     width, height = (d if image is None else number(image, tag, d, place.within("image")) for tag, d in sizes)
     if not (width == int(width) and height == int(height)):
-        raise place.within("image").wrong(f"{width:g} x {height:g} are no whole numbers of pixels")
+        raise place.within("image").wrong(
+            f"width and height must be whole numbers of pixels, got {width:g} x {height:g}"
+        )
     fov = number(element, "horizontal_fov", 1.047, place)
     kind = element.findtext("lens/type", "gnomonical").strip()
     lens: Fisheye | BrownConrady | None
@@ -153,7 +157,7 @@ def _camera(element: ElementTree.Element, place: Place) -> Camera:
             lens = _distortion(element, place)
             focal = focal_length(int(width), fov)
         else:
-            raise InputError(f"a lens of type {kind!r} is not offered; known: gnomonical, equidistant")
+            raise InputError(f"the type of a lens must be gnomonical or equidistant, got {kind!r}")
         intrinsics, inside = element.find("lens/intrinsics"), place.within("lens/intrinsics")
         values = (("fx", focal), ("fy", focal), ("cx", width / 2), ("cy", height / 2))
         fx, fy, cx, cy = (
@@ -182,7 +186,7 @@ def _noise(element: ElementTree.Element, place: Place) -> Sensor | None:
         return None
     mean, deviation = number(noise, "mean", 0.0, place), number(noise, "stddev", 0.0, place)
     if mean:
-        raise place.wrong(f"a mean of {mean:g} is no noise; make it 0")
+        raise place.wrong(f"the mean of the noise must be 0, got {mean:g}")
     if not 0 <= deviation <= 1:
-        raise place.wrong(f"a stddev of {deviation:g} must lie between 0 and 1, the white of a picture")
+        raise place.wrong(f"the stddev of the noise must be from 0 to 1 (white), got {deviation:g}")
     return Sensor(full_well=_WELL, read_noise=deviation * _WELL) if deviation else None

@@ -29,21 +29,20 @@ from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import path_of
 
 DEEPEST = 32
-"""includes within includes, and models within models"""
+"""maximum depth of nested includes, and of nested models"""
 
 
 @dataclass
 class Description:
-    """What `read_description` finds."""
+    """Cameras, bodies and splats of a description file."""
 
     cameras: dict[str, RigCamera] = field(default_factory=dict)
-    """by the sensor's name, for `Rig`; each hangs on its link"""
+    """by the sensor's name, for `Rig`; each is attached to its link"""
     bodies: dict[str, np.ndarray] = field(default_factory=dict)
-    """links by name, MODEL::LINK in SDF: their poses (7,) in the world as the file has them, of a robot with
-    all joints at 0"""
+    """poses (7,) of links in the world by name, MODEL::LINK in SDF; of a robot with all joints at 0"""
 
     def add(self, name: str, camera: RigCamera | None, place: Place) -> None:
-        """Keep a camera. Raises InputError where another has its name."""
+        """Add a camera. Raises InputError for a name that exists."""
         if camera is None:
             return
         if name in self.cameras:
@@ -59,21 +58,22 @@ def read_description(
     models: Iterable[str | os.PathLike[str]] = (),
     most_models: int = 10_000,
 ) -> Description:
-    """The cameras and links of an SDF or URDF file.
+    """Read the cameras and links of an SDF or URDF file.
 
-    Of an SDF: nested models and includes, poses relative to links, frames and joints of the same model;
-    sensors that are cameras, with field of view or intrinsics, distortion, clip, noise and update rate. Of a
-    URDF: links, joints at 0, sensors within `<gazebo reference>`, and `<sensor>` elements.
+    SDF: nested models and includes, poses relative to links, frames and joints of the same model;
+        sensors that are cameras, with field of view or intrinsics, distortion, clip, noise and update rate.
+        URDF: links, joints at 0, sensors within `<gazebo reference>`, and `<sensor>` elements.
 
-    Args:
-        path: the file, or a model's folder with model.sdf in it.
-        models: folders in which `model://NAME` is looked for, before those of the environment variables
-            GZ_SIM_RESOURCE_PATH and SDF_PATH and the file's own.
-        most_models: models that an SDF file may have with all includes, of which a few lines make millions.
+        Args:
+            path: the file, or a model's folder with model.sdf in it.
+            models: folders that are searched for `model://NAME` before those of the environment variables
+                GZ_SIM_RESOURCE_PATH and SDF_PATH and the file's folder.
+            most_models: maximum number of models of an SDF file with all includes; a few lines can include
+            millions.
 
-    Raises:
-        InputError: a file that cannot be read, more models or deeper ones than may be, an include that is not
-            found or that includes itself, a value that makes no camera, two cameras of one name; it names the
+        Raises:
+            InputError: a file that cannot be read, too many or too deeply nested models, an include that is
+            not found or includes itself, an invalid camera, two cameras of one name; the message names the
             file and the element.
     """
     file = path_of(path)
@@ -103,12 +103,12 @@ class _Sdf:
     most_models: int
     models: int = 0
     parsed: dict[Path, tuple[ElementTree.Element, Place]] = field(default_factory=dict)
-    """included files"""
+    """cached files of includes"""
 
     def group(
         self, parent: ElementTree.Element, prefix: str, at: np.ndarray, place: Place, files: tuple[Path, ...]
     ) -> None:
-        """The models of a world or a file."""
+        """Read the models and includes of a world, a model or a file."""
         for model in parent.findall("model"):
             self.model(model, prefix, at, place, files)
         for include in parent.findall("include"):
@@ -121,26 +121,26 @@ class _Sdf:
         place = place.within(f"include {uri}")
         file = self._file_of(uri, place)
         if file in files or len(files) >= DEEPEST:
-            raise place.wrong("it includes itself")
+            raise place.wrong("an include must not include itself; remove it")
         if file not in self.parsed:
             self.parsed[file] = parse(file)
         root, inner = self.parsed[file]
         model = root.find("model")
         if model is None:
-            raise inner.wrong("it has no <model> to include")
+            raise inner.wrong("an included file must have a <model>, got none")
         pose = None if include.find("pose") is None else pose_element(include, place)
         name = include.findtext("name", "").strip() or None
         self.model(model, prefix, at, inner, (*files, file), name, pose)
 
     def _file_of(self, uri: str, place: Place) -> Path:
         name = uri.removeprefix("model://").removeprefix("file://")
-        beside = place.file.resolve().parent
-        for folder in (*self.folders, beside, beside.parent):
+        parent = place.file.resolve().parent
+        for folder in (*self.folders, parent, parent.parent):
             for candidate in (folder / name, folder / name / "model.sdf"):
                 if name and candidate.is_file():
                     return candidate.resolve()
-        places = ", ".join(map(str, (*self.folders, beside, beside.parent)))
-        raise place.wrong(f"the model is not found in {places}; give its folder as models=[...]")
+        places = ", ".join(map(str, (*self.folders, parent, parent.parent)))
+        raise place.wrong(f"cannot find the model in {places}; give its folder as models=[...]")
 
     def model(
         self,
@@ -152,7 +152,7 @@ class _Sdf:
         name: str | None = None,
         pose: np.ndarray | None = None,
     ) -> None:
-        """One model, whose parent stands at `at`. An include may give it another name and pose."""
+        """Read one model, whose parent has the pose `at`. An include may give it another name and pose."""
         own = name or name_of(model, place)
         place = place.within(own)
         self.models += 1
@@ -178,21 +178,21 @@ class _Sdf:
 
 
 class _Frames:
-    """Poses of a model's links, frames and joints in the model."""
+    """Poses of a model's links, frames and joints relative to the model."""
 
     def __init__(self, model: ElementTree.Element, place: Place) -> None:
         kinds = ("link", "frame", "joint", "model")
         self._parts = {part.get("name", ""): part for kind in kinds for part in model.findall(kind)}
         self._place = place
 
-    def pose(self, name: str, seen: tuple[str, ...] = ()) -> np.ndarray:
-        """(7,), model from it."""
+    def pose(self, name: str, visited: tuple[str, ...] = ()) -> np.ndarray:
+        """Pose (7,) of a part, model from part."""
         if name == "__model__":
             return IDENTITY
         if name not in self._parts:
             raise self._place.wrong(unknown("frame", name, self._parts))
-        if name in seen:
-            raise self._place.wrong(f"the pose of {name!r} is relative to itself")
+        if name in visited:
+            raise self._place.wrong(f"the pose of {name!r} must not be relative to itself")
         part = self._parts[name]
         own = pose_element(part, self._place.within(name))
         element = part.find("pose")
@@ -200,7 +200,7 @@ class _Frames:
         if not base:
             base = part.get("attached_to", "") if part.tag == "frame" else ""
             base = part.findtext("child", "").strip() if part.tag == "joint" else base
-        return compose(self.pose(base, (*seen, name)), own) if base else own
+        return compose(self.pose(base, (*visited, name)), own) if base else own
 
 
 def _read_robot(root: ElementTree.Element, found: Description, place: Place) -> None:
@@ -209,7 +209,7 @@ def _read_robot(root: ElementTree.Element, found: Description, place: Place) -> 
         inside = place.within(name_of(joint, place))
         parent, child = (_link_of(joint, tag, inside) for tag in ("parent", "child"))
         if child in parents:
-            raise inside.wrong(f"the link {child!r} has two parents")
+            raise inside.wrong(f"the link {child!r} must have one parent, got two")
         parents[child] = parent, _origin(joint, inside)
     links = [name_of(link, place) for link in root.findall("link")]
     for name in links:
@@ -220,7 +220,7 @@ def _read_robot(root: ElementTree.Element, found: Description, place: Place) -> 
             at, step = parents[at]
             pose = compose(step, pose)
         else:
-            raise place.wrong(f"the joints above the link {name!r} go in a circle")
+            raise place.wrong(f"the joints above the link {name!r} must not form a cycle")
         found.bodies[name] = pose
     for gazebo in root.findall("gazebo"):
         link = gazebo.get("reference", "")
@@ -243,7 +243,7 @@ def _link_of(element: ElementTree.Element, tag: str, place: Place) -> str:
     child = element.find(tag)
     name = "" if child is None else child.get("link", "")
     if not name:
-        raise place.wrong(f"its <{tag}> names no link")
+        raise place.wrong(f"<{tag}> must name a link, got none")
     return name
 
 
@@ -257,7 +257,7 @@ def _origin(element: ElementTree.Element, place: Place) -> np.ndarray:
 
 
 def _own_camera(sensor: ElementTree.Element, link: str, place: Place) -> RigCamera:
-    """A camera of URDF's own `<sensor>`."""
+    """Camera of a URDF `<sensor>`."""
     image = sensor.find("camera/image")
     assert image is not None
     inside = place.within("camera/image")

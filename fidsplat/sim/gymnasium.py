@@ -1,4 +1,4 @@
-"""Pictures of splats in the observations of a Gymnasium environment."""
+"""Images of splats in the observations of a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from fidsplat.util.errors import InputError
 try:
     import gymnasium as _gymnasium  # type: ignore[import-not-found]
 except ImportError as error:
-    raise InputError(f"Gymnasium is not here ({error}); pip install 'fidsplat[sim]'") from None
+    raise InputError(f"cannot import Gymnasium ({error}); pip install 'fidsplat[sim]'") from None
 
-gymnasium: Any = _gymnasium  # whose names its types do not tell where it is not installed
+gymnasium: Any = _gymnasium  # type checkers do not know its names where it is not installed
 spaces = gymnasium.spaces
 
 
 class SplatObservation(gymnasium.ObservationWrapper):
-    """An environment whose observation holds what a rig's cameras see.
+    """Wrapper that adds images of a rig's cameras to the observation of an environment.
 
-    The observation becomes a dictionary: `state`, what the environment itself observes (its own entries
-    where that is a dictionary), and CAMERA_OUTPUT for each picture, e.g. `front_rgb` (h, w, 3) uint8,
-    `front_depth` (h, w) float32 metres.
+    The observation becomes a dictionary: `state`, the observation of the environment (or its entries, if it
+    is a dictionary), and CAMERA_OUTPUT for each image, e.g. `front_rgb` (h, w, 3) uint8, `front_depth` (h, w)
+    float32 metres.
 
     Args:
         env: the environment.
         rig: the cameras; a `MujocoRig` reads `env.unwrapped.data`.
-        poses: called with the unwrapped environment, gives the arguments of `rig.render`, for other
-            simulators: (bodies, cameras) as {name: (1, 7)}.
+        poses: for simulators other than MuJoCo: function of the unwrapped environment that returns the
+            arguments (bodies, cameras) of `rig.render` as {name: (1, 7)}.
 
     Raises:
         InputError: an environment without MuJoCo's data and no `poses`.
@@ -41,27 +41,28 @@ class SplatObservation(gymnasium.ObservationWrapper):
         super().__init__(env)
         if poses is None and not hasattr(env.unwrapped, "data"):
             raise InputError(
-                f"{env.unwrapped!r} has no MuJoCo data; say with poses=... where its bodies and cameras are"
+                f"env must have MuJoCo data, got {env.unwrapped!r}; give the poses of bodies and cameras "
+                "by poses=..."
             )
         self._rig, self._poses = rig, poses
         old = env.observation_space
         own = dict(old.spaces) if isinstance(old, spaces.Dict) else {"state": old}
         self._whole = not isinstance(old, spaces.Dict)
-        self.observation_space = spaces.Dict(own | self._picture_spaces())
+        self.observation_space = spaces.Dict(own | self._image_spaces())
 
     def observation(self, observation: Any) -> dict[str, Any]:
-        """The environment's observation with the pictures of this moment."""
+        """The environment's observation and images of its current state."""
         env = self.env.unwrapped
         given = (env.data,) if self._poses is None else self._poses(env)  # type: ignore[attr-defined]
-        pictures = self._rig.render(*given)
-        seen = {
-            f"{name}_{output}": _as_observed(output, pictures.of(name)[output][0])
+        images = self._rig.render(*given)
+        observed = {
+            f"{name}_{output}": _as_observed(output, images.of(name)[output][0])
             for name in self._rig.cameras
-            for output in pictures.of(name)
+            for output in images.of(name)
         }
-        return ({"state": observation} if self._whole else dict(observation)) | seen
+        return ({"state": observation} if self._whole else dict(observation)) | observed
 
-    def _picture_spaces(self) -> dict[str, Any]:
+    def _image_spaces(self) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for name, camera in self._rig.cameras.items():
             size = camera.camera.height, camera.camera.width
@@ -74,7 +75,7 @@ class SplatObservation(gymnasium.ObservationWrapper):
 
 
 def _space(output: Output, size: tuple[int, int]) -> Any:
-    """Space of an output image."""
+    """Gymnasium space of an output image."""
     shape = size if output.channels == 1 else (*size, output.channels)
     if output.dtype == "int32":
         return spaces.Box(output.blank, np.iinfo(np.int32).max, shape, np.int32)

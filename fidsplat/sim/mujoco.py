@@ -1,4 +1,4 @@
-"""Cameras of a MuJoCo model that see splats."""
+"""Rigs with the cameras and bodies of a MuJoCo model."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from fidsplat.util.errors import InputError, unknown
 try:
     import mujoco as _mujoco  # type: ignore[import-not-found]
 except ImportError as error:
-    raise InputError(f"MuJoCo is not here ({error}); pip install 'fidsplat[sim]'") from None
+    raise InputError(f"cannot import MuJoCo ({error}); pip install 'fidsplat[sim]'") from None
 
-mujoco: Any = _mujoco  # whose names its types do not tell
+mujoco: Any = _mujoco  # type checkers do not know its names
 
 _OPENCV = np.array([0.0, 1.0, 0.0, 0.0])
-"""half a turn about x: MuJoCo's cameras look along -z with y up, ours along z with y down"""
+"""180 degrees about x: MuJoCo's cameras look along -z with y up, ours along z with y down"""
 _OUTPUTS = {
     "mjCAMOUT_RGB": "rgb",
     "mjCAMOUT_DEPTH": "depth",
@@ -33,21 +33,21 @@ _OUTPUTS = {
     "mjCAMOUT_NORMAL": "normal",
     "mjCAMOUT_SEG": "label",
 }
-"""our name of each output that a camera of MJCF may name"""
+"""output name of each MuJoCo camera output"""
 
 
 class MujocoRig(Rig):
-    """The cameras of a MuJoCo model, looking at splats that hang on its bodies.
+    """A rig with the cameras of a MuJoCo model and splats attached to its bodies.
 
-    Resolution, fovy, focal length, principal point and outputs are the model's; the near and far planes are
-    ours (0.01 m and none), since MuJoCo's grow with the model.
+    Resolution, fovy, focal length, principal point and outputs are the model's; the near plane is at
+    0.01 m and there is no far plane, since MuJoCo scales both with the model.
 
     Args:
         model: mujoco.MjModel.
         scene: splats and markers; those with a label in `bodies` in the frame of their body.
         bodies: {label: name of the body in the model}.
-        cameras: names of the cameras that are wanted; default all that have one.
-        renderer, rest, outputs: as in `Rig`; without `outputs` a camera gives what its `output` names.
+        cameras: names of the requested cameras; default all cameras that have a name.
+        renderer, rest, outputs: as in `Rig`; by default a camera has the outputs of its `output` attribute.
 
     Raises:
         InputError: as `Rig`; a body or camera that the model does not have, a camera without a name.
@@ -65,33 +65,34 @@ class MujocoRig(Rig):
         outputs: Iterable[str] | None = None,
     ) -> None:
         if not isinstance(model, mujoco.MjModel):
-            raise InputError(f"model is {model!r}; it must be a mujoco.MjModel")
+            raise InputError(f"model must be a mujoco.MjModel, got {model!r}")
         if isinstance(cameras, str):
-            raise InputError(f"cameras is {cameras!r}; it must be a list of names, [{cameras!r}]")
-        there = [model.camera(i).name for i in range(model.ncam)]
-        wanted = [name for name in there if name] if cameras is None else list(cameras)
-        for name in wanted:
-            if name not in there or not name:
-                raise InputError(unknown("camera", name, filter(None, there)))
-        seen = [(name, camera_of(model, name, default=outputs is None)) for name in wanted]
-        super().__init__(scene, bodies, seen, renderer=renderer, rest=rest, outputs=outputs)
+            raise InputError(f"cameras must be a list of names, got {cameras!r}; use [{cameras!r}]")
+        names_of_model = [model.camera(i).name for i in range(model.ncam)]
+        requested = [name for name in names_of_model if name] if cameras is None else list(cameras)
+        for name in requested:
+            if name not in names_of_model or not name:
+                raise InputError(unknown("camera", name, filter(None, names_of_model)))
+        cameras_of_rig = [(name, camera_of(model, name, default=outputs is None)) for name in requested]
+        super().__init__(scene, bodies, cameras_of_rig, renderer=renderer, rest=rest, outputs=outputs)
         names = [model.body(i).name for i in range(model.nbody)]
         for name in self.bodies:
             if name not in names:
                 raise InputError(unknown("body", name, filter(None, names)))
         self._counts = model.nbody, model.ncam
         self._body_ids = [names.index(name) for name in self.bodies]
-        self._camera_ids = [there.index(name) for name in self.cameras]
+        self._camera_ids = [names_of_model.index(name) for name in self.cameras]
 
     def poses(self, data: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (env, body, 7) and (env, camera, 7), OpenCV axes, of what `render` takes."""
+        """Poses of bodies (env, body, 7) and of cameras (env, camera, 7), OpenCV axes. data: as in
+        `render`."""
         many = data if isinstance(data, list | tuple) else [data]
         if not many:
-            raise InputError("data is empty; give at least one MjData")
+            raise InputError("data must have at least one MjData, got an empty list")
         parts = [_arrays_of(each, *self._counts) for each in many]
         position, turn, at, axes = (np.concatenate([part[k] for part in parts]) for k in range(4))
         bodies = np.concatenate([position, turn], -1)[:, self._body_ids]
-        cameras = np.concatenate([at, quaternions_of(axes, turned=_OPENCV)], -1)[:, self._camera_ids]
+        cameras = np.concatenate([at, quaternions_of(axes, right=_OPENCV)], -1)[:, self._camera_ids]
         return bodies, cameras
 
     def render(  # type: ignore[override]
@@ -102,11 +103,11 @@ class MujocoRig(Rig):
         external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
         mask: Any = None,
     ) -> RigImages:
-        """What the cameras see.
+        """Render the images of all cameras.
 
         Args:
-            data: an MjData, a list of them, one for each environment, or mujoco_warp's Data; after
-                `mj_forward` or `mj_step`, which say where bodies and cameras are.
+            data: an MjData, a list of MjData, one for each environment, or mujoco_warp's Data; after
+                `mj_forward` or `mj_step`, which compute the poses of bodies and cameras.
             outputs, external_depths, mask: as in `Rig.render`.
 
         Raises:
@@ -117,9 +118,9 @@ class MujocoRig(Rig):
 
 
 def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:
-    """A camera of a MuJoCo model as ours. A model that gives no resolution means its off-screen buffer's.
+    """RigCamera of a MuJoCo camera. A camera without a resolution has that of the off-screen buffer.
 
-    default: take the outputs that the model names.
+    default: whether the camera has the outputs of the model.
     """
     number = model.camera(name).id
     width, height = map(int, model.cam_resolution[number])
@@ -141,9 +142,9 @@ def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:
 
 
 def _outputs_of(model: Any, number: int) -> tuple[str, ...] | None:
-    asked = int(model.cam_output[number])
+    bits = int(model.cam_output[number])
     return (
-        tuple(ours for theirs, ours in _OUTPUTS.items() if asked & int(getattr(mujoco.mjtCamOutBit, theirs)))
+        tuple(ours for theirs, ours in _OUTPUTS.items() if bits & int(getattr(mujoco.mjtCamOutBit, theirs)))
         or None
     )
 
@@ -156,13 +157,13 @@ def _arrays_of(data: Any, bodies: int, cameras: int) -> list[np.ndarray]:
     for name, width, count in kinds:
         array = getattr(data, name, None)
         if array is None:
-            raise InputError(f"data is {data!r}; it must be a mujoco.MjData or mujoco_warp's Data")
+            raise InputError(f"data must be a mujoco.MjData or mujoco_warp's Data, got {data!r}")
         host = array.numpy() if hasattr(array, "numpy") else array  # a wp.array, or NumPy
         numbers = np.asarray(host, np.float64)
-        there = numbers.shape[0 if numbers.ndim == 2 else 1]  # worlds are first
-        if there != count:
+        rows = numbers.shape[0 if numbers.ndim == 2 else 1]  # worlds are first
+        if rows != count:
             raise InputError(
-                f"data.{name} has {there} rows, but the model of the rig has {count}; give data of that model"
+                f"data.{name} must have {count} rows as the rig's model, got {rows}; give data of that model"
             )
         numbers = numbers.reshape(-1, count, width)
         found.append(numbers)

@@ -1,6 +1,6 @@
-"""Poses as simulators have them: (..., 7) float64, x y z in metres and a unit quaternion w x y z.
+"""Poses (..., 7) float64 in the layout of simulators: x y z in metres and a unit quaternion w x y z.
 
-All is computed element by element, so that a pose has the same bits alone and among thousands.
+All arithmetic is element by element, so that a pose does not depend on the batch it is computed in.
 """
 
 from __future__ import annotations
@@ -15,59 +15,59 @@ from fidsplat.util.errors import InputError
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 UNIT = 1e-3
-"""how far from 1 the length of a quaternion may be: float32 and integrators round"""
+"""tolerance of a quaternion's length, for rounding of float32 and integrators"""
 
 
 def check_poses(name: str, poses: Any, axes: tuple[str, ...]) -> np.ndarray:
-    """Poses as float64 with unit quaternions, of the shape (*axes, 7).
+    """Validate poses of the shape (*axes, 7); returns float64 with normalized quaternions.
 
     Raises:
         InputError: another shape, a number that is not finite, or a quaternion that is not of unit length;
-            the message names the first such pose by its place.
+            the message has the index of the first invalid pose.
     """
     array = real_array(name, poses, "poses x y z qw qx qy qz")
     if array.ndim != len(axes) + 1 or array.shape[-1] != 7:
-        wanted = f"({', '.join(axes)}, 7)" if axes else "(7,)"
-        raise InputError(f"{name} must have the shape {wanted}, but the shape is {array.shape}")
+        shape = f"({', '.join(axes)}, 7)" if axes else "(7,)"
+        raise InputError(f"{name} must have the shape {shape}, got {array.shape}")
     usable = np.isfinite(array).all(-1) & (np.abs(array[..., :3]) <= LARGEST).all(-1)
     if not usable.all():
         at = np.argwhere(~usable)[0].tolist()
-        raise InputError(f"{name}{at or ''} is {_shown(array, at)}; every number must be finite")
+        raise InputError(f"{name}{at or ''} must have finite numbers, got {_shown(array, at)}")
     w, x, y, z = np.moveaxis(array[..., 3:], -1, 0)
     length = np.sqrt(w * w + x * x + y * y + z * z)
     rigid = np.abs(length - 1) <= UNIT
     if not rigid.all():
         at = np.argwhere(~rigid)[0].tolist()
         raise InputError(
-            f"{name}{at or ''} is {_shown(array, at)}, which is not rigid: its quaternion (w, x, y, z) has "
-            f"the length {length[tuple(at)]:.4g}, not 1"
+            f"{name}{at or ''} must have a quaternion (w, x, y, z) of length 1, got "
+            f"{_shown(array, at)} of length {length[tuple(at)]:.4g}"
         )
     array[..., 3:] /= length[..., None]
     return array
 
 
 def compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """a_from_c of a_from_b and b_from_c."""
+    """Composition of two poses: a_from_c of a_from_b and b_from_c."""
     outer, inner = np.broadcast_arrays(outer, inner)
-    moved = outer[..., :3] + rotate(outer[..., 3:], inner[..., :3])
-    return np.concatenate([moved, quaternion_multiply(outer[..., 3:], inner[..., 3:])], axis=-1)
+    position = outer[..., :3] + rotate(outer[..., 3:], inner[..., :3])
+    return np.concatenate([position, quaternion_multiply(outer[..., 3:], inner[..., 3:])], axis=-1)
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:
-    """b_from_a of a_from_b."""
+    """Inverse pose: b_from_a of a_from_b."""
     back = pose[..., 3:] * [1.0, -1.0, -1.0, -1.0]
     return np.concatenate([-rotate(back, pose[..., :3]), back], axis=-1)
 
 
 def rotate(quaternion: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (..., 3) turned by unit quaternions (..., 4)."""
+    """Rotate points (..., 3) by unit quaternions (..., 4)."""
     w, axis = quaternion[..., :1], quaternion[..., 1:]
     across = 2 * np.cross(axis, points)
     return points + w * across + np.cross(axis, across)
 
 
 def matrix_of(pose: np.ndarray) -> np.ndarray:
-    """(..., 4, 4) of (..., 7)."""
+    """Matrices (..., 4, 4) of poses (..., 7)."""
     matrix = np.zeros((*pose.shape[:-1], 4, 4))
     matrix[..., :3, :3] = quaternion_to_matrix(pose[..., 3:])
     matrix[..., :3, 3] = pose[..., :3]
@@ -76,13 +76,14 @@ def matrix_of(pose: np.ndarray) -> np.ndarray:
 
 
 def pose_of(matrix: np.ndarray) -> np.ndarray:
-    """(7,) of one rigid (4, 4)."""
+    """Pose (7,) of a rigid matrix (4, 4)."""
     return np.concatenate([matrix[:3, 3], matrix_to_quaternion(matrix[:3, :3])])
 
 
-def quaternions_of(rotations: np.ndarray, turned: np.ndarray | None = None) -> np.ndarray:
-    """Unit quaternions (..., 4) of rotation matrices (..., 3, 3), times a quaternion (4,) by which these axes
-    are turned first; the method is `matrix_to_quaternion`'s."""
+def quaternions_of(rotations: np.ndarray, right: np.ndarray | None = None) -> np.ndarray:
+    """Unit quaternions (..., 4) of rotation matrices (..., 3, 3), multiplied from the right by `right` (4,).
+
+    The method is that of `matrix_to_quaternion`."""
     entry = np.moveaxis(rotations, (-2, -1), (0, 1))
     xx, yy, zz = entry[0, 0], entry[1, 1], entry[2, 2]
     wx, wy, wz = entry[2, 1] - entry[1, 2], entry[0, 2] - entry[2, 0], entry[1, 0] - entry[0, 1]
@@ -98,7 +99,7 @@ def quaternions_of(rotations: np.ndarray, turned: np.ndarray | None = None) -> n
     row = np.take_along_axis(outer, largest[..., None, None], -2)[..., 0, :]
     w, x, y, z = np.moveaxis(row, -1, 0)
     unit = row / np.sqrt(w * w + x * x + y * y + z * z)[..., None]
-    return unit if turned is None else quaternion_multiply(unit, np.broadcast_to(turned, unit.shape))
+    return unit if right is None else quaternion_multiply(unit, np.broadcast_to(right, unit.shape))
 
 
 def _shown(array: np.ndarray, at: list[int]) -> str:

@@ -1,4 +1,4 @@
-"""A rig: splats and cameras that hang on the bodies of a simulator, drawn in many environments at once."""
+"""A rig: splats and cameras attached to the bodies of a simulator, rendered in many environments at once."""
 
 from __future__ import annotations
 
@@ -23,55 +23,51 @@ from fidsplat.util.errors import InputError, MissingOutputError, unknown
 
 @dataclass(frozen=True, eq=False)
 class RigCamera:
-    """A camera and what it hangs on. Raises InputError for a part of the wrong kind."""
+    """A camera and the body that carries it. Raises InputError for a field of the wrong type."""
 
     camera: Camera
-    """intrinsics and lens. Its own pose is where it stands: `world_to_camera`, or on a body body_to_camera"""
+    """intrinsics and lens; its pose is the mount: world_to_camera without a body, else body_to_camera"""
     body: str | None = None
     """the body that carries it; None: the world"""
     sensor: Sensor | None = None
-    """what becomes of its rgb; None: what the scene says. Noise is another in every picture"""
+    """sensor model of rgb, with other noise for every image; None: the scene's"""
     outputs: tuple[str, ...] | None = None
     """names of its output images; None: the rig's"""
     rate: float | None = None
-    """pictures a second, for those who keep time; drawing takes no notice of it"""
+    """frames a second, for schedulers; rendering ignores it"""
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera):
-            raise InputError(f"camera is {self.camera!r}; it must be a Camera, e.g. fs.Camera.pinhole(...)")
+            raise invalid("camera", "a Camera", self.camera, "use fs.Camera.pinhole(...)")
         if not isinstance(self.body, str | None):
-            raise InputError(
-                f"the body of a camera is {self.body!r}; it must be a name, or None for the world"
-            )
+            raise invalid("the body of a camera", "a name, or None for the world", self.body)
         if not isinstance(self.sensor, Sensor | None):
-            raise InputError(f"the sensor of a camera is {self.sensor!r}; it must be a Sensor or None")
+            raise invalid("the sensor of a camera", "a Sensor or None", self.sensor)
         if self.outputs is not None:
             object.__setattr__(self, "outputs", output_names(self.outputs))
 
     @property
     def mount(self) -> np.ndarray:
-        """(7,) body from camera, OpenCV axes."""
+        """Pose of the camera, (7,) body from camera, OpenCV axes."""
         return inverse(pose_of(self.camera.world_to_camera))
 
 
 class Rig:
-    """Splats and cameras bound to bodies by name, drawn in every environment of a simulator.
+    """Splats and cameras bound to bodies by name, rendered in every environment of a simulator.
 
-    Splats with a label that is bound are given in the frame of their body (`rest` says otherwise); all
-    others are the world that the environments share. One body may carry several labels.
+    Splats with a label in `bodies` are given in the frame of their body, or at its `rest` pose; all others
+    are the static world that the environments share. One body may carry several labels.
 
     Args:
-        scene: splats and markers, and with its quality, background, fog and sensor how pictures are taken. A
-            scene's marker i has the label i + 1.
+        scene: splats and markers, with quality, background, fog and sensor. Marker i has the label i + 1.
         bodies: {label: name of the body}.
         cameras: {name: Camera or RigCamera}, or pairs of these.
-        renderer: draws; None: one for the default device.
-        rest: {name of a body: pose (7,)} of bodies whose splats lie in the scene where the body was then.
+        renderer: renders the images; None: one for the default device.
+        rest: {name of a body: pose (7,)} for bodies whose splats are given in the world, at this pose.
         outputs: names of the output images; default the scene's.
 
     Raises:
-        InputError: a label that no splat has, two cameras of one name, or none; a scene whose parts move by
-            themselves.
+        InputError: a label without splats, two cameras of one name, no camera; a scene with moving parts.
     """
 
     def __init__(
@@ -86,15 +82,15 @@ class Rig:
     ) -> None:
         self.scene = scene if isinstance(scene, Scene) else Scene((scene,))
         if not self.scene.motion.is_still:
-            raise InputError("parts of this scene move by themselves; in a rig the simulator moves them")
+            raise InputError("the scene of a rig must not have motion; the simulator moves the bodies")
         self.cameras = _cameras_of(cameras)
-        """RigCamera by name, in the order of the pictures' axis `camera`"""
+        """RigCamera by name, in the order of the images' axis `camera`"""
         cloud = self.scene.cloud()
         self.labels = _bodies_of({} if bodies is None else bodies, cloud)
         """name of the body by label"""
         mounts = (camera.body for camera in self.cameras.values() if camera.body is not None)
         self.bodies = tuple(dict.fromkeys((*self.labels.values(), *mounts)))
-        """names of the bodies whose poses are asked for, in the order of the axis `body`"""
+        """names of the bodies whose poses are required, in the order of the axis `body`"""
         self._rest = {}
         if renderer is not None:
             instance("renderer", renderer, Renderer, "an fs.Renderer or None")
@@ -107,7 +103,7 @@ class Rig:
         self.renderer = Renderer() if renderer is None else renderer
         self._cloud = self.renderer.upload(cloud)
         self._capture = self.scene.capture.with_(outputs=outputs)
-        self._drawn = 0
+        self._rendered = 0
 
     def render(
         self,
@@ -118,19 +114,19 @@ class Rig:
         external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
         mask: Any = None,
     ) -> RigImages:
-        """Pictures of every environment by every camera.
+        """Render every environment by every camera.
 
-        An environment's pictures have the same bits alone and among others.
+        The images of an environment do not depend on the other environments, bit for bit.
 
         Args:
             bodies: poses, world from body: {name: (env, 7)} of every body, or (env, body, 7) in the order of
-                `Rig.bodies`. None where there are none.
+                `Rig.bodies`. None if the rig has no bodies.
             cameras: poses, world from camera, OpenCV axes: {name: (env, 7)} of some cameras, or
-                (env, camera, 7). Cameras without one stand where they are mounted.
+                (env, camera, 7). Cameras without one use their mounts.
             outputs: names of the output images; default the rig's.
-            external_depths: {camera name: an ExternalDepth for each environment}, rendered by another
-                renderer from there.
-            mask: (env,) bool; environments that are False are not drawn: 0, and labels of -1.
+            external_depths: {camera name: [an ExternalDepth for each environment]}, rendered by another
+                renderer from the same pose.
+            mask: (env,) bool; environments with False are not rendered: images are 0, labels -1.
 
         Raises:
             InputError: an unknown body or camera, a body without a pose, a pose that is not rigid or not
@@ -140,30 +136,35 @@ class Rig:
         views = _by_name("camera", cameras, tuple(self.cameras))
         missing = [name for name in self.bodies if name not in given]
         if missing:
-            raise InputError(f"no pose for the body {missing[0]!r}; the rig has {', '.join(self.bodies)}")
+            raise InputError(
+                f"bodies must have a pose for every body ({', '.join(self.bodies)}), got none for "
+                f"{missing[0]!r}"
+            )
         count = _environments(given, views)
-        stands = {name: self._stands(name, given, count) for name in self.cameras} | views
+        poses = {name: self._mounted_pose(name, given, count) for name in self.cameras} | views
         names = None if outputs is None else output_names(outputs)
-        drawn = _mask_of(mask, count)
-        seen = {name: () for name in self.cameras} | self._external_of(external_depths, count)
+        active = _mask_of(mask, count)
+        external = {name: () for name in self.cameras} | self._external_of(external_depths, count)
         groups = {
             label: compose(given[name], self._rest[name]) if name in self._rest else given[name]
             for label, name in self.labels.items()
         }
         batches = {
-            name: self._draw(self._taken_by(name, names, seen[name], count), stands[name], groups, drawn)
+            name: self._render_camera(
+                self._captures_of(name, names, external[name], count), poses[name], groups, active
+            )
             for name in self.cameras
         }
-        self._drawn += count
-        return RigImages(self, batches, given, stands)
+        self._rendered += count
+        return RigImages(self, batches, given, poses)
 
     def outputs_of(self, camera: str) -> tuple[str, ...]:
-        """Names of a camera's output images, where `render` is not told others."""
+        """Names of a camera's output images if `render` has no `outputs`."""
         _known("camera", camera, self.cameras)
         return self.cameras[camera].outputs or self._capture.outputs
 
     def placed(self, bodies: Mapping[str, np.ndarray]) -> list[PlacedMarker]:
-        """The scene's markers where they are when the bodies have these poses (7,)."""
+        """The scene's markers for these poses (7,) of the bodies."""
         if not isinstance(bodies, Mapping):
             raise invalid("bodies", "{name of a body: pose (7,)}", bodies)
         placed = []
@@ -177,24 +178,20 @@ class Rig:
             placed.append(marker)
         return placed
 
-    def _stands(self, name: str, bodies: Mapping[str, np.ndarray], count: int) -> np.ndarray:
-        """(env, 7) world from camera, where it is mounted."""
+    def _mounted_pose(self, name: str, bodies: Mapping[str, np.ndarray], count: int) -> np.ndarray:
+        """Poses of a mounted camera, (env, 7) world from camera."""
         camera = self.cameras[name]
         on = np.broadcast_to(IDENTITY, (count, 7)) if camera.body is None else bodies[camera.body]
         return compose(on, camera.mount)
 
     def _external_of(self, external_depths: Any, count: int) -> dict[str, Sequence[ExternalDepth]]:
         if not isinstance(external_depths, Mapping | None):
-            raise InputError(
-                f"external_depths must be {{camera name: list of ExternalDepth}}, got {external_depths!r}"
-            )
+            raise invalid("external_depths", "{camera name: list of ExternalDepth}", external_depths)
         for name, each in (external_depths or {}).items():
             if name not in self.cameras:
                 raise InputError(unknown("camera", name, self.cameras))
             if not isinstance(each, Sequence):
-                raise InputError(
-                    f"external_depths[{name!r}] must be a list, one for each environment, got {each!r}"
-                )
+                raise invalid(f"external_depths[{name!r}]", "a list, one for each environment", each)
             if len(each) != count:
                 raise InputError(
                     f"external_depths[{name!r}] must have {count} images, got {len(each)}; give one for "
@@ -202,7 +199,7 @@ class Rig:
                 )
         return dict(external_depths or {})
 
-    def _taken_by(
+    def _captures_of(
         self, name: str, outputs: tuple[str, ...] | None, external: Sequence[ExternalDepth], count: int
     ) -> list[Capture]:
         """Captures of a camera: one for all environments, or one for each if there is noise or an external
@@ -215,7 +212,7 @@ class Rig:
             return [capture.with_(external_depth=one) for one in external] or [capture]
         place = list(self.cameras).index(name)
         seeds = [
-            (capture.sensor.seed + 0x9E3779B1 * (self._drawn + i) + 0x85EBCA77 * place) % 2**32
+            (capture.sensor.seed + 0x9E3779B1 * (self._rendered + i) + 0x85EBCA77 * place) % 2**32
             for i in range(count)
         ]
         return [
@@ -223,7 +220,7 @@ class Rig:
             for seed, one in zip(seeds, external or [None] * count, strict=True)
         ]
 
-    def _draw(
+    def _render_camera(
         self,
         captures: list[Capture],
         poses: np.ndarray,
@@ -235,7 +232,7 @@ class Rig:
 
 
 class RigImages(Mapping):
-    """What the cameras of a rig see: a mapping from an output's name to (env, camera, h, w[, c]).
+    """Images of a rig's cameras: a mapping from an output's name to (env, camera, h, w[, c]).
 
     `of(camera)` gives one camera's, (env, h, w[, c]), also where cameras have different sizes.
     """
@@ -263,16 +260,18 @@ class RigImages(Mapping):
             sizes = {(rig.camera.width, rig.camera.height) for rig in self.rig.cameras.values()}
             if len(sizes) > 1:
                 raise InputError(
-                    f"the cameras' pictures have different sizes; take those of one: "
-                    f"pictures.of({next(iter(self._batches))!r})[{name!r}]"
+                    f"the cameras of images[{name!r}] must have one size, got several; use "
+                    f"images.of({next(iter(self._batches))!r})[{name!r}]"
                 )
             for camera, batch in self._batches.items():
                 if name not in batch:
                     raise MissingOutputError(
-                        f"the camera {camera!r} has no {name!r}; it gives {', '.join(batch)}; name it there"
+                        f"the camera {camera!r} must render {name!r}, got {', '.join(batch)}; add it to "
+                        "its outputs"
                     )
             each = [batch[name] for batch in self._batches.values()]
-            # one camera's are not copied: of thousands of environments that takes longer than to draw them
+            # images of a single camera are not copied: for thousands of environments this would take longer
+            # than rendering
             stacked = each[0][:, None] if len(each) == 1 else np.stack(each, axis=1)
             stacked.flags.writeable = False
             self._arrays[name] = stacked
@@ -285,26 +284,26 @@ class RigImages(Mapping):
         return len(self._outputs)
 
     def wait(self) -> RigImages:
-        """These pictures, once the device has drawn them; nothing is copied."""
+        """Wait until the device has rendered these images; nothing is copied."""
         for batch in self._batches.values():
             batch.wait()
         return self
 
     def of(self, camera: str) -> FrameBatch:
-        """What one camera sees: (env, h, w[, c]). Raises InputError for a camera that the rig has not."""
+        """Images of one camera: (env, h, w[, c]). Raises InputError for an unknown camera."""
         _known("camera", camera, self._batches)
         return self._batches[camera]
 
     def camera(self, name: str, environment: int = 0) -> Camera:
-        """A camera with the pose that it had."""
-        self.of(name)  # a camera of the rig
+        """A camera with its pose in an environment."""
+        frames = self.of(name)
         whole_number("environment", environment, 0, len(self.cameras[name]) - 1)
-        camera = self.of(name).frame(environment).capture.camera
-        assert camera is not None  # of a rendered image
+        camera = frames.frame(environment).capture.camera
+        assert camera is not None  # a frame has a camera
         return camera
 
     def placed(self, environment: int = 0) -> list[PlacedMarker]:
-        """The scene's markers where they were."""
+        """The scene's markers with their poses in an environment."""
         most = min((len(poses) for poses in (*self.bodies.values(), *self.cameras.values())), default=1) - 1
         whole_number("environment", environment, 0, most)
         return self.rig.placed({body: pose[environment] for body, pose in self.bodies.items()})
@@ -321,40 +320,39 @@ def _cameras_of(cameras: Any) -> dict[str, RigCamera]:
             (name, camera) for name, camera in (cameras.items() if isinstance(cameras, Mapping) else cameras)
         ]
     except (TypeError, ValueError):
-        raise InputError(f"cameras is {cameras!r}; it must be {{name: Camera or RigCamera}}") from None
+        raise invalid("cameras", "{name: Camera or RigCamera}", cameras) from None
     found: dict[str, RigCamera] = {}
     for name, camera in pairs:
         if not isinstance(name, str) or not name:
-            raise InputError(f"the name of a camera is {name!r}; it must be text")
+            raise invalid("the name of a camera", "text", name)
         if name in found:
-            raise InputError(f"two cameras have the name {name!r}; give each its own")
+            raise InputError(f"the names of cameras must be unique, got {name!r} twice; rename one")
         found[name] = camera if isinstance(camera, RigCamera) else RigCamera(camera)
     if not found:
-        raise InputError("a rig without a camera draws nothing; give cameras={name: Camera}")
+        raise InputError("cameras must have at least one camera, got none; give cameras={name: Camera}")
     return found
 
 
 def _bodies_of(bodies: Mapping[int, str], cloud: SplatCloud) -> dict[int, str]:
     if not isinstance(bodies, Mapping):
-        raise InputError(f"bodies is {bodies!r}; it must be {{label of splats: name of the body}}")
-    there = set(np.unique(cloud.labels).tolist())
+        raise invalid("bodies", "{label of splats: name of the body}", bodies)
+    known = set(np.unique(cloud.labels).tolist())
     found: dict[int, str] = {}
     for label, name in bodies.items():
         if isinstance(label, bool) or not isinstance(label, int | np.integer) or not isinstance(name, str):
+            raise invalid("bodies", "{label of splats: name of the body}", {label: name})
+        if label not in known:
+            listed = ", ".join(map(str, sorted(known)[:20]))
             raise InputError(
-                f"bodies has {label!r}: {name!r}; it must be {{label of splats: name of the body}}"
-            )
-        if label not in there:
-            shown = ", ".join(map(str, sorted(there)[:20]))
-            raise InputError(
-                f"the body {name!r} has no splats: none has the label {label}; there are {shown or 'none'}"
+                f"the label of the body {name!r} must be a label of splats, got {label}; known: "
+                f"{listed or 'none'}"
             )
         found[int(label)] = name
     return found
 
 
 def _by_name(what: str, poses: Any, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """{name: (env, 7)} of what was given, checked."""
+    """Validated poses {name: (env, 7)}."""
     if poses is None:
         return {}
     if isinstance(poses, Mapping):
@@ -365,8 +363,9 @@ def _by_name(what: str, poses: Any, names: tuple[str, ...]) -> dict[str, np.ndar
     array = check_poses(f"the array of poses of each {what}", poses, ("env", what))
     if array.shape[1] != len(names):
         raise InputError(
-            f"the array of poses of each {what} has {array.shape[1]} of them; the rig has {len(names)}: "
-            f"{', '.join(names) or 'none'}"
+            f"the array of poses must have a column for each {what} of the rig "
+            f"({', '.join(names) or 'none'}), "
+            f"got {array.shape[1]}"
         )
     return {name: array[:, i] for i, name in enumerate(names)}
 
@@ -379,7 +378,9 @@ def _environments(bodies: Mapping[str, np.ndarray], cameras: Mapping[str, np.nda
     first, count = next(iter(counts.items()))
     for name, other in counts.items():
         if other != count:
-            raise InputError(f"the {first} has poses of {count} environments, the {name} of {other}")
+            raise InputError(
+                f"the {name} must have poses of {count} environments like the {first}, got {other}"
+            )
     return count
 
 
@@ -391,5 +392,5 @@ def _mask_of(mask: Any, count: int) -> np.ndarray | None:
     except ValueError:  # rows that differ in length
         array = np.empty(0, object)
     if array.dtype != bool or array.shape != (count,):
-        raise InputError(f"mask must be ({count},) bool, one for each environment, not {mask!r}")
+        raise invalid("mask", f"({count},) bool, one for each environment", mask)
     return array

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
-from fidsplat.images.files import read_image, read_over
+from fidsplat.images.files import read_image, read_on_background
 from fidsplat.train.dataset import MAX_POINTS, Dataset, TrainingView
 from fidsplat.train.transforms import DatasetContents, has_transforms, load_transforms
 from fidsplat.train.undistorted_view import undistorted_view
@@ -102,7 +102,7 @@ def _model(
     views = []
     for i, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
         progress(words, i / len(model.names))
-        image = read_over(folder / "images" / name, background)
+        image = read_on_background(folder / "images" / name, background)
         views.append(undistorted_view(name, camera, image, _mask(folder / "masks" / name)))
     return views, model.points, model.colors
 

@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, focal_length
 from fidsplat.formats.colmap_read import byte_colors
 from fidsplat.formats.ply_header import read_header
-from fidsplat.images.files import read_image, read_over
+from fidsplat.images.files import read_image, read_on_background
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.undistorted_view import undistorted_view
 from fidsplat.util.errors import InputError
@@ -120,7 +120,7 @@ def _divided(
 
 def _image(file: Path, name: str) -> np.ndarray:
     candidates = [file.parent / (name + suffix) for suffix in _SUFFIXES]
-    return read_over(next((one for one in candidates if one.is_file()), candidates[0]), _BLACK)
+    return read_on_background(next((one for one in candidates if one.is_file()), candidates[0]), _BLACK)
 
 
 def _camera(what: str, given: dict, image: np.ndarray, camera_to_world: np.ndarray) -> Camera:

@@ -315,7 +315,7 @@ def test_detect_in_folders_and_videos(capsys, image_file, tmp_path):
     assert result["pictures"][1]["detections"][0]["name"] == "apriltag:36h11:5"
 
     (tmp_path / "empty").mkdir()
-    assert "holds no picture" in fails(capsys, "detect", tmp_path / "empty")[1]
+    assert "must contain an image file" in fails(capsys, "detect", tmp_path / "empty")[1]
     (tmp_path / "broken.mp4").write_bytes(b"no film")
     assert "not a video" in fails(capsys, "detect", tmp_path / "broken.mp4")[1]
 

@@ -9,20 +9,17 @@ import pytest
 
 READ = """import sys
 import fidsplat as fs
-from fidsplat.images.files import {reader}
+from fidsplat.images.files import read_images
 for path in sys.argv[1:]:
     try:
-        print(sum(1 for _ in {reader}(path)))
+        print(sum(1 for _ in read_images(path)))
     except fs.InputError as error:
         print("refused", len(str(error).splitlines()))
 """
 
 
 @pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "mp4v"), (".avi", "XVID"), (".avi", "MJPG")])
-def test_damaged_videos_say_nothing_of_their_own(tmp_path, suffix, codec):
-    from fidsplat.images import files as module
-
-    reader = next(name for name in ("images", "pictures") if hasattr(module, name))
+def test_damaged_videos_print_nothing(tmp_path, suffix, codec):
     random = np.random.default_rng(0)
     whole = tmp_path / f"whole{suffix}"
     video = cv2.VideoWriter(str(whole), cv2.VideoWriter_fourcc(*codec), 10, (64, 48))
@@ -41,7 +38,7 @@ def test_damaged_videos_say_nothing_of_their_own(tmp_path, suffix, codec):
         paths.append(tmp_path / f"{k}{suffix}")
         paths[-1].write_bytes(data)
     done = subprocess.run(
-        [sys.executable, "-c", READ.format(reader=reader), str(whole), *map(str, paths)],
+        [sys.executable, "-c", READ, str(whole), *map(str, paths)],
         capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -16,7 +16,7 @@ from fidsplat.experiments.summary import read_summary
 from fidsplat.experiments.sweep import read_records
 from fidsplat.formats import load_splats, save_splats
 from fidsplat.formats.colmap import save_colmap
-from fidsplat.images.files import pictures, read_image, write_png
+from fidsplat.images.files import read_image, read_images, write_png
 from fidsplat.sim import read_description
 from fidsplat.store.build import build_store
 from fidsplat.store.store import Store
@@ -173,8 +173,8 @@ INPUTS = {
     "splats of a scene": lambda folder, pipe: put_scene(folder, pipe.rename(folder / "pipe.ply"), "splats"),
     "panorama": lambda folder, pipe: put_scene(folder, pipe, "panorama"),
     "image": lambda folder, pipe: read_image(pipe),
-    "image of a folder": lambda folder, pipe: next(pictures(pipe.rename(folder / "pipe.png").parent)),
-    "video": renamed(".mp4", lambda pipe: next(pictures(pipe))),
+    "image of a folder": lambda folder, pipe: next(read_images(pipe.rename(folder / "pipe.png").parent)),
+    "video": renamed(".mp4", lambda pipe: next(read_images(pipe))),
     "marker image": lambda folder, pipe: fs.marker(f"image:{pipe}", size=0.1),
     "drawing": lambda folder, pipe: fs.marker(f"svg:{pipe}", size=0.1),
     **{f"trajectory {suffix}": renamed(suffix, fs.load_trajectory) for suffix in (".tum", ".json")},
@@ -253,7 +253,7 @@ def test_splat_files_with_names_that_are_not_utf8(tmp_path, suffix):
 def test_a_video_with_a_name_that_is_not_utf8_is_read(tmp_path):
     file = tmp_path / f"{ODD}.avi"
     write_avi(tmp_path / "a.avi").rename(file)
-    assert [image.shape for _, image in pictures(file)] == [(48, 64, 3)] * 3
+    assert [image.shape for _, image in read_images(file)] == [(48, 64, 3)] * 3
 
 
 def write_avi(file):
@@ -287,8 +287,8 @@ def test_a_script_of_ffmpeg_is_no_video_and_opens_no_other_file(tmp_path):
     write_avi(tmp_path / "secret.avi")
     for text in ("ffconcat version 1.0\nfile secret.avi\n", "#EXTM3U\n#EXTINF:1,\nsecret.avi\n"):
         (tmp_path / "a.mp4").write_text(text)
-        with pytest.raises(InputError, match="not a video"):
-            next(pictures(tmp_path / "a.mp4"))
+        with pytest.raises(InputError, match="is not a video"):
+            next(read_images(tmp_path / "a.mp4"))
 
 
 def test_damaged_images_and_videos_are_one_line(tmp_path, capfd):

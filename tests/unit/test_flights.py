@@ -286,7 +286,7 @@ def test_a_video_has_every_picture(here):
         assert frame.shape == (34, 48, 3)  # H.264 wants even sides
         assert abs(float(frame.mean()) - (60 + 20 * k)) < 4
     assert not video.read()[0]
-    with pytest.raises(fs.InputError, match="there is no picture"):
+    with pytest.raises(fs.InputError, match="must have at least one frame"):
         list(write_video("none.mp4", [], 10.0))
     noise = [np.random.default_rng(k).integers(0, 256, (64, 64, 3), np.uint8) for k in range(4)]
     with small_files(2000), pytest.raises(fs.InputError, match="is the disk full"):
@@ -301,7 +301,7 @@ def test_a_video_has_every_picture(here):
         (["--rate", "0"], "the rate is 0.0; give a number"),
         (["--times", "0,noon"], "--times must be seconds separated by commas, got '0,noon'"),
         (["--times", "1,0"], "increasing"),
-        (["--video", "a.avi"], "videos are written as MP4: name a.mp4"),
+        (["--video", "a.avi"], "must have the suffix .mp4, got a.avi; use a.mp4"),
         (["--outputs", "deep"], "unknown output 'deep'"),
         (["--memory-budget", "lots"], "--memory-budget must be a number of bytes above 0, got 'lots'"),
         (["--trajectory", "none.tum"], "cannot read none.tum"),

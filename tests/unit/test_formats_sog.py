@@ -77,7 +77,7 @@ def test_a_sog_file_by_hand(tmp_path):
         ({"count": 5}, "has 4 pixels for 5 splats"),
         ({"sh0": {}}, r"damaged \(KeyError"),
         ({"q.webp": None}, "lacks q.webp"),
-        ({"q.webp": b"RIFF"}, "q.webp is not a picture of 8 bits"),
+        ({"q.webp": b"RIFF"}, "cannot be read as an image of 8 bits"),
         ({"q.webp": np.full((2, 2, 4), 251, np.uint8)}, "alpha is 251; it must be 252"),
         ({"n.webp": np.full((2, 2, 4), 255, np.uint8)}, "65535, is none of the palette's 128 entries"),
         ({"p.webp": np.full((2, 64, 4), 255, np.uint8)}, "64 pixels wide; 1 bands have 192"),
@@ -87,7 +87,7 @@ def test_a_sog_file_by_hand(tmp_path):
         ({"q.webp": np.zeros((300, 300, 4), np.uint8)}, "q.webp has 90000 pixels for 2; it is not read"),
         ({"q.webp": picture(".png", 300)}, "q.webp has 90000 pixels for 2; it is not read"),
         ({"p.webp": np.zeros((2600, 192, 4), np.uint8)}, "p.webp has 499200 pixels for 196608"),
-        ({"q.webp": picture(".bmp", 2)}, "q.webp is not a picture of 8 bits"),
+        ({"q.webp": picture(".bmp", 2)}, "cannot be read as an image of 8 bits"),
     ],
 )
 def test_damaged_sog_files(tmp_path, changes, words):

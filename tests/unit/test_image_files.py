@@ -62,7 +62,7 @@ def test_a_panorama_of_other_numbers_is_refused(tmp_path):
 
 @pytest.mark.parametrize("shape", [(3,), (2, 2, 4), (0, 3, 3)])
 def test_a_png_needs_the_shape_of_a_picture(tmp_path, shape):
-    with pytest.raises(InputError, match="PNG needs"):
+    with pytest.raises(InputError, match="image of a PNG must be"):
         write_png(tmp_path / "x.png", np.zeros(shape))
     with pytest.raises(InputError, match="rows of real numbers"):
         write_png(tmp_path / "x.png", np.full((2, 2), "a"))

@@ -132,20 +132,20 @@ def test_a_tag_takes_the_error_away_and_one_elsewhere_is_not_believed():
     filtered.covariance[:3, :3] = np.diag([0.03, 0.03, 0.02]) ** 2
     for _ in range(30):
         for tag in (far, near):
-            assert filtered.see(standing(np.eye(4)).project(tag), tag, standing)
+            assert filtered.correct(standing(np.eye(4)).project(tag), tag, standing)
     assert np.abs(filtered.state[:2]).max() < 0.005
     assert abs(filtered.state[2]) < 0.002
     assert np.sqrt(np.diag(filtered.covariance)[:2]).max() < 0.02
     before = filtered.state.copy()
-    assert not filtered.see(standing(np.eye(4)).project(far) + 60, far, standing)
+    assert not filtered.correct(standing(np.eye(4)).project(far) + 60, far, standing)
     np.testing.assert_array_equal(filtered.state, before)
-    assert filtered.refused == 1
+    assert filtered.rejected == 1
 
 
 def test_a_tag_behind_the_robot_is_not_believed():
     tag = np.array([[-2.0, 0.3, 0.5], [-2.0, 0.1, 0.5], [-2.0, 0.1, 0.3], [-2.0, 0.3, 0.3]])
     filtered = Localiser(np.zeros(3))
-    assert not filtered.see(np.full((4, 2), 100.0), tag, lambda pose: camera_at(CAMERA, pose))
+    assert not filtered.correct(np.full((4, 2), 100.0), tag, lambda pose: camera_at(CAMERA, pose))
 
 
 def test_errors_are_those_of_evo():

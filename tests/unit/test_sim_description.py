@@ -117,20 +117,20 @@ def test_a_robot(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("model://rover", "model://rovr", "include model://rovr: the model is not found in"),
+        ("model://rover", "model://rovr", "include model://rovr: cannot find the model in"),
         ('relative_to="top"', 'relative_to="tip"', r"unknown frame 'tip' \(did you mean 'top'"),
-        ('attached_to="pole"', 'attached_to="top"', "'top' is relative to itself"),
-        ("<width>64</width>", "<width>64.5</width>", "no whole numbers of pixels"),
-        ("<width>64</width>", "<width>wide</width>", "'wide' must be 1 finite number"),
+        ('attached_to="pole"', 'attached_to="top"', "'top' must not be relative to itself"),
+        ("<width>64</width>", "<width>64.5</width>", "must be whole numbers of pixels, got 64.5"),
+        ("<width>64</width>", "<width>wide</width>", "must be 1 finite number, got 'wide'"),
         ("<horizontal_fov>1.2<", "<horizontal_fov>3.2<", "depth/camera: camera fov_x must be between"),
         (
             'name="depth"',
             'name="front"',
             "two cameras have the name 'front', on mast::head and on first::base",
         ),
-        ("0 0 0.25 0 90 0", "0 0 0.25", "'0 0 0.25' must be 6 finite numbers"),
-        ('<sensor name="depth"', "<sensor", "a <sensor> has no name"),
-        ("<world", "<wrld", "is no XML"),
+        ("0 0 0.25 0 90 0", "0 0 0.25", "must be 6 finite numbers, got '0 0 0.25'"),
+        ('<sensor name="depth"', "<sensor", "a <sensor> must have a name"),
+        ("<world", "<wrld", "as XML"),
         ("sdf", "sdff", "the root is <sdff>; it must be <sdf> or <robot>"),
     ],
 )
@@ -139,7 +139,7 @@ def test_files_that_cannot_be_used(world, old, new, words):
     world.write_text(WORLD.replace(old, new))
     with pytest.raises(fs.InputError, match=words) as raised:
         read_description(world, [world.parent / "models"])
-    assert ".sdf: " in str(raised.value) or ".sdf is no XML" in str(raised.value)
+    assert ".sdf: " in str(raised.value) or ".sdf as XML" in str(raised.value)
 
 
 def test_a_model_that_includes_itself(tmp_path):
@@ -147,7 +147,7 @@ def test_a_model_that_includes_itself(tmp_path):
     (tmp_path / "loop/model.sdf").write_text(
         '<sdf><model name="loop"><include><uri>model://loop</uri></include></model></sdf>'
     )
-    with pytest.raises(fs.InputError, match="it includes itself"):
+    with pytest.raises(fs.InputError, match="must not include itself"):
         read_description(tmp_path / "loop", [tmp_path])
 
 
@@ -159,5 +159,5 @@ def test_files_that_are_not_there_and_xacro(tmp_path):
     (tmp_path / "r.xacro").write_text(
         '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="r"><xacro:property name="a"/></robot>'
     )
-    with pytest.raises(fs.InputError, match="is a xacro file; run `xacro"):
+    with pytest.raises(fs.InputError, match="must be URDF, got xacro; run `xacro"):
         read_description(tmp_path / "r.xacro")

@@ -139,8 +139,8 @@ def test_outputs_of_the_model_are_what_is_drawn(model, rig):
     [
         ({1: "bos"}, None, r"unknown body 'bos' \(did you mean 'box'\?\); known: world, box, robot"),
         ({1: "box"}, ["fron"], r"unknown camera 'fron' \(did you mean 'front'\?\); known: above, front"),
-        ({2: "box"}, None, "the body 'box' has no splats"),
-        ({1: "box"}, "front", r"cameras is 'front'; it must be a list of names, \['front'\]"),
+        ({2: "box"}, None, "the label of the body 'box' must be"),
+        ({1: "box"}, "front", r"cameras must be a list of names, got 'front'; use \['front'\]"),
     ],
 )
 def test_names_that_the_model_does_not_have(model, scene, bodies, cameras, words):
@@ -193,7 +193,7 @@ def test_mujoco_warps_own_data(model, rig):
 def test_data_without_poses(rig):
     with pytest.raises(fs.InputError, match=r"must be a mujoco\.MjData"):
         rig.render("data")
-    with pytest.raises(fs.InputError, match="data is empty"):
+    with pytest.raises(fs.InputError, match="got an empty list"):
         rig.render([])
 
 
@@ -203,7 +203,7 @@ def test_data_of_another_model(rig, nbody):
     other = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     data = mujoco.MjData(other)
     mujoco.mj_forward(other, data)
-    words = rf"data\.xpos has {nbody + 1} rows, but the model of the rig has \d; give data of that model"
+    words = rf"data\.xpos must have \d rows as the rig's model, got {nbody + 1}; give data of that model"
     with pytest.raises(fs.InputError, match=words):
         rig.render(data)
 
@@ -262,5 +262,5 @@ def test_gymnasium_needs_to_know_where_bodies_are(rig):
     class Blind(gymnasium.Env):
         observation_space = action_space = gymnasium.spaces.Discrete(2)
 
-    with pytest.raises(fs.InputError, match="has no MuJoCo data; say with poses"):
+    with pytest.raises(fs.InputError, match="must have MuJoCo data"):
         SplatObservation(Blind(), rig)

@@ -6,16 +6,16 @@ import pytest
 
 from fidsplat.images.visualize import (
     KEY_WIDTH,
+    colour_depth,
+    colour_labels,
+    colour_normals,
     contact_sheet,
     count_key,
     depth_key,
     depth_millimetres,
-    depth_picture,
     depth_span,
-    label_picture,
+    draw_outlines,
     normal_key,
-    normal_picture,
-    outlined,
 )
 from fidsplat.render.output_files import save_output
 
@@ -25,20 +25,20 @@ SQUARE = np.array([[20.5, 10.5], [60.5, 10.5], [60.5, 40.5], [20.5, 40.5]])
 def test_near_is_red_far_is_blue_and_nothing_is_black():
     depth = np.linspace(1, 5, 100).reshape(1, 100)
     depth[0, 50], depth[0, 51], depth[0, 52] = 0, np.nan, np.inf
-    colours = depth_picture(depth).astype(int)
+    colours = colour_depth(depth).astype(int)
     assert colours.shape == (1, 100, 3)
     assert colours[0, 2, 0] > colours[0, 2, 2], "red above blue"
     assert colours[0, 90, 2] > colours[0, 90, 0], "blue above red"
     assert (colours[0, 50:53] == 0).all()
-    assert (depth_picture(np.zeros((3, 4))) == 0).all()
-    assert depth_picture(np.full((3, 4), 2.0)).any(), "a flat picture has a colour"
+    assert (colour_depth(np.zeros((3, 4))) == 0).all()
+    assert colour_depth(np.full((3, 4), 2.0)).any(), "a flat picture has a colour"
 
 
 def test_one_stray_splat_does_not_use_up_the_colours():
     depth = np.tile(np.linspace(1, 2, 200), (10, 1))
     depth[0, 0] = 1000.0
     # stretched to 1000 m, all of the first row would be of one colour
-    assert len(np.unique(depth_picture(depth)[1], axis=0)) > 150
+    assert len(np.unique(colour_depth(depth)[1], axis=0)) > 150
 
 
 def test_millimetres():
@@ -48,12 +48,12 @@ def test_millimetres():
 
 def test_normals():
     normal = np.array([[[0, 0, -1], [1, 0, 0], [0, 0, 0]]], float)
-    assert normal_picture(normal).tolist() == [[[128, 128, 0], [255, 128, 128], [0, 0, 0]]]
+    assert colour_normals(normal).tolist() == [[[128, 128, 0], [255, 128, 128], [0, 0, 0]]]
 
 
 def test_labels_have_colours_of_their_own():
     label = np.array([[-1, 0, 1, 2, 3, 4, 5, 6, 7, 8]])
-    colours = [tuple(c) for c in label_picture(label)[0].tolist()]
+    colours = [tuple(c) for c in colour_labels(label)[0].tolist()]
     assert len(set(colours)) == 10
     assert colours[0] == (0, 0, 0)
     assert len(set(colours[1])) == 1
@@ -61,7 +61,7 @@ def test_labels_have_colours_of_their_own():
 
 def test_an_outline_stands_on_its_corners_and_leaves_the_picture_alone():
     image = np.zeros((60, 80, 3), np.uint8)
-    drawn = outlined(image, [(SQUARE, "")], thickness=1)
+    drawn = draw_outlines(image, [(SQUARE, "")], thickness=1)
     assert not image.any()
     assert drawn[25, 20].any()
     assert drawn[25, 60].any()
@@ -73,7 +73,7 @@ def test_captions_stand_below_their_outlines_and_not_over_each_other():
     image = np.zeros((200, 160, 3), np.uint8)
 
     def captions(*words):
-        drawn = outlined(image, [(SQUARE, word) for word in words], size=0.5)
+        drawn = draw_outlines(image, [(SQUARE, word) for word in words], size=0.5)
         return (drawn.min(axis=2) == 255).any(axis=1)[42:]  # rows with white in them; outlines are not white
 
     one, two = captions("näme"), captions("näme", "näme")
@@ -96,7 +96,7 @@ def test_keys_say_what_the_colours_mean():
     most = count_key(7, 200)
     assert (most[9, 20] == key[190, 20]).all(), "the greatest count has the colour of the nearest depth"
     ball = normal_key(200)
-    towards = normal_picture(np.array([[[0.0, 0, -1]]]))[0, 0]
+    towards = colour_normals(np.array([[[0.0, 0, -1]]]))[0, 0]
     assert (ball[100, KEY_WIDTH // 2] == towards).all()
     assert ball[100, KEY_WIDTH // 2 + 30, 0] > ball[100, KEY_WIDTH // 2 - 30, 0], "red is to the right"
 
