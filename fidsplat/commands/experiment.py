@@ -157,21 +157,21 @@ class Pictures(Command, RenderSettings):
     """
 
     def run(self) -> int:
-        files = draw_sheets(self)
+        files = render_sheets(self)
         return report(self.json, {"files": files}, *files)
 
 
-def draw_sheets(options: RenderSettings) -> list[str]:
+def render_sheets(options: RenderSettings) -> list[str]:
     """Render the sheets of images; returns their files."""
-    from fidsplat.experiments.methods import Painter
-    from fidsplat.experiments.pictures import write_sheets
+    from fidsplat.experiments.methods import MarkerRenderer
     from fidsplat.experiments.setup import chosen_categories
+    from fidsplat.experiments.sheets import write_sheets
     from fidsplat.render.renderer import Renderer
 
     options.check()
     categories = chosen_categories(options.category)
-    painter = Painter(Renderer(options.device), options.trained)
-    sheets = write_sheets(categories, options.methods, painter, options.seed, options.folder)
+    markers = MarkerRenderer(Renderer(options.device), options.trained)
+    sheets = write_sheets(categories, options.methods, markers, options.seed, options.folder)
     return [str(file) for file in show_progress("sheets", sheets, len(categories))]
 
 
@@ -199,7 +199,7 @@ class All(RayCommand, ExperimentSettings):
         status = measure(NAMES, self, self.json, self.ray)
         if self.shard is not None:
             return status
-        draw_sheets(self)
+        render_sheets(self)
         print_lines(console(True), f"report in {write_report([self.folder], self.folder)[0]}")
         return status
 

@@ -48,7 +48,7 @@ class Dataset(CountedSettings):
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.blender import check_pictures
+        from fidsplat.experiments.blender import check_images
         from fidsplat.experiments.dataset import dataset_scenes, write_scene
         from fidsplat.experiments.setup import chosen_categories
         from fidsplat.experiments.views import TRUTHS
@@ -58,7 +58,7 @@ class Dataset(CountedSettings):
             raise InputError(unknown("truth", self.truth, TRUTHS))
         self.check()
         if self.truth.startswith("blender-"):
-            check_pictures(self.blender, self.truth.removeprefix("blender-"), self.seed)
+            check_images(self.blender, self.truth.removeprefix("blender-"), self.seed)
         folder = writable_folder(self.out)
         wanted = dataset_scenes(chosen_categories(self.category), self.marker_count)
         scenes = (write_scene(part, folder, self.seed, self.truth, self.blender) for part in wanted)
@@ -143,7 +143,7 @@ class Blender(CountedSettings):
             blender.ready(view, environment)
         folder, done = self.out, 0
         for view in views:
-            blender.note_pictures(folder, view, self.seed, self.samples)
+            blender.record_images(folder, view, self.seed, self.samples)
         for view in views:
             jobs = [
                 blender.marker_job(category, index, self.seed, folder, view, self.training)

@@ -19,9 +19,9 @@ def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:
 
 def run_interleaved(name: str, sweeps: Sequence[Sweep]) -> list[Record]:
     """Measure the missing points of all sweeps round robin, with one progress bar; returns their records."""
-    from fidsplat.experiments.sweep import in_turn
+    from fidsplat.experiments.sweep import run_interleaved as measure
 
-    return list(_with_progress(name, sweeps, in_turn(sweeps)))
+    return list(_with_progress(name, sweeps, measure(sweeps)))
 
 
 def _with_progress(name: str, sweeps: Sequence[Sweep], records: Iterable[Record]) -> Iterator[Record]:

@@ -35,7 +35,7 @@ class TradeoffReport:
 
     Examples:
       fidsplat tradeoff report
-      fidsplat tradeoff report cpu gpu -o docs/accuracy.md
+      fidsplat tradeoff report cpu gpu -o accuracy.md
     """
 
     folders: Annotated[Folders, option("DIR", f"folders with results (default: {DEFAULT_FOLDER})")] = ()
@@ -49,6 +49,21 @@ class TradeoffReport:
         folders = [Path(folder) for folder in self.folders or (DEFAULT_FOLDER,)]
         files = write_report(folders, Path(self.out or folders[0]))
         return report(self.json, {"files": [str(file) for file in files]}, f"report in {files[0]}")
+
+
+@dataclass(frozen=True)
+class Measurement(TradeoffSettings):
+    """Options of the measurement."""
+
+    settings: Annotated[
+        tuple[str, ...] | None,
+        option(
+            "NAME...",
+            "quality settings to vary: names of Quality's fields, or preset, alone, marker, together "
+            "(default: all)",
+            "--knobs",
+        ),
+    ] = None
 
 
 @dataclass
@@ -71,10 +86,10 @@ class Tradeoff:
     Examples:
       fidsplat tradeoff --quick                              a rough measurement, under 3 minutes on two cores
       fidsplat tradeoff -o gpu --device opencl:nvidia        everything
-      fidsplat tradeoff --scenes hard --knobs alpha_cutoff transmittance_stop
+      fidsplat tradeoff --scenes hard --settings alpha_cutoff transmittance_stop
       fidsplat tradeoff --scene room.ply --cameras poses.tum --quick -o room
       fidsplat tradeoff --device opencl:nvidia --device opencl:pocl --plot both.svg
-      fidsplat tradeoff report cpu gpu -o docs/accuracy.md   a page of the results
+      fidsplat tradeoff report cpu gpu -o accuracy.md   a page of the results
     """
 
     PARTS: ClassVar[dict[str, type]] = {"report": TradeoffReport}
@@ -88,7 +103,7 @@ class Tradeoff:
         ),
     ] = None
     device: Devices = ()
-    measurement: TradeoffSettings = field(default_factory=TradeoffSettings)
+    measurement: Measurement = field(default_factory=Measurement)
     scene: UserScenes = ()
     cameras: Cameras = None
     plot: Annotated[
@@ -99,14 +114,14 @@ class Tradeoff:
 
     def run(self) -> int:
         from fidsplat.experiments.tradeoff.run import prepared
-        from fidsplat.experiments.tradeoff.scenes import own_pictures
+        from fidsplat.experiments.tradeoff.scenes import user_views
         from fidsplat.render.renderer import default_device
 
         if self.plot is not None:
             check_plot(self.plot, "pandas")
         folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.measurement.quick else ""))
         devices = tuple(dict.fromkeys(self.device)) or (default_device(),)
-        own = own_pictures(load_user_scenes(self.scene, self.cameras, self.measurement.scenes or ()))
+        own = user_views(load_user_scenes(self.scene, self.cameras, self.measurement.scenes or ()))
         folders = [folder / name.replace(":", "-") for name in devices] if len(devices) > 1 else [folder]
         with ExitStack() as stack:
             # open all devices first, so that a missing one is reported before another is measured

@@ -1,23 +1,21 @@
-"""Table 3: the largest tilts at which markers are found and read.
-
-Every detector reads the image of every tilt, so that gaps are found.
-"""
+"""Table 3: largest tilts at which markers are found and read, with gaps below them."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 
 import numpy as np
 
-from fidsplat.experiments.methods import IDEAL, Painter, plain_marker
+from fidsplat.cameras import Camera
+from fidsplat.experiments.methods import IDEAL, MarkerRenderer, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, Category
 from fidsplat.images.files import to_uint8
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
-from fidsplat.vision.readers import Target, attempt, readers
+from fidsplat.vision.readers import Attempt, Target, attempt, readers
 
 NAME = "angles"
 FULL_TILTS = "0:89.8:0.2"
@@ -25,7 +23,7 @@ QUICK_TILTS = "0:60:20,64:88:2"
 
 
 def parse_tilts(text: str) -> list[float]:
-    """Degrees of "first:last:step[,first:last:step...]", rising. Raises InputError for anything else."""
+    """Ascending degrees of "first:last:step[,first:last:step...]". Raises InputError for another format."""
     found: set[float] = set()
     for span in text.split(","):
         try:
@@ -34,8 +32,8 @@ def parse_tilts(text: str) -> list[float]:
                 raise ValueError
         except ValueError:
             raise InputError(
-                f"tilts are {text!r}; write first:last:step in degrees, 0 <= first <= last < 90, "
-                f"joined by commas, e.g. {FULL_TILTS}"
+                "tilts must be first:last:step in degrees with 0 <= first <= last < 90, joined by commas, "
+                f"e.g. {FULL_TILTS}, got {text!r}"
             ) from None
         count = math.floor((last - first) / step + 1e-6) + 1
         found |= {round(first + i * step, 6) for i in range(count)}
@@ -60,8 +58,8 @@ def angles_points(
     ]
 
 
-def measure_angles(point: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor, workers: int) -> dict:
-    """Scan one marker.
+def measure_angles(point: dict, markers: MarkerRenderer, seed: int, pool: Executor, workers: int) -> dict:
+    """Scan a marker over tilts with every detector.
 
     Returns two strings of 0 and 1 per detector, one digit per tilt: whether the code was `found` (its outline
     overlaps the code by half), and `read` exactly.
@@ -70,44 +68,38 @@ def measure_angles(point: dict, painter: Painter, seed: int, pool: ThreadPoolExe
     spec = category.spec(point["index"], seed)
     made = plain_marker(spec)
     module = protocol.module(made.grid.shape[0])
-    draw = painter.open(point["method"], f"{category.name}-{point['index']}", spec, module)
+    render = markers.prepare(point["method"], f"{category.name}-{point['index']}", spec, module)
     names = readers(category.kind)
     outline = made.corners / made.module * module
     in_pool = point["method"] == IDEAL  # a renderer is not shared by threads
 
-    def look(picture: np.ndarray, tilt: float) -> list[tuple[bool, bool]]:
-        target = Target(
-            category.kind, made.family or "", made.id, made.payload, protocol.camera(tilt).project(outline)
-        )
-        grey = to_uint8(picture)
-        tries = [attempt(name, grey, target) for name in names]
-        return [(one.found, one.read) for one in tries]
+    def detect(image: np.ndarray, camera: Camera) -> list[Attempt]:
+        corners = camera.project(outline)
+        target = Target(category.kind, made.family or "", made.id, made.payload, corners)
+        grey = to_uint8(image)
+        return [attempt(name, grey, target) for name in names]
 
-    waiting: deque[Future] = deque()
-    seen: list[list[tuple[bool, bool]]] = []
+    pending: deque[Future] = deque()
+    attempts: list[list[Attempt]] = []
     for tilt in parse_tilts(point["tilts"]):
         camera = protocol.camera(tilt)
         if in_pool:
-            waiting.append(pool.submit(lambda c, t: look(draw(c), t), camera, tilt))
+            pending.append(pool.submit(lambda camera: detect(render(camera), camera), camera))
         else:
-            waiting.append(pool.submit(look, draw(camera), tilt))
-        while len(waiting) > 2 * workers:  # bounds memory
-            seen.append(interrupts.result_of(waiting.popleft()))
-    seen += [interrupts.result_of(future) for future in waiting]
+            pending.append(pool.submit(detect, render(camera), camera))
+        while len(pending) > 2 * workers:  # bounds memory
+            attempts.append(interrupts.result_of(pending.popleft()))
+    attempts += [interrupts.result_of(future) for future in pending]
     return {
         "spec": spec if category.kind == "apriltag" else made.family,
         "readers": {
-            name: {
-                key: "".join("01"[tries[i][which]] for tries in seen)
-                for which, key in enumerate(("found", "read"))
-            }
-            for i, name in enumerate(names)
+            name: {key: "".join("01"[getattr(one, key)] for one in by_tilt) for key in ("found", "read")}
+            for name, by_tilt in zip(names, zip(*attempts, strict=True), strict=True)
         },
     }
 
 
 def largest(tilts: Sequence[float], hits: str) -> tuple[float | None, float | None]:
-    """Largest tilt of all hits, and largest tilt without a miss up to it; None if there is none."""
-    good = [tilt for tilt, hit in zip(tilts, hits, strict=True) if hit == "1"]
-    unbroken = len(hits) - len(hits.lstrip("1"))
-    return (good[-1] if good else None), (tilts[unbroken - 1] if unbroken else None)
+    """Largest tilt with a hit, and largest tilt without a miss up to it; None if there is none."""
+    last, first_miss = hits.rfind("1"), len(hits) - len(hits.lstrip("1"))
+    return tilts[last] if last >= 0 else None, tilts[first_miss - 1] if first_miss else None

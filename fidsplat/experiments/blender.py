@@ -34,17 +34,17 @@ FULL_SAMPLES = 64
 WORKER = Path(__file__).with_name("blender_worker.py")
 
 
-def novel_picture(folder: Path, view: str, category: str, index: int, number: int) -> Path:
+def novel_image(folder: Path, view: str, category: str, index: int, number: int) -> Path:
     """File of a test view."""
     return folder / view / f"{category}-{index}" / f"test-{number:02d}.png"
 
 
-def training_picture(folder: Path, view: str, category: str, index: int, number: int) -> Path:
+def training_image(folder: Path, view: str, category: str, index: int, number: int) -> Path:
     """File of a training view of the densest collection."""
     return folder / view / f"{category}-{index}" / f"view-{number:02d}.png"
 
 
-def check_pictures(folder: Path, view: str, seed: int, samples: int | None = None) -> dict:
+def check_images(folder: Path, view: str, seed: int, samples: int | None = None) -> dict:
     """Settings of the images of a view; {} if unknown.
 
     Raises InputError for another seed or number of samples (None: any).
@@ -63,9 +63,9 @@ def check_pictures(folder: Path, view: str, seed: int, samples: int | None = Non
     return about
 
 
-def note_pictures(folder: Path, view: str, seed: int, samples: int) -> None:
+def record_images(folder: Path, view: str, seed: int, samples: int) -> None:
     """Record the settings of the images of a view. Raises InputError for other settings."""
-    check_pictures(folder, view, seed, samples)
+    check_images(folder, view, seed, samples)
     writable_folder(folder / view)
     with atomic_write(_note(folder, view)) as stream:
         stream.write(json.dumps({"seed": seed, "samples": samples}).encode())
@@ -115,12 +115,12 @@ def marker_job(category: Category, index: int, seed: int, folder: Path, view: st
     """Worker job for the test views of a marker, and optionally its training views."""
     grid = plain_marker(category.spec(index, seed)).grid
     shots = [
-        (novel_picture(folder, view, category.name, index, i), camera)
+        (novel_image(folder, view, category.name, index, i), camera)
         for i, camera in enumerate(novel_cameras(category, index, seed))
     ]
     if training:
         shots += [
-            (training_picture(folder, view, category.name, index, i), camera)
+            (training_image(folder, view, category.name, index, i), camera)
             for i, camera in enumerate(training_cameras(COLLECTIONS[-1]))
         ]
     return {

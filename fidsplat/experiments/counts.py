@@ -22,11 +22,11 @@ def counts_points(categories: Iterable[Category], repeats: int, markers: int = 5
 
 
 def measure_counts(point: dict, seed: int) -> dict:
-    """Count one marker's parts, and time its construction.
+    """Sizes of a marker and times of its construction.
 
     Returns dark and light (quiet zone included) numbers of `cells`, `runs` (of one colour in each row) and
     `rectangles` of the minimum partition, `components`, `gaussians` by mixture and partition, and `seconds`
-    by mixture: one for each repeat, from the text to the splats, after one that is not counted.
+    by mixture: one for each repeat, from the text to the splats, after a warm-up.
     """
     spec = CATEGORIES[point["category"]].spec(point["index"], seed)
     plain = plain_marker(spec)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.experiments.blender import novel_picture, training_picture
+from fidsplat.experiments.blender import novel_image, training_image
 from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import (
     BACKGROUND,
@@ -74,8 +74,8 @@ def write_scene(wanted: dict, folder: Path, seed: int, truth: str, blender: Path
     note.unlink(missing_ok=True)
     points, colors = _points(spec, f"{seed} points {category.name} {wanted['index']}")
     sets = (
-        (scene, "view", training_cameras(wanted["views"]), training_picture),
-        (scene / "test", "test", novel_cameras(category, wanted["index"], seed), novel_picture),
+        (scene, "view", training_cameras(wanted["views"]), training_image),
+        (scene / "test", "test", novel_cameras(category, wanted["index"], seed), novel_image),
     )
     for place, stem, cameras, drawn in sets:
         writable_folder(place / "images")

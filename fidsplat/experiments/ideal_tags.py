@@ -9,7 +9,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.capture.environment import ExternalDepth
-from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.plane import plane_image
 from fidsplat.scenes import PlacedMarker
 
 _LEAST = 1 / 512
@@ -39,8 +39,8 @@ def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.nda
             **{"world_to_camera": pose, "position": None},
         )
         grid, module = tag.marker.grid, tag.marker.module
-        light = plane_picture(grid, module, part, 0.0, 1.0, 0.0)
-        covered = plane_picture(np.zeros_like(grid), module, part, 0.0, 1.0, 0.0)
+        light = plane_image(grid, module, part, 0.0, 1.0, 0.0)
+        covered = plane_image(np.zeros_like(grid), module, part, 0.0, 1.0, 0.0)
         far = _depth(pose, part)
         there = (covered > _LEAST) & (far > 0)
         white, black = tag.marker.palette

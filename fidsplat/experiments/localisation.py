@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.methods import Painter, plain_marker
+from fidsplat.experiments.methods import MarkerRenderer, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, Category
 from fidsplat.markers import Marker
 from fidsplat.util import interrupts
@@ -46,11 +46,11 @@ def localisation_points(
     ]
 
 
-def measure_localisation(point: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor) -> dict:
-    """Look at one marker from every distance and tilt.
+def measure_localisation(point: dict, markers: MarkerRenderer, seed: int, pool: Executor) -> dict:
+    """Pose errors of a marker at every distance and tilt.
 
-    Each camera turns about its axis and looks a little past the marker, by seeded amounts that are the same
-    for every method, so that modules fall anywhere on the pixels.
+    Roll and aim of the cameras are random, so that modules have any position relative to pixels; they are the
+    same for every method.
 
     Returns `views`: distance_m, tilt_deg, and position_mm, angle_deg, corners_px (root mean square), all None
     where the marker was not read.
@@ -59,33 +59,33 @@ def measure_localisation(point: dict, painter: Painter, seed: int, pool: ThreadP
     name = f"{category.name}-{point['index']}"
     spec = category.spec(point["index"], seed)
     plain = plain_marker(spec)
-    draw = painter.open(point["method"], name, spec, SIZE / plain.bits.shape[1])
-    waiting = []
+    render = markers.prepare(point["method"], name, spec, SIZE / plain.bits.shape[1])
+    pending = []
     for distance in point["distances"]:
         for tilt in point["tilts"]:
             camera = camera_at(distance, tilt, f"{seed} pose {name} {distance} {tilt}")
-            errors = pool.submit(_errors, plain, camera, draw(camera))
-            waiting.append(({"distance_m": distance, "tilt_deg": tilt}, errors))
-    return {"views": [place | interrupts.result_of(errors) for place, errors in waiting]}
+            errors = pool.submit(_errors, plain, camera, render(camera))
+            pending.append(({"distance_m": distance, "tilt_deg": tilt}, errors))
+    return {"views": [view | interrupts.result_of(errors) for view, errors in pending]}
 
 
-def _errors(plain: Marker, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:
-    code = own_code(plain, picture)
+def _errors(plain: Marker, camera: Camera, image: np.ndarray) -> dict[str, float | None]:
+    code = own_code(plain, image)
     if code is None:
         return {"position_mm": None, "angle_deg": None, "corners_px": None}
-    away, turn = pose_error(marker_pose(code.corners, SIZE, camera), camera.world_to_camera)
-    off = corner_error(code, camera.project(plain.corners * (SIZE / plain.size)))
-    return {"position_mm": away * 1e3, "angle_deg": math.degrees(turn), "corners_px": off}
+    metres, radians = pose_error(marker_pose(code.corners, SIZE, camera), camera.world_to_camera)
+    pixels = corner_error(code, camera.project(plain.corners * (SIZE / plain.size)))
+    return {"position_mm": metres * 1e3, "angle_deg": math.degrees(radians), "corners_px": pixels}
 
 
 def camera_at(distance: float, tilt: float, seed: str) -> Camera:
-    """A camera ``distance`` metres from the origin, ``tilt`` degrees off the marker's normal at a random
-    azimuth, turned by up to 20 degrees, looking up to 3 degrees past the marker."""
+    """Camera at a distance in metres and a tilt in degrees from the marker's normal, with random azimuth, a
+    roll of up to 20 degrees, and an aim of up to 3 degrees beside the marker."""
     generator = random.Random(seed)
     a, b = math.radians(tilt), generator.uniform(0, 2 * math.pi)
-    towards = np.array([math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), -math.cos(a)])
-    turn = math.radians(generator.uniform(-20, 20))
-    past = distance * math.tan(math.radians(3.0))
-    aim = [generator.uniform(-past, past), generator.uniform(-past, past), 0.0]
-    up = (math.sin(turn), -math.cos(turn), 0.0)
-    return Camera.look_at(WIDTH, HEIGHT, math.radians(FOV), distance * towards, aim, up)
+    direction = np.array([math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), -math.cos(a)])
+    roll = math.radians(generator.uniform(-20, 20))
+    reach = distance * math.tan(math.radians(3.0))
+    aim = [generator.uniform(-reach, reach), generator.uniform(-reach, reach), 0.0]
+    up = (math.sin(roll), -math.cos(roll), 0.0)
+    return Camera.look_at(WIDTH, HEIGHT, math.radians(FOV), distance * direction, aim, up)

@@ -11,11 +11,11 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
-from fidsplat.experiments.plane import from_srgb, plane_picture
+from fidsplat.experiments.plane import from_srgb, plane_image
 from fidsplat.experiments.setup import BACKGROUND, COLLECTIONS, PLANE
 from fidsplat.markers import Marker, marker
 from fidsplat.render.renderer import Renderer
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, unknown
 
 IDEAL = "ideal"
 _CUT = 1 / 255
@@ -27,19 +27,18 @@ FILTERS = {
 renderers"""
 _LIGHT = "light"
 """the filter "best", blended in linear light and then encoded by the sensor's sRGB curve"""
-# the settings of the paper for trained models
 _TRAINED_QUALITY = "surfel"
+"""the paper's settings for trained models"""
 
-Draw = Callable[[Camera], np.ndarray]
+Render = Callable[[Camera], np.ndarray]
 """camera -> (height, width) float grey, display values, not clamped"""
 
 
 def mixtures() -> tuple[str, ...]:
-    """Names of all mixtures, the paper's first, then the default."""
+    """Names of all mixtures, the paper's first, then `fitted`."""
     from fidsplat.markers.build import MIXTURES
 
-    first = [name for name in ("paper", "fitted") if name in MIXTURES]
-    return (*first, *(name for name in MIXTURES if name not in first))
+    return tuple(dict.fromkeys(("paper", "fitted", *MIXTURES)))
 
 
 def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> tuple[str, ...]:
@@ -47,14 +46,14 @@ def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> t
 
     Args:
         chosen: mixtures; by default all but `facets`, which needs order by depth.
-        trained: folder with trained models, see `Painter`.
+        trained: folder with trained models, see `MarkerRenderer`.
 
     Raises InputError for an unknown mixture.
     """
     known = mixtures()
     for name in chosen:
         if name not in known:
-            raise InputError(f"unknown mixture {name!r}; known: {', '.join(known)}")
+            raise InputError(unknown("mixture", name, known))
     own = [f"{m}/{f}" for m in known if (m in chosen if chosen else m != "facets") for f in FILTERS]
     models = [] if trained is None else [f"2dgs-{n}" for n in COLLECTIONS if (trained / f"2dgs-{n}").is_dir()]
     return (IDEAL, *own, *models)
@@ -62,8 +61,7 @@ def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> t
 
 def with_linear_light(methods: Iterable[str]) -> list[str]:
     """Methods, with a variant in linear light after each "MIXTURE/best"."""
-    more = ([m, m.replace("/best", f"/{_LIGHT}")] if m.endswith("/best") else [m] for m in methods)
-    return [name for names in more for name in names]
+    return list(dict.fromkeys(name for m in methods for name in (m, m.replace("/best", f"/{_LIGHT}"))))
 
 
 def in_linear_light(method: str) -> bool:
@@ -72,7 +70,7 @@ def in_linear_light(method: str) -> bool:
 
 
 @dataclass(eq=False)
-class Painter:
+class MarkerRenderer:
     """Renderer of markers by any method.
 
     Trained models are read from ``trained``/2dgs-17/small-0.ply: collection, marker.
@@ -82,20 +80,19 @@ class Painter:
     """None if only the ideal is rendered"""
     trained: Path | None = None
 
-    def open(self, method: str, name: str, spec: str, module: float) -> Draw:
+    def prepare(self, method: str, name: str, spec: str, module: float) -> Render:
         """Prepare a marker for rendering.
 
         Args:
             method: one of `method_names` or `with_linear_light`.
-            name: of the marker, e.g. "small-0".
-            spec: of the marker.
+            name, spec: name such as "small-0" and spec of the marker.
             module: edge of a module in metres.
 
         Raises InputError for an unknown method or a trained model that is missing.
         """
         plain = plain_marker(spec)
         if method == IDEAL:
-            return lambda camera: plane_picture(plain.grid, module, camera, background=BACKGROUND)
+            return lambda camera: plane_image(plain.grid, module, camera, background=BACKGROUND)
         renderer = self.renderer
         if renderer is None:
             raise InputError(f"the method {method} needs a renderer")
@@ -116,13 +113,13 @@ class Painter:
         ground = from_srgb(BACKGROUND) if linear else BACKGROUND
         sensor = Sensor(response="srgb") if linear else None
 
-        def draw(camera: Camera) -> np.ndarray:
+        def render(camera: Camera) -> np.ndarray:
             frame = renderer.render(
                 resident, camera, quality=quality, background=(ground,) * 3, sensor=sensor
             )
             return frame["rgb"].mean(2) if not filtered else frame["rgb"][:, :, 0]
 
-        return draw
+        return render
 
 
 def plain_marker(spec: str) -> Marker:

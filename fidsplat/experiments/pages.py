@@ -1,4 +1,4 @@
-"""Pages of results: Markdown from a template beside this file and tables."""
+"""Reports in Markdown from a template and tables."""
 
 from __future__ import annotations
 
@@ -15,48 +15,31 @@ from fidsplat.util.files import atomic_write, printable, writable_folder
 from fidsplat.util.markup import escaped
 
 NOTHING = "-"
-BEGIN, END = "<!-- begin generated -->", "<!-- end generated -->"
-"""lines around the generated block of a page that is otherwise written by hand"""
 
 
-def places(out: Path, name: str = "report.md") -> tuple[Path, Path]:
-    """The page and the folder of its charts and tables: for a folder both in it, for a name that ends in .md
-    a folder of that name without .md. Raises InputError when that cannot be written."""
+def page_and_folder(out: Path) -> tuple[Path, Path]:
+    """Report file, and folder of its charts and tables: report.md in a folder, or a name that ends in .md and
+    a folder of that name without .md. Raises InputError when the folder cannot be written."""
     if out.suffix == ".md":
         return out, writable_folder(out.with_suffix(""))
-    return writable_folder(out) / name, out
+    return writable_folder(out) / "report.md", out
 
 
 def write_page(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> None:
-    """Fill a template and write the page.
+    """Fill a template and write the report. Arguments: see `fill_template`."""
+    with atomic_write(page) as stream:
+        stream.write(printable(fill_template(page, folder, template, context)).encode())
+
+
+def fill_template(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> str:
+    """Text of a template.
 
     Args:
-        folder: of charts; the template has its name, relative to the page, as `folder`.
-        context: what the template needs; pandas tables are filtered by `table`. Text is escaped, as names of
-            data sets and files may hold HTML; Markdown of our own is a `Markup`.
+        page: file of the text.
+        folder: folder of charts; its name relative to the page is the variable `folder`.
+        context: variables of the template; pandas tables have the filter `table`. Text except a `Markup` is
+            escaped, since names of data sets and files may contain HTML.
     """
-    _write(page, _filled(page, folder, template, context))
-
-
-def has_block(page: Path) -> bool:
-    """Whether a page exists and has a generated block."""
-    return page.is_file() and BEGIN in page.read_text("utf-8").splitlines()
-
-
-def write_block(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> None:
-    """Replace the generated block of a page. Arguments: as `write_page`."""
-    before, _, rest = page.read_text("utf-8").partition(f"{BEGIN}\n")
-    _, _, after = rest.partition(f"{END}\n")
-    block = _filled(page, folder, template, context)
-    _write(page, f"{before}{BEGIN}\n{block}{END}\n{after}")
-
-
-def _write(page: Path, text: str) -> None:
-    with atomic_write(page) as stream:
-        stream.write(printable(text).encode())
-
-
-def _filled(page: Path, folder: Path, template: str, context: Mapping[str, Any]) -> str:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
         undefined=jinja2.StrictUndefined,
@@ -65,15 +48,15 @@ def _filled(page: Path, folder: Path, template: str, context: Mapping[str, Any])
         keep_trailing_newline=True,
         finalize=_inserted,
     )
-    environment.filters |= {"table": markdown_table, "number": number, "percent": percent, "listed": listed}
-    beside = "" if folder == page.parent else f"{folder.name}/"
-    return environment.get_template(template).render(**context, folder=beside)
+    environment.filters |= {"table": markdown_table, "number": number, "listed": listed}
+    prefix = "" if folder == page.parent else f"{folder.name}/"
+    return environment.get_template(template).render(**context, folder=prefix)
 
 
 def markdown_table(frame: Frame) -> Markup:
-    """A table; its first column is text, the others stand at the right."""
+    """A table; all columns except the first are right-aligned."""
     rows = [frame.columns, ["---", *["---:"] * (len(frame.columns) - 1)], *frame.itertuples(index=False)]
-    return Markup("\n".join("| " + " | ".join(_cell(cell) for cell in row) + " |" for row in rows))
+    return Markup("\n".join("| " + " | ".join(map(_cell, row)) + " |" for row in rows))
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -87,16 +70,16 @@ def fixed(value: float | None, digits: int = 1) -> str:
 
 
 def percent(ratio: float | None) -> str:
-    """A ratio of times as what it adds: +12 %."""
+    """Relative change of a ratio from 1, such as +12 %."""
     if ratio is None or pd.isna(ratio):
         return NOTHING
-    added = 100 * (ratio - 1)
-    return f"{added:+.1f} %" if abs(added) < 10 else f"{added:+.0f} %"
+    change = 100 * (ratio - 1)
+    return f"{change:+.1f} %" if abs(change) < 10 else f"{change:+.0f} %"
 
 
-def listed(words: list[str]) -> str:
-    """Things in a sentence, whose names may have commas; nothing is "none"."""
-    return "; ".join(words) if words else "none"
+def listed(names: list[str]) -> str:
+    """Names in a sentence, which may contain commas; "none" if empty."""
+    return "; ".join(names) if names else "none"
 
 
 def _cell(value: object) -> str:

@@ -15,7 +15,7 @@ from fidsplat.cameras import Camera
 from fidsplat.util.errors import InputError
 
 
-def plane_picture(
+def plane_image(
     grid: np.ndarray,
     module: float,
     camera: Camera,

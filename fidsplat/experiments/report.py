@@ -3,90 +3,85 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from fidsplat.experiments import angles, counts, localisation, trained, views
 from fidsplat.experiments.charts import bars, chart, legend_above
 from fidsplat.experiments.methods import FILTERS, IDEAL, mixtures, with_linear_light
-from fidsplat.experiments.pages import NOTHING, fixed, number, places, write_page
+from fidsplat.experiments.pages import NOTHING, fixed, number, page_and_folder, write_page
 from fidsplat.experiments.paper import ANGLES, CONSTRUCTION_SECONDS, TRAINING_SECONDS, VIEWS
-from fidsplat.experiments.pictures import sheet_files
 from fidsplat.experiments.results import load
 from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
+from fidsplat.experiments.sheets import sheet_files
 from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.views import LINEAR, TRUTHS
 from fidsplat.util.files import atomic_write, open_input
 
-_FURTHEST = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
+_READERS = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
 """detectors of each kind by limit on the ideal texture; the first available one is shown"""
-_SHOWN_TRUTHS = (("exact", "blender-raw"), ("blender-standard", "exact-linear"))
+_TRUTHS = (("exact", "blender-raw"), ("blender-standard", "exact-linear"))
 """ground truths of display values and of linear light; the first available one is shown"""
-_COMMANDS = {trained.NAME: "baseline"}
-"""commands of experiments with another name"""
 PAPER, TRAINED = "paper, its own", "paper, 2DGS 17 views"
+_NAN = float("nan")
 
 
 def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Write a report in Markdown with its charts, summaries and sheets; returns the files, the page first.
-    From the folder of the summaries the same page can be made again.
+    """Write a report in Markdown with its charts, summaries and sheets; returns the files, the report first.
+    The summaries suffice to make the same report again.
 
     Args:
-        folders: where results lie, see `fidsplat.experiments.results.load`, and sheets of pictures.
-        out: a folder for report.md and all that belongs to it; or a name that ends in .md, and the rest goes
-            into a folder of that name without .md.
+        folders: folders with results, see `fidsplat.experiments.results.load`, and sheets of images.
+        out: folder for report.md and its files; or a name that ends in .md, whose files are written to a
+            folder of that name without .md.
 
     Raises InputError when there are no results or the folder cannot be written.
     """
     loaded = load(folders)
-    page, folder = places(out)
-    files = [folder / f"{name}.csv" for name in loaded]
-    summaries = {
-        name: summary.write(file) for (name, summary), file in zip(loaded.items(), files, strict=True)
-    }
+    page, folder = page_and_folder(out)
+    summaries = {name: summary.write(folder / f"{name}.csv") for name, summary in loaded.items()}
     rows = {name: summary.rows for name, summary in summaries.items()}
-    context: dict = dict.fromkeys((counts.NAME, angles.NAME, views.NAME, localisation.NAME, trained.NAME))
-    for name, tables in (
-        (counts.NAME, _counts),
-        (angles.NAME, _angles),
-        (views.NAME, _views),
-        (localisation.NAME, _localisation),
-    ):
-        if name in rows:
-            context[name] = tables(rows[name], folder)
-    if trained.NAME in rows:
-        context[trained.NAME] = _trained(rows[trained.NAME], rows.get(views.NAME), rows.get(angles.NAME))
+    sections = {
+        counts.NAME: _counts,
+        angles.NAME: _angles,
+        views.NAME: _views,
+        localisation.NAME: lambda own, _: _localisation(own),
+        trained.NAME: lambda own, _: _trained(own, rows.get(views.NAME), rows.get(angles.NAME)),
+    }
+    context: dict[str, Any] = {
+        name: section(rows[name], folder) if name in rows else None for name, section in sections.items()
+    }
     sheets = next((found for place in (*folders, folder) if (found := sheet_files(place))), [])
     for sheet in sheets:
         if sheet.parent.resolve() != folder.resolve():
             with atomic_write(folder / sheet.name) as stream, open_input(sheet) as source:
                 shutil.copyfileobj(source, stream)
+    commands = {name: "baseline" if name == trained.NAME else name for name in summaries}
     context |= {
         "sheets": [sheet.name for sheet in sheets],
-        "runs": provenance(
-            {f"`{_COMMANDS.get(name, name)}`": summary for name, summary in summaries.items()}
-        ),
+        "runs": provenance({f"`{commands[name]}`": summary for name, summary in summaries.items()}),
         "training_seconds": TRAINING_SECONDS,
         "notes": list(dict.fromkeys(note for summary in summaries.values() for note in summary.notes)),
     }
     write_page(page, folder, "results.md.j2", context)
-    return [page, *files, *sorted(folder.glob("*.svg"))]
+    return [page, *(folder / f"{name}.csv" for name in loaded), *sorted(folder.glob("*.svg"))]
 
 
 def category_order(names: Iterable[str]) -> list[str]:
     """Occurring categories in the paper's order."""
-    there = set(names)
-    return [name for name in CATEGORIES if name in there]
+    names = set(names)
+    return [name for name in CATEGORIES if name in names]
 
 
 def method_order(names: Iterable[str]) -> list[str]:
     """Occurring methods that are shown: the ideal, mixtures without a low-pass, trained models."""
     own = with_linear_light(f"{mixture}/{name}" for mixture in mixtures() for name in FILTERS)
-    known = [IDEAL, *(name for name in own if not name.endswith("/screen"))]
-    there = set(names)
-    return [name for name in (*known, *(f"2dgs-{n}" for n in COLLECTIONS)) if name in there]
+    own = [name for name in own if not name.endswith("/screen")]
+    names = set(names)
+    return [name for name in (IDEAL, *own, *(f"2dgs-{n}" for n in COLLECTIONS)) if name in names]
 
 
 def _titles(categories: Iterable[str]) -> list[str]:
@@ -97,150 +92,132 @@ def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
     """Tables 1 and 2, and the chart of each."""
     categories = category_order(rows["category"])
     made = [name for name in mixtures() if name in set(rows["mixture"])]
-    mean = rows.groupby(["category", "mixture"]).mean(numeric_only=True)
+    means = rows.pivot_table(["gaussians", "seconds"], "category", "mixture", sort=False).reindex(categories)
     first = rows.groupby(["category", "marker"]).first().groupby("category").mean(numeric_only=True)
     sizes, seconds = [], []
     for name in categories:
         category, own = CATEGORIES[name], first.loc[name]
-        side = 8 if category.version is None else 17 + 4 * category.version
-        row = {
-            "category": category.title,
-            "characters": category.length or NOTHING,
-            "QR version": category.version or NOTHING,
-            "modules a side": side,
-        }
-        for column, words in (("components", "components"), ("rectangles", "rectangles")):
-            row[words] = f"{own[f'{column}_dark'] + own[f'{column}_light']:.0f}"
-        sizes.append(row | {f"splats, {m}": fixed(mean["gaussians"].get((name, m)), 0) for m in made})
-        seconds.append(
-            {"category": category.title} | {m: number(mean["seconds"].get((name, m)), 2) for m in made}
+        sizes.append(
+            {
+                "category": category.title,
+                "characters": category.length or NOTHING,
+                "QR version": category.version or NOTHING,
+                "modules a side": 8 if category.version is None else 17 + 4 * category.version,
+                "components": f"{own['components_dark'] + own['components_light']:.0f}",
+                "rectangles": f"{own['rectangles_dark'] + own['rectangles_light']:.0f}",
+            }
+            | {f"splats, {m}": fixed(means["gaussians"][m][name], 0) for m in made}
         )
-    every = mean["seconds"].groupby("mixture").mean()
-    seconds.append({"category": "all"} | {m: number(every[m], 2) for m in made})
+        seconds.append({"category": category.title} | {m: number(means["seconds"][m][name]) for m in made})
+    seconds.append({"category": "all"} | {m: number(means["seconds"][m].mean()) for m in made})
     seconds.append({"category": PAPER} | {m: f"{CONSTRUCTION_SECONDS:.2f}" for m in made})
-
-    def of(column: str) -> dict[str, list[float]]:
-        return {
-            f"mixture {m}": [mean[column].get((name, m), float("nan")) for name in categories] for m in made
-        }
-
-    with chart(folder / "counts.svg") as (figure, (axes,)):
-        bars(axes, _titles(categories), of("gaussians"), logarithmic=True)
-        axes.set_ylabel("splats of a marker")
-        legend_above(figure, axes)
-    with chart(folder / "seconds.svg") as (figure, (axes,)):
-        bars(axes, _titles(categories), of("seconds"), logarithmic=True)
-        axes.axhline(CONSTRUCTION_SECONDS, color="#555555", linestyle="--", label="paper, its own, mean")
-        axes.axhline(
-            TRAINING_SECONDS[17], color="#555555", linestyle=":", label="paper, training 2DGS, 17 views"
-        )
-        axes.set_ylabel("seconds from text to splats")
-        legend_above(figure, axes)
+    for file, column, label in (
+        ("counts.svg", "gaussians", "splats of a marker"),
+        ("seconds.svg", "seconds", "seconds from text to splats"),
+    ):
+        with chart(folder / file) as (figure, (axes,)):
+            series = {f"mixture {m}": means[column][m].tolist() for m in made}
+            bars(axes, _titles(categories), series, logarithmic=True)
+            if column == "seconds":
+                for time, style, text in (
+                    (CONSTRUCTION_SECONDS, "--", "paper, its own, mean"),
+                    (TRAINING_SECONDS[17], ":", "paper, training 2DGS, 17 views"),
+                ):
+                    axes.axhline(time, color="#555555", linestyle=style, label=text)
+            axes.set_ylabel(label)
+            legend_above(figure, axes)
     return {"sizes": pd.DataFrame(sizes), "seconds": pd.DataFrame(seconds)}
 
 
 def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
     """Table 3 by protocol, and its chart."""
-    rows = _of_furthest(rows)
+    rows = _best_reader(rows)
     categories, methods = category_order(rows["category"]), method_order(rows["method"])
-    tables, means = {}, {}
-    for protocol in (name for name in PROTOCOLS if name in set(rows["protocol"])):
-        there = rows[rows["protocol"] == protocol]
-        own = there.groupby(["category", "method"])
-        means[protocol] = own["read"].mean()
-        tables[protocol] = _beside_paper(
-            categories,
-            method_order(there["method"]),
-            lambda place, own=own: (
-                "/".join(_angle(own.get_group(place)[c]) for c in ("found", "read"))
-                if place in own.groups
-                else NOTHING
-            ),
-            {
-                name: {key: "{:.1f}/{:.1f}".format(*value) for key, value in row.items()}
-                for name, row in ANGLES.items()
-                if protocol == "fixed-plane"  # the paper's
-            },
-        )
-    series = {
-        protocol: _series(
-            categories, methods, mean, {c: {k: v[1] for k, v in row.items()} for c, row in ANGLES.items()}
-        )
-        for protocol, mean in means.items()
+    paper = {
+        name: {key: "{:.1f}/{:.1f}".format(*value) for key, value in row.items()}
+        for name, row in ANGLES.items()
     }
+    paper_read = {name: {key: value[1] for key, value in row.items()} for name, row in ANGLES.items()}
+    tables, series = {}, {}
+    for protocol in (name for name in PROTOCOLS if name in set(rows["protocol"])):
+        own = rows[rows["protocol"] == protocol]
+        cells = {
+            key: f"{_angle(group['found'])}/{_angle(group['read'])}"
+            for key, group in own.groupby(["category", "method"])
+        }
+        # the protocol of the paper
+        theirs = paper if protocol == "fixed-plane" else {}
+        tables[protocol] = _table(categories, method_order(own["method"]), cells, theirs)
+        means = own.groupby(["category", "method"])["read"].mean()
+        series[protocol] = _series(categories, methods, means, paper_read)
     _panels(folder / "angles.svg", categories, series, "largest tilt that is read, degrees")
     return tables
 
 
-def _of_furthest(rows: Frame) -> Frame:
-    """Rows of the detector with the furthest limit for each method."""
-    places = {name: place for names in _FURTHEST.values() for place, name in enumerate(names)}
-    place = rows["reader"].map(places)
-    each = place.groupby([rows["protocol"], rows["category"], rows["method"]])
-    return rows[place == each.transform("min")]
+def _best_reader(rows: Frame) -> Frame:
+    """Rows of the detector with the largest limit for each method."""
+    ranks = {name: rank for names in _READERS.values() for rank, name in enumerate(names)}
+    rank = rows["reader"].map(ranks)
+    by_method = rank.groupby([rows["protocol"], rows["category"], rows["method"]])
+    return rows[rank == by_method.transform("min")]
 
 
 def _angle(values: Row) -> str:
-    there = values.dropna()
-    if there.empty:
+    measured = values.dropna()
+    if measured.empty:
         return "never"
-    never = len(values) - len(there)
-    return f"{there.mean():.1f}" + (f" ({never} of {len(values)} never)" if never else "")
+    never = len(values) - len(measured)
+    return f"{measured.mean():.1f}" + (f" ({never} of {len(values)} never)" if never else "")
 
 
 def _views(rows: Frame, folder: Path) -> dict:
-    """Table 4 against ground truth of display values and of linear light, and its chart."""
-    categories = category_order(rows["category"])
-    there = set(rows["truth"])
-    shown = [name for names in _SHOWN_TRUTHS if (name := next((n for n in names if n in there), ""))]
+    """Table 4 relative to ground truth of display values and of linear light, and its chart."""
+    categories, measured = category_order(rows["category"]), set(rows["truth"])
+    paper_psnr = {name: {key: value[0] for key, value in row.items()} for name, row in VIEWS.items()}
     tables, series = {}, {}
-    for truth in shown:
+    for truth in filter(None, (next((n for n in names if n in measured), None) for names in _TRUTHS)):
+        linear = truth in LINEAR
         own = rows[rows["truth"] == truth]
         methods = method_order(own["method"])
-        mean = own.groupby(["category", "method"])[["psnr", "ssim"]].mean()
-
-        def cell(place: tuple[str, str], mean: Frame = mean) -> str:
-            if place not in mean.index:
-                return NOTHING
-            return f"{fixed(mean['psnr'][place], 1)}/{fixed(mean['ssim'][place], 3)}"
-
+        means = own.groupby(["category", "method"])[["psnr", "ssim"]].mean()
+        cells = {key: f"{fixed(row.psnr)}/{fixed(row.ssim, 3)}" for key, row in means.iterrows()}
         paper = {
             name: {key: f"{value[0]:.1f}/{value[1]:.2f}" for key, value in row.items()}
             for name, row in VIEWS.items()
-            if truth in LINEAR  # as the paper's, which is Blender's
+            if linear  # like the paper's, which is Blender's
         }
-        tables[truth] = {"title": TRUTHS[truth], "rows": _beside_paper(categories, methods, cell, paper)}
-        # in linear light what blends linear light
-        ending = "/light" if truth in LINEAR else "/best"
-        drawn = [method for method in methods if "/" not in method or method.endswith(ending)]
-        psnr = {c: {k: v[0] for k, v in row.items()} for c, row in VIEWS.items()}
-        title = f"mixtures drawn as `{ending[1:]}` against\n{TRUTHS[truth]}"
-        series[title] = _series(categories, drawn, mean["psnr"], psnr)
+        tables[truth] = {"title": TRUTHS[truth], "rows": _table(categories, methods, cells, paper)}
+        # methods that blend as the ground truth averages
+        ending = "light" if linear else "best"
+        shown = [method for method in methods if "/" not in method or method.endswith(f"/{ending}")]
+        title = f"mixtures rendered as `{ending}` against\n{TRUTHS[truth]}"
+        series[title] = _series(categories, shown, means["psnr"], paper_psnr)
     _panels(folder / "psnr.svg", categories, series, "PSNR, dB")
-    measured = {name: int(rows[name].notna().sum()) for name in ("flip", "lpips")}
-    return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": measured}
+    count = {name: int(rows[name].notna().sum()) for name in ("flip", "lpips")}
+    return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": count}
 
 
-def _trained(rows: Frame, seen: Frame | None, scans: Frame | None) -> dict:
-    """The paper's baseline: a row for each category and number of views, the paper's figures beside ours of
-    the first seed; other seeds say how far a PSNR is chance."""
-    table, trainings, every = [], len(rows), rows
-    rows = every[every["seed"] == 0]
-    read = {} if scans is None else _read_of(scans)
-    flips = {} if seen is None else _flips(seen)
-    for category in category_order(rows["category"]):
-        for count in sorted(set(rows["views"])):
-            own = rows[(rows["category"] == category) & (rows["views"] == count)]
-            if own.empty:
-                continue
-            theirs = ANGLES.get(category, {}).get(count)
-            ratio, similar, _ = VIEWS[category][count]
-            method = f"2dgs-{count}"
+def _trained(rows: Frame, viewed: Frame | None, scans: Frame | None) -> dict:
+    """The paper's baseline: the paper's figures and ours of the first seed, by category and number of views;
+    the other seeds show the random spread of PSNR."""
+    first = rows[rows["seed"] == 0]
+    read, flips = {}, {}
+    if scans is not None:
+        plane = _best_reader(scans[scans["protocol"] == "fixed-plane"])
+        read = {key: _angle(own["read"]) for key, own in plane.groupby(["category", "method"])}
+    if viewed is not None:
+        means = viewed[viewed["truth"] == "exact"].groupby(["category", "method"])["flip"].mean()
+        flips = {key: fixed(mean, 3) for key, mean in means.items()}
+    table = []
+    for category in category_order(first["category"]):
+        for count, own in first[first["category"] == category].groupby("views"):
+            psnr, ssim, _ = VIEWS[category][count]
+            theirs, method = ANGLES.get(category, {}).get(count), f"2dgs-{count}"
             table.append(
                 {
                     "marker, views": f"{CATEGORIES[category].title}, {count}",
                     "markers": own["marker"].nunique(),
-                    "PSNR/SSIM, paper": f"{ratio:.1f}/{similar:.2f}",
+                    "PSNR/SSIM, paper": f"{psnr:.1f}/{ssim:.2f}",
                     "ours": f"{own['psnr'].mean():.1f}/{own['ssim'].mean():.3f}",
                     "FLIP": flips.get((category, method), NOTHING),
                     "read to, paper": NOTHING if theirs is None else f"{theirs[1]:.1f}",
@@ -248,45 +225,57 @@ def _trained(rows: Frame, seen: Frame | None, scans: Frame | None) -> dict:
                     "read to, training-free": read.get((category, "exact/best"), NOTHING),
                     "splats": fixed(own["splats"].mean(), 0),
                     "seconds, paper": f"{TRAINING_SECONDS[count]:.0f}",
-                    "seconds, several at once": fixed(own["seconds"].median(), 1),
+                    "seconds, several at once": fixed(own["seconds"].median()),
                 }
             )
-    found: dict = {"rows": pd.DataFrame(table), "trainings": trainings, "markers": ""}
-    found["iterations"] = int(every["amount"].max())
-    if len(numbers := set(found["rows"]["markers"])) == 1:  # that needs no column
-        found["markers"] = f", {numbers.pop()} of each"
-        found["rows"] = found["rows"].drop(columns="markers")
-    unread = "" if scans is None else _unread(rows, scans)
-    return found | {"spread": _spread(every), "unread": unread, "enough": _enough(found["rows"])}
+    shown, markers = pd.DataFrame(table), ""
+    if shown["markers"].nunique() == 1:
+        markers = f", {shown['markers'][0]} of each"
+        shown = shown.drop(columns="markers")
+    return {
+        "rows": shown,
+        "trainings": len(rows),
+        "markers": markers,
+        "iterations": int(rows["amount"].max()),
+        "spread": _spread(rows),
+        "unread": "" if scans is None else _unread(first, scans),
+        "enough": _enough(shown),
+    }
 
 
 def _unread(rows: Frame, scans: Frame) -> str:
     """Categories and numbers of views with trainings that the detectors did not read."""
-    markers, lacking = ["category", "views", "marker"], {}
+    keys = ["category", "views", "marker"]
     scans = scans.assign(views=pd.to_numeric(scans["method"].str.extract(r"^2dgs-(\d+)$")[0]))
-    shown = set(scans[markers].itertuples(index=False, name=None))
-    for category, count, marker in sorted(rows[markers].itertuples(index=False, name=None)):
-        if (category, count, marker) not in shown:
-            lacking.setdefault(category, {})[str(count)] = None
-    return "; ".join(f"{CATEGORIES[c].title}, {', '.join(lacking[c])}" for c in category_order(lacking))
+    scanned = set(scans[keys].itertuples(index=False, name=None))
+    missing = rows[[key not in scanned for key in rows[keys].itertuples(index=False, name=None)]]
+    return "; ".join(f"{name}, {counts}" for name, counts in _views_by_category(missing).items())
+
+
+def _views_by_category(rows: Frame) -> dict[str, str]:
+    """Numbers of views as text by title of the category."""
+    return {
+        CATEGORIES[name].title: ", ".join(
+            map(str, sorted(rows.loc[rows["category"] == name, "views"].unique()))
+        )
+        for name in category_order(rows["category"])
+    }
 
 
 def _spread(rows: Frame) -> dict | None:
-    """How far apart the PSNR of a marker is that was trained by several seeds; None where none was."""
-    each = rows.groupby(["category", "views", "marker"])["psnr"].agg(["size", "min", "max"])
-    several = each[each["size"] > 1]
+    """Range of PSNR of markers that were trained with several seeds; None without any."""
+    psnr = rows.groupby(["category", "views", "marker"])["psnr"].agg(["size", "min", "max"])
+    several = psnr[psnr["size"] > 1]
     if several.empty:
         return None
-    apart = several["max"] - several["min"]
-    kinds = {category: [] for category in category_order(several.index.get_level_values("category"))}
-    for category, count, _ in several.index:
-        kinds[category].append(count)
-    named = ", ".join(
-        f"{CATEGORIES[category].title} on {', '.join(map(str, sorted(set(counts))))} views"
-        for category, counts in kinds.items()
-    )
-    most = int(several["size"].max())
-    return {"of": named, "seeds": most, "median": float(apart.median()), "most": float(apart.max())}
+    spread = several["max"] - several["min"]
+    named = _views_by_category(several.reset_index())
+    return {
+        "of": ", ".join(f"{name} on {counts} views" for name, counts in named.items()),
+        "seeds": int(several["size"].max()),
+        "median": float(spread.median()),
+        "most": float(spread.max()),
+    }
 
 
 def _enough(table: Frame) -> list[dict]:
@@ -296,25 +285,13 @@ def _enough(table: Frame) -> list[dict]:
         pd.Series(pd.to_numeric(table[name], errors="coerce"))
         for name in ("read to, ours", "read to, training-free", "seconds, several at once")
     )
-    kinds = table["marker, views"].str.rpartition(", ")
-    rows = {"marker": kinds[0], "views": kinds[2], "before": (free - ours).clip(lower=0), "seconds": seconds}
+    names = table["marker, views"].str.rpartition(", ")
+    rows = {"marker": names[0], "views": names[2], "before": (free - ours).clip(lower=0), "seconds": seconds}
     ordered = pd.DataFrame(rows).dropna(subset=["before"]).sort_values("before", kind="stable")
     return ordered.drop_duplicates("marker").sort_index().to_dict("records")
 
 
-def _flips(seen: Frame) -> dict[tuple[str, str], str]:
-    """FLIP of novel views against the ground truth of training, by category and method."""
-    means = seen[seen["truth"] == "exact"].groupby(["category", "method"])["flip"].mean()
-    return {place: fixed(mean, 3) for place, mean in means.items()}
-
-
-def _read_of(scans: Frame) -> dict[tuple[str, str], str]:
-    """Largest readable tilt on the paper's plane, by category and method."""
-    scans = _of_furthest(scans[scans["protocol"] == "fixed-plane"])
-    return {place: _angle(own["read"]) for place, own in scans.groupby(["category", "method"])}
-
-
-def _localisation(rows: Frame, folder: Path) -> Frame:
+def _localisation(rows: Frame) -> Frame:
     """Median position error by every other distance, and number of views read."""
     methods = method_order(rows["method"])
     rows = rows[rows["distance_m"].isin(sorted(set(rows["distance_m"]))[::2])]
@@ -323,50 +300,39 @@ def _localisation(rows: Frame, folder: Path) -> Frame:
         row = {"marker, distance": f"{CATEGORIES[str(category)].title}, {distance:g} m"}
         for method in methods:
             one = own[own["method"] == method]
-            read, seen = one["read"].sum(), one["amount"].sum()
-            lost = f" ({read}/{seen})" if read < seen else ""
-            row[method] = (number(one["position_mm"].median()) if read else "not read") + (
-                lost if read else ""
-            )
+            read, every = one["read"].sum(), one["amount"].sum()
+            missed = f" ({read}/{every})" if read < every else ""
+            row[method] = number(one["position_mm"].median()) + missed if read else "not read"
         table.append(row)
     return pd.DataFrame(table)
 
 
-def _beside_paper(
+def _table(
     categories: Sequence[str],
     methods: Sequence[str],
-    cell: Callable[[tuple[str, str]], str],
-    paper: dict[str, dict],
+    cells: Mapping[tuple[str, str], str],
+    paper: Mapping[str, Mapping],
 ) -> Frame:
-    """Rows by category: figures of the paper if any, then ours."""
+    """Table by category: figures of the paper if any, then cells of ours by category and method."""
     theirs = {PAPER: "ours", TRAINED: 17} if paper else {}
     return pd.DataFrame(
         [
             {"category": CATEGORIES[category].title}
-            | {words: paper.get(category, {}).get(key, NOTHING) for words, key in theirs.items()}
-            | {method: cell((category, method)) for method in methods}
+            | {text: paper.get(category, {}).get(key, NOTHING) for text, key in theirs.items()}
+            | {method: cells.get((category, method), NOTHING) for method in methods}
             for category in categories
         ]
     )
 
 
 def _series(
-    categories: Sequence[str], methods: Sequence[str], values: Row, paper: dict[str, dict]
+    categories: Sequence[str], methods: Sequence[str], values: Row, paper: Mapping[str, Mapping]
 ) -> dict[str, list[float]]:
     """Our figures by method, then the paper's, for `_panels`."""
-    nan = float("nan")
-    own = {_short(m): [values.get((c, m), nan) for c in categories] for m in methods}
-    theirs = {
-        words: [paper.get(c, {}).get(key, nan) for c in categories]
-        for words, key in ((PAPER, "ours"), (TRAINED, 17))
-    }
-    return own | theirs
-
-
-def _short(method: str) -> str:
-    """Name of a method in charts, without its filter."""
-    mixture, slash, _ = method.partition("/")
-    return f"mixture {mixture}" if slash else method
+    names = {m: f"mixture {m.partition('/')[0]}" if "/" in m else m for m in methods}
+    own = {name: [values.get((c, method), _NAN) for c in categories] for method, name in names.items()}
+    theirs = ((PAPER, "ours"), (TRAINED, 17))
+    return own | {text: [paper.get(c, {}).get(key, _NAN) for c in categories] for text, key in theirs}
 
 
 def _panels(
@@ -375,10 +341,10 @@ def _panels(
     """Panels of bars by category with one legend."""
     names = list(dict.fromkeys(name for series in panels.values() for name in series))
     names.sort(key=lambda name: (name in (PAPER, TRAINED), name != IDEAL))
-    nothing = [float("nan")] * len(categories)
+    missing = [_NAN] * len(categories)
     with chart(file, len(panels), (4.5 * len(panels) + 2, 4.2)) as (figure, axes):
         for one, (title, series) in zip(axes, panels.items(), strict=True):
-            bars(one, _titles(categories), {name: series.get(name, nothing) for name in names})
+            bars(one, _titles(categories), {name: series.get(name, missing) for name in names})
             one.set_title(title)
             one.tick_params(axis="x", labelsize=8)
         axes[0].set_ylabel(unit)

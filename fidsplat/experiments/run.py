@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 from fidsplat.experiments import angles, counts, localisation, views
-from fidsplat.experiments.methods import IDEAL, Painter
-from fidsplat.experiments.settings import (
-    AngleSettings,
-    ImageSettings,
-    MeasureSettings,
-    SweepSettings,
-    ViewSettings,
-)
+from fidsplat.experiments.methods import IDEAL, MarkerRenderer
+from fidsplat.experiments.settings import ImageSettings, MeasureSettings, SweepSettings
 from fidsplat.experiments.setup import MARKERS, PROTOCOLS, TEST_VIEWS, chosen_categories
-from fidsplat.experiments.sweep import Key, Results, Sweep
-from fidsplat.experiments.sweep import shard as share_of
+from fidsplat.experiments.sweep import Key, Results, Sweep, shard, thread_pool
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.files import writable_folder
 from fidsplat.util.provenance import run_facts
@@ -41,16 +35,15 @@ def prepared(names: Iterable[str], options: MeasureSettings) -> Iterator[list[Sw
     options.check()
     points = {name: points_of(name, options) for name in names}
     writable_folder(options.folder)
-    renderer, painter, workers = None, Painter(None), 1
+    renderer, markers, workers = None, MarkerRenderer(None), 1
     if isinstance(options, ImageSettings):
         if options.methods != (IDEAL,) and any(name != counts.NAME for name in points):
             renderer = Renderer(options.device)
-        painter, workers = Painter(renderer, options.trained), options.workers
-    device = None if renderer is None else device_words(renderer)
-    pool = ThreadPoolExecutor(workers)
-    try:
+        markers, workers = MarkerRenderer(renderer, options.trained), options.workers
+    device = None if renderer is None else device_name(renderer)
+    with thread_pool(workers) as pool:
         # first, since it reads files: --overwrite deletes nothing if a run cannot start
-        measures = {name: _measure(name, options, painter, pool) for name in points}
+        measures = {name: _measure(name, options, markers, pool) for name in points}
         yield [
             Sweep(
                 name,
@@ -60,66 +53,55 @@ def prepared(names: Iterable[str], options: MeasureSettings) -> Iterator[list[Sw
             )
             for name in points
         ]
-    finally:
-        # an interrupt must not wait for pending images
-        pool.shutdown(cancel_futures=True)
 
 
-def device_words(renderer: Renderer) -> str:
+def device_name(renderer: Renderer) -> str:
     """Title and driver of a device, for the facts of a run."""
     return f"{renderer.device.title}, {renderer.device.version}"
 
 
 def results_of(name: str, options: SweepSettings, device: str | None) -> Results:
-    """Results file of an experiment; device: `device_words` of the renderer, or None."""
+    """Results file of an experiment; device: `device_name` of the renderer, or None."""
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
     return Results(options.file(name), run_facts(device, options.seed, versions), options.overwrite)
 
 
 def points_of(name: str, options: MeasureSettings) -> list[Key]:
     """Points of an experiment, or of the shard of a run."""
-    return share_of(_points(name, options), options.shard)
+    return shard(_points(name, options), options.shard)
 
 
-def _points(name: str, options: MeasureSettings) -> list[Key]:
+def _points(name: str, options: Any) -> list[Key]:
     categories, count = chosen_categories(options.category), options.marker_count
     if name == counts.NAME:
         repeats = counts.QUICK_REPEATS if options.quick else counts.FULL_REPEATS
-        # all five cost a second
+        # all five markers take a second
         return counts.counts_points(categories, repeats, MARKERS if options.markers is None else count)
-    assert isinstance(options, ImageSettings)
     if name == localisation.NAME:
-        located = tuple(c for c in categories if c.name in localisation.LOCATED)
+        categories = tuple(c for c in categories if c.name in localisation.LOCATED)
         spans = (localisation.DISTANCES, localisation.TILTS)
         if options.quick:
             spans = (localisation.QUICK_DISTANCES, localisation.QUICK_TILTS)
-        return localisation.localisation_points(located, options.methods, *spans, count)
+        return localisation.localisation_points(categories, options.methods, *spans, count)
     if name == views.NAME:
-        assert isinstance(options, ViewSettings)
         number = QUICK_VIEWS if options.quick else TEST_VIEWS
         weights = None if options.lpips is None else weights_name(options.lpips)
         return views.views_points(categories, options.methods, options.blender_folder, count, number, weights)
-    assert isinstance(options, AngleSettings)
     tilts = options.tilts or (angles.QUICK_TILTS if options.quick else angles.FULL_TILTS)
-    return angles.angles_points(
-        categories, options.protocol or tuple(PROTOCOLS), options.methods, tilts, count
-    )
+    protocols = options.protocol or tuple(PROTOCOLS)
+    return angles.angles_points(categories, protocols, options.methods, tilts, count)
 
 
-def _measure(
-    name: str, options: MeasureSettings, painter: Painter, pool: ThreadPoolExecutor
-) -> Callable[[Key], dict]:
-    seed = options.seed
+def _measure(name: str, options: Any, markers: MarkerRenderer, pool: Executor) -> Callable[[Key], dict]:
     if name == counts.NAME:
-        return lambda part: counts.measure_counts(part, seed)
-    assert isinstance(options, ImageSettings)
+        return partial(counts.measure_counts, seed=options.seed)
+    common = {"markers": markers, "seed": options.seed, "pool": pool}
     if name == localisation.NAME:
-        return lambda part: localisation.measure_localisation(part, painter, seed, pool)
+        return partial(localisation.measure_localisation, **common)
     if name == views.NAME:
-        assert isinstance(options, ViewSettings)
-        perceptual = None if options.lpips is None else load_lpips(options.lpips)
+        lpips = None if options.lpips is None else load_lpips(options.lpips)
         cache = views.ImageCache()
-        return lambda part: views.measure_views(
-            part, painter, seed, options.blender_folder, pool, perceptual, cache
+        return partial(
+            views.measure_views, blender=options.blender_folder, lpips=lpips, cache=cache, **common
         )
-    return lambda part: angles.measure_angles(part, painter, seed, pool, options.workers)
+    return partial(angles.measure_angles, workers=options.workers, **common)

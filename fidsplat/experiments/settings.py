@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fidsplat.experiments.angles import parse_tilts
-from fidsplat.experiments.blender import VIEW_NAMES, check_pictures
+from fidsplat.experiments.blender import VIEW_NAMES, check_images
 from fidsplat.experiments.methods import IDEAL, method_names
 from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, chosen_categories
 from fidsplat.util.errors import InputError, unknown
@@ -65,7 +65,7 @@ class SweepSettings(CountedSettings):
     shard: str | None = None
     """Share of the work to measure, as i/n; `fidsplat experiment merge` joins the shares."""
     overwrite: bool = False
-    """Measure again what the folder for results holds."""
+    """Replace existing results."""
 
     def file(self, name: str) -> Path:
         """File for the results of an experiment."""
@@ -119,7 +119,7 @@ class RenderSettings(MarkerSettings):
             return
         if not folder.is_dir():
             raise InputError(
-                f"--trained must be a folder with 2dgs-17/small-0.ply and the like, got {folder}"
+                f"--trained must be a folder with models such as 2dgs-17/small-0.ply, got {folder}"
             )
         models = [method for method in self.methods if method.startswith("2dgs-")]
         if not models:
@@ -130,7 +130,7 @@ class RenderSettings(MarkerSettings):
                     file = folder / model / f"{category.name}-{index}.ply"
                     if not file.is_file():
                         raise InputError(
-                            f"{file} is missing; --category and --markers leave out what was not trained"
+                            f"{file} is missing; --category and --markers leave out untrained markers"
                         )
 
 
@@ -196,7 +196,7 @@ class ViewSettings(ImageSettings):
                 f"--blender must be a folder that `fidsplat experiment blender` wrote, got {self.blender}"
             )
         for view in VIEW_NAMES:
-            check_pictures(self.blender_folder, view, self.seed)
+            check_images(self.blender_folder, view, self.seed)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, unknown
 
 SEED = 0
 MARKERS = 5
@@ -56,10 +56,10 @@ CATEGORIES = {
 
 
 def chosen_categories(names: tuple[str, ...]) -> tuple[Category, ...]:
-    """The categories of these names, all when there are none. Raises InputError for an unknown name."""
+    """Categories by name; all if no name is given. Raises InputError for an unknown name."""
     for name in names:
         if name not in CATEGORIES:
-            raise InputError(f"unknown category {name!r}; known: {', '.join(CATEGORIES)}")
+            raise InputError(unknown("category", name, CATEGORIES))
     return tuple(category for name, category in CATEGORIES.items() if not names or name in names)
 
 
@@ -86,8 +86,8 @@ class Protocol:
     def camera(self, tilt: float) -> Camera:
         """Camera at ``tilt`` degrees from the normal of the marker, above it."""
         a = math.radians(tilt)
-        place = (0.0, -self.distance * math.sin(a), -self.distance * math.cos(a))
-        return Camera.look_at(self.pixels, self.pixels, math.radians(self.fov), place, (0.0, 0.0, 0.0))
+        position = (0.0, -self.distance * math.sin(a), -self.distance * math.cos(a))
+        return Camera.look_at(self.pixels, self.pixels, math.radians(self.fov), position, (0.0, 0.0, 0.0))
 
 
 PROTOCOLS = {

@@ -1,4 +1,4 @@
-"""Sweeps over points with results in a file: resume after a kill, shards, and merging of shards.
+"""Resumable sweeps over points, with shards and merging of shards.
 
 Results are JSON lines. A line {"run": ...} holds the facts of a run (`fidsplat.util.provenance.run_facts`)
 for the following lines {"key": ..., "result": ...}.
@@ -10,17 +10,20 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import atomic_write, from_json, ordinary_file, read_text, writable_folder
 
 Key = dict[str, Any]
-"""key of a measured point: plain data"""
+"""key of a point: plain data"""
+Work = Callable[[], dict[str, Any]]
+"""host work of a point, which returns its result"""
 
 
 class Record(NamedTuple):
@@ -51,11 +54,11 @@ class Results:
     """Results file of a sweep, written point by point.
 
     Args:
-        file: made with its folder if missing.
+        file: created with its folder if missing.
         run: facts of this run.
         overwrite: delete existing results.
 
-    Raises InputError when the file cannot be written, is none of ours, or holds results of another device,
+    Raises InputError when the file cannot be written, has another format, or holds results of another device,
     version, code or seed.
     """
 
@@ -80,9 +83,9 @@ class Results:
         return [key for key in points if name_of(key) not in self.done]
 
     def append(self, key: Key, result: dict[str, Any]) -> Record:
-        """Keep what was found at a point, numbers to six digits: no measurement has more.
+        """Append a result, with numbers rounded to six digits.
 
-        Raises ValueError for a result that JSON cannot hold, as NaN, InputError when the file cannot grow.
+        Raises ValueError for a result that JSON cannot hold, such as NaN, InputError if the file cannot grow.
         """
         record = Record(key, rounded(result), self.run)
         text = _line(record) if self.run == self._last_run else _header(self.run) + _line(record)
@@ -93,8 +96,8 @@ class Results:
                 os.fsync(stream.fileno())
         except OSError as error:
             raise InputError(
-                f"cannot write {self.file}: {error.strerror or error}; what it holds stays, and the same "
-                "command goes on from there"
+                f"cannot write {self.file}: {error.strerror or error}; earlier results stay, and the same "
+                "command resumes from them"
             ) from error
         self._last_run = self.run
         self.done[record.name] = record
@@ -108,12 +111,14 @@ class Sweep:
     name: str
     results: Results
     points: list[Key]
-    begin: Callable[[Key], Callable[[], dict[str, Any]]]
-    """runs the device work of a point and returns its host work, which returns the result"""
+    begin: Callable[[Key], Work]
+    """runs the device work of a point and returns its host work"""
     batch: int = 1
     """number of points whose device work runs before their host work, so that neither disturbs timings"""
     pool: Executor | None = None
     """runs the host work of a batch in parallel"""
+    record_errors: bool = False
+    """store a FidsplatError of the device work as the result `error`"""
 
     @property
     def left(self) -> list[Key]:
@@ -121,29 +126,53 @@ class Sweep:
         return self.results.left(self.points)
 
     def run(self) -> Iterator[Record]:
-        """Measure what is left; yields each record when it is in the file."""
-        left = self.left
-        for first in range(0, len(left), self.batch):
-            keys = left[first : first + self.batch]
-            rest = [self.begin(key) for key in keys]
-            found = map(_call, rest) if self.pool is None else self.pool.map(_call, rest)
-            for key, result in zip(keys, found, strict=True):
-                yield self.results.append(key, result)
+        """Measure the missing points; yields each record when it is in the file."""
+        return run_interleaved([self])
+
+    def run_batch(self, keys: Sequence[Key]) -> Iterator[Record]:
+        """Measure the missing points of a batch."""
+        keys = self.results.left(keys)
+        work = [self._begin(key) for key in keys]
+        results = map(_call, work) if self.pool is None else self.pool.map(_call, work)
+        for key, result in zip(keys, results, strict=True):
+            yield self.results.append(key, result)
+
+    def _begin(self, key: Key) -> Work:
+        try:
+            return self.begin(key)
+        except FidsplatError as error:
+            if not self.record_errors:
+                raise
+            result = {"error": str(error)}
+            return lambda: result
 
 
-def in_turn(sweeps: Sequence[Sweep]) -> Iterator[Record]:
-    """Measure what is left, the first point of each sweep before the second of any; yields each record when
-    it is in its file."""
-    for keys in zip_longest(*(sweep.points for sweep in sweeps)):
-        for sweep, key in zip(sweeps, keys, strict=True):
-            if key is not None and sweep.results.left([key]):
-                yield sweep.results.append(key, sweep.begin(key)())
+def run_interleaved(sweeps: Sequence[Sweep]) -> Iterator[Record]:
+    """Measure the missing points of sweeps, the first batch of each before the second of any; yields each
+    record when it is in its file, so that an interrupt loses at most one batch."""
+    batches = [
+        [sweep.points[first : first + sweep.batch] for first in range(0, len(sweep.points), sweep.batch)]
+        for sweep in sweeps
+    ]
+    for rounds in zip_longest(*batches, fillvalue=()):
+        for sweep, keys in zip(sweeps, rounds, strict=True):
+            yield from sweep.run_batch(keys)
+
+
+@contextmanager
+def thread_pool(workers: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads for the host work of sweeps; an interrupt cancels pending work."""
+    pool = ThreadPoolExecutor(workers)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def read_records(file: Path) -> list[Record]:
-    """Every record of a file, none when it is missing; a last line that was cut short is left out.
+    """Records of a file, none if it is missing; an incomplete last line is skipped.
 
-    Raises InputError when another line is none of ours.
+    Raises InputError for a file of another format.
     """
     if not file.exists():
         return []
@@ -170,10 +199,16 @@ def read_records(file: Path) -> list[Record]:
     return found
 
 
-def shard(points: list[Key], text: str | None) -> list[Key]:
-    """Every n-th point, from the i-th on, of "i/n"; all of them for None.
+def folder_records(folder: Path, name: str) -> list[Record]:
+    """Records of an experiment in a folder, unmerged shards included."""
+    files = [folder / f"{name}.jsonl", *sorted(folder.glob(f"{name}-*-of-*.jsonl"))]
+    return [record for file in files for record in read_records(file)]
 
-    Raises InputError for anything but i/n with 1 <= i <= n.
+
+def shard(points: list[Key], text: str | None) -> list[Key]:
+    """Every n-th point from the i-th on, for "i/n"; all points for None.
+
+    Raises InputError unless 1 <= i <= n.
     """
     if text is None:
         return points
@@ -193,11 +228,10 @@ class Merged(NamedTuple):
     """facts that affect results and differ between runs"""
 
 
-def merge(files: list[Path], target: Path) -> Merged:
-    """Merge files of shards into one; of duplicate points the first one is kept, and so are points that only
-    the target has.
+def merge(files: Sequence[Path], target: Path) -> Merged:
+    """Merge files of shards into one. The first record of a point wins; other points of the target stay.
 
-    Raises InputError when a file is missing or none of ours.
+    Raises InputError for a missing file or another format.
     """
     found: dict[str, Record] = {}
     repeated = 0
@@ -220,11 +254,11 @@ def merge(files: list[Path], target: Path) -> Merged:
 
 def missing_shards(files: Iterable[Path]) -> list[str]:
     """Missing shards "i/n", by the file names of `--shard i/n`."""
-    there: dict[int, set[int]] = {}
+    existing: dict[int, set[int]] = {}
     for file in files:
         if match := re.fullmatch(r".*-(\d+)-of-(\d+)\.jsonl", file.name):
-            there.setdefault(int(match[2]), set()).add(int(match[1]))
-    return [f"{i}/{n}" for n, found in sorted(there.items()) for i in range(1, n + 1) if i not in found]
+            existing.setdefault(int(match[2]), set()).add(int(match[1]))
+    return [f"{i}/{n}" for n, found in sorted(existing.items()) for i in range(1, n + 1) if i not in found]
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
@@ -258,5 +292,5 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-def _call(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    return function()
+def _call(work: Work) -> dict[str, Any]:
+    return work()

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -15,11 +14,11 @@ import numpy as np
 
 from fidsplat.experiments import angles, views
 from fidsplat.experiments.dataset import write_scene
-from fidsplat.experiments.methods import Painter
-from fidsplat.experiments.run import device_words, results_of
+from fidsplat.experiments.methods import MarkerRenderer
+from fidsplat.experiments.run import device_name, results_of
 from fidsplat.experiments.settings import SweepSettings
 from fidsplat.experiments.setup import COLLECTIONS, TEST_VIEWS, chosen_categories
-from fidsplat.experiments.sweep import Key, Sweep, shard
+from fidsplat.experiments.sweep import Key, Sweep, shard, thread_pool
 from fidsplat.render.renderer import Renderer
 from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
 from fidsplat.util.errors import InputError
@@ -29,8 +28,6 @@ from fidsplat.vision.metrics import has_flip
 NAME = "trained"
 _TILTS = "0:40:5,40.2:89.8:0.2"
 """tilts of the scans, dense near the limit of reading"""
-_PROTOCOL = "fixed-plane"
-"""protocol of the paper, also of the training views"""
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ class BaselineSettings(SweepSettings):
     @property
     def points(self) -> list[Key]:
         """The trainings, one marker of each category first."""
-        every = [
+        points = [
             {
                 **{"category": category.name, "index": index, "views": number},
                 **{"iterations": self.iterations, "seed": seed},
@@ -81,70 +78,57 @@ class BaselineSettings(SweepSettings):
             for category in chosen_categories(self.category)
             for number in self.views or COLLECTIONS
         ]
-        return shard(every, self.shard)
+        return shard(points, self.shard)
 
 
 @contextmanager
-def baseline_sweeps(wanted: BaselineSettings, renderer: Renderer) -> Iterator[list[Sweep]]:
-    """Sweeps of the trainings, and of the views and angles of the first seed, interleaved so that an
-    interrupted run has evaluated what it has trained.
+def baseline_sweeps(settings: BaselineSettings, renderer: Renderer) -> Iterator[list[Sweep]]:
+    """Sweeps of the trainings, and of the views and angles of the first seed, to run interleaved so that an
+    interrupted run has evaluated its trained models.
 
-    Raises InputError for what cannot be written, or holds results of another device, version, code, seed or
+    Raises InputError if files cannot be written, or hold results of another device, version, code, seed or
     number of iterations.
     """
-    points = wanted.points
-    shown = [point for point in points if point["seed"] == 0]
-    folder, painter = writable_folder(wanted.folder), Painter(renderer, wanted.folder)
-    device = device_words(renderer)
-    trainings = results_of(NAME, wanted, device)
-    if other := {record.key["iterations"] for record in trainings.done.values()} - {wanted.iterations}:
-        # of views and tilts the files do not say after how many they were
+    folder, markers = writable_folder(settings.folder), MarkerRenderer(renderer, settings.folder)
+    device = device_name(renderer)
+    trainings = results_of(NAME, settings, device)
+    if other := {record.key["iterations"] for record in trainings.done.values()} - {settings.iterations}:
+        # results of views and angles do not name the number of iterations
         raise InputError(
-            f"{trainings.file} holds trainings of {min(other)} iterations, not {wanted.iterations}; give "
+            f"{trainings.file} holds trainings of {min(other)} iterations, not {settings.iterations}; give "
             "another folder with -o, or --overwrite to train again"
         )
-    pool, cache = ThreadPoolExecutor(wanted.workers), views.ImageCache()
     train = partial(
         train_marker,
-        folder=wanted.dataset,
+        folder=settings.dataset,
         out=folder,
-        texts=wanted.seed,
+        texts=settings.seed,
         renderer=renderer,
-        restart=wanted.overwrite,
+        restart=settings.overwrite,
     )
-    look = partial(
-        views.measure_views, painter=painter, seed=wanted.seed, blender=Path(), pool=pool, cache=cache
-    )
-    scan = partial(
-        angles.measure_angles, painter=painter, seed=wanted.seed, pool=pool, workers=wanted.workers
-    )
-    try:
-        seen = (
-            (views.NAME, [_view_point(point) for point in shown], look),
-            (angles.NAME, [_angle_point(point) for point in shown], scan),
-        )
-        yield [
-            Sweep(NAME, trainings, points, partial(partial, train)),
-            *(
-                Sweep(name, results_of(name, wanted, device), own, partial(partial, measure))
-                for name, own, measure in seen
-            ),
+    with thread_pool(settings.workers) as pool:
+        common = {"markers": markers, "seed": settings.seed, "pool": pool}
+        view = partial(views.measure_views, blender=Path(), cache=views.ImageCache(), **common)
+        scan = partial(angles.measure_angles, workers=settings.workers, **common)
+        first = [
+            {"category": p["category"], "index": p["index"], "method": f"2dgs-{p['views']}"}
+            for p in settings.points
+            if p["seed"] == 0
         ]
-    finally:
-        # an interrupt must not wait for pending images
-        pool.shutdown(cancel_futures=True)
-
-
-def _view_point(point: Key) -> Key:
-    """Points of `experiment views` against the ground truth of the training."""
-    of = {"category": point["category"], "index": point["index"], "method": f"2dgs-{point['views']}"}
-    return of | {"truth": "exact", "views": TEST_VIEWS, "flip": has_flip(), "lpips": None}
-
-
-def _angle_point(point: Key) -> Key:
-    """Points of `experiment angles`."""
-    of = {"protocol": _PROTOCOL, "category": point["category"], "index": point["index"]}
-    return of | {"method": f"2dgs-{point['views']}", "tilts": _TILTS}
+        viewed = {"truth": "exact", "views": TEST_VIEWS, "flip": has_flip(), "lpips": None}
+        yield [
+            Sweep(name, results, points, partial(partial, measure))
+            for name, results, points, measure in (
+                (NAME, trainings, settings.points, train),
+                (views.NAME, results_of(views.NAME, settings, device), [p | viewed for p in first], view),
+                (
+                    angles.NAME,
+                    results_of(angles.NAME, settings, device),
+                    [{"protocol": "fixed-plane"} | p | {"tilts": _TILTS} for p in first],
+                    scan,
+                ),
+            )
+        ]
 
 
 def model_file(out: Path, point: Key) -> Path:
@@ -159,7 +143,7 @@ def train_marker(
     out: Path,
     texts: int,
     renderer: Renderer,
-    tell: Callable[[Step], None] | None = None,
+    progress: Callable[[Step], None] | None = None,
     restart: bool = False,
 ) -> dict:
     """Train a marker on a collection of views and write its splats.
@@ -167,18 +151,18 @@ def train_marker(
     An interrupted training resumes from its checkpoint, which is deleted at the end.
 
     Args:
-        point: of `Baseline.points`.
-        folder: of the data set; the scene is written where it is missing, with the ideal images.
-        out: gets 2dgs-17/small-0.ply and the like, of other seeds than 0 in seed-1 and so on.
+        point: a point of `BaselineSettings.points`.
+        folder: folder of the data set; a missing scene is written, with the ideal images.
+        out: folder for models, such as 2dgs-17/small-0.ply, or seed-1/2dgs-17/small-0.ply.
         texts: seed of the marker's text and views.
         restart: ignore a checkpoint.
 
     Returns:
-        `splats`, `seconds` of the training, `iterations` that these took, and of the views held out the means
-        `psnr` [dB] and `ssim` over their colours.
+        `splats`, `seconds` and `iterations` of this run, and the means `psnr` [dB] and `ssim` of the held-out
+        views.
 
     Raises:
-        InputError: the scene cannot be written or read, or a checkpoint is of another run.
+        InputError: the scene cannot be written or read, or a checkpoint is from another run.
     """
     scene = write_scene(point, folder, texts, "exact", Path())
     file = model_file(out, point)
@@ -187,7 +171,7 @@ def train_marker(
     checkpoint = file.with_suffix(".training.npz")
     trainer = Trainer(load_dataset(scene), renderer, settings, checkpoint, restart=restart)
     begun, before = time.perf_counter(), trainer.iteration
-    trainer.run(tell, prompt=False)
+    trainer.run(progress, prompt=False)
     seconds = time.perf_counter() - begun
     trainer.save(file)
     scores = trainer.evaluate()

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from fidsplat.experiments.charts import COLOURS, chart
-from fidsplat.experiments.pages import fixed, places, write_page
+from fidsplat.experiments.pages import fixed, page_and_folder, write_page
 from fidsplat.images.files import write_png
 from fidsplat.train import Trainer, TrainingView, ViewScore
 from fidsplat.util.provenance import run_facts
@@ -31,7 +31,7 @@ def write_training_page(
 
     Raises InputError when they cannot be written.
     """
-    page, folder = places(out)
+    page, folder = page_and_folder(out)
     files = [page, folder / "training.svg"]
     draw_curves(trainer.history, files[1])
     shown = []

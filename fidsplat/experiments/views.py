@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from concurrent.futures import Executor
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
 
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.blender import VIEW_NAMES, novel_picture
+from fidsplat.experiments.blender import VIEW_NAMES, novel_image
 from fidsplat.experiments.methods import (
     IDEAL,
-    Draw,
-    Painter,
+    MarkerRenderer,
     in_linear_light,
     plain_marker,
     with_linear_light,
 )
-from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
+from fidsplat.experiments.plane import from_srgb, plane_image, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS, TEST_VIEWS, Category, novel_cameras
 from fidsplat.images.files import read_image, to_uint8
 from fidsplat.util import interrupts
@@ -61,7 +60,7 @@ def views_points(
             truths += [
                 f"blender-{view}"
                 for view in VIEW_NAMES
-                if all(novel_picture(blender, view, category.name, index, i).is_file() for i in range(views))
+                if all(novel_image(blender, view, category.name, index, i).is_file() for i in range(views))
             ]
             for method in with_linear_light(methods):
                 for truth in truths:
@@ -84,28 +83,26 @@ class ImageCache:
     """Cache of 8-bit images for the following points."""
 
     def __init__(self) -> None:
-        self._about: dict[str, tuple] = {}
-        self._pictures: dict[str, dict[int, np.ndarray]] = {}
+        self._images: dict[str, tuple[tuple, dict[int, np.ndarray]]] = {}
         self._lock = Lock()  # evaluation threads make the ground truths
 
-    def get(self, kind: str, about: tuple, number: int, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """Image `number` of the subject `about`, made if missing; one subject per kind is cached."""
+    def get(self, kind: str, subject: tuple, number: int, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """Image `number` of a subject, made if missing; one subject per kind is cached."""
         with self._lock:
-            if self._about.get(kind) != about:
-                self._about[kind], self._pictures[kind] = about, {}
-            there = self._pictures[kind]
-        picture = there.get(number)
-        if picture is None:
-            picture = there[number] = to_uint8(make())
-        return picture
+            if kind not in self._images or self._images[kind][0] != subject:
+                self._images[kind] = subject, {}
+            images = self._images[kind][1]
+        if number not in images:
+            images[number] = to_uint8(make())
+        return images[number]
 
 
 def measure_views(
     point: dict,
-    painter: Painter,
+    markers: MarkerRenderer,
     seed: int,
     blender: Path,
-    pool: ThreadPoolExecutor,
+    pool: Executor,
     lpips: Perceptual | None = None,
     cache: ImageCache | None = None,
 ) -> dict:
@@ -118,31 +115,27 @@ def measure_views(
     Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for an unavailable
     metric, and for the PSNR of equal images.
     """
-    category = CATEGORIES[point["category"]]
+    category, truth, cache = CATEGORIES[point["category"]], point["truth"], cache or ImageCache()
     spec = category.spec(point["index"], seed)
     module = PROTOCOLS["fixed-plane"].module(plain_marker(spec).grid.shape[0])
-    cache = cache or ImageCache()
     marker = (point["category"], point["index"], seed)
-    opened: list[Draw] = []
+    method = (*marker, point["method"])
+    # uploads splats only if an image is missing
+    prepared = lru_cache(1)(
+        lambda: markers.prepare(point["method"], f"{category.name}-{point['index']}", spec, module)
+    )
 
-    def draw(camera: Camera) -> np.ndarray:
-        if not opened:
-            name = f"{category.name}-{point['index']}"
-            opened.append(painter.open(point["method"], name, spec, module))
-        return opened[0](camera)
-
-    def true(number: int, camera: Camera) -> np.ndarray:
-        kind = point["truth"]
-        if kind.startswith("exact"):
-            return cache.get(kind, marker, number, lambda: exact_view(spec, camera, kind == "exact-linear"))
-        view = kind.removeprefix("blender-")
-        return read_image(novel_picture(blender, view, category.name, point["index"], number))[:, :, 0]
-
-    def compare(number: int, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:
-        truth = true(number, camera)
-        if truth.shape != picture.shape:
+    def compare(number: int, camera: Camera, image: np.ndarray) -> dict[str, float | None]:
+        if truth.startswith("exact"):
+            render = partial(exact_view, spec, camera, truth == "exact-linear")
+            reference = cache.get(truth, marker, number, render)
+        else:
+            view = truth.removeprefix("blender-")
+            file = novel_image(blender, view, category.name, point["index"], number)
+            reference = to_uint8(read_image(file)[:, :, 0])
+        if reference.shape != image.shape:
             raise InputError(f"the Blender images in {blender} have another size; render them again")
-        ours, theirs = picture / 255.0, to_uint8(truth) / 255.0
+        ours, theirs = image / 255.0, reference / 255.0
         ratio = psnr(ours, theirs)
         found = {"psnr": None if np.isinf(ratio) else ratio, "ssim": ssim(ours, theirs)}
         if point["flip"]:
@@ -151,13 +144,11 @@ def measure_views(
             found["lpips"] = lpips(ours, theirs)
         return found
 
-    cameras = novel_cameras(category, point["index"], seed)[: point["views"]]
-    about = (*marker, point["method"])
-    waiting = [
-        pool.submit(compare, i, camera, cache.get("drawn", about, i, partial(draw, camera)))
-        for i, camera in enumerate(cameras)
-    ]
-    measured = [interrupts.result_of(future) for future in waiting]
+    pending = []
+    for i, camera in enumerate(novel_cameras(category, point["index"], seed)[: point["views"]]):
+        image = cache.get("method", method, i, lambda camera=camera: prepared()(camera))
+        pending.append(pool.submit(compare, i, camera, image))
+    measured = [interrupts.result_of(future) for future in pending]
     names = ("psnr", "ssim", "flip", "lpips")
     return {name: [one[name] for one in measured] if name in measured[0] else None for name in names}
 
@@ -170,5 +161,5 @@ def exact_view(spec: str, camera: Camera, linear: bool) -> np.ndarray:
     grid = plain_marker(spec).grid
     module = PROTOCOLS["fixed-plane"].module(grid.shape[0])
     if not linear:
-        return plane_picture(grid, module, camera, background=BACKGROUND)
-    return srgb(plane_picture(grid, module, camera, background=from_srgb(BACKGROUND)))
+        return plane_image(grid, module, camera, background=BACKGROUND)
+    return srgb(plane_image(grid, module, camera, background=from_srgb(BACKGROUND)))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fidsplat.experiments import counts
 from fidsplat.experiments.methods import IDEAL
-from fidsplat.experiments.run import device_words, prepared
+from fidsplat.experiments.run import device_name, prepared
 from fidsplat.experiments.settings import ImageSettings, ViewSettings
 from fidsplat.experiments.sweep import Key, Record, Results
 from fidsplat.remote.queue import Engine, drain
@@ -57,7 +57,7 @@ class ExperimentWorker:
         folder = self._open.enter_context(tempfile.TemporaryDirectory())
         options = replace(work.options, out=Path(folder))
         self._sweeps = {s.name: s for s in self._open.enter_context(prepared(work.names, options))}
-        self.title = "" if options.methods == (IDEAL,) else device_words(Renderer(options.device))
+        self.title = "" if options.methods == (IDEAL,) else device_name(Renderer(options.device))
 
     def __call__(self, item: tuple[str, int]) -> dict:
         """The result of a point, by the experiment's name and the point's index."""

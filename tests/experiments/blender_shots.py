@@ -16,7 +16,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.experiments import blender
 from fidsplat.experiments.methods import plain_marker
-from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
+from fidsplat.experiments.plane import from_srgb, plane_image, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES
 from fidsplat.images.files import read_image
 from fidsplat.vision.metrics import psnr
@@ -55,8 +55,8 @@ def ours(name: str, finer: int = 1, border: int = 0) -> np.ndarray:
     grid, camera = grid_of(name), finely(CAMERAS[camera], finer, border)
     module = EDGE / grid.shape[0]
     if view == "raw":
-        return plane_picture(grid, module, camera, background=BACKGROUND)
-    return srgb(plane_picture(grid, module, camera, background=from_srgb(BACKGROUND)))
+        return plane_image(grid, module, camera, background=BACKGROUND)
+    return srgb(plane_image(grid, module, camera, background=from_srgb(BACKGROUND)))
 
 
 def finely(camera: Camera, finer: int, border: int) -> Camera:

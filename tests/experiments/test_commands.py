@@ -10,7 +10,7 @@ from fidsplat.cli import main
 from fidsplat.commands.experiment import Experiment
 from fidsplat.experiments import angles, localisation, views
 from fidsplat.experiments import run as run_module
-from fidsplat.experiments.blender import check_pictures, note_pictures
+from fidsplat.experiments.blender import check_images, record_images
 from fidsplat.experiments.settings import ExperimentSettings
 from fidsplat.experiments.sweep import read_records
 from fidsplat.images.files import write_png
@@ -50,11 +50,11 @@ def test_an_interrupted_scan_goes_on(capsys, tmp_path, monkeypatch):
     words = ("angles", "--ideal", *SMALL, "--tilts", "0:80:40", "-o", tmp_path, "--json")
     real, done = angles.measure_angles, []
 
-    def stopped(part, *others):
+    def stopped(part, **others):
         if done:
             raise KeyboardInterrupt
         done.append(part)
-        return real(part, *others)
+        return real(part, **others)
 
     monkeypatch.setattr(angles, "measure_angles", stopped)
     status, out, err = run(capsys, *words)
@@ -152,7 +152,7 @@ def test_scenes_for_trainers(capsys, tmp_path):
         (["angles", "--workers", "0"], "--workers must be at least 1 thread, got 0"),
         (
             ["views", "--trained", "nowhere"],
-            "--trained must be a folder with 2dgs-17/small-0.ply",
+            "--trained must be a folder with models such as 2dgs-17/small-0.ply",
         ),
         (["views", "--lpips", "nowhere.npz", "--quick"], "cannot read the LPIPS weights"),
         (["counts", "--category", "huge", "--markers", "0"], "--markers must be 1 to 5, got 0"),
@@ -227,7 +227,7 @@ def test_merge_names_shards_that_are_missing(capsys, tmp_path):
 
 def test_pictures_of_another_seed_are_not_the_truth(capsys, tmp_path):
     """Blender's images are found by their names, which do not include the seed."""
-    note_pictures(tmp_path / "b", "raw", 0, 16)
+    record_images(tmp_path / "b", "raw", 0, 16)
     for words in (
         ("views", "--quick", *SMALL, "--blender", tmp_path / "b", "--seed", "1", "-o", tmp_path / "out"),
         (
@@ -246,6 +246,6 @@ def test_pictures_of_another_seed_are_not_the_truth(capsys, tmp_path):
         assert status == 2
         assert "holds images of seed 0, not 1" in err
     with pytest.raises(fs.InputError, match="images of samples 16, not 64; give another folder"):
-        note_pictures(tmp_path / "b", "raw", 0, 64)
-    assert check_pictures(tmp_path / "b", "raw", 0) == {"seed": 0, "samples": 16}
-    assert check_pictures(tmp_path / "b", "standard", 3) == {}
+        record_images(tmp_path / "b", "raw", 0, 64)
+    assert check_images(tmp_path / "b", "raw", 0) == {"seed": 0, "samples": 16}
+    assert check_images(tmp_path / "b", "standard", 3) == {}

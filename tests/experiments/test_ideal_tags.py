@@ -5,7 +5,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.experiments.ideal_tags import _window, tag_depth_image
-from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.plane import plane_image
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
 
@@ -24,7 +24,7 @@ def test_a_pixel_is_the_mean_of_what_it_shows(tag):
     there = np.isfinite(image.depth)
     camera = fs.Camera.pinhole(120, 90, 110, 110, 61, 44, world_to_camera=POSE)
     for channel, value in enumerate(BEHIND[0, 0]):
-        whole = plane_picture(tag.grid, tag.module, camera, background=value)
+        whole = plane_image(tag.grid, tag.module, camera, background=value)
         np.testing.assert_allclose(image.rgb[..., channel][there], whole[there], atol=1e-6)
         assert np.abs(whole[~there] - value).max() < 1 / 256
     np.testing.assert_allclose(image.rgb[~there], BEHIND[~there], atol=1e-6)

@@ -8,13 +8,13 @@ from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.experiments import angles, counts, localisation, plane, views
-from fidsplat.experiments.methods import IDEAL, Painter, method_names, mixtures, plain_marker
+from fidsplat.experiments.methods import IDEAL, MarkerRenderer, method_names, mixtures, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, novel_cameras
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.vision.metrics import psnr
 
 pytestmark = pytest.mark.usefixtures("optimised")
-CEILING = Painter(None)
+CEILING = MarkerRenderer(None)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
 
 @in_turn()
 def test_scans_do_not_hang_on_the_number_of_threads(renderer):
-    painter = Painter(renderer)
+    markers = MarkerRenderer(renderer)
     parts = angles.angles_points(
         [CATEGORIES["apriltag"]], ["fixed-plane"], [IDEAL, "fitted/best"], "0:88:11", 1
     )
@@ -68,7 +68,7 @@ def test_scans_do_not_hang_on_the_number_of_threads(renderer):
         results = []
         for workers in (1, 4):
             with ThreadPoolExecutor(workers) as threads:
-                results.append(angles.measure_angles(point, painter, 0, threads, workers))
+                results.append(angles.measure_angles(point, markers, 0, threads, workers))
         assert results[0] == results[1]
         assert "1" in results[0]["readers"]["pupil"]["read"]
 
@@ -82,7 +82,7 @@ def test_fitted_markers_are_read_wherever_the_ideal_is(renderer, pool, category,
     seen = []
     for method in (IDEAL, "fitted/best"):
         point = angles.angles_points([CATEGORIES[category]], ["fixed-plane"], [method], tilts, 1)[0]
-        found = angles.measure_angles(point, Painter(renderer), 0, pool, 2)["readers"]
+        found = angles.measure_angles(point, MarkerRenderer(renderer), 0, pool, 2)["readers"]
         seen.append({name: one["read"] for name, one in found.items()})
     assert "0" not in seen[0]["aruco" if category == "apriltag" else "cv2"]
     assert seen[1] == seen[0]
@@ -104,11 +104,11 @@ def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
     spec = CATEGORIES["small"].spec(0)
     protocol = PROTOCOLS["fixed-plane"]
     module = protocol.module(plain_marker(spec).grid.shape[0])
-    painter = Painter(renderer)
+    markers = MarkerRenderer(renderer)
     camera = protocol.camera(35.0)
-    ideal = painter.open(IDEAL, "small-0", spec, module)(camera)
+    ideal = markers.prepare(IDEAL, "small-0", spec, module)(camera)
     for name in method_names()[1:]:
-        picture = painter.open(name, "small-0", spec, module)(camera)
+        picture = markers.prepare(name, "small-0", spec, module)(camera)
         assert picture.shape == ideal.shape
         match = psnr(picture, ideal)
         shifted = max(psnr(np.roll(picture, step, axis), ideal) for step in (-1, 1) for axis in (0, 1))
@@ -124,18 +124,20 @@ def test_trained_models_are_rows_where_they_are(renderer, tmp_path):
     folder.mkdir()
     fs.save_ply(made.gaussians, folder / "apriltag-2.ply")
     assert method_names(("fitted",), tmp_path)[-1] == "2dgs-9"
-    painter = Painter(renderer, tmp_path)
+    markers = MarkerRenderer(renderer, tmp_path)
     for name in ("fixed-plane", "fixed-module"):
         protocol = PROTOCOLS[name]
-        draws = [painter.open(m, "apriltag-2", spec, protocol.module(10)) for m in ("2dgs-9", "paper/screen")]
+        draws = [
+            markers.prepare(m, "apriltag-2", spec, protocol.module(10)) for m in ("2dgs-9", "paper/screen")
+        ]
         trained, own = (draw(protocol.camera(20.0)) for draw in draws)
         assert psnr(trained, own) > 20
     with pytest.raises(fs.InputError, match="apriltag-0"):
-        painter.open("2dgs-9", "apriltag-0", spec, 0.2)
+        markers.prepare("2dgs-9", "apriltag-0", spec, 0.2)
     with pytest.raises(fs.InputError, match="needs a folder of trained models"):
-        Painter(renderer).open("2dgs-9", "apriltag-2", spec, 0.2)
+        MarkerRenderer(renderer).prepare("2dgs-9", "apriltag-2", spec, 0.2)
     with pytest.raises(fs.InputError, match="needs a renderer"):
-        CEILING.open("fitted/best", "apriltag-2", spec, 0.2)
+        CEILING.prepare("fitted/best", "apriltag-2", spec, 0.2)
 
 
 def part_of(method: str, truth: str, number: int = 2) -> dict:
@@ -163,9 +165,9 @@ def test_pictures_are_drawn_once_for_all_truths(pool, tmp_path):
     """And what is kept is the right marker's, method's and truth's."""
     drawn = []
 
-    class Counting(Painter):
-        def open(self, method, name, spec, module):
-            draw = super().open(method, name, spec, module)
+    class Counting(MarkerRenderer):
+        def prepare(self, method, name, spec, module):
+            draw = super().prepare(method, name, spec, module)
 
             def counted(camera):
                 drawn.append(name)
@@ -186,7 +188,7 @@ def test_pictures_are_drawn_once_for_all_truths(pool, tmp_path):
 def test_views_by_the_renderer_with_every_metric(renderer, pool, tmp_path):
     point = part_of("fitted/best", "exact")
     found = views.measure_views(
-        point, Painter(renderer), 0, tmp_path, pool, lambda a, b: float(abs(a - b).max())
+        point, MarkerRenderer(renderer), 0, tmp_path, pool, lambda a, b: float(abs(a - b).max())
     )
     assert all(27 < value < 40 for value in found["psnr"])
     assert all(0.9 < value < 1 for value in found["ssim"])
@@ -198,7 +200,7 @@ def test_blenders_pictures_take_part_where_a_marker_has_all_of_them(pool, tmp_pa
     category = CATEGORIES["small"]
     camera = novel_cameras(category, 0)[0]
     for index, number in ((0, 0), (0, 1), (1, 0)):
-        file = views.novel_picture(tmp_path, "raw", "small", index, number)
+        file = views.novel_image(tmp_path, "raw", "small", index, number)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_png(file, to_uint8(views.exact_view(category.spec(0), camera, False)))
     points = views.views_points([category], [IDEAL], tmp_path, markers=2, views=2)
@@ -211,7 +213,7 @@ def test_blenders_pictures_take_part_where_a_marker_has_all_of_them(pool, tmp_pa
     found = views.measure_views(point, CEILING, 0, tmp_path, pool)
     assert found["psnr"][0] is None  # the first view is in its place, the second is another view's picture
     assert found["psnr"][1] < 20
-    write_png(views.novel_picture(tmp_path, "raw", "small", 0, 1), np.zeros((10, 10), np.uint8))
+    write_png(views.novel_image(tmp_path, "raw", "small", 0, 1), np.zeros((10, 10), np.uint8))
     with pytest.raises(fs.InputError, match="have another size"):
         views.measure_views(point, CEILING, 0, tmp_path, pool)
 

@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 import fidsplat as fs
-from fidsplat.experiments.plane import from_srgb, plane_picture
+from fidsplat.experiments.plane import from_srgb, plane_image
 
 GRID = np.random.default_rng(5).integers(0, 2, (7, 9)).astype(np.uint8)
 MODULE = 0.2
@@ -48,7 +48,7 @@ def clipped_mean(camera: fs.Camera, row: int, column: int) -> float:
 @pytest.mark.parametrize("view", VIEWS)
 def test_every_pixel_is_the_mean_over_its_square(view):
     camera = VIEWS[view]
-    picture = plane_picture(GRID, MODULE, camera, **VALUES)
+    picture = plane_image(GRID, MODULE, camera, **VALUES)
     assert picture.shape == (47, 61)
     random = np.random.default_rng(1)
     places = set(zip(random.integers(0, 47, 60).tolist(), random.integers(0, 61, 60).tolist(), strict=True))
@@ -68,7 +68,7 @@ def test_it_is_what_rays_through_ever_more_points_tend_to():
     value = np.full(x.shape, VALUES["background"])
     value[inside] = np.where(GRID[row[inside], column[inside]], VALUES["dark"], VALUES["light"])
     sampled = value.reshape(47, k, 61, k).mean((1, 3))
-    exact = plane_picture(GRID, MODULE, camera, **VALUES)
+    exact = plane_image(GRID, MODULE, camera, **VALUES)
     # an edge through a pixel passes some 2 k of its k * k points, each off by at most half a cell
     assert np.abs(sampled - exact).max() < 2 / k
     assert abs(sampled.mean() - exact.mean()) < 1e-5
@@ -77,7 +77,7 @@ def test_it_is_what_rays_through_ever_more_points_tend_to():
 def test_modules_that_fill_pixels_keep_their_values():
     grid = np.array([[1, 0], [0, 1]], np.uint8)
     camera = fs.Camera.pinhole(6, 6, 2.0, 2.0, 3.0, 3.0, _away(1.0))
-    picture = plane_picture(grid, 1.0, camera)
+    picture = plane_image(grid, 1.0, camera)
     assert np.array_equal(picture[1:5, 1:5], np.kron(1.0 - grid, np.ones((2, 2))))
     assert np.all(picture[[0, -1]] == 0.5)
     assert np.all(picture[:, [0, -1]] == 0.5)
@@ -85,26 +85,26 @@ def test_modules_that_fill_pixels_keep_their_values():
 
 def test_a_plane_out_of_the_picture_and_one_without_contrast():
     aside = fs.Camera.look_at(20, 20, 0.3, (0, 0, -3), (9.0, 0, 0))
-    assert plane_picture(GRID, MODULE, aside, background=0.25) == pytest.approx(0.25, abs=1e-12)
-    same = plane_picture(GRID, MODULE, VIEWS["tilted"], dark=0.5, light=0.5, background=0.5)
+    assert plane_image(GRID, MODULE, aside, background=0.25) == pytest.approx(0.25, abs=1e-12)
+    same = plane_image(GRID, MODULE, VIEWS["tilted"], dark=0.5, light=0.5, background=0.5)
     assert np.all(same == 0.5)
 
 
 def test_a_plane_that_reaches_behind_the_camera_is_an_error():
     camera = fs.Camera.look_at(20, 20, 1.0, (0, -0.05, -0.05), (0, 1.0, 0))
     with pytest.raises(fs.InputError, match="move the camera away"):
-        plane_picture(GRID, MODULE, camera)
+        plane_image(GRID, MODULE, camera)
 
 
 def test_what_is_seen_from_behind_is_mirrored():
-    front = plane_picture(GRID, MODULE, VIEWS["front"])
+    front = plane_image(GRID, MODULE, VIEWS["front"])
     behind = fs.Camera.look_at(61, 47, 0.9, (0.0, 0.0, 2.5), (0.0, 0.0, 0.0))
-    assert plane_picture(GRID[:, ::-1], MODULE, behind) == pytest.approx(front, abs=1e-12)
+    assert plane_image(GRID[:, ::-1], MODULE, behind) == pytest.approx(front, abs=1e-12)
 
 
 def test_means_do_not_depend_on_how_the_picture_is_cut():
     whole = VIEWS["tilted"]
-    picture = plane_picture(GRID, MODULE, whole, **VALUES)
+    picture = plane_image(GRID, MODULE, whole, **VALUES)
     part = fs.Camera.pinhole(
         20,
         15,
@@ -115,7 +115,7 @@ def test_means_do_not_depend_on_how_the_picture_is_cut():
         whole.world_to_camera,
         position=whole.position,
     )
-    assert plane_picture(GRID, MODULE, part, **VALUES) == pytest.approx(picture[11:26, 17:37], abs=1e-12)
+    assert plane_image(GRID, MODULE, part, **VALUES) == pytest.approx(picture[11:26, 17:37], abs=1e-12)
     assert math.isclose(picture.max(), VALUES["light"], abs_tol=1e-12)
 
 

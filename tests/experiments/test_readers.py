@@ -9,7 +9,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.experiments.methods import plain_marker
-from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.plane import plane_image
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
 from fidsplat.images.files import to_uint8
 from fidsplat.vision.readers import Attempt, Target, attempt, overlap, reader_versions, readers
@@ -21,7 +21,7 @@ def ideal(category: str, tilt: float, protocol: str = "fixed-module") -> tuple[n
     spec = CATEGORIES[category].spec(1)
     made, setting = plain_marker(spec), PROTOCOLS[protocol]
     module, camera = setting.module(made.grid.shape[0]), setting.camera(tilt)
-    picture = plane_picture(made.grid, module, camera, background=BACKGROUND)
+    picture = plane_image(made.grid, module, camera, background=BACKGROUND)
     corners = camera.project(made.corners / made.module * module)
     return to_uint8(picture), Target(made.kind, made.family or "", made.id, made.payload, corners)
 

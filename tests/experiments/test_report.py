@@ -126,15 +126,15 @@ def test_the_report_says_what_was_measured(reported):
         "| QR Small | 31.5/0.980 |",
         "| QR Small | 25.4/0.83 | 37.2/0.99 | 33.0/1.000 |",
         "mean over 2 views of each marker",
-        "FLIP is of 5 of 5\ncases.",
-        "means over a category's markers, 2 of each.",
+        "FLIP was measured in 5 of 5\ncases.",
+        "means over the markers of a category, 2 of each.",
         "| QR Small, 1 m | 0.5 (1/2) |",
         "`angles`, 8 | a device |",
         "3 trainings of 7000 iterations",
-        "Tilts are not of all markers for QR Small, 9.\n",
-        "other random numbers (QR Small on 9 views) end 0.50 dB apart\n(median), at most 0.50",
+        "Tilts of some markers are missing for QR Small, 9.\n",
+        "different seeds (QR Small on 9 views) differ by 0.50 dB\n(median), at most 0.50",
         "| QR Small, 9 | 33.8/0.99 | 33.5/0.990 | 0.050 | 75.4 | 80.0 | 82.0 | 5000 | 386 | 7.0 |",
-        "- QR Small: none; 9 views end 2.0 degrees before, 7 s\n",
+        "- QR Small: none; with 9 views, 2.0 degrees less, 7 s\n",
     ):
         assert words in text, words
 
@@ -265,7 +265,7 @@ def test_a_report_that_is_made_again_has_the_same_tables(tmp_path):
 def test_what_all_was_shown_to_the_detectors_is_not_named(tmp_path):
     write(tmp_path, "angles", SCANS)
     write(tmp_path, "trained", TRAININGS[:1])
-    assert "Tilts are not of all" not in make_report([tmp_path], tmp_path / "page.md")[0].read_text()
+    assert "Tilts of some markers" not in make_report([tmp_path], tmp_path / "page.md")[0].read_text()
 
 
 def test_notes_of_tables_stand_on_the_page(tmp_path):

@@ -10,10 +10,10 @@ import fidsplat as fs
 from fidsplat.experiments.sweep import (
     Results,
     Sweep,
-    in_turn,
     merge,
     missing_shards,
     read_records,
+    run_interleaved,
     shard,
 )
 from fidsplat.util.provenance import run_facts
@@ -87,8 +87,8 @@ def test_a_point_that_was_refused_is_tried_again(tmp_path):
     assert [record.result for record in read_records(file)] == [{"value": 1}]
 
 
-def test_sweeps_in_turn_go_point_by_point(tmp_path):
-    """What is stopped has all of what it began with; what is there already is not measured again."""
+def test_interleaved_sweeps_alternate_by_point(tmp_path):
+    """Existing results are not measured again."""
     order = []
 
     def measured(name, points):
@@ -96,7 +96,7 @@ def test_sweeps_in_turn_go_point_by_point(tmp_path):
 
     list(measured("b", POINTS[:1]).run())
     order.clear()
-    found = list(in_turn([measured("a", POINTS[:3]), measured("b", POINTS[:2])]))
+    found = list(run_interleaved([measured("a", POINTS[:3]), measured("b", POINTS[:2])]))
     assert order == [("a", 0), ("a", 1), ("b", 1), ("a", 2)]
     assert [record.key["index"] for record in found] == [0, 1, 1, 2]
     assert [record.key for record in read_records(tmp_path / "b.jsonl")] == POINTS[:2]
@@ -144,7 +144,7 @@ def test_a_disk_that_is_full_is_no_fault_of_ours(tmp_path):
     kept = file.read_bytes()
     file.unlink()
     file.symlink_to("/dev/full")
-    with pytest.raises(fs.InputError, match=r"counts.jsonl: No space left on device; .* goes on from there"):
+    with pytest.raises(fs.InputError, match=r"counts.jsonl: No space left on device; .* resumes from them"):
         running.results.append(POINTS[1], {"value": 2.0})
     file.unlink()
     file.write_bytes(kept + b'{"key": {"category":')  # as far as there was room

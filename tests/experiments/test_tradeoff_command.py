@@ -13,7 +13,7 @@ from fidsplat.experiments.tradeoff.summary import load
 from fidsplat.scenes.random_clouds import random_cloud
 
 pytestmark = pytest.mark.usefixtures("optimised")
-WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
+WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--settings", "opacity_ceiling")
 
 
 def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
@@ -144,7 +144,7 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
     ("words", "message"),
     [
         (["--scenes", "qr11"], "unknown scene 'qr11' (did you mean 'qr10'?)"),
-        (["--knobs", "alpha_cutof"], "unknown knob 'alpha_cutof' (did you mean 'alpha_cutoff'?)"),
+        (["--settings", "alpha_cutof"], "unknown setting 'alpha_cutof' (did you mean 'alpha_cutoff'?)"),
         (["--device", "reference"], "give another --device"),
         (["report", "nowhere"], "no results in nowhere"),
     ],
@@ -162,7 +162,7 @@ def test_help_teaches(capsys, words):
     assert main(["tradeoff", *words, "--help"]) == 0
     out = capsys.readouterr().out
     assert f"usage: {' '.join(('fidsplat tradeoff', *words))}" in out
-    assert "  fidsplat tradeoff report cpu gpu -o docs/accuracy.md" in out
+    assert "  fidsplat tradeoff report cpu gpu -o accuracy.md" in out
 
 
 def test_names_of_scenes():

@@ -27,30 +27,29 @@ EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise",
 SHARP = {"lowpass": "none", "samples": 3}
 """quality of markers: exact splats, the mean of 3 x 3 samples"""
 
-# setting -> (its values, kinds of scenes: r random and hard, m markers, t of 3D Gaussians)
-_BY_FORMULA: dict[str, tuple[tuple[Any, ...], str]] = {
+_VALUES: dict[str, tuple[Any, ...]] = {
     "alpha_cutoff": (
-        (1e-6, 1e-5, 1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 512, 2 / 255, math.exp(-4.5), 4 / 255),
-        "rm",
+        *(1e-6, 1e-5, 1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 512),
+        *(2 / 255, math.exp(-4.5), 4 / 255),
     ),
-    "transmittance_stop": ((0.0, 1e-6, 1e-5, 1e-3, 1 / 512, 1 / 256, 1e-2), "rm"),
-    "opacity_ceiling": ((0.999, 0.99), "rm"),
-    "stop_rule": (("exclusive",), "rm"),
-    "order": (("pixel", "centre"), "rm"),
-    "ellipsoid": (ELLIPSOID, "t"),
-    "lowpass": (("pixel", "none"), "rm"),
-    "samples": ((2, 3), "rm"),
-    "setup_precision": (("float32",), "rm"),
-    "arithmetic": (("fast",), "rm"),
-    "blend_precision": (("float64",), "rm"),
+    "transmittance_stop": (0.0, 1e-6, 1e-5, 1e-3, 1 / 512, 1 / 256, 1e-2),
+    "opacity_ceiling": (0.999, 0.99),
+    "stop_rule": ("exclusive",),
+    "order": ("pixel", "centre"),
+    "ellipsoid": ELLIPSOID,
+    "lowpass": ("pixel", "none"),
+    "samples": (2, 3),
+    "setup_precision": ("float32",),
+    "arithmetic": ("fast",),
+    "blend_precision": ("float64",),
 }
-_QUICK = {
+_QUICK_VALUES = _VALUES | {
     "alpha_cutoff": (1e-4, 1 / 1024, 2 / 255),
     "transmittance_stop": (0.0, 1 / 512),
     "lowpass": ("none",),
     "samples": (2,),
 }
-_MARKER_LADDER = (
+_MARKER_QUALITIES = (
     *(MarkerQuality("paper", levels=levels, density=1) for levels in (1, 2, 3, 4, 5)),
     MarkerQuality("paper"),
     *(
@@ -61,12 +60,12 @@ _MARKER_LADDER = (
     *(replace(BASE.marker, growth=growth) for growth in (0.0, 0.2)),
     MarkerQuality("exact"),
 )
-_QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("exact"))
+_QUICK_MARKER_QUALITIES = (MarkerQuality("paper"), MarkerQuality("exact"))
 _COMBINED_CUTOFFS, _COMBINED_STOPS = (1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 255), (1e-4, 1e-3, 1 / 512)
 _FAST, _FASTEST = {"arithmetic": "fast"}, {"arithmetic": "fast", "setup_precision": "float32"}
 _FASTEST_STOP = 1e-3
 
-_ALONE: tuple[dict[str, Any], ...] = (
+_ABLATIONS: tuple[dict[str, Any], ...] = (
     {"alpha_cutoff": 1 / 255},
     {"alpha_cutoff": math.exp(-4.5)},
     {"transmittance_stop": 1e-4},
@@ -79,36 +78,40 @@ _ALONE: tuple[dict[str, Any], ...] = (
 )
 """constants that are changed in `EXACT`, one at a time"""
 
-_FRACTIONS = {
+_TEXTS = {math.exp(-4.5): "3 sigma"} | {  # cut-off of an opaque splat at 3 sigma
     above / below: f"{above}/{below}"
     for above, below in (
         (1, 255), (2, 255), (4, 255), (1, 256), (1, 512), (1, 1024), (1, 2048), (1, 4096),
     )
 }  # fmt: skip
 
-PRESETS_KNOB, ALONE, TOGETHER, MARKER_KNOB = "preset", "alone", "together", "marker"
-KNOBS = (PRESETS_KNOB, ALONE, *_BY_FORMULA, MARKER_KNOB, TOGETHER)
-"""values of --knobs"""
+PRESET, ABLATION, COMBINED, MARKER = "preset", "alone", "together", "marker"
+"""settings that are not fields of Quality; values of stored keys"""
+SETTINGS = (PRESET, ABLATION, *_VALUES, MARKER, COMBINED)
+"""values of --settings"""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A quality setting to measure."""
+    """A quality to measure."""
 
-    knob: str
-    """name in `KNOBS`, or `base`"""
+    setting: str
+    """name in `SETTINGS`, or `base`"""
     value: str
     """value as text"""
     quality: Quality
 
     def key(self) -> dict:
-        """Differences from the base, for the key of a result."""
+        """Part of a result's key; the quality as differences from the base."""
         changes = _changes(asdict(self.quality), asdict(BASE))
-        return {"knob": self.knob, "value": self.value, "quality": changes}
+        return {"knob": self.setting, "value": self.value, "quality": changes}
+
+
+BASE_POINT = Point("base", "base", BASE)
 
 
 def quality_of(changes: dict) -> Quality:
-    """Point of a result key's `quality`."""
+    """Quality of a result's key."""
     marker = replace(BASE.marker, **changes.get("marker", {}))
     return BASE.with_(**changes | {"marker": marker})
 
@@ -122,65 +125,64 @@ def _changes(values: dict, others: dict) -> dict:
     }
 
 
-def knob_names(words: Iterable[str]) -> tuple[str, ...]:
+def setting_names(names: Iterable[str]) -> tuple[str, ...]:
     """Distinct names of settings; all if none is given.
 
     Raises:
         InputError: an unknown setting.
     """
-    names = tuple(dict.fromkeys(words)) or KNOBS
+    names = tuple(dict.fromkeys(names)) or SETTINGS
     for name in names:
-        if name not in KNOBS:
-            raise InputError(unknown("knob", name, KNOBS))
+        if name not in SETTINGS:
+            raise InputError(unknown("setting", name, SETTINGS))
     return names
 
 
 def points(
-    knobs: Iterable[str], on_marker: bool, quick: bool = False, every_ladder: bool = True
+    settings: Iterable[str], on_marker: bool, quick: bool = False, every_value: bool = True
 ) -> list[Point]:
     """Distinct points for one kind of scene, the most informative first.
 
-    every_ladder: whether to vary each setting; else only presets and marker qualities.
-
     The base comes first: its own error, and its time relative to itself, which shows the noise.
+
+    Args:
+        every_value: vary each setting; otherwise only presets and marker qualities.
     """
-    chosen = tuple(knobs)
-    found = [Point("base", "base", BASE)]
-    if PRESETS_KNOB in chosen:
+    settings = tuple(settings)
+    found = [BASE_POINT]
+    if PRESET in settings:
         # surfel has the same constants as gsplat
-        found += [Point(PRESETS_KNOB, name, preset(name)) for name in PRESETS if name != "surfel"]
-    if ALONE in chosen and not on_marker:
-        found.append(Point(ALONE, "exact", EXACT))
-        found += [alone(changes) for changes in (_ALONE[:6] if quick else _ALONE)]
-    if MARKER_KNOB in chosen and on_marker:
+        found += [Point(PRESET, name, preset(name)) for name in PRESETS if name != "surfel"]
+    if ABLATION in settings and not on_marker:
+        found.append(Point(ABLATION, "exact", EXACT))
+        found += map(ablation, _ABLATIONS[:6] if quick else _ABLATIONS)
+    if MARKER in settings and on_marker:
         found += _marker_points(quick)
-    for knob, (values, kinds) in _BY_FORMULA.items() if every_ladder else ():
-        if knob in chosen and ("m" if on_marker else "r") in kinds:
-            for value in _QUICK.get(knob, values) if quick else values:
-                found.append(_turned(knob, value))
-    if TOGETHER in chosen and not on_marker:
-        found += _together(quick)
-    return list({(point.knob, point.value): point for point in found}.values())
+    for setting, values in (_QUICK_VALUES if quick else _VALUES).items():
+        if every_value and setting in settings and setting != "ellipsoid":
+            found += [_variation(setting, value) for value in values]
+    if COMBINED in settings and not on_marker:
+        found += _combinations(quick)
+    return list({(point.setting, point.value): point for point in found}.values())
 
 
-def thick_points(knobs: Iterable[str]) -> list[Point]:
+def ellipsoid_points(settings: Iterable[str]) -> list[Point]:
     """Points of scenes with 3D Gaussians: the base, and the values of `ellipsoid` in exact frames."""
-    values = _BY_FORMULA["ellipsoid"][0] if "ellipsoid" in tuple(knobs) else ()
-    ways = (Point("ellipsoid", value, EXACT.with_(ellipsoid=value)) for value in values)
-    return [Point("base", "base", BASE), *ways]
+    values = ELLIPSOID if "ellipsoid" in settings else ()
+    return [BASE_POINT, *(Point("ellipsoid", value, EXACT.with_(ellipsoid=value)) for value in values)]
 
 
-def decode_points(knobs: Iterable[str], quick: bool = False) -> list[Point]:
-    """Points whose markers are tilted until no detector reads them: settings that change edges."""
-    chosen = tuple(knobs)
-    found = [Point("base", "base", BASE)]
-    if PRESETS_KNOB in chosen:
-        found.append(Point(PRESETS_KNOB, "gsplat", preset("gsplat")))
-    if MARKER_KNOB in chosen:
+def decode_points(settings: Iterable[str], quick: bool = False) -> list[Point]:
+    """Points for the largest readable tilt: settings that change edges."""
+    settings = tuple(settings)
+    found = [BASE_POINT]
+    if PRESET in settings:
+        found.append(Point(PRESET, "gsplat", preset("gsplat")))
+    if MARKER in settings:
         found += _marker_points(quick)
-    for knob in ("lowpass", "samples"):
-        if knob in chosen and not quick:
-            found += [_turned(knob, value) for value in _BY_FORMULA[knob][0]]
+    for setting in ("lowpass", "samples"):
+        if setting in settings and not quick:
+            found += [_variation(setting, value) for value in _VALUES[setting]]
     return found
 
 
@@ -189,56 +191,53 @@ def preset(name: str) -> Quality:
     return PRESETS[name].with_(marker=BASE.marker)
 
 
-def marker_words(knobs: MarkerQuality) -> str:
-    """Marker quality as text, e.g. "paper L3 x1"."""
-    if knobs.mixture == "paper":
-        words = f"paper L{knobs.levels} x{knobs.density}"
-    else:
-        words = f"fitted {knobs.template}" if knobs.mixture == "fitted" else knobs.mixture
-    return words if knobs.growth is None else f"{words} growth {knobs.growth:g}"
-
-
-def alone(changes: dict[str, Any]) -> Point:
+def ablation(changes: dict[str, Any]) -> Point:
     """A constant changed in `EXACT`."""
-    knob, value = next(iter(changes.items()))
-    return Point(ALONE, f"{knob} {value_words(value)}", EXACT.with_(**changes))
+    setting, value = next(iter(changes.items()))
+    return Point(ABLATION, f"{setting} {value_text(value)}", EXACT.with_(**changes))
 
 
-def _turned(knob: str, value: Any) -> Point:
-    changes = {knob: value}
+def _variation(setting: str, value: Any) -> Point:
+    """A value changed in `BASE`."""
+    changes = {setting: value}
     if value == "exclusive":
         changes["order"] = "centre"  # the exclusive stop cannot composite layers
-    return Point(knob, value_words(value), BASE.with_(**changes))
+    return Point(setting, value_text(value), BASE.with_(**changes))
 
 
-def value_words(value: Any) -> str:
-    """Value as text; well-known fractions such as 1/255 are kept."""
-    if value in _FRACTIONS:
-        return _FRACTIONS[value]
-    if value == math.exp(-4.5):
-        return "3 sigma"  # cut-off of an opaque splat at 3 sigma
-    return f"{value:g}" if isinstance(value, float) else str(value)
+def value_text(value: Any) -> str:
+    """Value as text, with well-known numbers such as 1/255."""
+    return _TEXTS.get(value) or (f"{value:g}" if isinstance(value, float) else str(value))
+
+
+def marker_text(quality: MarkerQuality) -> str:
+    """Marker quality as text, e.g. "paper L3 x1"."""
+    text = {
+        "paper": f"paper L{quality.levels} x{quality.density}",
+        "fitted": f"fitted {quality.template}",
+    }.get(quality.mixture, quality.mixture)
+    return text if quality.growth is None else f"{text} growth {quality.growth:g}"
 
 
 def _marker_points(quick: bool) -> Iterator[Point]:
     """Points of all marker qualities, rendered with the base and with `SHARP`."""
-    for knobs in (BASE.marker, *(_QUICK_MARKERS if quick else _MARKER_LADDER)):
-        words = marker_words(knobs)
-        if knobs != BASE.marker:
-            yield Point(MARKER_KNOB, words, BASE.with_(marker=knobs))
-        if knobs.mixture != "exact":  # boxes are always filtered
-            yield Point(MARKER_KNOB, f"{words}, 3 x 3", BASE.with_(marker=knobs, **SHARP))
+    for quality in (BASE.marker, *(_QUICK_MARKER_QUALITIES if quick else _MARKER_QUALITIES)):
+        text = marker_text(quality)
+        if quality != BASE.marker:
+            yield Point(MARKER, text, BASE.with_(marker=quality))
+        if quality.mixture != "exact":  # boxes are always filtered
+            yield Point(MARKER, f"{text}, 3 x 3", BASE.with_(marker=quality, **SHARP))
 
 
-def _together(quick: bool) -> Iterator[Point]:
+def _combinations(quick: bool) -> Iterator[Point]:
     """Combinations of cut-off and stop, in precise and fast arithmetic, some with a float32 set-up."""
     cutoffs = _COMBINED_CUTOFFS[1::2] if quick else _COMBINED_CUTOFFS
-    for more, words in (({}, ""), (_FAST, ", fast"), (_FASTEST, ", fast, float32 set-up")):
+    for more, text in (({}, ""), (_FAST, ", fast"), (_FASTEST, ", fast, float32 set-up")):
         stops = (_FASTEST_STOP,) if quick or more is _FASTEST else _COMBINED_STOPS
         for cutoff in cutoffs:
             for stop in stops:
                 if not more and (cutoff == BASE.alpha_cutoff or stop == BASE.transmittance_stop):
                     continue  # a single setting
                 changes = {"alpha_cutoff": cutoff, "transmittance_stop": stop, **more}
-                value = f"cutoff {value_words(cutoff)}, stop {value_words(stop)}{words}"
-                yield Point(TOGETHER, value, BASE.with_(**changes))
+                value = f"cutoff {value_text(cutoff)}, stop {value_text(stop)}{text}"
+                yield Point(COMBINED, value, BASE.with_(**changes))

@@ -1,4 +1,4 @@
-"""The page of `fidsplat tradeoff report`: its tables and charts, worked out from results alone."""
+"""Report of `fidsplat tradeoff report`: tables, charts and recommendations from results."""
 
 from __future__ import annotations
 
@@ -6,192 +6,175 @@ import math
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 
 from fidsplat.experiments.charts import Axes, chart, label_points, literal, plain_ticks
-from fidsplat.experiments.pages import fixed, has_block, number, percent, places, write_block, write_page
+from fidsplat.experiments.pages import fixed, number, page_and_folder, percent, write_page
 from fidsplat.experiments.summary import Frame, Row, provenance
-from fidsplat.experiments.tradeoff.linear import ANGLES, DISTANCES
-from fidsplat.experiments.tradeoff.points import ALONE, MARKER_KNOB, PRESETS_KNOB, TOGETHER
-from fidsplat.experiments.tradeoff.run import LINEAR
-from fidsplat.experiments.tradeoff.scenes import HARD, RANDOM, THICK
-from fidsplat.experiments.tradeoff.summary import TILT, Device, load
+from fidsplat.experiments.tradeoff.points import ABLATION, COMBINED, MARKER, PRESET
+from fidsplat.experiments.tradeoff.run import REFERENCE
+from fidsplat.experiments.tradeoff.scenes import GAUSSIANS_3D, HARD, RANDOM
+from fidsplat.experiments.tradeoff.summary import TILT, DeviceResults, load
 from fidsplat.util.errors import InputError
 
 INVISIBLE = 1 / 512
 """half a step of 8 bits"""
-_LEAST = 1e-7
-"""errors below this are drawn there"""
-MARKER = "qr10"
-"""the marker that the table of mixtures shows"""
-_SHARP = ", 3 x 3"
-"""ends the name of a marker that is drawn without a low-pass and with nine samples a pixel"""
+_SMALLEST = 1e-7
+"""smaller errors are plotted here"""
+SHOWN_MARKER = "qr10"
+"""marker of the table of mixtures"""
 
 
 class Constant(NamedTuple):
     """A constant of splat renderers, and the point that measures it."""
 
-    words: str
+    text: str
     users: str
-    knob: str
+    setting: str
     value: str
 
 
 CONSTANTS = (
-    Constant("alpha below 1/255 is skipped", "3DGS, 2DGS, gsplat", ALONE, "alpha_cutoff 1/255"),
-    Constant("splats are truncated at 3 sigma", "3DGS, 2DGS (bounding boxes)", ALONE, "alpha_cutoff 3 sigma"),
-    Constant("blending stops at T = 1e-4", "our `standard`", ALONE, "transmittance_stop 0.0001"),
-    Constant("blending stops at T = 1/256", "our `fast`", ALONE, "transmittance_stop 1/256"),
-    Constant("stop at 1e-4 without the last fragment", "3DGS, 2DGS, gsplat", ALONE, "stop_rule exclusive"),
-    Constant("alpha is clamped to 0.99", "3DGS, 2DGS, gsplat", ALONE, "opacity_ceiling 0.99"),
-    Constant("projection in float32", "3DGS, 2DGS, gsplat, our `fast`", ALONE, "setup_precision float32"),
-    Constant("exponentials by polynomials", "our `standard`, `fast`", ALONE, "arithmetic fast"),
-    Constant("**`gsplat`**: gsplat's constants together", "gsplat, 2DGS", PRESETS_KNOB, "gsplat"),
-    Constant("**`fast`**: 2/255, T = 1/256, float32 set-up", "ours", PRESETS_KNOB, "fast"),
-    Constant("**`standard`**: 1e-5, T = 1e-4, exponentials", "ours", PRESETS_KNOB, "standard"),
+    Constant("alpha below 1/255 is skipped", "3DGS, 2DGS, gsplat", ABLATION, "alpha_cutoff 1/255"),
+    Constant(
+        "splats are truncated at 3 sigma", "3DGS, 2DGS (bounding boxes)", ABLATION, "alpha_cutoff 3 sigma"
+    ),
+    Constant("blending stops at T = 1e-4", "our `standard`", ABLATION, "transmittance_stop 0.0001"),
+    Constant("blending stops at T = 1/256", "our `fast`", ABLATION, "transmittance_stop 1/256"),
+    Constant("stop at 1e-4 without the last fragment", "3DGS, 2DGS, gsplat", ABLATION, "stop_rule exclusive"),
+    Constant("alpha is clamped to 0.99", "3DGS, 2DGS, gsplat", ABLATION, "opacity_ceiling 0.99"),
+    Constant("projection in float32", "3DGS, 2DGS, gsplat, our `fast`", ABLATION, "setup_precision float32"),
+    Constant("exponentials by polynomials", "our `standard`, `fast`", ABLATION, "arithmetic fast"),
+    Constant("**`gsplat`**: gsplat's constants together", "gsplat, 2DGS", PRESET, "gsplat"),
+    Constant("**`fast`**: 2/255, T = 1/256, float32 set-up", "ours", PRESET, "fast"),
+    Constant("**`standard`**: 1e-5, T = 1e-4, exponentials", "ours", PRESET, "standard"),
 )
-WAYS = {
+ELLIPSOIDS = {
     "ewa": "`ewa`: as 3DGS and gsplat",
     "ewa_antialiased": "`ewa_antialiased`: as Mip-Splatting",
     "exact": "`exact`",
 }
-"""ways of drawing 3D Gaussians"""
-_LABELLED = {
-    (PRESETS_KNOB, "gsplat"): "gsplat",
-    (PRESETS_KNOB, "fast"): "fast",
-    (PRESETS_KNOB, "standard"): "standard",
-    (PRESETS_KNOB, "reference"): "reference",
+"""projections of 3D Gaussians"""
+_LABELS = {
+    (PRESET, "gsplat"): "gsplat",
+    (PRESET, "fast"): "fast",
+    (PRESET, "standard"): "standard",
+    (PRESET, "reference"): "reference",
     ("alpha_cutoff", "4/255"): "cut-off 4/255",
     ("alpha_cutoff", "1/1024"): "cut-off 1/1024",
     ("alpha_cutoff", "0.0001"): "cut-off 1e-4",
-    (ALONE, "opacity_ceiling 0.99"): "only alpha up to 0.99",
-    (ALONE, "transmittance_stop 1/256"): "only T down to 1/256",
-    (ALONE, "stop_rule exclusive"): "only the last fragment dropped",
+    (ABLATION, "opacity_ceiling 0.99"): "only alpha up to 0.99",
+    (ABLATION, "transmittance_stop 1/256"): "only T down to 1/256",
+    (ABLATION, "stop_rule exclusive"): "only the last fragment dropped",
 }
-"""the points of a chart that have names"""
+"""labelled points of a chart"""
 
 
 def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Write the page, and for each device a chart and its results as a table; returns the files, the page
-    first. From the folder of those tables the same page can be made again.
-
-    A page that exists with a generated block (`pages.BEGIN`) keeps its text: the block is replaced by a
-    summary, and the complete report is written as report.md next to the tables.
+    """Write the report, and for each device a chart and its results as a table; returns the files, the report
+    first. The tables suffice to make the same report again.
 
     Args:
-        folders: where results lie, see `load`.
-        out: a folder for report.md and all that belongs to it; or a name that ends in .md, and the rest goes
-            into a folder of that name without .md.
+        folders: folders with results, see `load`.
+        out: folder for report.md and its files; or a name that ends in .md, whose files are written to a
+            folder of that name without .md.
 
     Raises InputError when there are no results or the folder cannot be written.
     """
-    page, folder = places(out)
+    page, folder = page_and_folder(out)
+    context, files = report_content(folders, folder)
+    write_page(page, folder, "accuracy.md.j2", context)
+    return [page, *files]
+
+
+def report_content(folders: Sequence[Path], folder: Path) -> tuple[dict[str, Any], list[Path]]:
+    """Write the tables and charts of a report; returns the context of its template, and the files."""
     loaded = load(folders)
     names = _short_names(loaded)
     files = [folder / f"{name}.csv" for name in names]
-    devices = [Device(device.summary.write(file)) for device, file in zip(loaded, files, strict=True)]
-    plotted = [next(iter(_plain(device)), "") for device in devices]
-    plain = [device for device in devices if _plain(device)]
-    twice = {device.title for device, other in combinations(devices, 2) if device.title == other.title}
-    for device, name, scene in zip(devices, names, plotted, strict=True):
+    devices = [DeviceResults(device.summary.write(file)) for device, file in zip(loaded, files, strict=True)]
+    shown = []
+    for device, name in zip(devices, names, strict=True):
+        scene = next(iter(_disk_scenes(device)), "")
         if scene:
             files.append(folder / f"{name}.svg")
-            draw_chart([device], scene, files[-1])
-    context = {
-        "devices": [
-            {
-                "name": name,
-                "kind": device.kind,
-                "title": device.title,
-                "scene": scene,
-                "facts": _facts(device),
-            }
-            for device, name, scene in zip(devices, names, plotted, strict=True)
-        ],
-        "constants": constants_table(plain) if plain else None,
-        "ways": ways_table(devices),
-        "linear": linear_table(devices),
+            write_chart([device], scene, files[-1])
+        facts = {"name": name, "kind": device.kind, "title": device.title, "scene": scene}
+        shown.append(facts | {"facts": _facts(device)})
+    repeated = {one.title for one, other in combinations(devices, 2) if one.title == other.title}
+    titles = {
+        f"{device.title} ({name})" if device.title in repeated else device.title: device.summary
+        for device, name in zip(devices, names, strict=True)
+    }
+    disks = [device for device in devices if _disk_scenes(device)]
+    return {
+        "devices": shown,
+        "constants": constants_table(disks) if disks else None,
+        "ellipsoids": ellipsoids_table(devices),
         "orders": orders_table(devices),
         "markers": markers_table(devices[0]),
-        "choices": choices(plain),
-        "standard": max((_worst(device, "standard") for device in devices), default=0.0),
-        "fast": max((_worst(device, "fast") for device in devices), default=0.0),
+        "choices": recommendations(disks),
+        "standard": max(_preset_error(device, "standard") for device in devices),
+        "fast": max(_preset_error(device, "fast") for device in devices),
         "refused": sorted({f"{r.knob} {r.value} ({r.error})" for d in devices for r in _refused(d)}),
-        "checked": max((_truth_error(device) for device in devices), default=0.0),
-        "runs": provenance(
-            {
-                f"{device.title} ({name})" if device.title in twice else device.title: device.summary
-                for device, name in zip(devices, names, strict=True)
-            }
-        ),
+        "checked": max(_reference_error(device) for device in devices),
+        "runs": provenance(titles),
         "notes": [note for device in devices for note in device.summary.notes],
-        "marker": f"{MARKER} at {TILT} degrees",
+        "marker": f"{SHOWN_MARKER} at {TILT} degrees",
         "invisible": INVISIBLE,
-    }
-    if not has_block(page):
-        write_page(page, folder, "accuracy.md.j2", context | {"summary": False})
-        return [page, *files]
-    write_block(page, folder, "accuracy_summary.md.j2", context | {"summary": True})
-    complete = folder / "report.md"
-    write_page(complete, folder, "accuracy.md.j2", context | {"summary": False})
-    return [page, complete, *files]
+        "summary": False,
+    }, files
 
 
 def write_plot(folders: Sequence[Path], file: Path) -> None:
-    """One chart of the results in folders, a panel for each device.
+    """Write one chart of results, with a panel for each device.
 
-    Raises InputError when there are no results, no scene that all devices have drawn, or the file cannot be
+    Raises InputError when there are no results, the devices have no scene in common, or the file cannot be
     written.
     """
     devices = load(folders)
-    draw_chart(devices, plotted_scene(devices), file)
-
-
-def plotted_scene(devices: Sequence[Device]) -> str:
-    """The scene of a chart in which devices stand side by side: one that all have drawn, markers last.
-
-    Raises InputError where there is none.
-    """
     first = devices[0]
-    for scene in dict.fromkeys((*_plain(first), *first.scenes)):
+    for scene in dict.fromkeys((*_disk_scenes(first), *first.scenes)):
         if all(scene in device.scenes for device in devices):
-            return scene
+            write_chart(devices, scene, file)
+            return
     raise InputError(f"{' and '.join(device.title for device in devices)} have no scene in common to plot")
 
 
-def draw_chart(devices: Sequence[Device], scene: str, file: Path) -> None:
-    """Milliseconds against the largest error of every setting that draws the base's picture, a panel for each
-    device."""
+def write_chart(devices: Sequence[DeviceResults], scene: str, file: Path) -> None:
+    """Write a chart of milliseconds and largest errors of the settings with the image definition of the base,
+    with a panel for each device."""
     with chart(file, len(devices), (9.0 * len(devices), 5.2)) as (figure, panels):
-        named = [_draw_panel(axes, device, scene) for axes, device in zip(panels, devices, strict=True)]
+        labels = [_plot(axes, device, scene) for axes, device in zip(panels, devices, strict=True)]
         panels[0].set_ylabel("largest error (peak 1)")
-        handles, words = panels[0].get_legend_handles_labels()
-        figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False)
-        for axes, points in zip(panels, named, strict=True):
+        handles, texts = panels[0].get_legend_handles_labels()
+        figure.legend(handles, texts, loc="outside lower center", ncols=4, frameon=False)
+        for axes, points in zip(panels, labels, strict=True):
             label_points(figure, axes, points)
 
 
-def _draw_panel(axes: Axes, device: Device, scene: str) -> list[tuple[float, float, str]]:
-    """Draw one device's settings; returns those that have names, with their places."""
-    points = device.same_picture(scene)
-    points = points[points["knob"] != "blend_precision"]  # for truths, and many times as slow
-    points = points.assign(error=points["maximum"].clip(lower=_LEAST))
-    ladder = points[points["knob"].isin(("base", "alpha_cutoff"))].sort_values("error")
-    names = pd.Series(list(zip(points["knob"], points["value"], strict=True)), index=points.index).map(
-        _LABELLED
+def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, float, str]]:
+    """Plot the settings of a device; returns labelled points."""
+    points = device.same_definition(scene)
+    points = points[points["knob"] != "blend_precision"]  # for reference images, and much slower
+    points = points.assign(
+        error=points["maximum"].clip(lower=_SMALLEST),
+        label=[_LABELS.get(key) for key in zip(points["knob"], points["value"], strict=True)],
     )
+    labelled = points[points["label"].notna()]
+    cutoffs = points[points["knob"].isin(("base", "alpha_cutoff"))].sort_values("error")
     axes.set(xscale="log", yscale="log", xlabel="milliseconds per frame")
     axes.plot(points["ms"], points["error"], ".", color="#bbbbbb", label="every setting")
-    axes.plot(ladder["ms"], ladder["error"], "-", color="#00798c", label="the cut-off alone")
-    for knob, style, colour, words in (
-        (PRESETS_KNOB, "o", "#d1495b", "presets"),
+    axes.plot(cutoffs["ms"], cutoffs["error"], "-", color="#00798c", label="only the cut-off")
+    for setting, style, colour, text in (
+        (PRESET, "o", "#d1495b", "presets"),
         ("alpha_cutoff", "o", "#00798c", None),
-        (ALONE, "s", "#edae49", "one constant in an exact picture"),
+        (ABLATION, "s", "#edae49", "one constant in an exact image"),
     ):
-        chosen = points[names.notna() & (points["knob"] == knob)]
-        axes.plot(chosen["ms"], chosen["error"], style, color=colour, label=words)
+        chosen = labelled[labelled["knob"] == setting]
+        axes.plot(chosen["ms"], chosen["error"], style, color=colour, label=text)
     axes.axhline(INVISIBLE, color="#777777", linestyle="--", linewidth=0.8)
     axes.annotate(
         "half a step of 8 bits", (0, INVISIBLE), (4, 3), xycoords=("axes fraction", "data"),
@@ -200,70 +183,74 @@ def _draw_panel(axes: Axes, device: Device, scene: str) -> list[tuple[float, flo
     axes.margins(0.08)
     plain_ticks(axes.xaxis)
     axes.set_title(literal(f"{scene} on {device.title}"))
-    named = points[names.notna()]
-    return list(zip(named["ms"], named["error"], names[names.notna()], strict=True))
+    return list(labelled[["ms", "error", "label"]].itertuples(index=False, name=None))
 
 
-def constants_table(devices: Sequence[Device]) -> Frame:
-    """What each constant saves beside the exact picture on each device, and the error that it makes; no row
-    for what nobody measured."""
+def constants_table(devices: Sequence[DeviceResults]) -> Frame:
+    """Time that each constant saves relative to the exact image, and its error; only measured constants."""
     rows = []
+    shared = _shared_scene(devices)
+    scenes = (shared, HARD) if any(HARD in device.scenes for device in devices) else (shared,)
     for constant in CONSTANTS:
-        row: dict[str, str] = {"constant": constant.words, "used by": constant.users}
-        there = False
-        shared = _shared(devices)
-        for scene in (shared, HARD) if any(HARD in device.scenes for device in devices) else (shared,):
-            worst = []
-            for device in devices:
-                point = device.at(scene, constant.knob, constant.value)
-                exact = device.at(scene, ALONE, "exact")
-                if scene != HARD:
-                    row[f"time, {device.kind}"] = percent(
+        row: dict[str, str] = {"constant": constant.text, "used by": constant.users}
+        measured = False
+        for scene in dict.fromkeys(scenes):
+            pairs = [(device, *_pair(device, scene, constant)) for device in devices]
+            if scene != HARD:
+                row |= {
+                    f"time, {device.kind}": percent(
                         None if point is None or exact is None else point["ratio"] / exact["ratio"]
                     )
-                if point is not None and exact is not None:
-                    worst.append(point["maximum"])
-            there |= bool(worst)
-            row[f"largest error, {scene}"] = number(max(worst, default=None))
+                    for device, point, exact in pairs
+                }
+            errors = [
+                point["maximum"] for _, point, exact in pairs if point is not None and exact is not None
+            ]
+            measured |= bool(errors)
+            row[f"largest error, {scene}"] = number(max(errors, default=None))
         verdicts = [_verdict(device, constant) for device in devices]
-        row["verdict"] = " / ".join(dict.fromkeys(word for word in verdicts if word))
-        if there:
+        row["verdict"] = " / ".join(dict.fromkeys(filter(None, verdicts)))
+        if measured:
             rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _verdict(device: Device, constant: Constant) -> str:
-    scene = _shared([device])
-    point, exact = device.at(scene, constant.knob, constant.value), device.at(scene, ALONE, "exact")
+def _pair(device: DeviceResults, scene: str, constant: Constant) -> tuple[Row | None, Row | None]:
+    """Rows of a constant and of the exact image."""
+    return device.at(scene, constant.setting, constant.value), device.at(scene, ABLATION, "exact")
+
+
+def _verdict(device: DeviceResults, constant: Constant) -> str:
+    point, exact = _pair(device, _shared_scene([device]), constant)
     if point is None or exact is None:
         return ""
     verdict = device.verdict(point, exact)
     return "no effect" if verdict == "dominated" and point["maximum"] <= INVISIBLE / 2 else verdict
 
 
-def ways_table(devices: Sequence[Device]) -> Frame:
-    """What each way of drawing 3D Gaussians takes beside `ewa` on each device, and how far its picture is
-    from the Gaussians themselves at most; no column for what nobody measured."""
+def ellipsoids_table(devices: Sequence[DeviceResults]) -> Frame:
+    """Time of each projection of 3D Gaussians relative to `ewa`, and its largest error; only measured
+    scenes."""
     rows = []
-    for way, words in WAYS.items():
-        row = {"3D Gaussians": words}
-        for scene in THICK:
-            points = []
+    for name, text in ELLIPSOIDS.items():
+        row = {"3D Gaussians": text}
+        for scene in GAUSSIANS_3D:
+            errors = []
             for device in devices:
-                point, ewa = (device.at(scene, "ellipsoid", name) for name in (way, "ewa"))
+                point, ewa = (device.at(scene, "ellipsoid", one) for one in (name, "ewa"))
                 if point is not None and ewa is not None:
-                    points.append(point)
+                    errors.append(point["maximum"])
                     row[f"time, {scene}, {device.kind}"] = percent(point["ratio"] / ewa["ratio"])
-            if points:
-                row[f"largest error, {scene}"] = number(max(point["maximum"] for point in points))
+            if errors:
+                row[f"largest error, {scene}"] = number(max(errors))
         if len(row) > 1:
             rows.append(row)
     return pd.DataFrame(rows)
 
 
-def orders_table(devices: Sequence[Device]) -> Frame:
-    """What compositing by depth at each pixel takes beside the order of centres on each device, and how far
-    each is from the exact picture in its own order at most; no row for a scene that nobody drew in both."""
+def orders_table(devices: Sequence[DeviceResults]) -> Frame:
+    """Time of compositing by depth per pixel relative to the order of centres, and the largest errors of both
+    relative to the exact image in the same order; only scenes with both."""
     rows = []
     for scene in dict.fromkeys(scene for device in devices for scene in device.scenes):
         errors: dict[str, list[float]] = {"pixel": [], "centre": []}
@@ -276,120 +263,100 @@ def orders_table(devices: Sequence[Device]) -> Frame:
                 errors["centre"].append(centre["maximum"])
         if times:
             worst = {f"largest error, `{name}`": number(max(found)) for name, found in errors.items()}
-            rows.append({"`pixel` beside `centre`": scene} | worst | times)
+            rows.append({"`pixel` relative to `centre`": scene} | worst | times)
     return pd.DataFrame(rows).fillna("-")
 
 
-def linear_table(devices: Sequence[Device]) -> Frame:
-    """What the linear image of EWA is wrong by, by distance and angle off the axis."""
-    rows: Frame = pd.concat([device.summary.rows for device in devices])
-    rows = rows[rows["what"] == LINEAR]
-    found = {(row["knob"], str(row["value"])): row["maximum"] for _, row in rows.iterrows()}
-    if not found:
-        return pd.DataFrame()
-    return pd.DataFrame(
-        {"distance, standard deviations": str(distance)}
-        | {f"{angle} degrees": number(found.get((f"{distance} sigma", str(angle)))) for angle in ANGLES}
-        for distance in DISTANCES
-    )
-
-
-def markers_table(device: Device) -> Frame:
-    """What Gaussians of a marker give, drawn sharp: time, PSNR from the print, how far it is read."""
-    view, rows = f"{MARKER}@{TILT}", []
+def markers_table(device: DeviceResults) -> Frame:
+    """Marker qualities rendered without a low-pass with nine samples per pixel: time, PSNR relative to the
+    printed texture, largest readable tilt."""
+    view, rows = f"{SHOWN_MARKER}@{TILT}", []
     if view not in device.scenes:
         return pd.DataFrame()
     points = device.of(view)
-    for _, point in points[points["knob"] == MARKER_KNOB].iterrows():
-        words = point["value"].removesuffix(_SHARP)
-        if (words == "exact" or words != point["value"]) and "growth" not in words:
+    for _, point in points[points["knob"] == MARKER].iterrows():
+        name, sharp, _ = point["value"].partition(", 3 x 3")
+        if (sharp or name == "exact") and "growth" not in name:
             rows.append(
                 {
-                    "marker": words,
+                    "marker": name,
                     "Gaussians per rectangle": fixed(point["per_rectangle"], 0),
                     "time": percent(point["ratio"]),
                     "PSNR, dB": fixed(point["ideal_psnr"]),
                     "corner error, px": number(point["corners_px"]),
-                    "read up to": fixed(device.read_to(MARKER, point["knob"], point["value"]), 0),
+                    "read up to": fixed(device.read_to(SHOWN_MARKER, point["knob"], point["value"]), 0),
                 }
             )
     return pd.DataFrame(rows)
 
 
-def choices(devices: Sequence[Device]) -> list[dict[str, str]]:
-    """The cheapest setting on each device whose error nobody sees, on random scenes and on all scenes."""
+def recommendations(devices: Sequence[DeviceResults]) -> list[dict[str, str]]:
+    """Cheapest setting with an invisible error on each device, for random scenes and for all scenes."""
     found = []
     for device in devices:
-        plain = _plain(device)
+        every = _disk_scenes(device)
         kind = "one's own scenes" if device.own else "random scenes"
-        for words, scenes in ((kind, [s for s in plain if s != HARD]), ("all scenes", plain)):
+        for text, scenes in ((kind, [s for s in every if s != HARD]), ("all scenes", every)):
             best = device.cheapest_within(scenes, INVISIBLE) if scenes else []
             if best:
                 costs = ", ".join(f"{row['scene']} {percent(row['ratio'])}" for row in best)
-                found.append({"kind": device.kind, "on": words, "setting": _words(best[0]), "costs": costs})
+                setting, value = best[0]["knob"], best[0]["value"]
+                name = value if setting in ("base", PRESET, COMBINED) else f"{setting} {value}"
+                found.append({"kind": device.kind, "on": text, "setting": name, "costs": costs})
     return found
 
 
-def _words(point: Row) -> str:
-    plain = point["knob"] in ("base", PRESETS_KNOB, TOGETHER)
-    return point["value"] if plain else f"{point['knob']} {point['value']}"
-
-
-def _facts(device: Device) -> dict[str, str]:
-    """`standard` beside gsplat's constants, on the scene that is plotted."""
-    scene = _shared([device])
-    ours, theirs = (device.at(scene, PRESETS_KNOB, name) for name in ("standard", "gsplat"))
+def _facts(device: DeviceResults) -> dict[str, str]:
+    """Comparison of `standard` with gsplat's constants on the plotted scene."""
+    scene = _shared_scene([device])
+    ours, theirs = (device.at(scene, PRESET, name) for name in ("standard", "gsplat"))
     if ours is None or theirs is None:
         return {}
-    better = math.floor(theirs["maximum"] / max(ours["maximum"], _LEAST))
-    same = device.same_picture(scene)
-    at_error = same[same["maximum"] <= theirs["maximum"]].nsmallest(1, "ratio").iloc[0]
-    in_time = same[same["ratio"] <= theirs["ratio"] * 1.02].nsmallest(1, "maximum").iloc[0]
+    same = device.same_definition(scene)
+    fastest = same[same["maximum"] <= theirs["maximum"]]["ratio"].min()
+    most_accurate = same[same["ratio"] <= theirs["ratio"] * 1.02]["maximum"].min()
     return {
         "time": percent(ours["ratio"] / theirs["ratio"]),
-        "better": f"{better}",
-        "at_error": percent(at_error["ratio"] / theirs["ratio"]),
-        "in_time": f"{math.floor(theirs['maximum'] / max(in_time['maximum'], _LEAST))}",
-        "base_ms": fixed(device.base_ms(scene), 2),
+        "better": f"{math.floor(theirs['maximum'] / max(ours['maximum'], _SMALLEST))}",
+        "at_error": percent(fastest / theirs["ratio"]),
+        "in_time": f"{math.floor(theirs['maximum'] / max(most_accurate, _SMALLEST))}",
         "noise": f"{device.noise(scene):.0%}",
     }
 
 
-def _worst(device: Device, preset: str) -> float:
-    """A preset's largest error on scenes that are no markers."""
-    points = [device.at(scene, PRESETS_KNOB, preset) for scene in _plain(device)]
+def _preset_error(device: DeviceResults, preset: str) -> float:
+    """Largest error of a preset on scenes of disks."""
+    points = [device.at(scene, PRESET, preset) for scene in _disk_scenes(device)]
     return max((point["maximum"] for point in points if point is not None), default=0.0)
 
 
-def _plain(device: Device) -> list[str]:
-    """Users' own scenes, random scenes of disks, the largest first, and the hard cases."""
+def _disk_scenes(device: DeviceResults) -> list[str]:
+    """The user's scenes, random scenes of disks, the largest first, and the hard cases."""
     order = [*device.own, *reversed(RANDOM), HARD]
     return sorted((s for s in device.scenes if s in order), key=order.index)
 
 
-def _shared(devices: Sequence[Device]) -> str:
-    """The scene that stands for all: of those that every device has the first, a user's own or the largest
-    random one."""
-    common = [s for s in _plain(devices[0]) if all(s in device.scenes for device in devices)]
-    return common[0] if common else HARD
+def _shared_scene(devices: Sequence[DeviceResults]) -> str:
+    """First of the `_disk_scenes` that all devices have."""
+    shared = (s for s in _disk_scenes(devices[0]) if all(s in device.scenes for device in devices))
+    return next(shared, HARD)
 
 
-def _refused(device: Device):
+def _refused(device: DeviceResults):
     rows = device.summary.rows
     return rows[rows["error"].notna()].itertuples()
 
 
-def _truth_error(device: Device) -> float:
-    """Largest error of the reference renderings with order `centre`; with `pixel`, ties may resolve either
-    way."""
+def _reference_error(device: DeviceResults) -> float:
+    """Largest error of reference images with order `centre`; with `pixel`, the order of ties is undefined."""
     rows = device.summary.rows
-    truths = rows[(rows["what"] == "truth") & ~rows["value"].str.endswith(", pixel", na=False)]
-    worst = truths["maximum"].max()
+    checks = rows[(rows["what"] == REFERENCE) & ~rows["value"].str.endswith(", pixel", na=False)]
+    worst = checks["maximum"].max()
     return 0.0 if pd.isna(worst) else float(worst)
 
 
-def _short_names(devices: Sequence[Device]) -> list[str]:
-    """cpu, gpu, gpu-2 ... for the names of files."""
+def _short_names(devices: Sequence[DeviceResults]) -> list[str]:
+    """File names by kind: cpu, gpu, gpu-2 ..."""
     found: list[str] = []
     for device in devices:
         same = sum(name.partition("-")[0] == device.kind for name in found)

@@ -20,14 +20,14 @@ from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.provenance import digest_of
 
 RANDOM = ("r100k_720p", "r1m_1080p")
-THICK = ("r100k_720p_3d", "r1m_1080p_3d")
+GAUSSIANS_3D = ("r100k_720p_3d", "r1m_1080p_3d")
 """scenes of 3D Gaussians, for the values of `ellipsoid`"""
 HARD = "hard"
 MARKERS = {"apriltag": "apriltag", "qr2": "small", "qr5": "medium", "qr10": "large", "qr22": "huge"}
 """name -> category of the paper; its marker 0 is used"""
-FEW_KNOBS = ("apriltag", "qr2", "qr5", "qr22")
-"""markers for all marker qualities; qr10 is used for every other setting"""
-NAMES = (*RANDOM, *THICK, HARD, *MARKERS)
+FEW_SETTINGS = ("apriltag", "qr2", "qr5", "qr22")
+"""markers that only presets and marker qualities are measured on; qr10 has every setting"""
+NAMES = (*RANDOM, *GAUSSIANS_3D, HARD, *MARKERS)
 QUICK_NAMES = ("r100k_720p", HARD, "apriltag", "qr10")
 TILTS = (0, 60, 80)
 """tilts in degrees"""
@@ -47,7 +47,7 @@ class TradeScene:
     cloud: SplatCloud
     camera: Camera
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    made: Marker | None = None
+    marker: Marker | None = None
     """marker with the module of `PROTOCOL`"""
 
     @cached_property
@@ -56,13 +56,13 @@ class TradeScene:
         return Capture(self.camera, background=self.background)
 
 
-def scene_names(words: Iterable[str], quick: bool = False) -> tuple[str, ...]:
+def scene_names(names: Iterable[str], quick: bool = False) -> tuple[str, ...]:
     """Distinct names of scenes; all if none is given, or those of a quick run.
 
     Raises:
         InputError: an unknown scene.
     """
-    names = tuple(dict.fromkeys(words)) or (QUICK_NAMES if quick else NAMES)
+    names = tuple(dict.fromkeys(names)) or (QUICK_NAMES if quick else NAMES)
     for name in names:
         if name not in NAMES:
             raise InputError(unknown("scene", name, NAMES))
@@ -79,39 +79,35 @@ def is_marker(view: str) -> bool:
     return view.partition("@")[0] in MARKERS
 
 
-def make(view: str, knobs: MarkerQuality) -> TradeScene:
-    """View of a name in `views_of`; marker quality for markers.
-
-    Raises:
-        InputError: there is no such mixture or template.
-    """
+def make_view(view: str, quality: MarkerQuality) -> TradeScene:
+    """View of a name in `views_of`. Raises InputError for an unknown mixture or template of the marker."""
     name, _, tilt = view.partition("@")
     if name in MARKERS:
-        made = made_marker(name, knobs)
-        return TradeScene(view, made.cloud, PROTOCOL.camera(float(tilt)), GREY, made)
+        placed = placed_marker(name, quality)
+        return TradeScene(view, placed.cloud, PROTOCOL.camera(float(tilt)), GREY, placed)
     cloud, camera = hard_scene(SEED) if name == HARD else load_scene(name, SEED)
     return TradeScene(view, cloud, camera)
 
 
 @lru_cache(maxsize=32)
-def made_marker(name: str, knobs: MarkerQuality) -> Marker:
+def placed_marker(name: str, quality: MarkerQuality) -> Marker:
     """Marker of a name on its plane of 2 x 2 m, quiet zone included."""
     spec = CATEGORIES[MARKERS[name]].spec(0, SEED)
     plain = marker(spec)
     module = PROTOCOL.module(plain.grid.shape[0])
-    return marker(spec, module * plain.bits.shape[1], quality=knobs)
+    return marker(spec, module * plain.bits.shape[1], quality=quality)
 
 
-Own = Mapping[str, TradeScene]
+Views = Mapping[str, TradeScene]
 """the user's views by name"""
 
 
-def own_pictures(views: Mapping[str, BenchScene]) -> dict[str, TradeScene]:
+def user_views(views: Mapping[str, BenchScene]) -> dict[str, TradeScene]:
     """Views of the user's `fidsplat bench` scenes: only splats, on black."""
     return {name: TradeScene(name, *view.make()) for name, view in views.items()}
 
 
-def digests(own: Own) -> dict[str, str]:
+def digests(own: Views) -> dict[str, str]:
     """Digests of the splats and camera of each view, by name, which identify its results."""
     clouds = {id(scene.cloud): scene.cloud for scene in own.values()}
     splats = {number: digest_of(cloud) for number, cloud in clouds.items()}

@@ -12,13 +12,13 @@ from fidsplat.accuracy.error import full_precision, reference_image, reference_r
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import MarkerQuality, Quality
 from fidsplat.experiments.tradeoff.points import BASE
-from fidsplat.experiments.tradeoff.scenes import Own, TradeScene, make
+from fidsplat.experiments.tradeoff.scenes import TradeScene, Views, make_view
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.util.timing import frame_timer, quartiles, ratios, time_interleaved
 
-_SCENES, _TRUTHS = 12, 6
+_SCENES, _REFERENCES = 12, 6
 """cached at a time"""
 DEFINITION = ("lowpass", "samples", "order")
 """settings that define the image; the others define its accuracy"""
@@ -30,60 +30,63 @@ class Session:
     Reference images come from the renderer itself, or from OpenCL on the CPU if it cannot blend in float64.
     """
 
-    def __init__(self, renderer: Renderer, own: Own | None = None) -> None:
+    def __init__(self, renderer: Renderer, own: Views | None = None) -> None:
         """own: views of the user's files, which ignore marker qualities."""
-        self.renderer, self._reference = renderer, reference_renderer(renderer, Capture())
+        self.renderer, self._precise = renderer, reference_renderer(renderer, Capture())
         self._own, self._uploaded = own or {}, {}
-        self._made = lru_cache(_SCENES)(make)
+        self._make = lru_cache(_SCENES)(make_view)
         self.resident = lru_cache(_SCENES)(self._resident)
         """(view, marker quality) -> its splats on the device"""
-        self._truth = lru_cache(_TRUTHS)(self._draw_truth)
+        self._reference = lru_cache(_REFERENCES)(self._render_reference)
 
-    def scene(self, view: str, knobs: MarkerQuality) -> TradeScene:
+    def scene(self, view: str, marker: MarkerQuality) -> TradeScene:
         """Scene of a view."""
-        return self._own[view] if view in self._own else self._made(view, knobs)
+        return self._own[view] if view in self._own else self._make(view, marker)
 
-    def _resident(self, view: str, knobs: MarkerQuality) -> ResidentCloud:
-        cloud = self.scene(view, knobs).cloud
+    def _resident(self, view: str, marker: MarkerQuality) -> ResidentCloud:
+        cloud = self.scene(view, marker).cloud
         if view not in self._own:
             return self.renderer.upload(cloud)
         if id(cloud) not in self._uploaded:  # views of a file share their splats
             self._uploaded[id(cloud)] = self.renderer.upload(cloud)
         return self._uploaded[id(cloud)]
 
-    def draw(self, view: str, quality: Quality) -> Frame:
+    def render(self, view: str, quality: Quality) -> Frame:
         """Frame of a view at a quality, without waiting for it."""
         capture = self.scene(view, quality.marker).capture
         return self.renderer.render(self.resident(view, quality.marker), capture, quality=quality)
 
-    def truth(self, view: str, quality: Quality) -> np.ndarray:
+    def reference(self, view: str, quality: Quality) -> np.ndarray:
         """Reference image (h, w, 3) float64: the same splats and image definition at full precision."""
-        return self._truth(view, self.definition(view, quality))
+        return self._reference(view, self.definition(view, quality))
 
-    def _draw_truth(self, view: str, like: Quality) -> np.ndarray:
-        scene, own = self.scene(view, like.marker), self._reference is self.renderer
-        what = self.resident(view, like.marker) if own else scene.cloud
-        return reference_image(self._reference, what, scene.capture.with_(quality=like))
+    def _render_reference(self, view: str, definition: Quality) -> np.ndarray:
+        scene, same_device = self.scene(view, definition.marker), self._precise is self.renderer
+        splats = self.resident(view, definition.marker) if same_device else scene.cloud
+        return reference_image(self._precise, splats, scene.capture.with_(quality=definition))
 
     def definition(self, view: str, quality: Quality) -> Quality:
-        """The base with what `quality` says of the definition; 3D Gaussians as they are, in one's own
-        pictures as the setting draws them: captures look as they did to their trainer."""
-        asked = {name: getattr(quality, name) for name in DEFINITION}
+        """The base with the image definition of a quality.
+
+        3D Gaussians are projected exactly; those of the user as `quality` projects them, since captures look
+        as they did in training.
+        """
+        defined = {name: getattr(quality, name) for name in DEFINITION}
         ellipsoid = quality.ellipsoid if view in self._own else "exact"
-        return BASE.with_(**asked, ellipsoid=ellipsoid, marker=quality.marker)
+        return BASE.with_(**defined, ellipsoid=ellipsoid, marker=quality.marker)
 
     def full(self, view: str, quality: Quality) -> Quality:
-        """Quality of `truth`."""
-        like = Capture(quality=self.definition(view, quality))
-        return full_precision(like, self._reference).quality
+        """Quality of the reference image."""
+        capture = Capture(quality=self.definition(view, quality))
+        return full_precision(capture, self._precise).quality
 
 
 @dataclass(frozen=True)
 class Effort:
     """Length of a measurement: pairs of frames for some seconds, within limits."""
 
-    least: int = 5
-    most: int = 30
+    minimum: int = 5
+    maximum: int = 30
     seconds: float = 0.3
 
 
@@ -95,20 +98,22 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
 
     Returns the image, and `ms`, `base_ms` (medians), their quartiles, `ratio` (median of the pairs' ratios,
     and its quartiles), `repeats`, `stages_ms` by the device's own clock, `memory_bytes` (scratch, cloud and
-    picture; None where the backend cannot tell), `splats`, `pairs`.
+    image; None if the backend does not report it), `splats`, `pairs`.
     """
     memory = memory_of(session, view, quality)
-    frame = session.draw(view, quality)
+    frame = session.render(view, quality)
     own, base = (
         frame_timer(
             session.renderer,
-            session.resident(view, drawn.marker),
-            session.scene(view, drawn.marker).capture,
-            quality=drawn,
+            session.resident(view, timed.marker),
+            session.scene(view, timed.marker).capture,
+            quality=timed,
         )
-        for drawn in (quality, BASE)
+        for timed in (quality, BASE)
     )
-    time_interleaved([own, base], effort.most, min_rounds=effort.least, seconds=effort.seconds, warm_up=1)
+    time_interleaved(
+        [own, base], effort.maximum, min_rounds=effort.minimum, seconds=effort.seconds, warm_up=1
+    )
     result: dict = {"repeats": len(own.ms), "stages_ms": own.part_medians, "memory_bytes": memory}
     for name, values in (("ms", own.ms), ("base_ms", base.ms), ("ratio", ratios(own, base))):
         low, result[name], high = quartiles(values)
@@ -122,7 +127,7 @@ def memory_of(session: Session, view: str, quality: Quality) -> int | None:
     if not backend.traits.measures_rates:
         return None
     backend.release_scratch()
-    # a cloud keeps every form of its colours that was ever asked for; this one has been asked for nothing yet
+    # a cloud caches every form of its colours that was ever requested; a new one has none
     resident = session.renderer.upload(scene.cloud)
     session.renderer.render(resident, scene.capture, quality=quality)
     return backend.memory_bytes + resident.memory_bytes + 12 * scene.camera.width * scene.camera.height

@@ -7,14 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.experiments.methods import Painter, plain_marker
+from fidsplat.experiments.methods import MarkerRenderer, plain_marker
 from fidsplat.experiments.setup import PROTOCOLS, Category
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.visualize import contact_sheet
 from fidsplat.util.files import writable_folder
 
 TILTS = (0.0, 45.0, 70.0)
-_PIXELS = 160  # of the cut-out in the middle of each picture, at most
+_PIXELS = 160
+"""maximum edge of the central part of an image that is shown"""
 
 
 def sheet_files(folder: Path) -> list[Path]:
@@ -23,7 +24,7 @@ def sheet_files(folder: Path) -> list[Path]:
 
 
 def write_sheets(
-    categories: Iterable[Category], methods: Iterable[str], painter: Painter, seed: int, folder: Path
+    categories: Iterable[Category], methods: Iterable[str], markers: MarkerRenderer, seed: int, folder: Path
 ) -> Iterator[Path]:
     """Render marker 0 of each category by every method, one row per tilt; yields each file.
 
@@ -35,17 +36,20 @@ def write_sheets(
     for category in categories:
         spec = category.spec(0, seed)
         module = protocol.module(plain_marker(spec).grid.shape[0])
-        draws = {name: painter.open(name, f"{category.name}-0", spec, module) for name in methods}
+        prepared = {name: markers.prepare(name, f"{category.name}-0", spec, module) for name in methods}
         rows = [
-            [(f"{name}, {tilt:g} deg", _middle(draw(protocol.camera(tilt)))) for name, draw in draws.items()]
+            [
+                (f"{name}, {tilt:g} deg", _middle(render(protocol.camera(tilt))))
+                for name, render in prepared.items()
+            ]
             for tilt in TILTS
         ]
         sheet = contact_sheet(rows, width=_PIXELS)
-        yield write_png(folder / f"sheet-{category.name}.png", sheet[:, :, 0])  # there is no colour in it
+        yield write_png(folder / f"sheet-{category.name}.png", sheet[:, :, 0])  # grey
 
 
-def _middle(picture: np.ndarray) -> np.ndarray:
-    h, w = picture.shape
+def _middle(image: np.ndarray) -> np.ndarray:
+    h, w = image.shape
     y, x = max((h - _PIXELS) // 2, 0), max((w - _PIXELS) // 2, 0)
-    part = to_uint8(picture[y : y + _PIXELS, x : x + _PIXELS])
+    part = to_uint8(image[y : y + _PIXELS, x : x + _PIXELS])
     return np.repeat(part[:, :, None], 3, axis=2)
