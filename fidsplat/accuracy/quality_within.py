@@ -103,8 +103,8 @@ def choose(
     bases, content = [requested.quality], splats
     if isinstance(splats, ChunkedSplats):
         content = splats.content
-        # levels of detail may use half of the error
-        allowed = [0.0, *DETAIL_ERRORS] if error is None else [min(max(error, 0.0) / 2, DETAIL_ERRORS[-1])]
+        # levels of detail may use half of the error; their measured errors do not bound those of this view
+        allowed = [0.0, *DETAIL_ERRORS] if error is None else [min(max(error, 0) / 2, DETAIL_ERRORS[-1]), 0.0]
         bases = [_with_detail(splats, requested.quality, detail) for detail in allowed]
         requested = replace(requested, quality=requested.quality.with_(detail_error=0.0))
     info = renderer.device
@@ -119,7 +119,7 @@ def choose(
         measurement.base = base  # all bases have the same reference image
         return _search(CandidateSearch(measurement, front), error, ms)
 
-    choice = _best_of(dict.fromkeys(bases), search_with)
+    choice = _best_of(dict.fromkeys(bases), search_with, first=error is not None)
     numbers = {"error": choice.error, "ms": choice.ms, "ms_late": choice.ms_late}
     cache.save(key, {"settings": choice.settings, **numbers})
     return choice
@@ -237,14 +237,16 @@ def _with_detail(splats: ChunkedSplats, quality: Quality, error: float) -> Quali
         return quality.with_(detail_error=0.0)
 
 
-def _best_of(bases: Iterable[Quality], search_with: Callable[[Quality], Choice]) -> Choice:
-    """The choice with the lowest error over base qualities of rising `detail_error`.
+def _best_of(
+    bases: Iterable[Quality], search_with: Callable[[Quality], Choice], first: bool = False
+) -> Choice:
+    """The choice with the lowest error over base qualities of rising `detail_error`, or the first one found.
 
     Bases that allow a larger error than the best choice has are not tried.
     """
     best, refused = None, None
     for base in bases:
-        if best is not None and best.error <= base.detail_error:
+        if best is not None and (first or best.error <= base.detail_error):
             break
         try:
             choice = search_with(base)

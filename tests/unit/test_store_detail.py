@@ -314,6 +314,18 @@ def test_an_error_bound_allows_levels_of_detail(store, renderer):
     assert np.array_equal(exact, reference_image(renderer, store.cloud(), capture))
 
 
+def test_an_error_that_levels_of_detail_exceed_is_kept_without_them(store, renderer):
+    """Measured errors hold for measured views; here they are wrong for all."""
+    copy = fs.Store(store.path)
+    copy.detail_errors = [measured(level, (4.0,), (1e-9,)) for level in range(1, copy.levels + 1)]
+    capture = fs.Capture(camera_at(1500.0), quality="lowpass=pixel")
+    quality = fs.quality_within(error=1e-3, scene=copy, capture=capture, device=renderer)
+    assert quality.detail_error == 0
+    frame = renderer.render(copy, capture, quality=quality)
+    exact = reference_image(renderer, store, capture.with_(quality=quality))
+    assert np.abs(frame["rgb"] - exact).max() <= 1e-3
+
+
 def test_a_time_bound_allows_levels_of_detail(store, renderer, monkeypatch, tmp_path):
     """Allowed errors rise until they exceed the best one found."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
