@@ -54,7 +54,6 @@ PARSED_ONLY = {
 """commands that are parsed but not run, with the reason"""
 PARSED_WORDS = {
     "--device": "a machine's own",
-    "--max-error": "tests/unit/test_quality_within.py",
     "--max-ms": "times the machine",
     "--plants-from": "made by an experiment",
     "--ray": "a cluster",
@@ -71,6 +70,11 @@ EXTRAS = {
     "viewer": ("viser",),
 }
 """modules of extras; they are hidden from lines whose page does not mention the extra"""
+
+
+SLOW = {"check", "demo", "experiment", "store measure", "bench", "tradeoff", "train"}
+SLOW |= {"--max-ms", "city/city.toml"}
+"""of both, what ends and runs on every machine: `pytest -m exhaustive tests/unit/test_docs.py` runs it"""
 
 
 def check_commands(text: str, run=lambda words, line: None) -> None:
@@ -194,6 +198,20 @@ def test_code_blocks_work_as_printed(page, tmp_path, monkeypatch):
         create_room()
     for example in BLOCKS.parse(page).examples():
         example.evaluate()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_slow_commands_work_as_printed(page, tmp_path, monkeypatch):
+    """The code blocks again, with the commands that the test above only parses (up to an hour for all pages).
+    Those that need a GPU, a cluster, or a download are left to their own tests."""
+    for parsed in (PARSED_ONLY, PARSED_WORDS):
+        for name in SLOW & set(parsed):
+            monkeypatch.delitem(parsed, name)
+    monkeypatch.setitem(PARSED_WORDS, "blender", "a download of 1 GB")
+    monkeypatch.setitem(PARSED_WORDS, "plants", "needs Blender")
+    monkeypatch.setitem(PARSED_WORDS, "shards", "made by eight processes")
+    test_code_blocks_work_as_printed(page, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
