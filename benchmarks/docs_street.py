@@ -1,6 +1,6 @@
 """Make docs/images/street.jpg: a street of `fidsplat store demo --markers 1000`.
 
-python benchmarks/docs_street.py [--splats 2e6]
+python benchmarks/docs_street.py [--splats 2000000]
 """
 
 import math
@@ -18,7 +18,7 @@ import fidsplat as fs
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--splats", default="2e6", help="of the city")
+    parser.add_argument("--splats", default="2000000", help="of the city")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         city = ["store", "demo", "--splats", arguments.splats, "--markers", "1000", "--views", "0", "--out"]

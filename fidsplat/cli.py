@@ -108,10 +108,7 @@ _SHORTAGES = {
 
 def _parse(words: list[str]):
     """The command object of the arguments. Raises InputError, or SystemExit after help or the version."""
-    import tyro
-
     from fidsplat import __version__
-    from fidsplat.commands.options import value_rules
     from fidsplat.util.errors import InputError, unknown
 
     if not words:
@@ -136,15 +133,17 @@ def _parse(words: list[str]):
             raise SystemExit(0)
         given = unknown("command", words[0], known) if words else f"no command; known: {', '.join(known)}"
         raise InputError(f"{given}; see {program} --help")
+    import tyro
+
+    from fidsplat.commands.declarations import rules
+
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed):
             config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
             # tyro joins lines that begin with a letter; a space before each line prevents it
             about = "\n".join(f" {line}" for line in about.splitlines())
-            return tyro.cli(
-                kind, prog=program, description=about, args=words, config=config, registry=value_rules
-            )
+            return tyro.cli(kind, prog=program, description=about, args=words, config=config, registry=rules)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from datetime import date
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +13,13 @@ from fidsplat.accuracy.error import REFERENCE_CUTOFF
 from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
-from fidsplat.capture.quality import LOWPASS, Quality
+from fidsplat.capture.quality import Quality
 from fidsplat.render.renderer import Renderer
 from fidsplat.store.chunked_splats import ChunkedSplats
-from fidsplat.store.detail_errors import DetailErrors, load_detail_errors, save_detail_errors
+from fidsplat.store.detail_errors import DetailErrors, DetailSettings, load_detail_errors, save_detail_errors
 from fidsplat.store.store import Store
 from fidsplat.streaming.level_of_detail import select
+from fidsplat.util.arguments import settings_with
 from fidsplat.util.errors import InputError
 
 SIZES = tuple(2.0 ** (k / 2) for k in range(-8, 3))
@@ -28,42 +30,36 @@ WIDTH, HEIGHT, FOV_X = 320, 180, math.radians(60.0)
 def measure_detail(
     store: Store,
     renderer: Renderer,
-    views: int = 60,
-    lowpass: Sequence[str] = ("pixel",),
-    seed: int = 0,
+    settings: DetailSettings | None = None,
     progress: Callable[[str, float], object] = lambda words, share: None,
+    **changes: Any,
 ) -> list[DetailErrors]:
     """Measure errors by cell size from random poses around and inside a store, for `Quality.detail_error`.
 
     The errors are saved in the store's folder.
 
     Args:
-        views: number of poses, each for one level in turn.
-        lowpass: values of `Quality.lowpass` to measure.
-        seed: seed of the poses.
+        settings: `DetailSettings`; None: the defaults. `changes` are settings by name: views, lowpass, seed.
         progress: called with the current step and its share done, 0 to 1.
 
     Raises:
         InputError: an instanced store, one without levels of detail or splats, or an invalid option.
     """
+    settings = settings_with(DetailSettings, settings, changes)
     if store.poses is not None:
         raise InputError(f"{store.path} is instanced; measure {store.header.store} instead")
     if not len(store) or not store.nodes["level"].any():
         raise InputError(f"{store.path} has no levels of detail; build it with them, from more splats")
-    if isinstance(views, bool) or not isinstance(views, int) or not 1 <= views <= 10_000:
-        raise InputError(f"views must be a whole number from 1 to 10,000, got {views!r}")
-    if unknown := set(lowpass) - set(LOWPASS):
-        raise InputError(f"lowpass must be among {', '.join(LOWPASS)}, got {min(unknown)!r}")
-    measured, levels = [], range(1, store.levels + 1)
-    for number, one in enumerate(lowpass):
+    measured, levels, views = [], range(1, store.levels + 1), settings.views
+    for number, one in enumerate(settings.lowpass):
         worst: dict[int, list[float | None]] = {level: [None] * len(SIZES) for level in levels}
-        for done, camera in enumerate(cameras_around(store, views, seed)):
+        for done, camera in enumerate(cameras_around(store, views, settings.seed)):
             level = levels[done % len(levels)]
             # a cut-off omits a larger share of small splats than of merged ones
             capture = Capture(camera, quality=Quality(lowpass=one, alpha_cutoff=REFERENCE_CUTOFF))
             found = errors_of(store, renderer, capture, SIZES, level)
             worst[level] = [_larger(*pair) for pair in zip(worst[level], found, strict=True)]
-            progress("measuring levels of detail", (number + (done + 1) / views) / len(lowpass))
+            progress("measuring levels of detail", (number + (done + 1) / views) / len(settings.lowpass))
         about = -(-views // len(levels)), renderer.device.title, date.today().isoformat()
         measured += [
             DetailErrors(one, level, SIZES, tuple(errors), *about) for level, errors in worst.items()

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from fidsplat.commands.options import Devices, check_plot, option, writable_file
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Devices, check_plot, writable_file
 from fidsplat.commands.output import console, json_text, print_lines, print_table, progress_bar
 from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
 from fidsplat.util import interrupts

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.options import Device, Json, option
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import console, delayed_progress, print_json, print_lines, print_table
 from fidsplat.util.errors import InputError, several
 from fidsplat.util.files import writable_folder

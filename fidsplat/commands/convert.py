@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, Overwrite, new_file, option, switch
+from fidsplat.commands.declarations import option, switch
+from fidsplat.commands.options import Device, Json, Overwrite, new_file
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.commands.scenes import framing_camera
 from fidsplat.util.errors import InputError

@@ -4,7 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from fidsplat.commands.options import Device, Json, check_range, option
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Device, Json, check_range
 from fidsplat.commands.output import (
     console,
     delayed_progress,

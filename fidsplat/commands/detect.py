@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.options import Json, option
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Json
 from fidsplat.commands.output import console, delayed_progress, print_json, print_table
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
+from fidsplat.commands.declarations import option
 from fidsplat.commands.experiment_data import (
     Baseline,
     Blender,
@@ -16,7 +17,7 @@ from fidsplat.commands.experiment_data import (
     write_report,
 )
 from fidsplat.commands.localise import Localise
-from fidsplat.commands.options import Json, RayAddress, option, repeatable, require_packages
+from fidsplat.commands.options import Json, RayAddress, repeatable, require_packages
 from fidsplat.commands.output import console, print_lines, report, show_progress
 from fidsplat.commands.sweeps import measure_on_cluster, run_sweeps
 from fidsplat.experiments.settings import (

@@ -8,16 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import (
     BlenderEnvironment,
     Device,
     Folders,
     Json,
     ReportTo,
-    option,
     repeatable,
     require_packages,
-    switch,
 )
 from fidsplat.commands.output import console, delayed_progress, report, show_progress
 from fidsplat.commands.sweeps import run_interleaved

@@ -9,16 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from fidsplat.commands.options import (
-    Json,
-    Overwrite,
-    RayAddress,
-    Workers,
-    check_workers,
-    option,
-    switch,
-    writable_file,
-)
+from fidsplat.commands.declarations import option, switch
+from fidsplat.commands.options import Json, Overwrite, RayAddress, Workers, check_workers, writable_file
 from fidsplat.commands.output import console, report, show_progress
 from fidsplat.commands.scenes import RenderInput
 from fidsplat.util.errors import InputError
@@ -90,7 +82,7 @@ class Fly(RenderInput):
         from fidsplat.images.video import check_video
         from fidsplat.render.flight import Flight, FlightFolder
 
-        budget = self.check()
+        self.check()
         check_workers(self.ray, self.workers)
         if self.out.endswith(".mcap"):
             self.log, self.out = self.log or self.out, self.out.removesuffix(".mcap")
@@ -105,8 +97,8 @@ class Fly(RenderInput):
         scene = self.load()
         path = path or _camera_motion(self.source, scene, self.smooth)
         times = path.sampled(self.rate).times if self.times is None else _parse_times(self.times)
-        flight = Flight(scene, path, times, scene.capture.with_(outputs=self.names, quality=self.quality))
-        with self._engine(flight, budget) as (title, render):
+        flight = Flight(scene, path, times, scene.capture.with_(outputs=self.outputs, quality=self.quality))
+        with self._engine(flight) as (title, render):
             log_is_complete = self._log_is_complete(flight.key(title))
             folder = FlightFolder(self.out, flight, title, self.overwrite, self.source)
             begun = time.perf_counter()
@@ -131,16 +123,14 @@ class Fly(RenderInput):
         return check_log(self.log, self.overwrite, source)
 
     @contextmanager
-    def _engine(
-        self, flight: Flight, budget: int | None
-    ) -> Iterator[tuple[str, Callable[[FlightFolder], Iterator[int]]]]:
+    def _engine(self, flight: Flight) -> Iterator[tuple[str, Callable[[FlightFolder], Iterator[int]]]]:
         """Title of the device or cluster, and a function that renders the missing frames of a folder."""
         from fidsplat.render.renderer import Renderer, default_device
 
         device = self.device or flight.scene.device or default_device()
         if self.ray is None:
             with console(self.json).status("opening the device"):
-                renderer = Renderer(device, budget)
+                renderer = Renderer(device, self.memory_budget)
             yield renderer.device.title, lambda folder: folder.render(renderer)
             return
         from fidsplat.remote.flights import FlightWork, render_flight
@@ -148,7 +138,7 @@ class Fly(RenderInput):
 
         with ExitStack() as stack:
             with console(self.json).status("starting workers"):
-                work = FlightWork(flight, device, budget)
+                work = FlightWork(flight, device, self.memory_budget)
                 engine = stack.enter_context(ray_engine(self.ray, work, self.workers))
             yield engine.title, lambda folder: render_flight(folder, engine, engine.workers)
 

@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from fidsplat.commands.options import Json, Overwrite, option
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Json, Overwrite
 from fidsplat.commands.output import report
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of, writable_folder

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.options import Json, option
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Json
 from fidsplat.commands.output import delayed_progress, report
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, option, require_packages, switch
+from fidsplat.commands.declarations import option, switch
+from fidsplat.commands.options import Device, Json, require_packages
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.experiments.localise import Drive
 

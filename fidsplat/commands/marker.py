@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.options import Json, Overwrite, new_file, option, switch
+from fidsplat.commands.declarations import option, switch
+from fidsplat.commands.options import Json, Overwrite, new_file
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.util.errors import InputError
 

@@ -2,58 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Union, get_args, get_origin
+from typing import Annotated
 
 import tyro
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from fidsplat.commands.declarations import option, switch
+from fidsplat.util.arguments import Bytes
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import ordinary_file, path_of, writable_folder
 
-_UNSET = "unset"
 repeatable = tyro.conf.configure(tyro.conf.UseAppendAction)
 """Decorator of a command whose options with several values are repeated, one value each time."""
-
-
-def option(metavar: str, text: str, short: str | None = None):
-    """tyro's description of an option. The text states a default that is computed; others are appended."""
-    aliases = [] if short is None else [short]
-    return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint=_default)
-
-
-def _default(value: str) -> str:
-    return "" if value in (_UNSET, "") else f"(default: {value})"
-
-
-def switch(text: str):
-    """tyro's description of an option without a value."""
-    return tyro.conf.arg(help=text, help_behavior_hint="")
-
-
-value_rules = ConstructorRegistry()
-"""tyro's rules for values, with one for optional values: help shows `INT (default: unset)` instead of
-`{None}|INT (default: None)`."""
-
-
-@value_rules.primitive_rule
-def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
-    if get_origin(info.type) not in (Union, UnionType) or len(kinds) != 1:
-        return None
-    inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
-    if not isinstance(inner, PrimitiveConstructorSpec):
-        return None
-    return replace(
-        inner,
-        is_instance=lambda value: value is None or inner.is_instance(value),
-        str_from_instance=lambda value: [_UNSET] if value is None else inner.str_from_instance(value),
-    )
 
 
 Device = Annotated[
@@ -68,7 +30,7 @@ Overwrite = Annotated[bool, switch("replace existing files")]
 """Commands whose output may be somebody's own or cost hours refuse to replace it without this option. Images,
 charts and tables replace earlier ones without asking."""
 MemoryBudget = Annotated[
-    str | None,
+    Bytes | None,
     option("SIZE", "device memory for an image and its splats, e.g. 2GiB (default: nine tenths of it)"),
 ]
 RayAddress = Annotated[
@@ -86,33 +48,12 @@ BlenderEnvironment = Annotated[
 ]
 
 
-def parse_outputs(text: str | None) -> tuple[str, ...] | None:
-    """Output names of a comma-separated list; None stays None."""
-    return None if text is None else tuple(name.strip() for name in text.split(","))
-
-
 def check_request(outputs: tuple[str, ...] | None, quality: str | None) -> None:
     """Raise InputError for outputs or a quality that no scene can have, before anything is opened."""
     import fidsplat as fs
     from fidsplat.effects import select
 
     select(fs.SplatCloud.empty(), fs.Capture(outputs=outputs or "rgb", quality=fs.Quality.of(quality)))
-
-
-_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
-
-
-def parse_bytes(option: str, text: str | None) -> int | None:
-    """A number of bytes, with or without a unit; None stays None. Raises InputError."""
-    if text is None:
-        return None
-    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)\s*", text.lower())
-    size = int(float(found[1]) * _UNITS.get(found[2], 0)) if found else 0
-    if size <= 0:
-        raise InputError(
-            f"{option} must be a number of bytes above 0, got {text!r}; write for example 500MB or 2GiB"
-        )
-    return size
 
 
 def check_range(option: str, value: float, low: float, high: float, unit: str = "") -> None:

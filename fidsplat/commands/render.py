@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, check_request, option
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Device, Json, check_request
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.commands.scenes import RenderInput, load_source
 from fidsplat.effects.catalogue import outputs_help
@@ -81,17 +82,17 @@ class Render(RenderInput):
         from fidsplat.accuracy.quality_within import check_bounds
         from fidsplat.render.output_files import save_output
 
-        memory = self.check()
+        self.check()
         bounded = self.max_error is not None or self.max_ms is not None
         if bounded:
             check_bounds(self.max_error, self.max_ms)
         name_of = _file_names(self.out, path_of(self.source))
         scene = self.load()
-        with _scene_key(self.source, "render.outputs", self.names is None):
+        with _scene_key(self.source, "render.outputs", self.outputs is None):
             check_request(scene.outputs, None)
         named = _scene_key(self.source, "render.device", self.device is None and scene.device is not None)
         with console(self.json).status("opening the device"), named:
-            renderer = fs.Renderer(self.device or scene.device, memory)
+            renderer = fs.Renderer(self.device or scene.device, self.memory_budget)
         choice = self._choose_quality(scene, renderer) if bounded else None
         begun = time.perf_counter()
         frame = self._render(renderer, scene, self.quality if choice is None else choice.quality)
@@ -137,10 +138,10 @@ class Render(RenderInput):
             with delayed_progress() as progress:
                 step = 1 if self.every is None else self.every
                 return renderer.render_every(
-                    step, scene, None, self.names, quality, lambda share: progress("rendering", share)
+                    step, scene, None, self.outputs, quality, lambda share: progress("rendering", share)
                 )
         with console(self.json).status("rendering"):
-            return renderer.render(scene, outputs=self.names, quality=quality)
+            return renderer.render(scene, outputs=self.outputs, quality=quality)
 
 
 Render.__doc__ = (Render.__doc__ or "").replace("    {outputs}", indent(outputs_help(), "    "))

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.options import MemoryBudget, check_request, option, parse_bytes, parse_outputs
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import MemoryBudget, check_request
 from fidsplat.commands.output import delayed_progress
+from fidsplat.util.arguments import Names
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,18 +40,9 @@ class SceneInput:
     """A scene, its outputs and its quality."""
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "scene to render")]
-    outputs: Annotated[
-        str | None,
-        option(
-            "A,B,...", "output images; `fidsplat render --help` lists them (default: the scene's, or rgb)"
-        ),
-    ] = None
+    outputs: Names | None = None
+    """output images; `fidsplat render --help` lists them (default: the scene's, or rgb)"""
     quality: SceneQuality = None
-
-    @property
-    def names(self) -> tuple[str, ...] | None:
-        """Names of --outputs."""
-        return parse_outputs(self.outputs)
 
     def load(self) -> Scene:
         """The scene, with a progress bar when loading takes long. Raises InputError."""
@@ -64,10 +57,9 @@ class RenderInput(SceneInput):
     device: SceneDevice = None
     memory_budget: MemoryBudget = None
 
-    def check(self) -> int | None:
-        """Raise InputError for values that no scene can have; returns the memory budget in bytes."""
-        check_request(self.names, self.quality)
-        return parse_bytes("--memory-budget", self.memory_budget)
+    def check(self) -> None:
+        """Raise InputError for outputs or a quality that no scene can have."""
+        check_request(self.outputs, self.quality)
 
 
 def load_source(source: str, quality: str | None, progress: Progress) -> Scene:

@@ -4,7 +4,7 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from fidsplat.commands.options import option
+from fidsplat.commands.declarations import option
 from fidsplat.commands.scenes import SceneInput
 from fidsplat.util.errors import InputError
 
@@ -45,7 +45,7 @@ class Source(SceneInput):
         from fidsplat.effects import select
 
         scene = self.load()
-        features = select(scene.splats, scene.capture.with_(outputs=self.names, quality=self.quality))
+        features = select(scene.splats, scene.capture.with_(outputs=self.outputs, quality=self.quality))
         if self.device is None:
             shape = cpu_shape() if self.schedule == "lanes" else gpu_shape()
             source = assemble(features, shape_for(features, shape))

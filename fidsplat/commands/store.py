@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from fidsplat.commands.options import Device, Json, Overwrite, check_range, option, parse_bytes, switch
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Device, Json, Overwrite
 from fidsplat.commands.output import console, delayed_progress, print_json, print_table, report
+from fidsplat.experiments.city_demo import CityDemoSettings
+from fidsplat.store.build_plan import BuildSettings
+from fidsplat.store.detail_errors import DetailSettings
 from fidsplat.util.errors import InputError, several
-from fidsplat.util.files import writable_folder
 
 if TYPE_CHECKING:
     import fidsplat as fs
@@ -36,41 +38,28 @@ class Build:
 
     inputs: Annotated[tyro.conf.Positional[list[str]], option("IN...", "splat files")]
     out: Out
-    chunk: Annotated[int, option("N", "maximum number of splats per chunk")] = 32768
-    memory: Annotated[str, option("SIZE", "approximate memory while building")] = "2GiB"
-    sh_degree: Annotated[
-        int | None, option("N", "highest SH degree to store (default: that of the files)")
-    ] = None
-    colors: Annotated[str, option("TYPE", "type of colours and SH: float32 or float16")] = "float32"
-    no_levels: Annotated[bool, switch("store no levels of detail; every image is then exact")] = False
+    settings: BuildSettings = field(default_factory=BuildSettings)
     overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.store.build import build_store
-        from fidsplat.store.store import Store
+        import fidsplat as fs
 
-        memory, begun = parse_bytes("--memory", self.memory), time.perf_counter()
-        assert memory is not None
+        begun = time.perf_counter()
         with delayed_progress() as progress:
-            folder = build_store(
-                self.inputs,
-                self.out,
-                chunk=self.chunk,
-                memory=memory,
-                levels=not self.no_levels,
-                sh_degree=self.sh_degree,
-                colors=self.colors,
-                overwrite=self.overwrite,
-                progress=progress,
+            store = fs.Store(
+                fs.build_store(
+                    self.inputs, self.out, self.settings, overwrite=self.overwrite, progress=progress
+                )
             )
-        seconds, store = time.perf_counter() - begun, Store(folder)
-        facts = {"store": str(folder), "splats": len(store), "chunks": store.chunks, "bytes": store.nbytes}
-        facts |= {"left_out": store.header.dropped, "seconds": seconds}
-        words = f"{_splats(store)}, {store.nbytes / 2**20:.1f} MiB, "
-        left = (f"dropped: {count:,}: {why}" for why, count in store.header.dropped.items())
+        seconds, facts = time.perf_counter() - begun, store.facts()
+        facts = {name: facts[name] for name in ("store", "splats", "chunks", "bytes", "left_out")}
+        words = f"{_splats(store)}, {store.nbytes / 2**20:.1f} MiB, in {seconds:.1f} s"
         rate = len(store) / seconds / 1e6
-        return report(self.json, facts, words + f"in {seconds:.1f} s ({rate:.2f} M/s): {folder}", *left)
+        dropped = (f"dropped: {count:,}: {why}" for why, count in store.header.dropped.items())
+        return report(
+            self.json, facts | {"seconds": seconds}, f"{words} ({rate:.2f} M/s): {store.path}", *dropped
+        )
 
 
 @dataclass
@@ -94,25 +83,23 @@ class Place:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.formats import load_trajectory
-        from fidsplat.store.instances import place_store
-        from fidsplat.store.store import Store
+        import fidsplat as fs
+        from fidsplat.store.instances import grid_poses
 
         if (self.grid is None) == (self.poses is None):
             raise InputError("give either --grid NX,NY,NZ or --poses FILE")
         if self.poses is not None:
-            poses = list(load_trajectory(self.poses).poses)
+            poses = list(fs.load_trajectory(self.poses).poses)
         else:
-            poses = _grid_poses(
-                _parse_triple("--grid", self.grid, int), _parse_triple("--pitch", self.pitch, float)
+            counts, pitch = (
+                _parse_triple("--grid", self.grid, int),
+                _parse_triple("--pitch", self.pitch, float),
             )
-        store = Store(place_store(self.source, self.out, poses, overwrite=self.overwrite))
+            poses = grid_poses(counts, pitch)
+        store = fs.Store(fs.place_store(self.source, self.out, poses, overwrite=self.overwrite))
         facts = {"store": str(store.path), "places": store.instances, "splats": len(store)}
-        return report(
-            self.json,
-            facts,
-            f"{several(len(store), 'splats')} at {several(store.instances, 'places')}: {store.path}",
-        )
+        words = f"{several(len(store), 'splats')} at {several(store.instances, 'places')}: {store.path}"
+        return report(self.json, facts, words)
 
 
 def _splats(store: fs.Store) -> str:
@@ -128,17 +115,6 @@ def _parse_triple(name: str, text: str | None, kind: type) -> list:
         what = "three whole numbers of at least 1" if kind is int else "three lengths in metres"
         raise InputError(f"{name} must be {what}, got {text!r}; write for example 10,1,2") from None
     return values
-
-
-def _grid_poses(counts: list[int], pitch: list[float]) -> list:
-    import numpy as np
-
-    if np.prod([float(count) for count in counts]) > 1e7:
-        raise InputError(f"--grid must be at most 10,000,000 instances, got {' x '.join(map(str, counts))}")
-    steps = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    poses = np.tile(np.eye(4), (len(steps), 1, 1))
-    poses[:, :3, 3] = steps * pitch
-    return list(poses)
 
 
 @dataclass
@@ -159,34 +135,10 @@ class StoreInfo:
 
 def report_store(path: str, as_json: bool) -> int:
     """Describe a store; returns the exit status 0. Raises InputError for another kind of folder."""
-    from fidsplat.store.store import Store
+    import fidsplat as fs
 
-    facts = _facts(Store(path))
+    facts = fs.Store(path).facts()
     return report(as_json, facts, table=(path, ("", ""), _rows(facts)))
-
-
-def _facts(store: fs.Store) -> dict[str, Any]:
-    import numpy as np
-
-    nodes = store.nodes
-    levels = [
-        {
-            "level": int(level),
-            "nodes": int(np.count_nonzero(nodes["level"] == level)) * store.instances,
-            "splats": int(nodes["count"][nodes["level"] == level].sum()) * store.instances,
-            "cell_m": float(np.median(nodes["size"][nodes["level"] == level])),
-        }
-        for level in np.unique(nodes["level"])
-    ]
-    header = store.header
-    facts = {"store": str(store.path), "splats": len(store), "kind": _KINDS[store.ellipsoids]}
-    facts |= {"sh_degree": max(store.sh_degree, 0), "chunks": store.chunks, "places": store.instances}
-    facts |= {"placed": header.store, "bytes": store.nbytes, "columns": dict(header.columns)}
-    facts |= {"sources": list(header.sources), "left_out": dict(header.dropped), "levels": levels}
-    return facts | {"bounds": list(store.bounds()) if len(store) else None}
-
-
-_KINDS = {"none": "2D", "all": "3D", "some": "2D and 3D"}
 
 
 def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
@@ -227,9 +179,7 @@ class Measure:
     """
 
     store: StorePath
-    views: Annotated[int, option("N", "number of viewpoints")] = 60
-    lowpass: Annotated[str, option("A,B,...", "low-pass filters: pixel, screen, none")] = "pixel"
-    seed: Annotated[int, option("N", "seed of the viewpoints")] = 0
+    settings: DetailSettings = field(default_factory=DetailSettings)
     device: Device = None
     json: Json = False
 
@@ -237,10 +187,8 @@ class Measure:
         import fidsplat as fs
         from fidsplat.accuracy.detail_errors import measure_detail
 
-        store, names = fs.Store(self.store), [name.strip() for name in self.lowpass.split(",")]
         with delayed_progress() as progress:
-            renderer = fs.Renderer(self.device)
-            made = measure_detail(store, renderer, self.views, names, self.seed, progress)
+            made = measure_detail(fs.Store(self.store), fs.Renderer(self.device), self.settings, progress)
         if self.json:
             print_json({"store": self.store, "details": [vars(one) for one in made]})
             return 0
@@ -268,55 +216,21 @@ class StoreDemo:
     """
 
     out: Annotated[str, option("DIR", "folder", "-o")] = "fidsplat-city"
-    splats: Annotated[float, option("N", "number of splats")] = 20e6
-    houses: Annotated[int, option("N", "houses along a side")] = 8
-    seed: Annotated[int, option("N", "seed of houses and splats")] = 0
-    markers: Annotated[int, option("N", "markers on the walls, 0 to 1,000")] = 0
-    views: Annotated[int, option("N", "viewpoints of the measurement, 0 for none")] = 24
+    city: CityDemoSettings = field(default_factory=CityDemoSettings)
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:
-        import fidsplat as fs
-        from fidsplat.accuracy.detail_errors import measure_detail
-        from fidsplat.accuracy.error import REFERENCE_CUTOFF
-        from fidsplat.worlds.city import City, flight
+        from fidsplat.experiments.city_demo import write_city
 
-        if not (math.isfinite(self.splats) and self.splats == int(self.splats)):
-            raise InputError(f"--splats must be a whole number, got {self.splats:g}")
-        check_range("--views", self.views, 0, 10_000)
-        check_range("--markers", self.markers, 0, 1000)
-        city, folder = City(int(self.splats), self.houses, self.seed), writable_folder(self.out)
         begun = time.perf_counter()
         with delayed_progress() as progress:
-            path = fs.build_store(
-                [city.source], folder / "city.fss", overwrite=self.overwrite, progress=progress
-            )
-            store = fs.Store(path)
-            if self.views and len(store.nodes) > store.chunks:
-                measure_detail(store, fs.Renderer(self.device), self.views, progress=progress)
-        camera, motion = flight(city)
-        error = DEMO_ERROR if store.detail_errors else 0.0
-        quality = fs.Quality(lowpass="pixel", alpha_cutoff=REFERENCE_CUTOFF, detail_error=error)
-        scene = folder / "city.toml"
-        poses = city.marker_poses(self.markers)
-        placed = [
-            fs.scenes.PlacedMarker(fs.marker(f"aruco:4x4_1000:{number}", size=0.8), pose)
-            for number, pose in enumerate(poses)
-        ]
-        whole = fs.Scene(
-            markers=placed, stores=(store,), camera=camera, camera_motion=motion, quality=quality
-        )
-        whole.save(scene)
+            store, scene = write_city(self.out, self.city, self.device, self.overwrite, progress)
         seconds = time.perf_counter() - begun
-        facts = {"store": str(path), "scene": str(scene), "splats": len(store), "seconds": seconds}
-        words = f"{_splats(store)}, in {seconds:.0f} s: {path}"
+        facts = {"store": str(store.path), "scene": str(scene), "splats": len(store), "seconds": seconds}
+        words = f"{_splats(store)}, in {seconds:.0f} s: {store.path}"
         return report(self.json, facts, words, f"fly through it: fidsplat fly {scene}")
-
-
-DEMO_ERROR = 1 / 255
-"""error of the demo's images, one step of 8 bits"""
 
 
 @dataclass
@@ -331,9 +245,9 @@ class Verify:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.store.store import Store
+        import fidsplat as fs
 
-        store = Store(self.store)
+        store = fs.Store(self.store)
         with delayed_progress() as progress:
             wrong = store.verify(progress)
         facts = {"store": self.store, "nodes": len(store.nodes), "damaged": wrong}

@@ -7,15 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from fidsplat.commands.options import (
-    Devices,
-    Folders,
-    Json,
-    ReportTo,
-    check_plot,
-    option,
-    require_packages,
-)
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Devices, Folders, Json, ReportTo, check_plot, require_packages
 from fidsplat.commands.output import report
 from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
 from fidsplat.commands.sweeps import point_label, run_sweeps

@@ -11,15 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.options import (
-    Device,
-    Json,
-    new_file,
-    option,
-    require_packages,
-    switch,
-    writable_file,
-)
+from fidsplat.commands.declarations import option, switch
+from fidsplat.commands.options import Device, Json, new_file, require_packages, writable_file
 from fidsplat.commands.output import console, delayed_progress, print_lines, progress_bar, report
 from fidsplat.train.settings import TrainSettings
 from fidsplat.util import interrupts

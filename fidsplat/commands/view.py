@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.options import MemoryBudget, option, parse_bytes
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import MemoryBudget
 from fidsplat.commands.output import console, delayed_progress, print_lines
 from fidsplat.commands.scenes import SceneDevice, SceneQuality, framing_camera, load_source
 from fidsplat.util import interrupts
@@ -70,7 +71,6 @@ class View:
         from fidsplat.formats import load_trajectory
         from fidsplat.viewer.server import Viewer, check_port
 
-        budget = parse_bytes("--memory-budget", self.memory_budget)
         if not 0 < self.rate <= 1000:
             raise InputError(f"--rate must be above 0 and at most 1000 frames per second, got {self.rate:g}")
         check_port(self.host, self.port)
@@ -86,7 +86,7 @@ class View:
                 scene,
                 file,
                 self.device,
-                budget,
+                self.memory_budget,
                 self.host,
                 self.port,
                 self.rate,

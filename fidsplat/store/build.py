@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 
 from fidsplat.formats.collect import Progress
-from fidsplat.store.build_plan import ON_PLANE, BuildPlan, plan_build
+from fidsplat.store.build_plan import ON_PLANE, BuildPlan, BuildSettings, plan_build
 from fidsplat.store.columns import ColumnFiles, node_record
-from fidsplat.store.layout import CHUNK, NODE, Header, npy_header, write_nodes
+from fidsplat.store.layout import NODE, Header, npy_header, write_nodes
 from fidsplat.store.merge import REDUCTION, merged
 from fidsplat.store.sources import Source, open_sources, splats_of
 from fidsplat.store.staging import clear, refuse_existing, staged, store_folder
 from fidsplat.util import interrupts
-from fidsplat.util.arguments import callback
+from fidsplat.util.arguments import callback, settings_with
 from fidsplat.util.errors import InputError, bytes_words
 from fidsplat.util.files import atomic_write, from_json, read_input
 
@@ -40,14 +40,11 @@ _MIN_ROOT = 64
 def build_store(
     inputs: Sequence[str | os.PathLike[str] | Source],
     out: str | os.PathLike[str],
+    settings: BuildSettings | None = None,
     *,
-    chunk: int = CHUNK,
-    memory: int = 2 * 2**30,
-    levels: bool = True,
-    sh_degree: int | None = None,
-    colors: str = "float32",
     overwrite: bool = False,
     progress: Progress | None = None,
+    **changes: Any,
 ) -> Path:
     """Build a store from splat files and return its folder. The same call resumes an interrupted build.
 
@@ -55,10 +52,8 @@ def build_store(
         inputs: PLY files of any size, which are read in parts; files of other formats, which are loaded; or
             `Source` objects.
         out: the store's folder; its name ends with .fss.
-        chunk: splats of a chunk. memory: approximate maximum bytes of memory.
-        levels: whether to build levels of detail.
-        sh_degree: highest degree of SH to store; None: that of the inputs.
-        colors: storage type of colours and SH, float32 or float16.
+        settings: `BuildSettings`; None: the defaults. `changes` are settings by name: chunk, memory, levels,
+            sh_degree, colors.
         overwrite: whether to replace an existing store when the new one is complete.
         progress: called with the current step and its share done, 0 to 1.
 
@@ -69,7 +64,8 @@ def build_store(
     progress = callback("progress", progress)
     folder = store_folder(out)
     refuse_existing(folder, overwrite)
-    plan = plan_build(open_sources(inputs), chunk, memory, levels, sh_degree, colors)
+    settings = settings_with(BuildSettings, settings, changes)
+    plan = plan_build(open_sources(inputs), settings)
     with staged(folder) as part:
         _Build(plan, part, progress or (lambda words, share: None)).run()
     return folder

@@ -14,7 +14,7 @@ from fidsplat.store.layout import CHUNK, MAX_SPLATS, NODE, row_bytes, shapes_of
 from fidsplat.store.merge import REDUCTION
 from fidsplat.store.morton import Grid, grid_around
 from fidsplat.store.sources import Source, degree_of, sample, spans
-from fidsplat.util.arguments import flag, whole_number
+from fidsplat.util.arguments import Bytes, flag, whole_number
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import printable
 
@@ -27,6 +27,34 @@ colours, 1,530 with SH of degree 3)"""
 ON_PLANE = np.uint64(1 << 63)
 """code of splats of coplanar groups: they are last, in their own chunks, which are part of every frame, since
 a group is sorted as one"""
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """Chunks and columns of a store. Raises InputError for an unusable value."""
+
+    chunk: int = CHUNK
+    """maximum number of splats per chunk"""
+    memory: Bytes = 2 * 2**30
+    """approximate memory while building"""
+    levels: bool = True
+    """whether to store levels of detail; without them every image is exact"""
+    sh_degree: int | None = None
+    """highest SH degree to store (default: that of the files)"""
+    colors: str = "float32"
+    """type of colours and SH: float32 or float16"""
+
+    def __post_init__(self) -> None:
+        chunk, memory = self.chunk, self.memory
+        if isinstance(chunk, bool) or not isinstance(chunk, int) or not 64 <= chunk <= 1 << 22:
+            raise InputError(f"chunk must be a whole number of splats from 64 to {1 << 22}, got {chunk!r}")
+        if isinstance(memory, bool) or not isinstance(memory, int) or memory < _MIN_MEMORY:
+            raise InputError(f"memory must be at least {_MIN_MEMORY >> 20} MiB, got {memory!r}")
+        flag("levels", self.levels)
+        if not isinstance(self.colors, str) or self.colors not in COLORS:
+            raise InputError(f"colors must be one of {', '.join(COLORS)}, got {self.colors!r}")
+        if self.sh_degree is not None:
+            whole_number("sh_degree", self.sh_degree, 0, 3)
 
 
 @dataclass(frozen=True)
@@ -98,29 +126,15 @@ class BuildPlan:
         return sha.hexdigest()
 
 
-def plan_build(
-    sources: Sequence[Source],
-    chunk: int = CHUNK,
-    memory: int = 2 * 2**30,
-    levels: bool = True,
-    sh_degree: int | None = None,
-    colors: str = "float32",
-) -> BuildPlan:
-    """Plan a build. Raises InputError for an invalid option."""
-    if isinstance(chunk, bool) or not isinstance(chunk, int) or not 64 <= chunk <= 1 << 22:
-        raise InputError(f"chunk must be a whole number of splats from 64 to {1 << 22}, got {chunk!r}")
-    if isinstance(memory, bool) or not isinstance(memory, int) or memory < _MIN_MEMORY:
-        raise InputError(f"memory must be at least {_MIN_MEMORY >> 20} MiB, got {memory!r}")
-    flag("levels", levels)
-    if not isinstance(colors, str) or colors not in COLORS:
-        raise InputError(f"colors must be one of {', '.join(COLORS)}, got {colors!r}")
-    if sh_degree is not None:
-        whole_number("sh_degree", sh_degree, 0, 3)
+def plan_build(sources: Sequence[Source], settings: BuildSettings | None = None) -> BuildPlan:
+    """Plan a build. Raises InputError for a chunk that the memory does not allow, or too many splats."""
+    settings = settings or BuildSettings()
+    chunk, memory, levels, sh_degree = settings.chunk, settings.memory, settings.levels, settings.sh_degree
     degree = max(map(degree_of, sources))
     if sh_degree is not None:
         degree = min(degree, sh_degree) or -1
     kinds = {"means": "<f4", "quats": "<f4", "scales": "<f4", "opacities": "<f4"}
-    kinds["colors" if degree < 0 else "sh"] = "<f4" if colors == "float32" else "<f2"
+    kinds["colors" if degree < 0 else "sh"] = "<f4" if settings.colors == "float32" else "<f2"
     given = [source.rows for source in sources]
     if any(rows.thick for rows in given):
         kinds["thickness"] = "<f4"

@@ -8,7 +8,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from fidsplat.capture.quality import LOWPASS
 from fidsplat.store.layout import header_crc
+from fidsplat.util.arguments import Names
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, read_input
 
@@ -16,6 +18,24 @@ FILE = "detail.json"
 MARGIN = 3.0
 """factor between the requested error and the largest measured one: other views have larger errors than the
 measured views, and a few still exceed the requested error"""
+
+
+@dataclass(frozen=True)
+class DetailSettings:
+    """Views of a measurement of levels of detail. Raises InputError for an unusable value."""
+
+    views: int = 60
+    """number of viewpoints, each for one level in turn"""
+    lowpass: Names = ("pixel",)
+    """low-pass filters: pixel, screen, none"""
+    seed: int = 0
+    """seed of the viewpoints"""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.views, bool) or not isinstance(self.views, int) or not 1 <= self.views <= 10_000:
+            raise InputError(f"views must be a whole number from 1 to 10,000, got {self.views!r}")
+        if unknown := set(self.lowpass) - set(LOWPASS):
+            raise InputError(f"lowpass must be among {', '.join(LOWPASS)}, got {min(unknown)!r}")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import zlib
 from collections.abc import Sequence
@@ -17,6 +18,20 @@ from fidsplat.store.store import Store
 from fidsplat.util.arguments import real_array
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
+
+
+def grid_poses(counts: Sequence[int], pitch: Sequence[float]) -> list[np.ndarray]:
+    """Poses (4, 4) on a grid along the world's axes; the first is the identity.
+
+    Args:
+        counts: instances along x, y, z, each at least 1. pitch: metres between them.
+    """
+    if math.prod(counts) > 10_000_000:
+        raise InputError(f"a grid must have at most 10,000,000 instances, got {' x '.join(map(str, counts))}")
+    steps = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
+    poses = np.tile(np.eye(4), (len(steps), 1, 1))
+    poses[:, :3, 3] = steps * np.asarray(pitch)
+    return list(poses)
 
 
 def place_store(

@@ -7,6 +7,7 @@ import zlib
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -102,6 +103,21 @@ class Store(Summarised):
         if len(self):
             rows["bounds"] = " to ".join(map(point, self.bounds())) + " m"
         return rows | {f"dropped: {why}": f"{n:,}" for why, n in self.header.dropped.items()}
+
+    def facts(self) -> dict[str, Any]:
+        """Its content as JSON values: splats, chunks, levels of detail, bytes, bounds."""
+        header, nodes = self.header, self.nodes
+        kinds = {"none": "2D", "all": "3D", "some": "2D and 3D"}
+        facts = {"store": str(self.path), "splats": len(self), "kind": kinds[self.ellipsoids]}
+        facts |= {"sh_degree": max(self.sh_degree, 0), "chunks": self.chunks, "places": self.instances}
+        facts |= {"placed": header.store, "bytes": self.nbytes, "columns": dict(header.columns)}
+        facts |= {"sources": list(header.sources), "left_out": dict(header.dropped), "levels": []}
+        for level in np.unique(nodes["level"]).tolist():
+            own = nodes[nodes["level"] == level]
+            count = {"nodes": len(own), "splats": int(own["count"].sum())}
+            row = {name: number * self.instances for name, number in count.items()}
+            facts["levels"].append({"level": level, **row, "cell_m": float(np.median(own["size"]))})
+        return facts | {"bounds": list(self.bounds()) if len(self) else None}
 
     # traits, like those of a cloud
 

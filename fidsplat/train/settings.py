@@ -8,8 +8,8 @@ from typing import Any
 
 from fidsplat.capture.quality import Quality
 from fidsplat.splats.harmonics import MAX_DEGREE
-from fidsplat.util.arguments import as_float, instance, whole_number
-from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.arguments import as_float, whole_number
+from fidsplat.util.errors import InputError
 
 STRATEGIES = ("default", "mcmc")
 MAX_ITERATIONS = 10_000_000
@@ -67,9 +67,11 @@ class TrainSettings:
     """weight of the mean depth distortion after `distortion_from` iterations; the authors use 100 to 1000 for
     bounded scenes"""
     distortion_from: int = 3000
+    """iteration after which `distortion_weight` applies"""
     normal_weight: float = 0.05
     """weight of normal consistency (`fidsplat.train.losses.normal_loss`) after `normal_from` iterations"""
     normal_from: int = 7000
+    """iteration after which `normal_weight` applies"""
 
     position_rate: float = 1.6e-4
     """initial learning rate of the means, in units of the scene extent"""
@@ -80,10 +82,15 @@ class TrainSettings:
     color_rate: float = 2.5e-3
     """learning rate of SH coefficients of degree 0; higher ones have a twentieth"""
     opacity_rate: float = 0.05
+    """learning rate of the opacities' logits"""
     scale_rate: float = 0.005
+    """learning rate of the scales' logarithms"""
     rotation_rate: float = 0.001
+    """learning rate of the quaternions"""
     beta1: float = 0.9
+    """decay of Adam's first moments"""
     beta2: float = 0.999
+    """decay of Adam's second moments"""
     epsilon: float = 1e-15
     """epsilon of Adam"""
     sparse_adam: bool = False
@@ -93,7 +100,9 @@ class TrainSettings:
     densify_from: int = 500
     """first iteration of densification"""
     densify_until: int = 15_000
+    """last iteration of densification"""
     densify_every: int = 100
+    """iterations between densifications"""
     gradient_threshold: float = 2e-4
     """mean screen gradient, in half images, above which a splat is cloned or split"""
     dense_share: float = 0.01
@@ -105,7 +114,9 @@ class TrainSettings:
     reset_every: int = 3000
     """iterations between opacity resets, which limit opacities to `reset_opacity`"""
     reset_opacity: float = 0.01
+    """maximum opacity after a reset"""
     initial_opacity: float = 0.1
+    """opacity of the first splats; for mcmc it is `mcmc_opacity`"""
 
     relocate_until: int = 25_000
     """mcmc: last iteration of relocation and growth, which start at `densify_from`"""
@@ -201,13 +212,3 @@ class TrainSettings:
 def _put(settings: TrainSettings, name: str, value: Any) -> None:
     """Set a field of frozen settings during their creation."""
     object.__setattr__(settings, name, value)
-
-
-def settings_with(settings: TrainSettings | None, changes: dict[str, Any]) -> TrainSettings:
-    """Settings (None: the defaults) with changes. Raises InputError for an unknown setting."""
-    if settings is not None:
-        instance("settings", settings, TrainSettings)
-    for name in changes:
-        if name not in TrainSettings.__dataclass_fields__:
-            raise InputError(unknown("training setting", name, TrainSettings.__dataclass_fields__))
-    return TrainSettings(**{**({} if settings is None else vars(settings)), **changes})

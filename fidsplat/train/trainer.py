@@ -34,9 +34,9 @@ from fidsplat.train.optimiser import learning_rates
 from fidsplat.train.parameters import Splats, TrainingError, initial_splats, splats_from_cloud
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.scores import ViewScore, score_view
-from fidsplat.train.settings import TrainSettings, settings_with
+from fidsplat.train.settings import TrainSettings
 from fidsplat.util import interrupts
-from fidsplat.util.arguments import callback, instance, invalid, items
+from fidsplat.util.arguments import callback, instance, invalid, items, settings_with
 from fidsplat.util.errors import DeviceError, InputError
 from fidsplat.util.files import ordinary_file, writable_folder
 
@@ -99,7 +99,7 @@ class Trainer:
             raise invalid("renderer", "an fs.Renderer or None", renderer)
         if start is not None:
             instance("start", start, SplatCloud, "an fs.SplatCloud or None")
-        self.settings = settings_with(settings, changes)
+        self.settings = settings_with(TrainSettings, settings, changes)
         self.renderer = Renderer() if renderer is None else renderer
         self.checkpoint = None if checkpoint is None else _writable(checkpoint)
         backend = self.renderer.backend

@@ -6,15 +6,19 @@ Every check raises InputError with a message `<what> must be <requirement>, got 
 import math
 import operator
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import fields, replace
 from numbers import Real
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, unknown
 
 T = TypeVar("T")
+Bytes = Annotated[int, "bytes"]
+"""a number of bytes; the command line accepts units"""
+Names = Annotated[tuple[str, ...], "separated by commas"]
+"""names, which the command line separates by commas"""
 LARGEST = 1e15
 """largest length [m] or colour; products of larger numbers would overflow in single precision"""
 _LONGEST = 200
@@ -106,6 +110,17 @@ def items(what: str, value: Any, kind: type[T], requirement: str) -> tuple[T, ..
     if found is None or not all(isinstance(item, kind) for item in found):
         raise invalid(what, requirement, value)
     return found
+
+
+def settings_with(kind: type[T], settings: T | None, changes: dict[str, Any]) -> T:
+    """A settings dataclass (None: its defaults) with changed fields; an unknown field is an error."""
+    if settings is not None:
+        instance("settings", settings, kind)
+    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    for name in changes:
+        if name not in known:
+            raise InputError(unknown("setting", name, known))
+    return replace(kind() if settings is None else settings, **changes)  # type: ignore[type-var]
 
 
 class PickledByFields:

@@ -35,10 +35,12 @@ class City:
     """Houses on a square grid; equal settings make equal cities on every machine. Raises InputError for
     numbers out of range."""
 
-    splats: int
+    splats: int = 20_000_000
+    """number of splats"""
     houses: int = 8
     """number of houses along a side"""
     seed: int = 0
+    """seed of houses and splats"""
 
     def __post_init__(self) -> None:
         for name, highest in (("splats", MAX_SPLATS), ("houses", 100), ("seed", 2**32 - 1)):

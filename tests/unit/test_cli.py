@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import is_dataclass
+from typing import Annotated, get_args, get_origin
 
 import cv2
 import numpy as np
@@ -13,10 +15,11 @@ import pytest
 from command_line import fails, prints_json
 from ideal_image import draw, photographed, pose, qr_bits, turned
 from rich.console import Console
+from tyro.constructors import MISSING_NONPROP, StructTypeInfo
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.commands import COMMANDS
+from fidsplat.commands import COMMANDS, declarations
 from fidsplat.commands.output import delayed_progress
 from fidsplat.images.files import read_image, write_png
 from fidsplat.images.tag_dictionaries import dictionary_bits
@@ -48,6 +51,34 @@ def test_help_teaches_with_examples(words, capsys):
         for name, kind in COMMANDS.items():
             first = kind.__doc__.split(".")[0].split("\n")[0]
             assert f" {name} {' '.join(first.split()[:4])}" in listed, name
+
+
+def commands_within(name, kind):
+    """A command and the commands of its group, by their words."""
+    if hasattr(kind, "run"):
+        yield name, kind
+    for part, inner in getattr(kind, "PARTS", {}).items():
+        yield from commands_within(f"{name} {part}", inner)
+
+
+def options_of(kind):
+    """Names and help of the options of a command, also of the settings that it nests."""
+    spec = declarations.describe_fields(StructTypeInfo.make(kind, MISSING_NONPROP, in_union_context=False))
+    for field in spec.fields:
+        base, *marks = get_args(field.type) if get_origin(field.type) is Annotated else (field.type,)
+        if is_dataclass(base):
+            yield from options_of(base)
+        else:
+            yield field.name, next(mark.help for mark in marks if hasattr(mark, "help_behavior_hint"))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_has_help_and_one_declaration(name):
+    for words, kind in commands_within(name, COMMANDS[name]):
+        names, texts = zip(*options_of(kind), strict=True)
+        assert len(set(names)) == len(names), words
+        missing = [option for option, text in zip(names, texts, strict=True) if not text]
+        assert not missing, f"{words}: no help for {', '.join(missing)}"
 
 
 def test_help_loads_nothing_heavy():

@@ -322,9 +322,8 @@ def test_a_scene_that_stands_still_needs_a_trajectory(here, capsys):
 
 
 def test_sizes_in_bytes():
-    from fidsplat.commands.options import parse_bytes
+    from fidsplat.commands.declarations import parse_bytes
 
-    assert parse_bytes("--x", None) is None
     sizes = {"1": 1, "2GiB": 2 * 2**30, "1.5 MB": 1_500_000, "3kb": 3000, "7 MiB": 7 * 2**20}
     assert {text: parse_bytes("--x", text) for text in sizes} == sizes
     for text in ("", "0", "-1", "2 GBit", "1e9", "GiB"):

@@ -1,0 +1,182 @@
+"""Options from dataclasses: rules for tyro, which parses the command line.
+
+The fields of a command and of the settings that it nests are its options. The docstring of a field is the
+help of its option, `option` adds a placeholder or a short form, and `-o` is short for a field `out`.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import re
+import textwrap
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+import tyro
+from tyro.constructors import (
+    MISSING,
+    MISSING_NONPROP,
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from fidsplat.util.arguments import Bytes, Names
+from fidsplat.util.errors import InputError
+
+rules = ConstructorRegistry()
+"""tyro's rules, with those of this module"""
+_UNSET = "unset"
+_PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "DIR"}
+"""placeholders of values in help, by type; settings have no paths but folders"""
+_Description = type(tyro.conf.arg())
+
+
+def option(metavar: str, text: str | None = None, short: str | None = None):
+    """tyro's description of an option: placeholder, help (else the field's docstring) and short form.
+
+    The help states a default that is computed; other defaults are appended.
+    """
+    aliases = [] if short is None else [short]
+    return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint=_shown_default)
+
+
+def switch(text: str | None):
+    """tyro's description of an option without a value."""
+    return tyro.conf.arg(help=text, help_behavior_hint="")
+
+
+def _shown_default(value: str) -> str:
+    return "" if value in (_UNSET, "") else f"(default: {value})"
+
+
+@rules.primitive_rule
+def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """An optional value: help shows neither `{None}` nor a default of None."""
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if get_origin(info.type) not in (Union, UnionType) or len(kinds) != 1:
+        return None
+    inner = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], info.markers))
+    if not isinstance(inner, PrimitiveConstructorSpec):
+        return None
+    return dataclasses.replace(
+        inner,
+        is_instance=lambda value: value is None or inner.is_instance(value),
+        str_from_instance=lambda value: [_UNSET] if value is None else inner.str_from_instance(value),
+    )
+
+
+_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+
+
+def parse_bytes(option: str, text: str) -> int:
+    """A number of bytes, with or without a unit. Raises InputError."""
+    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)\s*", text.lower())
+    size = int(float(found[1]) * _UNITS.get(found[2], 0)) if found else 0
+    if size <= 0:
+        raise InputError(
+            f"{option} must be a number of bytes above 0, got {text!r}; write for example 500MB or 2GiB"
+        )
+    return size
+
+
+def _spec(metavar: str, parse: Callable[[str], Any], shown: Callable[[Any], str]) -> PrimitiveConstructorSpec:
+    """A value that is one word on the command line."""
+    return PrimitiveConstructorSpec(
+        1,
+        metavar,
+        lambda words: parse(words[0]),
+        lambda value: True,
+        lambda value: [_UNSET if value is None else shown(value)],
+    )
+
+
+def _shown_bytes(size: int) -> str:
+    unit = next((unit for unit in ("GiB", "MiB", "KiB") if size % _UNITS[unit.lower()] == 0), "B")
+    return f"{size // _UNITS[unit.lower()]}{unit}"
+
+
+def _parse_names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(","))
+
+
+@rules.struct_rule
+def describe_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """tyro's description of a dataclass; the docstrings of fields without `option` are their help."""
+    if not dataclasses.is_dataclass(info.type):
+        return None
+    hints, texts = get_type_hints(info.type, include_extras=True), _field_docstrings(info.type)
+    repeated = tyro.conf.UseAppendAction in info.markers
+    options = []
+    for field in dataclasses.fields(info.type):
+        kind = _described(field.name, hints[field.name], texts.get(field.name), repeated)
+        options.append(StructFieldSpec(field.name, kind, _default_of(field, info.default)))
+    return StructConstructorSpec(info.type, tuple(options))
+
+
+def _described(name: str, kind: Any, text: str | None, repeated: bool) -> Any:
+    """The type of a field, with tyro's description of its option."""
+    base, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+    given = next((mark for mark in marks if isinstance(mark, _Description)), None)
+    kinds = (kind, base, *get_args(base))
+    if Bytes in kinds:
+        parse = partial(parse_bytes, "--" + name.replace("_", "-"))
+        kind = Annotated[base, _spec("SIZE", parse, _shown_bytes), *marks]
+    elif Names in kinds:
+        kind = Annotated[base, _spec("A,B,...", _parse_names, ",".join), *marks]
+    if dataclasses.is_dataclass(base) or (given is not None and given.help):
+        return kind
+    if base is bool:
+        return Annotated[kind, switch(text)]
+    metavar = given.metavar if given is not None and given.metavar else _placeholder(kind, repeated)
+    return Annotated[kind, option(metavar, text, "-o" if name == "out" else None)]
+
+
+def _placeholder(kind: Any, repeated: bool) -> str:
+    """The placeholder of a type's values."""
+    if get_origin(kind) is Annotated:
+        spec = next((mark for mark in get_args(kind) if isinstance(mark, PrimitiveConstructorSpec)), None)
+        return spec.metavar if spec else _placeholder(get_args(kind)[0], repeated)
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(each for each in get_args(kind) if each is not NoneType)
+    if get_origin(kind) is tuple:
+        return _placeholder(get_args(kind)[0], repeated) + ("" if repeated else "...")
+    return _PLACEHOLDERS.get(kind, "TEXT")
+
+
+def _default_of(field: dataclasses.Field, parent: Any) -> Any:
+    """The default of a field, from an instance of its class if there is one."""
+    if parent is MISSING:
+        return MISSING
+    if parent is not MISSING_NONPROP and parent is not None:
+        return getattr(parent, field.name)
+    if field.default is not dataclasses.MISSING:
+        return field.default
+    return MISSING_NONPROP if field.default_factory is dataclasses.MISSING else field.default_factory()
+
+
+@cache
+def _field_docstrings(kind: type) -> dict[str, str]:
+    """Docstrings of a dataclass's fields, also inherited ones, as help: without a capital and a full stop."""
+    found: dict[str, str] = {}
+    for each in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(each):
+            continue
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, text in zip(definition.body, definition.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+                found.pop(field.target.id, None)
+                if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                    words = " ".join(str(text.value.value).split()).removesuffix(".")
+                    lower = words[1:2].islower() or words[1:2] == " "
+                    found[field.target.id] = words[0].lower() + words[1:] if lower else words
+    return found
