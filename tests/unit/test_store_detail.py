@@ -374,4 +374,4 @@ def test_markers_on_the_walls_of_a_city_are_read(tmp_path, renderer, capsys):
         assert reading.detection is not None, number
         assert reading.position_error < 0.01
     assert main([*words, "--markers", "1001"]) == 2
-    assert "--markers must be 0 to 1,000, got 1001" in capsys.readouterr().err
+    assert "--markers must be a whole number from 0 to 1000, got 1001" in capsys.readouterr().err
