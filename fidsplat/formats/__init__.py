@@ -1,5 +1,5 @@
-"""Files of splats (PLY, .splat, SPZ, glTF, OpenUSD, SOG) and of trajectories (TUM, KITTI, COLMAP,
-transforms.json)."""
+"""Reading and writing of splat files (PLY, .splat, SPZ, glTF, OpenUSD, SOG) and trajectories (TUM, KITTI,
+COLMAP, transforms.json)."""
 
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.files import load_splats, losses, save_splats

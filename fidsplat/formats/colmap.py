@@ -1,7 +1,6 @@
-"""Models in COLMAP's format: cameras, images and points3D, as text and binary, for trainers of splats.
+"""Writing of COLMAP models, text and binary: cameras, images and points3D.
 
-Layout of the files: COLMAP's documentation, "Output format". Poses are world to camera with OpenCV's axes,
-as ours are.
+Format: COLMAP's documentation, "Output format". Poses are world to camera with OpenCV's axes, as in fidsplat.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, writable_folder
 
-_PINHOLE = 1  # number of the camera model with fx, fy, cx, cy
+_PINHOLE = 1  # id of the camera model PINHOLE: fx, fy, cx, cy
 _HEADS = {
     "cameras": "# Camera list with one line of data per camera:\n"
     "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n",
@@ -35,20 +34,20 @@ def save_colmap(
     points: np.ndarray,
     colors: np.ndarray,
 ) -> list[Path]:
-    """Write a model, cameras, images and points3D, each as .txt and .bin.
+    """Write a COLMAP model: cameras, images and points3D, each as .txt and .bin.
 
     Args:
-        folder: made when it is missing.
+        folder: created if missing.
         names: n file names of the images, without line breaks or blanks.
         cameras: n cameras. Equal intrinsics become one COLMAP camera (model PINHOLE).
-        points: (m, 3) float64 metres; they have no tracks.
+        points: (m, 3) float64 metres; written without tracks.
         colors: (m, 3) uint8.
 
-    Raises InputError when the folder cannot be written or a name cannot be used.
+    Raises InputError for a folder that cannot be written or an invalid name.
     """
     for name in names:
         if not name or name.split() != [name]:
-            raise InputError(f"{name!r} cannot name an image of a COLMAP model; use a name without blanks")
+            raise InputError(f"the name of a COLMAP image must have no blanks, got {name!r}; rename it")
     if len(names) != len(cameras) or len(points) != len(colors):
         raise InputError(
             f"a COLMAP model needs as many names as cameras and colours as points, not {len(names)}, "

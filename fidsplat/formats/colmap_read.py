@@ -1,4 +1,4 @@
-"""Reading models in COLMAP's format, text or binary (COLMAP's documentation, "Output format")."""
+"""Reading of COLMAP models, text or binary (COLMAP's documentation, "Output format")."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MODELS = {
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
-"""camera models by their numbers: name, parameters"""
+"""name and number of parameters of COLMAP's camera models by id"""
 _LENSES: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": (BrownConrady, ()),
     "PINHOLE": (BrownConrady, ()),
@@ -40,40 +40,39 @@ _LENSES: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
     "SIMPLE_RADIAL_FISHEYE": (Fisheye, ("k1",)),
     "RADIAL_FISHEYE": (Fisheye, ("k1", "k2")),
 }
-"""those that we have, with the last of their parameters; before them stand f or fx and fy, cx and cy"""
+"""supported camera models: lens and its parameters, which follow f or fx, fy, and cx, cy"""
 
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """What a model says of a scene."""
+    """Images, cameras and points of a COLMAP model."""
 
     names: tuple[str, ...]
-    """of the images, as paths below the folder of images, in their alphabetical order"""
+    """names of the images, paths below the image folder, sorted"""
     cameras: tuple[Camera, ...]
-    """of each image"""
+    """camera of each image"""
     points: np.ndarray
-    """(m, 3) float64, metres (or whatever unit the model has)"""
+    """(m, 3) float64 in the unit of the model"""
     colors: np.ndarray
     """(m, 3) uint8"""
 
 
 def load_colmap(folder: Path) -> ColmapModel:
-    """Read cameras, images and points3D from a folder, binary where both are there; without points3D there
-    are no points.
+    """Read cameras, images and optionally points3D from a folder; binary files are preferred.
 
-    Raises InputError when a file is missing or damaged, or a camera has a lens that we lack.
+    Raises InputError for a missing or damaged file, or an unsupported camera model.
     """
     lenses = dict(_read(folder, "cameras", _binary_cameras, _text_cameras))
     views = sorted(_read(folder, "images", _binary_images, _text_images), key=lambda view: view[0])
     found = list(_read(folder, "points3D", _binary_points, _text_points, needed=False))
     if not views:
-        raise InputError(f"the COLMAP model in {folder} has no images; give one with views")
+        raise InputError(f"the COLMAP model in {folder} must have images, got none")
     cameras = []
     for name, number, pose in views:
         if number not in lenses:
-            raise InputError(f"{folder}: image {name} has camera {number}, which cameras does not have")
+            raise InputError(f"{folder}: the camera of image {name} must be in cameras, got {number}")
         matrix = np.eye(4)
-        with np.errstate(invalid="ignore"):  # of 0 none is made, and the camera says so
+        with np.errstate(invalid="ignore"):  # a quaternion of 0 becomes NaN, which Camera rejects
             matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
         try:
             cameras.append(_camera(lenses[number], matrix))
@@ -89,22 +88,21 @@ def load_colmap(folder: Path) -> ColmapModel:
 
 
 def byte_colors(name: str, values: np.ndarray) -> np.ndarray:
-    """Colors of points as uint8. Raises InputError for numbers that are not from 0 to 255."""
+    """Convert colours of points to uint8. Raises InputError for numbers outside 0 to 255."""
     if not ((values >= 0) & (values <= 255)).all():
         raise InputError(f"{name} must have colors from 0 to 255; check the file")
     return values.astype(np.uint8)
 
 
 def image_poses(file: Path) -> list[tuple[str, tuple[float, ...]]]:
-    """Names of the images in a file images.bin or images.txt, in their alphabetical order, with the poses
-    world to camera: quaternion w, x, y, z and translation, as they stand there. Raises InputError for a
-    damaged file."""
+    """Read images.bin or images.txt: sorted names, and poses world to camera (quaternion w, x, y, z and
+    translation) as stored. Raises InputError for a damaged file."""
     views = _read_file(file, _binary_images, _text_images)
     return sorted((name, pose) for name, _, pose in views)
 
 
 def has_colmap(folder: Path) -> bool:
-    """Whether a model lies in the folder."""
+    """Whether a folder has a COLMAP model."""
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
@@ -114,7 +112,7 @@ def _read(folder: Path, name: str, binary, text, needed: bool = True) -> list:
             return _read_file(folder / f"{name}{suffix}", binary, text)
     if not needed:
         return []
-    raise InputError(f"{folder} has neither {name}.bin nor {name}.txt; it is no COLMAP model")
+    raise InputError(f"a COLMAP model must have {name}.bin or {name}.txt, got neither in {folder}")
 
 
 def _read_file(file: Path, binary, text) -> list:
@@ -126,60 +124,60 @@ def _read_file(file: Path, binary, text) -> list:
     except InputError:
         raise
     except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise InputError(f"{file} is damaged, or not COLMAP's: {error}; export the model again") from error
+        raise InputError(f"cannot read {file} as COLMAP's: {error}; export the model again") from error
 
 
 class _Bytes:
-    """A binary file, read from its beginning on."""
+    """Sequential reader of a binary file."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._place = data, 0
 
     def take(self, form: str) -> tuple:
-        """The next numbers."""
+        """Read the next numbers. form: a format of `struct`."""
         values = struct.unpack_from("<" + form, self._data, self._place)
         self._place += struct.calcsize("<" + form)
         return values
 
     def count(self) -> int:
-        """The next number of things, of which each takes a byte at least."""
+        """Read a number of items; it is limited by the size of the file."""
         (count,) = self.take("Q")
         if count > len(self._data):
-            raise ValueError(f"it says that it holds {count} things")
+            raise ValueError(f"it declares {count} items")
         return count
 
     def word(self) -> str:
-        """The next text, which a zero ends."""
+        """Read a zero-terminated text."""
         end = self._data.index(b"\0", self._place)
         text = self._data[self._place : end].decode()
         self._place = end + 1
         return text
 
     def skip(self, size: int) -> None:
-        """Leaves out so many bytes."""
+        """Skip some bytes."""
         if self._place + size > len(self._data):
-            raise ValueError("it ends too early")
+            raise ValueError("it is truncated")
         self._place += size
 
 
-_Taken = tuple[str, int, int, tuple[float, ...]]
+_Intrinsics = tuple[str, int, int, tuple[float, ...]]
 _View = tuple[str, int, tuple[float, ...]]
 
 
-def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Taken]]:
+def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Intrinsics]]:
     for _ in range(data.count()):
         number, model, width, height = data.take("iiQQ")
         if model not in _MODELS:
-            raise ValueError(f"camera {number} has a model that is not known, {model}")
+            raise ValueError(f"the model of camera {number} must be 0 to 11, got {model}")
         name, parameters = _MODELS[model]
         yield number, (name, width, height, data.take(f"{parameters}d"))
 
 
-def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Taken]]:
+def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Intrinsics]]:
     for line in filter(None, lines):
         number, model, width, height, *parameters = line.split()
         if len(parameters) != dict(_MODELS.values()).get(model, len(parameters)):
-            raise ValueError(f"camera {number} is {model} with {len(parameters)} parameters")
+            raise ValueError(f"camera {number} of model {model} must not have {len(parameters)} parameters")
         yield int(number), (model, int(width), int(height), tuple(map(float, parameters)))
 
 
@@ -187,24 +185,24 @@ def _binary_images(data: _Bytes) -> Iterator[_View]:
     for _ in range(data.count()):
         _, *pose, camera = data.take("i7di")
         name = data.word()
-        data.skip(24 * data.count())  # points that were found in the picture
+        data.skip(24 * data.count())  # keypoints
         yield name, camera, tuple(pose)
 
 
 def _text_images(lines: list[str]) -> Iterator[_View]:
-    # every second line has the points that were found in the picture, and may be empty
+    # every second line has the keypoints and may be empty
     for line in lines[::2]:
         if line:
             words = line.split(maxsplit=9)
             if len(words) < 10:
-                raise ValueError(f"the line {line!r} has {len(words)} of the 10 words of an image")
+                raise ValueError(f"the line of an image must have 10 words, got {line!r}")
             yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 
 
 def _binary_points(data: _Bytes) -> Iterator[tuple]:
     for _ in range(data.count()):
         _, *values, _ = data.take("Q3d3Bd")
-        data.skip(8 * data.count())  # pictures that it was seen in
+        data.skip(8 * data.count())  # track
         yield tuple(values)
 
 
@@ -214,12 +212,12 @@ def _text_points(lines: list[str]) -> Iterator[tuple]:
         yield tuple(map(float, (x, y, z, r, g, b)))
 
 
-def _camera(taken: _Taken, pose: np.ndarray) -> Camera:
-    model, width, height, values = taken
+def _camera(intrinsics: _Intrinsics, pose: np.ndarray) -> Camera:
+    model, width, height, values = intrinsics
     if model not in _LENSES:
         raise InputError(
-            f"its camera has the model {model}, and known are {', '.join(_LENSES)}; undistort the pictures "
-            "first, e.g. by colmap image_undistorter"
+            f"the camera model must be one of {', '.join(_LENSES)}, got {model}; undistort the images, "
+            "e.g. by colmap image_undistorter"
         )
     kind, names = _LENSES[model]
     own = len(values) - len(names)

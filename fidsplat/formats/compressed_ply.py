@@ -1,10 +1,10 @@
-"""SuperSplat's compressed PLY, as PlayCanvas' editor and splat-transform write it.
+"""Reading of SuperSplat's compressed PLY, written by PlayCanvas' editor and splat-transform.
 
 Every 256 splats share a row of the element chunk, which holds the smallest and largest position, log scale
 and (in newer files) colour. The element vertex has four 32-bit words per splat:
 
     packed_position, packed_scale   11, 10, 11 bits x, y, z from the top, in [min, max] of the chunk
-    packed_rotation                 2 bits: which of w, x, y, z is the largest (left out, taken as positive);
+    packed_rotation                 2 bits: index of the largest of w, x, y, z (omitted, positive);
                                     3 x 10 bits: the others in that order, in [-1, 1] / sqrt(2)
     packed_color                    8 bits each of r, g, b (in [min, max] of the chunk, or [0, 1]) and opacity
 
@@ -24,15 +24,15 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
 def is_compressed(header: Header) -> bool:
-    """Whether the file is meant to be a compressed one; ``compressed_rows`` checks that it is."""
+    """Whether a header has elements of a compressed PLY; `compressed_rows` validates them."""
     vertex = header.elements.get("vertex")
     return vertex is not None and any(name in vertex.properties for name in _PACKED)
 
 
 def compressed_rows(header: Header) -> Rows:
-    """Splats of three scales, all float32.
+    """Rows of a compressed PLY: three scales, all arrays float32.
 
-    Raises InputError when an element or a property is missing, of the wrong type or of the wrong length.
+    Raises InputError for an element or a property that is missing or of the wrong type or length.
     """
     n = header.elements["vertex"].count
     _check(header, "vertex", _PACKED, "<u4", n)
@@ -46,7 +46,7 @@ def compressed_rows(header: Header) -> Rows:
     if rest:
         _check(header, "sh", [f"f_rest_{i}" for i in range(rest)], "|u1", n)
         if rest not in (9, 24, 45):
-            raise InputError(f"{header.path}: the element sh has {rest} properties; not 9, 24 or 45")
+            raise InputError(f"{header.path}: the element sh must have 9, 24 or 45 properties, got {rest}")
 
     columns = {
         "means": ((3,), np.float32),
@@ -63,7 +63,7 @@ def compressed_rows(header: Header) -> Rows:
             header.rows("chunk", first // CHUNK, -(-end // CHUNK)),
         )
         bands = header.rows("sh", first, end) if rest else None
-        for start in range(0, len(rows), BLOCK):  # so that the float64 stays small
+        for start in range(0, len(rows), BLOCK):  # small float64 temporaries
             part = slice(start, start + BLOCK)
             owners = chunks[start // CHUNK : start // CHUNK + _CHUNKS_AT_ONCE]
             unpacked = _unpack(rows[part], owners, coloured)
@@ -77,7 +77,8 @@ def compressed_rows(header: Header) -> Rows:
 
 
 def _unpack(rows: np.ndarray, chunks: np.ndarray, coloured: bool) -> dict[str, np.ndarray]:
-    """The splats of some chunks, float64: means, quats, scales, opacities, and dc (k, 3), SH of degree 0."""
+    """Decode the splats of chunks to float64: means, quats, scales, opacities, and dc (k, 3), SH of degree
+    0."""
     chunk_of = np.arange(len(rows)) // CHUNK
 
     def end(which: str, axes: str) -> np.ndarray:
@@ -112,7 +113,7 @@ def _check(header: Header, name: str, properties, kind: str, count: int) -> None
 
 
 def _unit_fractions(words: np.ndarray, *widths: int) -> np.ndarray:
-    """(n, len(widths)) float64 in [0, 1] from the lowest bits of words (n,), the highest field first."""
+    """Decode bit fields of words (n,) to (n, len(widths)) float64 in [0, 1], the highest field first."""
     columns, shift = [], sum(widths)
     for width in widths:
         shift -= width
@@ -134,7 +135,7 @@ def _quaternions(words: np.ndarray) -> np.ndarray:
 
 
 def _bands(rows: np.ndarray, rest: int) -> np.ndarray:
-    """(n, rest / 3, 3) float32: the middle of each byte's bin, and the ends of [-4, 4] for 0 and 255."""
+    """Decode SH bytes to (n, rest / 3, 3) float32 in [-4, 4]: bin centres, the ends for 0 and 255."""
     fraction = (np.arange(256) + 0.5) / 256
     fraction[[0, 255]] = 0.0, 1.0
     value = ((fraction - 0.5) * 8).astype(np.float32)

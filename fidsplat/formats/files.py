@@ -1,4 +1,4 @@
-"""Splat files of every format, told apart by their endings."""
+"""Reading and writing of splat files of all formats, selected by suffix."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fidsplat.util.files import path_of
 
 @dataclass(frozen=True)
 class Format:
-    """How files of an ending are read and written, and what they cannot hold."""
+    """Reader, writer and limitations of a file format."""
 
     name: str
     load: Callable[[Path], SplatCloud]
@@ -62,37 +62,38 @@ FORMATS = {
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """The format of a file by its ending. Raises InputError for an unknown one."""
+    """The format of a file by its suffix. Raises InputError for an unknown one."""
     suffix = path_of(path).suffix.lower()
     if suffix not in FORMATS:
-        raise InputError(f"{path}: {unknown('ending of a splat file', suffix, FORMATS)}")
+        raise InputError(f"{path}: {unknown('suffix of a splat file', suffix, FORMATS)}")
     return FORMATS[suffix]
 
 
 def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
-    """Read splats of any format that is known by its ending: .ply, .splat, .spz, .glb, .gltf, .usda, .usdc,
-    .usd, .sog. progress: as `load_ply`, for PLY.
+    """Read a splat file: .ply, .splat, .spz, .glb, .gltf, .usda, .usdc, .usd or .sog.
 
-    Raises InputError for an unknown ending or a damaged file.
+    progress: callback of the current task and its completed share, 0 to 1, for PLY.
+
+    Raises InputError for an unknown suffix or a damaged file.
     """
     known = format_of(path)
     return load_ply(path, progress) if known.load is load_ply else known.load(path_of(path))
 
 
 def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:
-    """Write splats in the format of the file's ending; `losses` says what it cannot hold.
+    """Write splats in the format of the file's suffix; `losses` lists what that format cannot store.
 
-    Raises InputError for an unknown or read-only ending, boxes, or a file that cannot be written.
+    Raises InputError for an unknown or read-only suffix, boxes, or a file that cannot be written.
     """
     if not isinstance(cloud, SplatCloud):
-        raise InputError(f"save_splats writes a SplatCloud, not a {type(cloud).__name__}")
+        raise InputError(f"cloud must be a SplatCloud, got a {type(cloud).__name__}")
     save = check_writable(path).save
     assert save is not None
     save(cloud, path_of(path))
 
 
 def check_writable(path: str | os.PathLike[str]) -> Format:
-    """The format of a file that is to be written. Raises InputError for an unknown or a read-only one."""
+    """The format of an output file. Raises InputError for an unknown or read-only format."""
     known = format_of(path)
     if known.save is None:
         others = ", ".join(suffix for suffix, other in FORMATS.items() if other.save is not None)
@@ -101,14 +102,14 @@ def check_writable(path: str | os.PathLike[str]) -> Format:
 
 
 def losses(cloud: SplatCloud, path: str | os.PathLike[str]) -> list[str]:
-    """What of a cloud the format of that file cannot hold, in words; empty where it comes back whole."""
+    """Descriptions of what a file's format loses of a cloud; empty if the round trip is lossless."""
     known, found = format_of(path), []
     if cloud.sh_degree > 0 and not known.harmonics:
         found.append(f"SH of degree {cloud.sh_degree}: colours do not change with the view")
     if cloud.labels.any() and not known.labels:
         found.append(f"labels ({len(np.unique(cloud.labels))} different)")
     if cloud.coplanar_groups is not None and not known.coplanar_groups:
-        found.append("coplanar groups: their splats are ordered by depth alone")
+        found.append("coplanar groups: the splats are sorted by depth only")
     if cloud.origin.any() and not known.origin:
         means = cloud.world_means()
         off = float(np.abs(means - means.astype(np.float32)).max(initial=0.0))

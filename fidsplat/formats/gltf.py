@@ -1,8 +1,8 @@
-"""glTF with KHR_gaussian_splatting, as .glb and .gltf: activated values in float32, so that a cloud comes
-back with its bits. Extension: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
+"""glTF with KHR_gaussian_splatting, as .glb and .gltf: activated values in float32, without loss.
 
-glTF has y up. The splats are written as they are, under a node that turns them half about x, and read through
-the transforms of the nodes above them and that half turn.
+Extension: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting. glTF has y up: splats are written
+unchanged below a node that rotates them by 180 degrees about x; reading applies the transforms of the parent
+nodes and the inverse rotation.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ EXTENSION = "KHR_gaussian_splatting"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _COPIES = 3
-"""of each value while it is read: as it stands in the file, as a cloud, and moved to its place"""
+"""copies of each value while a file is read: accessor, cloud, transformed cloud"""
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 def load_gltf(path: Path) -> SplatCloud:
-    """Read the splats of a .glb or .gltf file, all that its nodes show, as one cloud.
+    """Read the splats of all nodes of a .glb or .gltf file as one cloud.
 
     Raises:
-        InputError: it is damaged, holds no splats, refers to a file outside of its folder, or its nodes
-            scale unevenly or mirror.
+        InputError: a damaged file, no splats, a reference to a file outside of its folder, a node with
+            non-uniform scale or reflection.
     """
     data = content(path, (b"glTF", b"{", codecs.BOM_UTF8))
     document, binary = _parts(path, data)
@@ -58,19 +58,19 @@ def load_gltf(path: Path) -> SplatCloud:
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
         raise InputError(f"{path}: the glTF file is damaged ({type(error).__name__}: {error})") from None
     if not clouds:
-        raise InputError(f"{path} holds no splats: no primitive of its nodes has {EXTENSION}")
+        raise InputError(f"{path} must have splats, got no primitive with {EXTENSION}")
     return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
 
 
 def save_gltf(cloud: SplatCloud, path: Path) -> None:
-    """Write a .glb file, or a .gltf one with its data inside. Labels and planes stand in attributes of
-    ours, _LABEL and _PLANE.
+    """Write a .glb file, or a .gltf file with embedded data. The application-specific attributes _LABEL and
+    _PLANE hold labels and coplanar groups.
 
-    Raises InputError for boxes, or where it cannot be written.
+    Raises InputError for boxes or a file that cannot be written.
     """
     refuse_boxes(cloud, "glTF")
     if not len(cloud):
-        raise InputError("glTF cannot hold an empty cloud: its arrays have at least one element")
+        raise InputError("a cloud in glTF must have at least one splat, got none")
     means, sh = world_means(cloud), coefficients(cloud)
     prefix = f"{EXTENSION}:"
     arrays = {"POSITION": means, f"{prefix}ROTATION": cloud.quats[:, [1, 2, 3, 0]]}
@@ -85,7 +85,9 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
         if whole is None:
             continue
         if np.abs(whole.astype(np.int64)).max() >= 2**24:
-            raise InputError(f"glTF holds {name}s as floats, so up to 2^24; give smaller ones")
+            raise InputError(
+                f"{name}s in glTF must be less than 2^24, since they are floats; use smaller ones"
+            )
         arrays[f"_{name.upper()}"] = whole[:, None].astype(np.float32)
     views, accessors, chunks, place = [], [], [], 0
     for array in arrays.values():
@@ -139,7 +141,7 @@ def _glb(document: dict[str, Any], binary: bytes) -> bytes:
 
 
 def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
-    """The document, and the binary part that a .glb file has, where it lies."""
+    """The JSON document, and a view of the binary chunk of a .glb file."""
     text, binary = data, None
     if data[:4] == b"glTF":
         try:
@@ -152,7 +154,7 @@ def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
         except struct.error:
             version, size, chunks = 0, 0, {}
         if version != 2 or size > len(data) or _JSON not in chunks:
-            raise InputError(f"{path}: cut short, or not binary glTF of version 2")
+            raise InputError(f"{path}: truncated, or not binary glTF of version 2")
         text, binary = bytes(chunks[_JSON]), chunks.get(_BIN)
     try:
         document = from_json(text)
@@ -164,12 +166,12 @@ def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
 
 
 class _Reader:
-    """The splats of a document."""
+    """Reader of the splats of a glTF document."""
 
     def __init__(self, path: Path, document: dict[str, Any], binary: memoryview | None) -> None:
         self._path, self._document, self._binary = path, document, binary
         self._buffers: dict[int, bytes | memoryview] = {}
-        self._seen: set[int] = set()
+        self._visited: set[int] = set()
 
     def clouds(self) -> list[SplatCloud]:
         scenes = self._document.get("scenes")
@@ -179,23 +181,25 @@ class _Reader:
             else range(len(self._document.get("nodes", [])))
         )
         placed = [pair for root in roots for pair in self._below(root, HALF_TURN)]
-        self._admit([primitive for primitive, _ in placed])
-        made: dict[int, SplatCloud] = {}  # by the primitive's id: nodes may share a mesh
+        self._check_expansion([primitive for primitive, _ in placed])
+        cloud_of_primitive: dict[int, SplatCloud] = {}  # by id of the primitive: nodes may share a mesh
         for primitive, _ in placed:
-            if id(primitive) not in made:
-                made[id(primitive)] = self._cloud(primitive)
+            if id(primitive) not in cloud_of_primitive:
+                cloud_of_primitive[id(primitive)] = self._cloud(primitive)
         return [
-            made[id(primitive)]
+            cloud_of_primitive[id(primitive)]
             if np.abs(matrix - np.eye(4)).max() < 1e-12
-            else made[id(primitive)].transformed(matrix)
+            else cloud_of_primitive[id(primitive)].transformed(matrix)
             for primitive, matrix in placed
         ]
 
     def _below(self, number: int, above: np.ndarray) -> list[tuple[dict[str, Any], np.ndarray]]:
-        """Primitives of splats of a node and of those below it, with their poses (4, 4)."""
-        if number in self._seen:
-            raise InputError(f"{self._path}: node {number} stands below two others, or below itself")
-        self._seen.add(number)
+        """Splat primitives of a node and its descendants, with their poses (4, 4)."""
+        if number in self._visited:
+            raise InputError(
+                f"{self._path}: node {number} must have one parent and not be its own descendant"
+            )
+        self._visited.add(number)
         node = self._document["nodes"][number]
         matrix = above @ _matrix(node)
         found = []
@@ -208,15 +212,18 @@ class _Reader:
     def _cloud(self, primitive: dict[str, Any]) -> SplatCloud:
         kernel = primitive["extensions"][EXTENSION].get("kernel", "ellipse")
         if kernel != "ellipse":
-            raise InputError(f"{self._path}: the kernel {kernel!r} is not known; ellipse is")
+            raise InputError(f"{self._path}: the kernel must be ellipse, got {kernel!r}")
         attributes, prefix = primitive["attributes"], f"{EXTENSION}:"
         if primitive["extensions"][EXTENSION].get("extensions"):
-            raise InputError(f"{self._path}: its splats are compressed by an extension, which is not read")
+            raise InputError(
+                f"{self._path}: its splats must be uncompressed, got a compression extension; export "
+                "without it"
+            )
         arrays = {name: self._array(number) for name, number in attributes.items() if name != "COLOR_0"}
         count = sum(name.startswith(f"{prefix}SH_DEGREE_") for name in arrays)
         names = [f"{prefix}SH_DEGREE_{(d := int(np.sqrt(k)))}_COEF_{k - d * d}" for k in range(count)]
         sh = np.stack([arrays[name] for name in names], axis=1)
-        labels, groups = (self._whole(arrays, name) for name in ("_LABEL", "_PLANE"))
+        labels, groups = (self._integers(arrays, name) for name in ("_LABEL", "_PLANE"))
         quats = arrays[f"{prefix}ROTATION"][:, [3, 0, 1, 2]]
         scales, opacities = arrays[f"{prefix}SCALE"], arrays[f"{prefix}OPACITY"][:, 0]
         return cloud_of(
@@ -230,8 +237,8 @@ class _Reader:
             coplanar_groups=groups,
         )
 
-    def _admit(self, primitives: list[dict[str, Any]]) -> None:
-        """Check what all primitives take: nodes may share a mesh, and attributes an accessor."""
+    def _check_expansion(self, primitives: list[dict[str, Any]]) -> None:
+        """Check the memory of all primitives: nodes may share a mesh, and attributes an accessor."""
         accessors = [
             self._document["accessors"][number] for one in primitives for number in one["attributes"].values()
         ]
@@ -239,8 +246,8 @@ class _Reader:
         size = sum(len(self._buffer(number)) for number in range(len(self._document["buffers"])))
         check_expansion(self._path, need, "its nodes with all their attributes", size)
 
-    def _whole(self, arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
-        """(n,) int32 of an attribute of ours that holds whole numbers as floats, if it is there."""
+    def _integers(self, arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
+        """(n,) int32 of an optional attribute of whole numbers stored as floats."""
         if name not in arrays:
             return None
         values = arrays[name][:, 0]
@@ -249,10 +256,10 @@ class _Reader:
         return values.astype(np.int32)
 
     def _array(self, number: int) -> np.ndarray:
-        """(n, width) float32 of an accessor."""
+        """Values (n, width) float32 of an accessor."""
         accessor = self._document["accessors"][number]
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise InputError(f"{self._path}: accessor {number} is sparse, which is not read")
+            raise InputError(f"{self._path}: accessor {number} must be dense, got a sparse one")
         view = self._document["bufferViews"][accessor["bufferView"]]
         kind, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         row, count = kind.itemsize * width, int(accessor["count"])
@@ -261,12 +268,12 @@ class _Reader:
         data = self._buffer(view["buffer"])
         need = start + (count - 1) * stride + row
         if min(count, start + 1, stride) < 1 or need > len(data) or need > start - first + view["byteLength"]:
-            raise InputError(f"{self._path}: cut short: accessor {number} reaches beyond its buffer")
+            raise InputError(f"{self._path}: truncated: accessor {number} exceeds its buffer")
         values = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
         if kind.kind == "f":
             return values.copy()
         if not accessor.get("normalized"):
-            raise InputError(f"{self._path}: accessor {number} holds whole numbers that are not normalized")
+            raise InputError(f"{self._path}: integers of accessor {number} must be normalized")
         return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1)
 
     def _buffer(self, number: int) -> bytes | memoryview:
@@ -278,7 +285,7 @@ class _Reader:
     def _read(self, uri: str | None, number: int) -> bytes | memoryview:
         if uri is None:
             if self._binary is None or number:
-                raise InputError(f"{self._path}: buffer {number} has no data")
+                raise InputError(f"{self._path}: buffer {number} must have data, got none")
             return self._binary
         if uri.startswith("data:"):
             try:
@@ -288,10 +295,10 @@ class _Reader:
         folder = self._path.parent.resolve()
         file = (folder / unquote(uri)).resolve()
         if "://" in uri or not file.is_relative_to(folder):
-            raise InputError(f"{self._path} refers to {uri!r}, outside of its folder; it is not read")
+            raise InputError(f"files of {self._path} must be in its folder, got {uri!r}")
         views = [view for view in self._document["bufferViews"] if view["buffer"] == number]
         size = max(int(view.get("byteOffset", 0)) + int(view["byteLength"]) for view in views)
-        return read_input(file, first=max(size, 0))  # whatever else the file holds
+        return read_input(file, first=max(size, 0))  # the file may be larger
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What formats beside PLY have in common: a cloud as arrays with three scales and SH, and back."""
+"""Conversion between clouds and the arrays of formats other than PLY: three scales and SH."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import open_input, read_input
 
 PADDED = np.float32(1e-6)
-"""third scale, in metres, of a disk in formats that want three"""
+"""third scale [m] of a disk in formats that require three"""
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
-"""about x: between y down, z away, as splats are trained, and y up, z towards one, as glTF, USD and SPZ
-are"""
+"""rotation by 180 degrees about x: from y down, z forward (trained splats) to y up, z backward (glTF, USD,
+SPZ)"""
 C0_SPLAT = np.float32(C0)
 
 
 def refuse_boxes(cloud: SplatCloud, what: str) -> None:
-    """Raises InputError for boxes, which no format holds."""
+    """Raise InputError for boxes, which no file format can store."""
     if cloud.boxes is not None:
         raise InputError(
             f"{int(cloud.boxes.sum())} of {len(cloud)} splats are boxes, which {what} cannot hold; write the "
@@ -31,18 +31,18 @@ def refuse_boxes(cloud: SplatCloud, what: str) -> None:
 
 
 def world_means(cloud: SplatCloud) -> np.ndarray:
-    """(n, 3) float32 in the world; the bits of the cloud's own where it has no origin."""
+    """Means (n, 3) float32 in the world; those of the cloud if it has no origin."""
     return cloud.world_means().astype(np.float32) if cloud.origin.any() else cloud.means
 
 
 def three_scales(cloud: SplatCloud) -> np.ndarray:
-    """(n, 3) float32 metres; the third of a disk is 1e-6."""
+    """Three scales (n, 3) float32 [m]; the third of a disk is 1e-6."""
     third = np.zeros(len(cloud), np.float32) if cloud.thickness is None else cloud.thickness
     return np.column_stack([cloud.scales, np.where(third > 0, third, PADDED)]).astype(np.float32)
 
 
 def coefficients(cloud: SplatCloud) -> np.ndarray:
-    """(n, k, 3) float32 SH; plain colours as those of degree 0."""
+    """SH coefficients (n, k, 3) float32; plain colours become degree 0."""
     if cloud.sh is not None:
         return cloud.sh
     assert cloud.colors is not None
@@ -50,7 +50,7 @@ def coefficients(cloud: SplatCloud) -> np.ndarray:
 
 
 def plain_colors(cloud: SplatCloud) -> np.ndarray:
-    """(n, 3) float32 RGB, of SH the part of degree 0."""
+    """RGB (n, 3) float32 of SH degree 0."""
     return coefficients(cloud)[:, 0] * C0_SPLAT + np.float32(0.5)
 
 
@@ -65,11 +65,11 @@ def cloud_of(
     labels=None,
     coplanar_groups=None,
 ) -> SplatCloud:
-    """The cloud of a file's arrays, scales (n, 3) in metres; what cannot be drawn is left out and counted.
+    """Make a cloud of a file's arrays, with scales (n, 3) in metres; invalid splats are dropped and counted.
 
-    disk: third scales up to this, but for rounding, are those of disks.
+    disk: maximum third scale of a disk, apart from rounding.
 
-    Raises InputError for arrays that make no splats, or unusable coplanar groups.
+    Raises InputError for invalid arrays or coplanar groups.
     """
     interrupts.check()
     scales = np.array(scales, np.float32)
@@ -83,19 +83,19 @@ def cloud_of(
         )
     if cloud.dropped:
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
-        kept, _ = find_defects({name: np.asarray(array, np.float32) for name, array in given.items()})
-        coplanar_groups = coplanar_groups[kept]
+        valid, _ = find_defects({name: np.asarray(array, np.float32) for name, array in given.items()})
+        coplanar_groups = coplanar_groups[valid]
     try:
         return cloud.with_coplanar_groups(coplanar_groups)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
-def content(path: Path, begins: tuple[bytes, ...]) -> bytes:
-    """A file's bytes; where they begin with none of these, behind spaces, its first ones alone, from which
-    its reader sees that it is another's. Raises InputError as `read_input`."""
+def content(path: Path, magic: tuple[bytes, ...]) -> bytes:
+    """Read a file; if it does not begin with one of these magic numbers, after white space, only its first
+    bytes, so that a large file of another format is not read. Raises InputError as `read_input`."""
     with open_input(path) as stream:
         head = stream.read(64)
         while head.isspace():
             head = stream.read(1 << 16)
-    return read_input(path) if head.lstrip().startswith(begins) else head
+    return read_input(path) if head.lstrip().startswith(magic) else head

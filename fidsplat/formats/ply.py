@@ -1,4 +1,4 @@
-"""Reading splats from a PLY file, whichever layout it has."""
+"""Reading of splats from PLY files of all layouts."""
 
 import os
 import warnings
@@ -25,17 +25,15 @@ _NEEDED += ("rot_0", "rot_1", "rot_2", "rot_3")
 def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
     """Read a splat file: 2DGS layout (two scales), 3DGS layout (three), or SuperSplat's compressed PLY.
 
-    Properties are found by name, in any order and among any others. Splats of three scales are 3D Gaussians
-    (`SplatCloud.thickness`; `SplatCloud.flattened` makes disks of them), but those whose third is 1e-6, which
-    marks a disk. The 3D filter of Mip-Splatting's files (``filter_3D``) is applied: splats are as their
-    trainer drew them (`Quality.ellipsoid="ewa_antialiased"`). Integer properties ``label`` and ``plane`` are
-    taken up. Colours come as SH of degree 0 to
-    3. Splats that cannot be drawn are left out while the file is read, as `SplatCloud` does, and one warning
-    counts them.
+    Properties may have any order; unknown ones are ignored. Splats of three scales are 3D Gaussians
+    (`SplatCloud.thickness`; `SplatCloud.flattened` makes them disks), except that a third scale of 1e-6 marks
+    a disk. The 3D filter of Mip-Splatting's files (`filter_3D`) is applied, as the trainer rendered them
+    (`Quality.ellipsoid="ewa_antialiased"`). Integer properties `label` and `plane` become labels and coplanar
+    groups. Colours are SH of degree 0 to 3. Invalid splats are dropped with one warning.
 
-    progress: called now and then with what is being done and the share of it that is done, 0 to 1.
+    progress: callback of the current task and its completed share, 0 to 1.
 
-    Raises InputError for a file that is missing, damaged, of another kind, or lacks a property.
+    Raises InputError for a file that is missing, damaged, not PLY, or lacks a property.
     """
     rows, origin = ply_rows(path)
     arrays, dropped = collect(rows, progress)
@@ -47,8 +45,10 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
 
 
 def ply_rows(path: str | os.PathLike[str]) -> tuple[Rows, np.ndarray | None]:
-    """The rows of a splat file and the origin (3,) float64 that it names, if it does: for who reads it in
-    parts. Raises InputError as `load_ply`."""
+    """The rows of a splat file, for reading in parts, and its optional origin (3,) float64.
+
+    Raises InputError for a file that is missing, damaged, not PLY, or lacks a property.
+    """
     header = read_header(path)
     origin = _origin(header)
     return compressed_rows(header) if is_compressed(header) else _plain_rows(header), origin
@@ -69,13 +69,13 @@ def _plain_rows(header: Header) -> Rows:
         "opacities": ((), np.float32),
         "sh": ((k, 3), np.float32),
     }
-    # name of a property: the array that it goes to, and where there
+    # target of each property: name of an array and index
     places: dict[str, tuple] = {axis: ("means", slice(None), i) for i, axis in enumerate("xyz")}
     places |= {f"rot_{i}": ("quats", slice(None), i) for i in range(4)}
     places |= {f"scale_{i}": ("scales", slice(None), i) for i in range(scales)}
     places["opacity"] = ("opacities",)
     places |= {f"f_dc_{c}": ("sh", slice(None), 0, c) for c in range(3)}
-    # the file has all of red's higher bands, then green's, then blue's
+    # the file has all higher bands of red, then of green, then of blue
     places |= {
         f"f_rest_{c * (k - 1) + i}": ("sh", slice(None), 1 + i, c) for c in range(3) for i in range(k - 1)
     }
@@ -94,17 +94,17 @@ def _plain_rows(header: Header) -> Rows:
         _sigmoid(arrays["opacities"])
         if filtered:
             _widen(arrays["scales"], arrays["opacities"], rows[FILTER])
-        if "coplanar_groups" in arrays and (least := arrays["coplanar_groups"].min(initial=-1)) < -1:
+        if "coplanar_groups" in arrays and (lowest := arrays["coplanar_groups"].min(initial=-1)) < -1:
             raise InputError(
-                f"{header.path}: the property plane holds {least}; it must be an id of at least 0, or -1 for "
-                "a splat of no plane"
+                f"{header.path}: the property plane must be an id of 0 or more, or -1 for a splat without a "
+                f"group, got {lowest}"
             )
 
     return Rows(header.path, element.count, columns, fill)
 
 
 def _check_properties(header: Header, element: Element) -> int:
-    """The SH degree of a vertex element that has all that a splat needs."""
+    """Check the properties of the vertex element; returns the SH degree."""
     names = element.properties
     missing = [name for name in _NEEDED if name not in names]
     if missing:
@@ -123,7 +123,7 @@ def _check_properties(header: Header, element: Element) -> int:
 
 
 def _sigmoid(x: np.ndarray) -> None:
-    """Opacity from its logit, in place; -inf and inf give exactly 0 and 1."""
+    """Sigmoid in place; exactly 0 and 1 for -inf and inf."""
     np.negative(x, out=x)
     np.exp(x, out=x)
     x += 1
@@ -131,8 +131,11 @@ def _sigmoid(x: np.ndarray) -> None:
 
 
 def _widen(scales: np.ndarray, opacities: np.ndarray, filters: np.ndarray) -> None:
-    """3D Gaussians (n, 3) convolved with one of the standard deviation of their filter (n,), in place; their
-    opacities (n,) fall as their density does (the 3D smoothing filter of Mip-Splatting, Yu et al. 2024)."""
+    """Apply the 3D smoothing filter of Mip-Splatting (Yu et al. 2024) in place.
+
+    Gaussians of scales (n, 3) are convolved with isotropic ones of standard deviations (n,); opacities (n,)
+    decrease with the density.
+    """
     wide = np.hypot(scales.astype(np.float64), filters[:, None])
     opacities *= np.divide(scales, wide, out=np.ones_like(wide), where=wide > 0).prod(axis=1)
     scales[:] = wide

@@ -1,5 +1,4 @@
-"""The header of a binary little-endian PLY file, checked against the file's size before anything is
-mapped."""
+"""Header of a binary little-endian PLY file, validated against the file's size before data is mapped."""
 
 import os
 import re
@@ -38,8 +37,7 @@ _TYPES = {
 
 @dataclass(frozen=True)
 class Element:
-    """One table of the file: ``count`` rows of ``dtype`` (packed, fields in file order) from byte
-    ``offset``."""
+    """A table of the file: `count` rows of `dtype` (packed, fields in file order) from byte `offset`."""
 
     name: str
     count: int
@@ -53,7 +51,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What the header says, and the file it stands in."""
+    """Elements and comments of a PLY file."""
 
     path: Path
     elements: dict[str, Element]
@@ -62,8 +60,11 @@ class Header:
     """whether the rows are lines of text; ``offset`` is then where the first element's begin, for all"""
 
     def rows(self, name: str, first: int, end: int) -> np.ndarray:
-        """Rows first to end of an element as a read-only structured array, mapped from the file, not read;
-        those of a text are read. Raises InputError for a text that is damaged."""
+        """Rows [first, end) of an element as a read-only structured array, memory-mapped if the file is
+        binary.
+
+        Raises InputError for a damaged text file.
+        """
         element = self.elements[name]
         if end <= first:
             return np.zeros(0, element.dtype)
@@ -71,7 +72,7 @@ class Header:
             return self._text_rows(element)[first:end]
         offset = element.offset + first * element.dtype.itemsize
         mapped = np.memmap(self.path, element.dtype, "r", offset, (end - first,))
-        return mapped.view(np.ndarray)  # indexing a memmap costs several times that of an array
+        return mapped.view(np.ndarray)  # indexing a memmap is several times slower than an array
 
     def _text_rows(self, element: Element) -> np.ndarray:
         before = 0
@@ -86,20 +87,20 @@ class Header:
             raise InputError(f"{self.path}: rows of {element.name} are damaged: {error}") from error
         if len(rows) != element.count:
             raise InputError(
-                f"{self.path}: cut short: its header calls for {element.count} rows of {element.name}, but "
+                f"{self.path}: cut short: its header declares {element.count} rows of {element.name}, but "
                 f"the file has {len(rows)}"
             )
         return rows
 
 
 def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
-    """Read and check a header.
+    """Read and validate the header of a PLY file.
 
-    text: whether ASCII files are read too.
+    text: whether ASCII files are accepted.
 
-    Raises InputError when the path is not a file that can be read, the file is not a binary little-endian
-    PLY, its header is damaged, longer than 64 KiB or holds a list property, or the file is shorter than its
-    header says. Warns when it is longer.
+    Raises InputError for a file that cannot be read, is not binary little-endian PLY, is shorter than its
+    header declares, or has a header that is damaged, longer than 64 KiB or with a list property. Warns of a
+    longer file.
     """
     file = path_of(path)
     head, size = _beginning(file)
@@ -130,15 +131,13 @@ def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
         elements = {name: Element(name, counts[name], dtypes[name], start) for name in counts}
         return Header(file, elements, tuple(comments), True)
     if layout != "binary_little_endian":
-        raise InputError(
-            f"{file}: the PLY format is {layout}; only binary_little_endian is read, so convert it first"
-        )
+        raise InputError(f"{file}: the PLY format must be binary_little_endian, got {layout}; convert it")
     elements, offset = {}, start
     for name, count in counts.items():
         elements[name] = Element(name, count, np.dtype(fields[name]), offset)
         offset += count * elements[name].dtype.itemsize
     if size < offset:
-        raise InputError(f"{file}: cut short: its header calls for {offset} bytes, but the file has {size}")
+        raise InputError(f"{file}: cut short: its header declares {offset} bytes, but the file has {size}")
     if size > offset:
         warnings.warn(f"{file}: {size - offset} bytes after the PLY data are not read", stacklevel=3)
     return Header(file, elements, tuple(comments))
@@ -150,7 +149,7 @@ def _beginning(file: Path) -> tuple[bytes, int]:
 
 
 def _lines(file: Path, head: bytes) -> tuple[list[str], int]:
-    """The header's lines between ``ply`` and ``end_header``, and the number of bytes before the data."""
+    """Header lines between `ply` and `end_header`, and the number of bytes before the data."""
     if not head:
         raise InputError(f"{file} is empty, not a PLY file")
     if not re.match(rb"ply\r?\n", head):
@@ -161,7 +160,7 @@ def _lines(file: Path, head: bytes) -> tuple[list[str], int]:
     try:
         text = head[: found.start()].decode("utf-8")
     except UnicodeDecodeError:
-        raise InputError(f"{file}: the PLY header is damaged: it holds bytes that are not text") from None
+        raise InputError(f"{file}: the PLY header must be text, got other bytes") from None
     return text.replace("\r", "").split("\n")[1:], found.end()
 
 
@@ -173,7 +172,7 @@ def _count(file: Path, line: str, word: str) -> int:
 
 def _field(file: Path, line: str, words: list[str], before: list[tuple[str, str]]) -> tuple[str, str]:
     if len(words) > 1 and words[1] == "list":
-        raise InputError(f"{file}: the PLY header's line {line[:60]!r} is a list; a splat file has none")
+        raise InputError(f"{file}: the PLY header's line {line[:60]!r} must not be a list property")
     if len(words) != 3 or words[1] not in _TYPES:
         raise InputError(
             f"{file}: the PLY header's line {line[:60]!r} is not 'property TYPE NAME' of a known type"

@@ -1,4 +1,4 @@
-"""Writing splats to a PLY file of the 2DGS authors' layout."""
+"""Writing of splats to PLY files in the layout of the 2DGS authors."""
 
 import os
 
@@ -19,19 +19,18 @@ MAX_LOGIT = 100.0
 def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool = False) -> None:
     """Write binary little-endian PLY, all float32: x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*.
 
-    The third scale is a 3D Gaussian's thickness, and log(1e-6) for a disk, so that 3DGS tools open the file;
-    ``native_2dgs`` leaves it out.
-    Plain colours are written as SH of degree 0. An int property label follows when any label is not 0, and an
-    int property plane when the cloud has planes. An origin other than 0 is kept in a comment, and x, y, z are
+    The third scale is the thickness of a 3D Gaussian, and log(1e-6) for a disk, so that 3DGS tools open the
+    file; `native_2dgs` omits it. Plain colours become SH of degree 0. Optional int properties are label, if
+    any label is not 0, and plane, the coplanar group. A comment has an origin other than 0; x, y, z are
     relative to it.
 
-    Raises InputError when the file cannot be written, when the cloud has boxes, which the format does not, or
-    3D Gaussians and ``native_2dgs`` is asked for; an older file of that name is then left as it was.
+    Raises InputError for a file that cannot be written, boxes, or 3D Gaussians with `native_2dgs`; an
+    existing file then stays unchanged.
     """
     if not isinstance(cloud, SplatCloud):
-        raise InputError(f"save_ply writes a SplatCloud, not a {type(cloud).__name__}")
+        raise InputError(f"cloud must be a SplatCloud, got a {type(cloud).__name__}")
     if not isinstance(native_2dgs, bool):
-        raise InputError(f"native_2dgs is {native_2dgs!r}; it must be True or False")
+        raise InputError(f"native_2dgs must be True or False, got {native_2dgs!r}")
     if cloud.boxes is not None:
         raise InputError(
             f"{int(cloud.boxes.sum())} of {len(cloud)} splats are boxes, which a PLY file cannot hold; write "

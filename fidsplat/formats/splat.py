@@ -1,4 +1,4 @@
-"""`.splat`, as antimatter15's viewer reads it: 32 bytes a splat and nothing else.
+"""Reading and writing of `.splat`, the format of antimatter15's viewer: 32 bytes for each splat.
 
 Three float32 of position, three of scale in metres, then bytes: red, green, blue, opacity, and the quaternion
 w, x, y, z as 128 + 128 q. Colours do not depend on the view.
@@ -23,11 +23,12 @@ _SEEN = 4096
 
 
 def load_splat(path: Path) -> SplatCloud:
-    """Read a .splat file. Raises InputError where it is not one."""
+    """Read a .splat file. Raises InputError for another file."""
     size = regular_file(path).stat().st_size
     if not size or size % _ROW.itemsize:
         raise InputError(
-            f"{path}: {size} bytes are not rows of {_ROW.itemsize}; cut short, or not a .splat file"
+            f"{path}: the size must be a multiple of {_ROW.itemsize} bytes, got {size}; cut short, or not "
+            "a .splat file"
         )
     check_expansion(path, 4 * size, f"{size // _ROW.itemsize:,} splats")
     rows = np.memmap(path, _ROW, "r").view(np.ndarray)
@@ -41,10 +42,10 @@ def load_splat(path: Path) -> SplatCloud:
 
 
 def save_splat(cloud: SplatCloud, path: Path) -> None:
-    """Write a .splat file. Raises InputError for boxes, for no splats, or where it cannot be written."""
+    """Write a .splat file. Raises InputError for boxes, an empty cloud, or a file that cannot be written."""
     refuse_boxes(cloud, "a .splat file")
     if not len(cloud):
-        raise InputError("a .splat file cannot hold an empty cloud: it would be no file of any kind")
+        raise InputError("a cloud in a .splat file must have at least one splat, got none")
     rows = np.zeros(len(cloud), _ROW)
     rows["means"], rows["scales"] = world_means(cloud), three_scales(cloud)
     rgba = np.column_stack([plain_colors(cloud), cloud.opacities])

@@ -1,8 +1,8 @@
-"""SPZ, Niantic's compressed splats: versions 2 and 3 read, 3 written. Layout: nianticlabs/spz, load-spz.cc.
+"""SPZ, Niantic's compressed splats: reads versions 2 and 3, writes 3. Format: nianticlabs/spz, load-spz.cc.
 
-Gzip around a header of 16 bytes and then, for all splats in turn: positions (3 x 24 bits, fixed point),
-opacities, colours and scales (a byte each), rotations (3 bytes: x, y, z; from version 3 on 4: the three
-smallest of x, y, z, w and which is left out), higher SH (a byte each). Axes: y up, z towards one.
+Gzip of a header of 16 bytes and arrays of all splats: positions (3 x 24 bits, fixed point), opacities,
+colours and scales (a byte each), rotations (version 2: 3 bytes x, y, z; version 3: 4 bytes with the three
+smallest of x, y, z, w and the index of the omitted one), higher SH (a byte each). Axes: y up, z backward.
 """
 
 from __future__ import annotations
@@ -24,49 +24,50 @@ from fidsplat.util.limits import check_expansion
 _HEAD = struct.Struct("<IIIBBBB")
 _MAGIC = 0x5053474E
 _COLOR = 0.15
-_LEAST = float(np.exp(-10.0))
-"""the smallest scale, in metres, that it holds: a third one that small is a disk's"""
+_MIN_SCALE = float(np.exp(-10.0))
+"""smallest scale [m] of the format; a third scale of this size marks a disk"""
 _REST = {0: 0, 1: 3, 2: 8, 3: 15}
 _FINEST, _BITS = 20, 23
-"""bits behind the point at most, and of a coordinate without its sign"""
-_FEW = 2**20
-"""splats that a file may hold however small it is; of more, each takes a byte of it at least"""
+"""maximum number of fractional bits, and bits of a coordinate without its sign"""
+_MAX_UNCHECKED = 2**20
+"""number of splats above which a file must have at least a byte for each"""
 
 
 def load_spz(path: Path) -> SplatCloud:
-    """Read an SPZ file. Raises InputError where it is none, is cut short, or has another version."""
+    """Read an SPZ file. Raises InputError for a damaged file or another version."""
     data = content(path, (b"\x1f\x8b", b"NGSP"))
-    if data[:4] == _MAGIC.to_bytes(4, "little"):  # without gzip around it
+    if data[:4] == _MAGIC.to_bytes(4, "little"):  # version 4 is not compressed by gzip
         raise InputError(
-            f"{path}: SPZ of version {int.from_bytes(data[4:8], 'little')}; versions 2 and 3 are read"
+            f"{path}: the version of SPZ must be 2 or 3, got {int.from_bytes(data[4:8], 'little')}"
         )
     try:
         head = zlib.decompressobj(31).decompress(data, _HEAD.size)
         magic, version, n, degree, point, _, _ = _HEAD.unpack(head)
     except (zlib.error, struct.error):
-        raise InputError(f"{path} is not an SPZ file: it does not begin with its header in gzip") from None
+        raise InputError(f"{path} is not an SPZ file: it must begin with a gzip header") from None
     if magic != _MAGIC:
-        raise InputError(f"{path} is not an SPZ file: its header is another's")
+        raise InputError(f"{path} is not an SPZ file: its magic number differs")
     if version not in (2, 3) or degree not in _REST or point > _BITS:
         raise InputError(
-            f"{path}: SPZ of version {version}, SH degree {degree}, {point} bits behind the point; versions "
-            f"2 and 3 with degrees 0 to 3 and up to {_BITS} bits are read"
+            f"{path}: SPZ must have version 2 or 3, SH degree 0 to 3 and at most {_BITS} fractional bits, "
+            "got version "
+            f"{version}, degree {degree} and {point} bits"
         )
     widths = {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "quats": 4 if version == 3 else 3}
     widths["rest"] = 3 * _REST[degree]
     size = _HEAD.size + n * sum(widths.values())
-    if max(_FEW, len(data)) < n and size <= 1040 * len(data):
-        raise InputError(f"{path}: {n} splats in {len(data)} bytes; no scene is so small, and it is not read")
-    if size <= 1040 * len(data):  # its bytes, and position, opacity, color, scales, rotation, harmonics
+    if max(_MAX_UNCHECKED, len(data)) < n and size <= 1040 * len(data):
+        raise InputError(f"{path}: {n} splats must have at least as many bytes, got {len(data)}")
+    if size <= 1040 * len(data):  # bytes of the file and of the arrays
         check_expansion(path, n * (sum(widths.values()) + 4 * (14 + widths["rest"])), f"{n:,} splats")
     try:
-        # nothing is made larger than the header says, and no file grows by more than gzip can
+        # not more than the header declares, nor than gzip's maximum ratio of about 1040
         stream = zlib.decompressobj(31)
         whole = stream.decompress(data, size + 1) if size <= 1040 * len(data) else b""
     except zlib.error as error:
         raise InputError(f"{path}: the SPZ file is damaged ({error})") from None
     if len(whole) < size or (len(whole) == size and not stream.eof):
-        raise InputError(f"{path}: cut short: its header calls for {size} bytes, and {len(whole)} are there")
+        raise InputError(f"{path}: cut short: its header declares {size} bytes, got {len(whole)}")
     parts, place = {}, _HEAD.size
     for name, width in widths.items():
         parts[name] = np.frombuffer(whole, np.uint8, n * width, place).reshape(n, width)
@@ -78,30 +79,31 @@ def load_spz(path: Path) -> SplatCloud:
     rest = (parts["rest"].reshape(n, _REST[degree], 3).astype(np.float32) - 128) / 128
     sh = np.concatenate([dc[:, None], rest], axis=1)
     opacities = (parts["opacities"][:, 0] / 255.0).astype(np.float32)
-    return cloud_of(path, means, quats, scales, opacities, sh, _LEAST).transformed(HALF_TURN)
+    return cloud_of(path, means, quats, scales, opacities, sh, _MIN_SCALE).transformed(HALF_TURN)
 
 
 def save_spz(cloud: SplatCloud, path: Path) -> None:
-    """Write an SPZ file, with as many bits behind the point as its extent leaves, 20 at most (1 um).
+    """Write an SPZ file, with as many fractional bits as the extent of the cloud allows, at most 20 (1 um).
 
-    Raises InputError for boxes, splats further than 8388 km from the origin, or where it cannot be written.
+    Raises InputError for boxes, splats further than 8388 km from the origin, or a file that cannot be
+    written.
     """
     refuse_boxes(cloud, "an SPZ file")
-    turned = cloud.transformed(HALF_TURN)
-    means, sh = means_of(turned).astype(np.float64), coefficients(turned)
+    rotated = cloud.transformed(HALF_TURN)
+    means, sh = means_of(rotated).astype(np.float64), coefficients(rotated)
     furthest = float(np.abs(means).max(initial=0.0))
     point = min(_FINEST, int(np.floor(_BITS - np.log2(max(furthest, 1e-9) * (1 + 1e-6)) - 1e-9)))
     if point < 0:
-        raise InputError(f"SPZ holds coordinates up to {2**_BITS:,} m; these reach {furthest:g} m")
+        raise InputError(f"coordinates in SPZ must be at most {2**_BITS:,} m, got {furthest:g} m")
     degree = int(np.sqrt(sh.shape[1])) - 1
     fixed = np.rint(means * 2.0**point).astype("<i4")
     parts = [
         _HEAD.pack(_MAGIC, 3, len(cloud), degree, point, 0, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
-        _byte(turned.opacities * 255.0),
+        _byte(rotated.opacities * 255.0),
         _byte((sh[:, 0] * _COLOR + 0.5) * 255.0),
-        _byte((np.log(three_scales(turned).astype(np.float64)) + 10.0) * 16.0),
-        _packed(turned.quats),
+        _byte((np.log(three_scales(rotated).astype(np.float64)) + 10.0) * 16.0),
+        _packed(rotated.quats),
         _byte(sh[:, 1:] * 128.0 + 128.0),
     ]
     with atomic_write(path) as stream:
@@ -113,14 +115,15 @@ def _byte(values: np.ndarray) -> bytes:
 
 
 def _fixed(data: np.ndarray) -> np.ndarray:
-    """(n, 3) whole numbers of 24 bits."""
+    """Decode signed 24-bit integers to (n, 3)."""
     wide = np.zeros((len(data), 3, 4), np.uint8)
     wide[:, :, 1:] = data.reshape(-1, 3, 3)
     return wide.view("<i4")[:, :, 0] >> 8
 
 
 def _packed(quats: np.ndarray) -> bytes:
-    """Unit quaternions w, x, y, z: which of x, y, z, w is the largest, and sign and 9 bits of the others."""
+    """Encode unit quaternions w, x, y, z: index of the largest of x, y, z, w, sign and 9 bits of the
+    others."""
     q = quats[:, [1, 2, 3, 0]].astype(np.float64)
     largest = np.abs(q).argmax(axis=1)
     q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
@@ -136,12 +139,12 @@ def _smallest_three(data: np.ndarray) -> np.ndarray:
     word = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.uint32)
     largest, q = word >> 30, np.zeros((len(word), 4))
     for i in (3, 2, 1, 0):
-        there = largest != i
+        stored = largest != i
         size = (word & 511) / 511 / np.sqrt(2)
-        q[:, i] = np.where(there, np.where(word >> 9 & 1, -size, size), 0)
-        word = np.where(there, word >> 10, word)
-    left = np.sqrt(np.maximum(0, 1 - (q * q).sum(axis=1)))
-    q[np.arange(len(q)), largest] = left
+        q[:, i] = np.where(stored, np.where(word >> 9 & 1, -size, size), 0)
+        word = np.where(stored, word >> 10, word)
+    omitted = np.sqrt(np.maximum(0, 1 - (q * q).sum(axis=1)))
+    q[np.arange(len(q)), largest] = omitted
     return q[:, [3, 0, 1, 2]]
 
 

@@ -1,7 +1,7 @@
-"""Trajectories of cameras in files: TUM, KITTI, COLMAP and nerfstudio's transforms.json.
+"""Trajectory files: TUM, KITTI, COLMAP and nerfstudio's transforms.json.
 
-All of them as camera to world with OpenCV's axes, as ours are; transforms.json has OpenGL's (y up, z
-backwards), COLMAP world to camera. Sources: the TUM RGB-D benchmark's "File Formats", KITTI's odometry
+Poses are converted to camera to world with OpenCV's axes; transforms.json has OpenGL's (y up, z backwards),
+COLMAP world to camera. Sources: the TUM RGB-D benchmark's "File Formats", KITTI's odometry
 development kit, COLMAP's "Output format", nerfstudio's "Data conventions".
 """
 
@@ -30,23 +30,23 @@ RATE = 10.0
 """poses a second of files that hold no times, as KITTI's were taken"""
 ROUNDED = 1e-3
 """how far a file's rotation may be from one: six digits are common"""
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes to OpenCV's, and back
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenGL's and OpenCV's camera axes
 _SUFFIXES = ".tum and .txt (TUM), .kitti, .json (transforms.json), or a folder (COLMAP)"
 
 
 def load_trajectory(path: str | os.PathLike[str], rate: float = RATE, smooth: bool = False) -> Trajectory:
-    """Read the camera-to-world poses of a file: TUM (8 numbers a line), KITTI (12), transforms.json, or
-    COLMAP's images.txt, images.bin or the folder with them.
+    """Read a trajectory file: TUM (8 numbers a line), KITTI (12), transforms.json, or COLMAP's images.txt,
+    images.bin or their folder. Poses are camera to world.
 
     Args:
-        path: told apart by its ending and what it holds.
-        rate: poses a second where the file has no times: KITTI's, COLMAP's (in the order of the images'
-            names), and frames of transforms.json without "time".
-        smooth: as `Trajectory.smooth`.
+        path: the format follows from suffix and content.
+        rate: poses a second for files without times: KITTI, COLMAP (sorted by image name), and
+            transforms.json without "time".
+        smooth: whether poses are interpolated smoothly, see `Trajectory.smooth`.
 
     Raises:
-        InputError: naming file and line, for whatever is wrong: times that do not increase, values that are
-            not finite, quaternions that are not of length 1 and matrices that are no rotations (within 1e-3).
+        InputError: an invalid file, with its line: times that do not increase, values that are not finite,
+            quaternions not of length 1 or matrices that are not rotations (within 1e-3).
     """
     file = path_of(path)
     check_rate(rate)
@@ -59,13 +59,13 @@ def load_trajectory(path: str | os.PathLike[str], rate: float = RATE, smooth: bo
         try:
             text = content.decode("utf-8")
         except UnicodeDecodeError:
-            raise InputError(f"{file} is not a trajectory: it is not text in UTF-8") from None
+            raise InputError(f"a trajectory must be text in UTF-8, got {file}") from None
         if file.suffix.lower() == ".json":
             times, poses = _transforms(file, text)
         else:
             times, poses = _lines(file, text)
     if not len(poses):
-        raise InputError(f"{file} holds no pose")
+        raise InputError(f"a trajectory must have a pose, got none in {file}")
     try:
         return Trajectory(np.arange(len(poses)) / rate if times is None else times, np.array(poses), smooth)
     except InputError as error:
@@ -80,26 +80,26 @@ def save_trajectory(
 ) -> None:
     """Write camera-to-world poses: .tum or .txt (TUM), .kitti, .json (transforms.json), or a folder (COLMAP).
 
-    KITTI and COLMAP hold no times. A trajectory that is smooth is written by its keyframes.
+    KITTI and COLMAP have no times. Of a smooth trajectory the keyframes are written.
 
     Args:
         trajectory: k keyframes.
-        path: its ending says the format.
-        camera: its size and focal lengths, for transforms.json and COLMAP, which need them.
-        images: k names of pictures for these two; frame-000000.png and so on when left out.
+        path: its suffix selects the format.
+        camera: size and focal lengths, required for transforms.json and COLMAP.
+        images: k image names for these two; default frame-000000.png and so on.
 
     Raises:
-        InputError: an unknown ending, no camera where one is needed, a lens these formats are not written
-            with, a number of names other than k, a file that cannot be written.
+        InputError: an unknown suffix, a missing camera, a camera with a lens, a number of names other than
+            k, a file that cannot be written.
     """
     if not isinstance(trajectory, Trajectory):
-        raise InputError(f"save_trajectory writes a Trajectory, not a {type(trajectory).__name__}")
+        raise InputError(f"trajectory must be a Trajectory, got a {type(trajectory).__name__}")
     file = path_of(path)
     names = [f"frame-{k:06d}.png" for k in range(len(trajectory))] if images is None else images
     if isinstance(names, str) or not isinstance(names, Sequence) or len(names) != len(trajectory):
-        raise InputError(f"images is {images!r}; give a name for each of {len(trajectory)} poses")
+        raise InputError(f"images must have a name for each of {len(trajectory)} poses, got {images!r}")
     if not all(isinstance(name, str) for name in names):
-        raise InputError(f"images is {images!r}; give names as text")
+        raise InputError(f"images must be names as text, got {images!r}")
     suffix = file.suffix.lower()
     if suffix == "" or file.is_dir():
         lens = _pinhole(camera, file)
@@ -117,21 +117,21 @@ def save_trajectory(
     elif suffix == ".json":
         text = json.dumps(_said(trajectory, _pinhole(camera, file), names), indent=2) + "\n"
     else:
-        raise InputError(f"cannot write a trajectory to {file}; known endings are {_SUFFIXES}")
+        raise InputError(f"the suffix of a trajectory must be one of {_SUFFIXES}, got {file}")
     with atomic_write(file) as stream:
         stream.write(text.encode())
 
 
 def _rows(rows: np.ndarray) -> str:
-    # repr of a float is the shortest text that reads back as the same number
+    # repr of a float is the shortest text that parses to the same number
     return "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
 
 
 def _pinhole(camera: Camera | None, file: Path) -> Camera:
     if not isinstance(camera, Camera):
-        raise InputError(f"{file} needs a camera as well, for its size and focal lengths; not {camera!r}")
+        raise InputError(f"{file} needs a Camera for size and focal lengths, got {camera!r}; give camera=")
     if camera.lens is not None:
-        raise InputError(f"{file}: cameras with a lens ({camera.lens.kind}) are not written; give a pinhole")
+        raise InputError(f"the camera of {file} must be a pinhole, got the lens {camera.lens.kind}")
     return camera
 
 
@@ -151,11 +151,13 @@ def _of_folder(folder: Path) -> Path:
     for name in ("images.bin", "images.txt", "transforms.json"):
         if (folder / name).is_file():
             return folder / name
-    raise InputError(f"{folder} is a folder without images.bin, images.txt or transforms.json")
+    raise InputError(
+        f"a trajectory folder must have images.bin, images.txt or transforms.json, got none in {folder}"
+    )
 
 
 def _lines(file: Path, text: str) -> tuple[list[float] | None, list[np.ndarray]]:
-    """Times and poses of TUM's lines of 8 numbers, or the poses of KITTI's of 12."""
+    """Parse lines of 8 numbers (TUM, with times) or of 12 (KITTI)."""
     times: list[float] = []
     poses: list[np.ndarray] = []
     width = None
@@ -167,16 +169,13 @@ def _lines(file: Path, text: str) -> tuple[list[float] | None, list[np.ndarray]]
         values = _numbers(where, words)
         width = width or len(values)
         if width not in (8, 12) or len(values) != width:
-            wanted = width if width in (8, 12) else "8 (TUM) or 12 (KITTI)"
-            raise InputError(f"{where}: {len(values)} numbers; a trajectory has {wanted} on every line")
+            expected = width if width in (8, 12) else "8 (TUM) or 12 (KITTI)"
+            raise InputError(f"{where}: a line must have {expected} numbers, got {len(values)}")
         if width == 12:
             poses.append(_rigid(where, np.vstack([np.reshape(values, (3, 4)), (0, 0, 0, 1)])))
             continue
         if times and not values[0] > times[-1]:
-            raise InputError(
-                f"{where}: the time {words[0]} is not above the one before, {times[-1]:.15g}; times must "
-                "increase"
-            )
+            raise InputError(f"{where}: times must increase, got {words[0]} after {times[-1]:.15g}")
         times.append(values[0])
         poses.append(_turned(where, values[1:4], (values[7], *values[4:7])))
     return times or None, poses
@@ -186,21 +185,23 @@ def _numbers(where: str, words: Sequence[Any]) -> list[float]:
     try:
         values = [float(word) for word in words]
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{where}: {' '.join(map(str, words))[:80]!r} are not numbers") from None
+        raise InputError(
+            f"{where}: a line must have numbers, got {' '.join(map(str, words))[:80]!r}"
+        ) from None
     if not all(map(math.isfinite, values)):
-        raise InputError(f"{where}: a number is not finite")
+        raise InputError(f"{where}: numbers must be finite")
     return values
 
 
 def _turned(where: str, position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
     length = math.hypot(*quaternion)
     if abs(length - 1) > ROUNDED:
-        raise InputError(f"{where}: the quaternion has the length {length:g}; it must be 1")
+        raise InputError(f"{where}: the length of the quaternion must be 1, got {length:g}")
     return rigid_matrix(position, quaternion)
 
 
 def _rigid(where: str, matrix: np.ndarray) -> np.ndarray:
-    """The rigid matrix nearest to one that was rounded."""
+    """The rigid matrix nearest to a rounded one."""
     u, sizes, v = np.linalg.svd(matrix[:3, :3])
     if np.abs(sizes - 1).max() > ROUNDED or np.linalg.det(u @ v) < 0:
         scales = ", ".join(f"{size:.7g}" for size in sizes)
@@ -216,7 +217,7 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
         pairs = [(frame.get("time"), np.array(frame["transform_matrix"], np.float64)) for frame in frames]
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise InputError(
-            f'{file} is not a transforms.json: it needs "frames", a list of objects with a '
+            f'{file} must have "frames", a list of objects with a '
             f'"transform_matrix" of 4 x 4 numbers ({type(error).__name__}: {error})'
         ) from None
     poses = []
@@ -233,7 +234,7 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
 
 
 def _colmap(file: Path) -> list[np.ndarray]:
-    """Camera to world of COLMAP's images, in the order of their names."""
+    """Camera-to-world matrices of COLMAP's images, sorted by name."""
     found = [
         _turned(f"{file}, image {name}", _numbers(f"{file}, image {name}", pose)[4:], pose[:4])
         for name, pose in image_poses(file)

@@ -1,11 +1,11 @@
-"""OpenUSD: ParticleField with the Gaussian surflet kernel, which is a 2D splat as ours, or of 3D Gaussians as
-ParticleField3DGaussianSplat (extra `usd`). Schemas: openusd.org, usdVol.
+"""OpenUSD splats: ParticleField with the Gaussian surflet kernel for 2D splats, ParticleField3DGaussianSplat
+for 3D Gaussians (extra `usd`). Schemas: openusd.org, usdVol.
 
-USD stages here have y up: the splats are written as they are, under a half turn about x. Labels and
+The stages have y up: splats are written unchanged below a rotation by 180 degrees about x. Labels and
 coplanar groups are in the attributes fidsplat:labels and fidsplat:planes.
 
-Damaged files crash usd-core, or make it run for ever or use gigabytes: a child process with limits of memory
-and processor time reads them.
+Damaged files make usd-core crash, hang or use gigabytes: a child process with limits of memory and processor
+time reads them.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from fidsplat.util.limits import VARIABLE, input_limit
 _SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
 _KINDS = ("ParticleField", "ParticleField3DGaussianSplat")
 _SECONDS = 30
-"""of processor time for any file, and one more for each MiB"""
+"""seconds of processor time for a file, and one more for each MiB"""
 _REFUSED = 3
-"""exit status of the child process when it prints why it refuses the file"""
+"""exit status of the child process after it has printed an InputError"""
 _CHILD = (
     "import sys; sys.path[:] = sys.argv[4:]; from fidsplat.formats.usd import _child; _child(*sys.argv[1:4])"
 )
 
 
 def load_usd(path: Path) -> SplatCloud:
-    """Read the splats of a .usda, .usdc or .usd file, all its fields of Gaussians, as one cloud.
+    """Read all Gaussian particle fields of a .usda, .usdc or .usd file as one cloud.
 
     Raises:
-        InputError: it is damaged, holds no such field, or one whose kernel is not known; reading crashes or
+        InputError: a damaged file, no such field, or one with an unknown kernel; reading crashes or
             exceeds `input_limit`; the extra is missing.
     """
     with open_input(path) as stream:
@@ -78,11 +78,11 @@ def load_usd(path: Path) -> SplatCloud:
 
 
 def _child(limit: str, source: str, target: str) -> None:
-    """Write the arrays of a USD file into an .npz file; runs in a process of its own.
+    """Convert a USD file to an .npz file of arrays; runs in a child process.
 
-    limit: bytes of memory, in addition to what the libraries take.
+    limit: bytes of memory, in addition to that of the libraries.
     """
-    os.environ["PXR_WORK_THREAD_LIMIT"] = "1"  # the stacks of threads would count
+    os.environ["PXR_WORK_THREAD_LIMIT"] = "1"  # stacks of threads count towards the limit
     try:
         pxr = _pxr()
         _set_limits(int(limit), _SECONDS + os.stat(source).st_size // 2**20)
@@ -90,16 +90,15 @@ def _child(limit: str, source: str, target: str) -> None:
         np.savez(target, **_read(pxr, source))
     except MemoryError:
         raise
-    except Exception as error:  # USD's own, also of arrays, which are read late, when they are requested
+    except Exception as error:  # errors of USD, which reads arrays lazily
         text = str(error) if isinstance(error, InputError) else "it is not a USD file that can be read"
         sys.stdout.buffer.write(text.encode("ascii", "backslashreplace"))
         sys.stdout.flush()
-        os._exit(_REFUSED)  # not through the finalizers of a library with a damaged stage
+        os._exit(_REFUSED)  # skip USD's finalizers, which can crash on a damaged stage
 
 
 def _set_limits(limit: int, seconds: int) -> None:
-    """Limit this process to its present size and so many bytes, and to a processor time, where the system
-    can."""
+    """Limit memory (in addition to the present size) and processor time of this process, where supported."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -112,7 +111,7 @@ def _set_limits(limit: int, seconds: int) -> None:
 
 
 def _check_layers(pxr: Any, source: str) -> None:
-    """Check that all files that layers refer to are regular files, before USD opens them."""
+    """Check that all files referenced by layers are regular files, before USD opens them."""
     todo, known = [source], {source}
     while todo:
         layer = pxr.Sdf.Layer.FindOrOpen(todo.pop())
@@ -124,16 +123,16 @@ def _check_layers(pxr: Any, source: str) -> None:
 
 
 def _read(pxr: Any, name: str) -> dict[str, Any]:
-    """Arrays of each field of Gaussians, their names followed by its number."""
+    """Arrays of each field of Gaussians; names end with the index of the field."""
     stage = pxr.Usd.Stage.Open(name, pxr.Usd.Stage.LoadAll)
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in _KINDS]
     if not prims:
-        raise InputError("it holds no ParticleField")
+        raise InputError("it must have a ParticleField, got none")
     up = HALF_TURN if pxr.UsdGeom.GetStageUpAxis(stage) == "Y" else np.eye(4)
     metres = pxr.UsdGeom.GetStageMetersPerUnit(stage) if stage.HasAuthoredMetadata("metersPerUnit") else 1.0
     found = {}
     for k, prim in enumerate(prims):
-        # USD's matrices act on rows
+        # USD multiplies row vectors
         placed = np.array(pxr.UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0)).T
         matrix = np.diag([metres, metres, metres, 1.0]) @ up @ placed
         arrays = {"matrix": matrix, **_field(prim)}
@@ -142,7 +141,7 @@ def _read(pxr: Any, name: str) -> dict[str, Any]:
 
 
 def save_usd(cloud: SplatCloud, path: Path) -> None:
-    """Write a .usda, .usdc or .usd file. Raises InputError for boxes, or where it cannot be written."""
+    """Write a .usda, .usdc or .usd file. Raises InputError for boxes or a file that cannot be written."""
     refuse_boxes(cloud, "USD")
     pxr = _pxr()
     flat, suffix = cloud.thickness is None, path.suffix.lower()
@@ -159,7 +158,7 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
     means, sh = world_means(cloud), coefficients(cloud)
     scales = three_scales(cloud)
     if flat:
-        scales[:, 2] = 1.0  # the kernel lies in the plane z = 0
+        scales[:, 2] = 1.0  # the kernel has no extent along z
     vt = pxr.Vt
     values = {
         "positions": vt.Vec3fArray.FromNumpy(np.ascontiguousarray(means)),
@@ -176,8 +175,8 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
     whole = {"labels": cloud.labels if cloud.labels.any() else None, "planes": cloud.coplanar_groups}
     for name, numbers in whole.items():
         if numbers is not None:
-            made = prim.CreateAttribute(f"fidsplat:{name}", pxr.Sdf.ValueTypeNames.IntArray, True)
-            made.Set(vt.IntArray.FromNumpy(numbers))
+            attribute = prim.CreateAttribute(f"fidsplat:{name}", pxr.Sdf.ValueTypeNames.IntArray, True)
+            attribute.Set(vt.IntArray.FromNumpy(numbers))
     if len(cloud):
         extent = np.array(cloud.bounds(), np.float32)
         prim.GetAttribute("extent").Set(vt.Vec3fArray.FromNumpy(extent))
@@ -188,19 +187,19 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
         except pxr.Tf.ErrorException:
             done = False
         if not done:
-            raise InputError(f"cannot write {path}: USD says no more; is the disk full?")
+            raise InputError(f"cannot write {path}: USD gives no reason; is the disk full?")
 
 
 def _field(prim: Any) -> dict[str, np.ndarray]:
-    """Arguments of `cloud_of`."""
+    """Arguments of `cloud_of` from a particle field."""
     surflet = _SURFLET in prim.GetAppliedSchemas()
     if prim.GetTypeName() == _KINDS[0] and not surflet:
-        raise InputError(f"the kernel of {prim.GetPath()} is not known; Gaussian surflets are")
+        raise InputError(f"the kernel of {prim.GetPath()} must be the Gaussian surflet, got another")
 
     def array(name: str, *columns: int) -> np.ndarray:
-        found = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()  # h: in half precision
+        found = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()  # half precision
         if found is None:
-            raise InputError(f"{prim.GetPath()} has no {name}")
+            raise InputError(f"{prim.GetPath()} must have {name}, got none")
         values = np.array(found, np.float32)
         if values.shape[1:] != columns or values.ndim != 1 + len(columns):
             raise InputError(
@@ -215,9 +214,9 @@ def _field(prim: Any) -> dict[str, np.ndarray]:
     sh = array("radiance:sphericalHarmonicsCoefficients", 3)
     n, k = len(means), (degree + 1) ** 2
     if len(sh) != n * k:
-        raise InputError(f"{prim.GetPath()} has {len(sh)} SH coefficients for {n} splats of {k}")
+        raise InputError(f"{prim.GetPath()} must have {n * k} SH coefficients, got {len(sh)}")
     found = {"means": means, "scales": scales, "sh": sh.reshape(n, k, 3), "opacities": array("opacities")}
-    found["quats"] = array("orientations", 4)[:, [3, 0, 1, 2]]  # USD's have the imaginary parts first
+    found["quats"] = array("orientations", 4)[:, [3, 0, 1, 2]]  # USD has the real part last
     for name, attribute in (("labels", "labels"), ("coplanar_groups", "planes")):
         if (numbers := prim.GetAttribute(f"fidsplat:{attribute}").Get()) is not None:
             found[name] = np.array(numbers, np.int32)

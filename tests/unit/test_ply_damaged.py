@@ -51,7 +51,7 @@ def swap(old, new):
 
 HEAD = b"ply\nformat binary_little_endian 1.0\n"
 DAMAGES = {
-    "cut in the data": (lambda c: c[:-1], r"cut short: its header calls for \d+ bytes, but the file has \d+"),
+    "cut in the data": (lambda c: c[:-1], r"cut short: its header declares \d+ bytes, but the file has \d+"),
     "cut after the header": (lambda c: c[: c.index(b"end_header\n") + 11], "cut short"),
     "cut in the header": (lambda c: c[:200], "no end_header"),
     "empty": (lambda c: b"", "is empty"),
@@ -59,15 +59,21 @@ DAMAGES = {
     "text": (lambda c: b"hello\n", "is not a PLY file"),
     "zeros": (lambda c: bytes(5000), "is not a PLY file"),
     "begins like one": (lambda c: b"plywood\n" + c, "is not a PLY file"),
-    "ascii": (swap(b"binary_little_endian", b"ascii"), "format is ascii; only binary_little_endian"),
-    "big-endian": (swap(b"binary_little_endian", b"binary_big_endian"), "format is binary_big_endian"),
-    "no format": (swap(b"format binary_little_endian 1.0\n", b""), "format is None"),
+    "ascii": (swap(b"binary_little_endian", b"ascii"), "format must be binary_little_endian, got ascii"),
+    "big-endian": (
+        swap(b"binary_little_endian", b"binary_big_endian"),
+        "the PLY format must be binary_little_endian, got binary_big_endian;",
+    ),
+    "no format": (
+        swap(b"format binary_little_endian 1.0\n", b""),
+        "the PLY format must be binary_little_endian, got None; convert it",
+    ),
     "no end_header": (swap(b"end_header\n", b""), "no end_header"),
     "endless header": (lambda c: HEAD + b"comment x\n" * 10**6, "no end_header within 65536 bytes"),
     "endless line": (lambda c: HEAD + b"x" * 10**6, "no end_header within 65536 bytes"),
     "10^12 vertices": (
         swap(b"vertex 300", b"vertex 1000000000000"),
-        r"cut short: its header calls for \d{15} bytes",
+        r"cut short: its header declares \d{15} bytes",
     ),
     "10^17 vertices": (swap(b"vertex 300", b"vertex 100000000000000000"), "cut short"),
     "10^30 vertices": (swap(b"vertex 300", b"vertex 1" + b"0" * 30), "must be a whole number >= 0"),
@@ -80,7 +86,7 @@ DAMAGES = {
     "property before the element": (swap(b"element vertex 300\n", b""), "property before its first element"),
     "list property": (
         swap(b"end_header", b"element face 1\nproperty list uchar int vertex_indices\nend_header"),
-        "is a list",
+        "the PLY header's line 'property list uchar int vertex_indices' must not be",
     ),
     "unknown type": (swap(b"property float x\n", b"property half x\n"), "known type"),
     "short property line": (swap(b"property float x\n", b"property float\n"), "known type"),
@@ -99,7 +105,10 @@ DAMAGES = {
     "SH of no degree": (swap(b"f_rest_8\n", b"g_rest_8\n"), "8 properties f_rest"),
     "SH numbered wrongly": (swap(b"f_rest_8\n", b"f_rest_9\n"), "numbered from 0"),
     "unknown keyword": (swap(b"end_header", b"elephant 3\nend_header"), "'elephant 3' is unknown"),
-    "bytes that are no text": (swap(b"element vertex", b"comment \xff\xfe\nelement vertex"), "not text"),
+    "bytes that are no text": (
+        swap(b"element vertex", b"comment \xff\xfe\nelement vertex"),
+        "the PLY header must be text, got other bytes",
+    ),
     "damaged origin": (
         swap(b"element vertex", b"comment fidsplat origin 1 2\nelement vertex"),
         "three finite numbers",
@@ -193,7 +202,7 @@ def sparse(path, content, rows=ROWS, good=0):
 @pytest.mark.parametrize("good", [0, 100])
 def test_memory_follows_what_is_kept(tmp_path, content, good, monkeypatch):
     """Of rows that are no splats, however many, only a window is in memory at a time."""
-    monkeypatch.setattr(collect, "_FIRST_ROOM", 1000)
+    monkeypatch.setattr(collect, "_INITIAL_CAPACITY", 1000)
     monkeypatch.setattr(collect, "WINDOW", 20_000)
     path = sparse(tmp_path / "zeros.ply", content, good=good)
     tracemalloc.start()
@@ -213,7 +222,7 @@ def test_arrays_that_grow_while_a_file_is_read(tmp_path, content, monkeypatch):
     path.write_bytes(content)
     whole = fs.load_ply(path)
     for room in (16, 64, 299):
-        monkeypatch.setattr(collect, "_FIRST_ROOM", room)
+        monkeypatch.setattr(collect, "_INITIAL_CAPACITY", room)
         monkeypatch.setattr(collect, "WINDOW", 16)
         read = fs.load_ply(path)
         for name in ("means", "quats", "scales", "opacities", "sh"):

@@ -190,8 +190,14 @@ def test_cameras_of_a_model_that_cannot_be_used_are_named(folder):
     line = next(line for line in texts[0].splitlines() if line[:1].isdigit())
     number = line.split()[0]
     for other, words in (
-        (f"{number} PINHOLE 24 18 20", "cameras.txt is damaged.*PINHOLE with 1 parameters"),
-        (f"{number} FOV 24 18 20 20 12 9 0.1", r"image 1\.png: .*the model FOV, .*; undistort the pictures"),
+        (
+            f"{number} PINHOLE 24 18 20",
+            "cannot read .*cameras.txt as COLMAP's: camera 1 of model PINHOLE must not have 1 parameters",
+        ),
+        (
+            f"{number} FOV 24 18 20 20 12 9 0.1",
+            r"image 1\.png: .*the camera model must be .*, got FOV; undistort the images",
+        ),
         (f"{number} SIMPLE_RADIAL 24 18 20 12 9 -9", r"image 1\.png: .*k1 = -9\) cannot be inverted"),
         (f"{number} PINHOLE 24 18 0 20 12 9", r"image 1\.png: "),
     ):
@@ -345,7 +351,7 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
         whole = file.read_bytes()
         for data in (whole[:-3], whole[:11], b"\xff" * 40):
             file.write_bytes(data)
-            with pytest.raises(fs.InputError, match=f"{name}.bin is damaged"):
+            with pytest.raises(fs.InputError, match=f"{name}.bin as COLMAP's"):
                 load_dataset(folder)
         file.write_bytes(whole)
     nerf = transforms(made, tmp_path / "nerf")
@@ -373,9 +379,13 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
 @pytest.mark.parametrize(
     ("name", "line", "words"),
     [
-        ("cameras", "1 PINHOLE 64 48 50", "with 1 parameters"),
+        (
+            "cameras",
+            "1 PINHOLE 64 48 50",
+            "cannot read .*cameras.txt as COLMAP's: camera 1 of model PINHOLE must not have 1 parameters",
+        ),
         ("points3D", "1 0 0 0 9", "not enough"),
-        ("images", "1 1 0 0 0 0", "'1 1 0 0 0 0' has 6 of the 10 words"),
+        ("images", "1 1 0 0 0 0", "must have 10 words, got '1 1 0 0 0 0'"),
     ],
 )
 def test_lines_of_a_colmap_model_that_end_early(folder, name, line, words):
