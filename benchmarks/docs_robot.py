@@ -60,12 +60,14 @@ def floor_plan(arguments: Drive, ways: list[np.ndarray], height: int) -> np.ndar
     """The greenhouse from above with the ways (n, 2) [m] so far, (height, MAP, 3) uint8; x is up."""
     house = arguments.house
     sheet = np.full((height, MAP, 3), GROUND, np.uint8)
-    scale = min((height - 90) / (house.length + 2), MAP / (house.middles[-1] + 2))
+    scale = min((height - 90) / (house.length + 2), MAP / (house.row_positions[-1] + 2))
 
     def pixel(x: float, y: float) -> tuple[int, int]:
-        return round(MAP / 2 + (house.middles[-1] / 2 - y) * scale), round(height - 70 - (x + 1) * scale)
+        return round(MAP / 2 + (house.row_positions[-1] / 2 - y) * scale), round(
+            height - 70 - (x + 1) * scale
+        )
 
-    for y in house.middles:
+    for y in house.row_positions:
         half = BENCH[0] / 2
         cv2.rectangle(sheet, pixel(0, y + half), pixel(house.length, y - half), WOOD, -1)
     for tag in arguments.tags.values():

@@ -55,7 +55,7 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
     Raises:
         InputError: as `prepare`; views that call for different effects.
     """
-    rendered = views.drawn
+    rendered = views.active
     indices = np.array(rendered, np.uint32)
     indices.flags.writeable = False
     if len(views.captures) == 1 and views.captures[0].motion.is_still:

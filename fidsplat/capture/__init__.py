@@ -1,1 +1,1 @@
-"""How an image is taken: camera, outputs, quality, sensor, environment; plain data."""
+"""Capture settings of a frame as plain data: camera, outputs, quality, sensor, environment."""

@@ -19,7 +19,7 @@ from fidsplat.util.errors import InputError, unknown
 class Capture(PickledByFields):
     """Camera, outputs, quality, background, motion, shutter, sensor and fog of a frame.
 
-    The same object works on every device. Raises InputError for a value of the wrong kind; output names are
+    It does not depend on the device. Raises InputError for a value of the wrong type; output names are
     checked when the frame is rendered.
     """
 
@@ -114,7 +114,7 @@ def output_names(outputs: Any) -> tuple[str, ...]:
     except TypeError:  # a 0-dimensional array is an Iterable too
         names = (outputs,)
     if not names:
-        raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
+        raise InputError("outputs must have at least one name, e.g. 'rgb', got none")
     if not all(isinstance(name, str) for name in names):
         raise InputError(f"outputs must be one or more names, got {outputs!r}")
     return tuple(dict.fromkeys(names))

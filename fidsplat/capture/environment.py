@@ -17,9 +17,9 @@ MAX_PANORAMA = 16384
 
 @dataclass(frozen=True)
 class Fog:
-    """Homogeneous fog: a surface at distance r keeps exp(-density r) of its colour, the rest is the fog's.
+    """Homogeneous fog: a surface at distance r retains exp(-density r) of its colour, the rest is the fog's.
 
-    The fog also replaces the background. Raises InputError for a density below 0 or a colour that is not
+    The fog also replaces the background. Raises InputError for a negative density or a colour that is not
     three finite numbers.
     """
 
@@ -67,14 +67,14 @@ class Panorama(PickledByFields):
     """
 
     image: np.ndarray
-    """(h, w, 3) float32 RGB, read-only; uint8 is taken as 255ths, uint16 as 65535ths"""
+    """(h, w, 3) float32 RGB, read-only; uint8 is divided by 255, uint16 by 65535"""
     file: str | None = None
     """its file"""
 
     def __post_init__(self) -> None:
         try:
             given: np.ndarray = np.asarray(self.image)
-        except ValueError:  # rows that differ in length
+        except ValueError:  # rows of different lengths
             given = np.empty(0)
         if given.ndim != 3 or given.shape[2] != 3 or given.dtype.kind not in "fiu":
             raise InputError(
@@ -86,11 +86,11 @@ class Panorama(PickledByFields):
                 f"background: a panorama must have 2 to {MAX_PANORAMA} pixels a side, got {width} x {height}"
             )
         whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
-        with np.errstate(over="ignore"):  # what float32 cannot hold is refused below
+        with np.errstate(over="ignore"):  # an overflow of float32 is rejected below
             image = np.array(given, np.float32, order="C") / np.float32(whole)
         if not np.isfinite(image).all():
             which = f"the panorama {self.file}" if self.file else "the panorama"
-            raise InputError(f"background: {which} must hold finite numbers; replace the others")
+            raise InputError(f"background: {which} must have finite numbers; replace the others")
         image.flags.writeable = False
         object.__setattr__(self, "image", image)
 
@@ -111,7 +111,7 @@ class ExternalDepth(PickledByFields):
     """
 
     rgb: np.ndarray
-    """(h, w, 3) float32 in display space, read-only; uint8 is taken as 255ths"""
+    """(h, w, 3) float32 in display space, read-only; uint8 is divided by 255"""
     depth: np.ndarray
     """(h, w) float32 metres, as the camera's depths are (along z; along the ray for a fisheye or panorama);
     infinite where there is nothing, also given as 0 or NaN"""
@@ -127,7 +127,7 @@ class ExternalDepth(PickledByFields):
             )
         whole = 255 if rgb.dtype == np.uint8 else 1
         if not np.isfinite(rgb).all() or (depth < 0).any():
-            raise InputError("external_depth must hold finite colours and depths of at least 0")
+            raise InputError("external_depth must have finite colours and depths of at least 0")
         label = _array_of("label", self.label)
         if label.dtype.kind not in "iu" or label.shape not in ((), depth.shape):
             raise InputError(f"label of external_depth must be integers {depth.shape}, or one for all")
@@ -146,7 +146,7 @@ class ExternalDepth(PickledByFields):
 def _array_of(name: str, value: Any) -> np.ndarray:
     try:
         array: np.ndarray = np.asarray(value)
-    except ValueError:  # rows that differ in length
+    except ValueError:  # rows of different lengths
         array = np.empty(0, object)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} of external_depth must be an array of numbers, got {value!r}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import as_float, whole_number
+from fidsplat.util.arguments import as_float, invalid, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 LOWPASS = ("screen", "pixel", "none")
@@ -30,7 +30,7 @@ MAX_LEVELS, MAX_DENSITY = 8, 100
 
 def _one_of(what: str, value: Any, known: tuple) -> None:
     if not isinstance(value, (str, int, type(None))) or isinstance(value, bool) or value not in known:
-        raise InputError(f"{what} is {value!r}; known: {', '.join(map(str, known))}")
+        raise invalid(what, f"one of {', '.join(map(str, known))}", value)
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,13 @@ class MarkerQuality:
         _one_of("marker quality: template", self.template, TEMPLATE_SIZES)
         growth = self.growth
         if growth is not None and not (isinstance(growth, Real) and 0 <= growth <= 1):
-            raise InputError(f"marker quality: growth must lie from 0 to 1 module, got {growth!r}")
+            raise invalid("marker quality: growth", "0 to 1 module", growth)
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality settings of a frame. Their error has no bound that holds for every scene; the output `error`
-    bounds it for one frame (docs/accuracy.md).
+    """Quality settings of a frame. No bound on their error holds for every scene; the output `error` is a
+    bound for one frame (docs/accuracy.md).
 
     Raises:
         InputError: a value is out of range.
@@ -92,7 +92,7 @@ class Quality:
     splats of alpha 0.0039 lose 32 % opacity (docs/accuracy.md)."""
 
     transmittance_stop: float = 1e-4
-    """Transmittance at which a pixel is finished, in [0, 1), default 1e-4: splats behind change the pixel by
+    """Transmittance at which a pixel terminates, in [0, 1), default 1e-4: further splats change the pixel by
     at most this. Higher values skip more occluded splats; 0 never stops."""
 
     stop_rule: str = "inclusive"
@@ -167,7 +167,7 @@ class Quality:
             )
             if not ok:
                 left, right = "(" if low_open else "[", ")" if high_open else "]"
-                raise InputError(f"quality: {name} must lie in {left}{low:g}, {high:g}{right}, got {value!r}")
+                raise InputError(f"quality: {name} must be in {left}{low:g}, {high:g}{right}, got {value!r}")
 
         within("alpha_cutoff", 0.0, 1.0, True, True)
         within("transmittance_stop", 0.0, 1.0, False, True)
@@ -188,26 +188,25 @@ class Quality:
             raise InputError(f"quality: marker must be an fs.MarkerQuality(...), got {self.marker!r}")
         if self.blend_precision == "float64" and self.setup_precision != "float64":
             raise InputError(
-                "quality: blend_precision='float64' means nothing after a set-up in float32; use "
-                "setup_precision='float64' with it"
+                "quality: setup_precision must be 'float64' with blend_precision='float64', got 'float32'"
             )
         if self.stop_rule == "exclusive" and self.order != "centre":
             raise InputError(
-                f"quality: order is {self.order!r}, but the exclusive stop drops single splats, which a "
-                "printed plane has not at a pixel; use order='centre' with it"
+                f"quality: order must be 'centre' with stop_rule='exclusive', got {self.order!r}; coplanar "
+                "groups are composited as one fragment, of which the exclusive stop cannot drop single splats"
             )
         whole_number("quality: samples", self.samples, 1, MAX_SAMPLES)
 
     @classmethod
     def named(cls, name: str) -> Quality:
-        """The preset of that name: standard, fast, reference, gsplat or surfel."""
+        """A preset by name: standard, fast, reference, gsplat or surfel."""
         if isinstance(name, str) and name in PRESETS:
             return PRESETS[name]
         raise InputError(unknown("quality", name, PRESETS))
 
     @classmethod
     def of(cls, quality: Quality | str | None) -> Quality:
-        """A `Quality` from itself, from text, or the default from None.
+        """Convert a `Quality`, a text or None (the default) to a `Quality`.
 
         Text is the name of a preset, settings as key=value, or both: "fast", "alpha_cutoff=1e-3",
         "fast,samples=2,marker.template=9". Without a name the settings change standard.
@@ -236,7 +235,7 @@ class Quality:
         return chosen.with_(**changes)
 
     def with_(self, **changes) -> Quality:
-        """A copy with some settings changed; an unknown setting is an error that names the known ones.
+        """A copy with some settings changed. Raises InputError for an unknown setting.
 
         marker: a `MarkerQuality`, or a dict of its settings to change.
         """
@@ -265,7 +264,7 @@ def _check_known(kind: type[Quality] | type[MarkerQuality], name: str) -> None:
 def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> Any:
     """Parse the value of a setting."""
     if name == "marker":
-        raise InputError("quality: marker has its own settings; write e.g. marker.template=9")
+        raise InputError("quality: marker must be given by its settings, e.g. marker.template=9")
     _check_known(kind, name)
     wanted = setting_types(kind)[name]
     if wanted.endswith("| None") and text.lower() == "none":
@@ -280,7 +279,7 @@ def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> An
 
 # gsplat: gsplat 1.5/1.6 `rasterization_2dgs`; surfel: the 2DGS authors' diff-surfel-rasterization.
 # Both clamp alpha at 0.99, cut at 1/255 and drop the fragment that would take T below 1e-4. Their differences
-# (bounding boxes, low-pass centre, near plane) are defects, not constants: see docs/conventions.md.
+# (bounding boxes, low-pass centre, near plane) are defects and are not reproduced: see docs/conventions.md.
 _PARITY = Quality(
     alpha_cutoff=1.0 / 255.0,
     transmittance_stop=1e-4,
@@ -290,8 +289,8 @@ _PARITY = Quality(
     arithmetic="precise",
 )
 
-# standard: the cheapest quality of docs/accuracy.md with an error of at most 1/512 on every scene, hard cases
-# included; with fast arithmetic, which is cheaper on CPUs and at most 1 % slower on GPUs
+# standard: the fastest quality of docs/accuracy.md with an error of at most 1/512 on every scene, including
+# the self-test; fast arithmetic is faster on CPUs and at most 1 % slower on GPUs
 PRESETS: dict[str, Quality] = {
     "standard": Quality(),
     "fast": Quality(alpha_cutoff=2.0 / 255.0, transmittance_stop=1.0 / 256.0, setup_precision="float32"),

@@ -21,8 +21,8 @@ LARGEST = 1e15
 
 @dataclass(frozen=True)
 class Sensor:
-    """Sensor of a camera. Values of the frame are linear light; the steps are applied in this order, and a
-    step with its default value costs nothing.
+    """Sensor model of a camera. The values of a frame are linear light; the steps are applied in the order of
+    the fields. A step with its default value costs nothing.
 
     Raises:
         InputError: a value is out of range.
@@ -60,30 +60,31 @@ class Sensor:
                     f"sensor: {name} must be a number of at least 0, at most {highest:g}, got {value!r}"
                 )
         if self.read_noise > 0 and math.isinf(self.full_well):
-            raise InputError(f"sensor: read_noise is {self.read_noise!r} electrons; give full_well with it")
+            raise InputError(
+                f"sensor: full_well must be given with read_noise, got read_noise={self.read_noise!r} only"
+            )
         if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and 0 <= self.seed < 2**32):
             raise InputError(f"sensor: seed must be a whole number from 0 to 2^32 - 1, got {self.seed!r}")
         if self.bits is not None and not (isinstance(self.bits, int) and self.bits in BITS):
-            raise InputError(f"sensor: bits is {self.bits!r}; known: 8, 16, or none")
+            raise InputError(f"sensor: bits must be 8, 16 or None, got {self.bits!r}")
         object.__setattr__(self, "vignetting", _numbers("vignetting", self.vignetting, 0, 3))
         if isinstance(self.response, str):
             if self.response not in RESPONSES:
                 raise InputError(
-                    f"sensor: response is {self.response!r}; known: {', '.join(RESPONSES)}, a gamma above 0, "
-                    "or a table"
+                    f"sensor: response must be {', '.join(RESPONSES)}, a gamma above 0, or a table, got "
+                    f"{self.response!r}"
                 )
         elif _is_number(self.response):
             if not GAMMAS[0] <= self.response <= GAMMAS[1]:  # type: ignore[operator]
                 raise InputError(
-                    f"sensor: response is {self.response!r}; a gamma must lie between {GAMMAS[0]:g} and "
-                    f"{GAMMAS[1]:g}"
+                    f"sensor: a gamma must be from {GAMMAS[0]:g} to {GAMMAS[1]:g}, got {self.response!r}"
                 )
         else:
             object.__setattr__(self, "response", _numbers("response", self.response, 2, 65536))
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """Names of the active effects, in their order."""
+        """Names of the active steps, in order of application."""
         found = [
             ("exposure", self.exposure != 1),
             ("vignetting", any(self.vignetting)),
@@ -95,14 +96,14 @@ class Sensor:
         elif self.response == "srgb":
             found.append(("response_srgb", True))
         elif isinstance(self.response, tuple):
-            # a straight line from 0 to 1 still clamps, but so does every output
+            # a line from 0 to 1 only clamps, which every output does as well
             line = np.linspace(0, 1, len(self.response))
             found.append(("response_table", not np.array_equal(self.response, line)))
         found.append(("quantise", self.bits is not None))
         return tuple(name for name, active in found if active)
 
     def uniform(self, name: str) -> tuple[Any, ...]:
-        """Kernel arguments of a step, in their order."""
+        """Kernel arguments of a step, in order."""
         match name:
             case "noise":
                 variance = 1 / self.full_well

@@ -40,13 +40,13 @@ class Views:
         counts |= {} if self.mask is None else {"mask": len(self.mask)}
         if len(set(counts.values())) > 1:
             listed = ", ".join(f"{name} has {count}" for name, count in counts.items())
-            raise InputError(f"a batch must have one number of views: {listed}")
+            raise InputError(f"all arguments of a batch must have the same number of views, got {listed}")
         if not len(self):
-            raise InputError(f"a batch must have one view or more; {next(iter(counts))} is empty")
+            raise InputError(f"a batch must have at least one view, got an empty {next(iter(counts))}")
         for number, capture in enumerate(self.captures):
-            self._refuse_two_motions(number, capture.motion)
+            self._check_motion(number, capture.motion)
 
-    def _refuse_two_motions(self, number: int, motion: Motion) -> None:
+    def _check_motion(self, number: int, motion: Motion) -> None:
         if self.poses is not None and motion.camera is not None:
             raise InputError(f"poses and the motion of view {number} both move its camera; leave one out")
         for label in self.groups or ():
@@ -64,12 +64,12 @@ class Views:
         return next((len(each) for each in (*of_poses, *(self.groups or {}).values())), len(self.captures))
 
     @property
-    def drawn(self) -> list[int]:
+    def active(self) -> list[int]:
         """Indices of the views to render."""
         return list(range(len(self))) if self.mask is None else np.flatnonzero(self.mask).tolist()
 
     def capture(self, number: int) -> Capture:
-        """Capture of one view; rendered alone, it is bit-identical."""
+        """Capture of one view, which renders bit-identically to the view in the batch."""
         base = self.captures[number if len(self.captures) > 1 else 0]
         camera, motion = base.camera, base.motion
         if self.poses is not None and camera is not None:
@@ -93,13 +93,14 @@ class Views:
             ):
                 if one != other:
                     raise InputError(
-                        f"the views of a batch must have the same {what}: view 0 has {one}, view {number} "
-                        f"has {other}; render them in separate batches"
+                        f"the views of a batch must have the same {what}, got {one} of view 0 and {other} "
+                        "of view "
+                        f"{number}; render them in separate batches"
                     )
 
 
 def camera_at(camera: Camera, pose: np.ndarray) -> Camera:
-    """The camera at a pose (4, 4), camera to world, with an unchanged position."""
+    """The camera at a pose (4, 4), camera to world; its position is stored exactly."""
     matrix = np.eye(4)
     matrix[:3, :3] = pose[:3, :3].T
     matrix[:3, 3] = -matrix[:3, :3] @ pose[:3, 3]
@@ -138,7 +139,7 @@ def pose_matrices(name: str, poses: Any) -> np.ndarray:
         raise InputError(
             f"{name} must have the shape (views, 7), x y z and a quaternion w x y z, got {given.shape}"
         )
-    with np.errstate(over="ignore"):  # an overflow becomes infinite, and is refused
+    with np.errstate(over="ignore"):  # an overflow becomes infinite and is rejected
         lengths = np.linalg.norm(given[:, 3:], axis=1)
         wrong = ~((np.abs(given[:, :3]) <= LARGEST).all(1) & (lengths > 0) & (lengths < np.inf))
     if wrong.any():
@@ -157,7 +158,7 @@ def pose_matrices(name: str, poses: Any) -> np.ndarray:
 def _mask(given: Any) -> np.ndarray:
     try:
         mask = np.asarray(given)
-    except ValueError:  # rows that differ in length
+    except ValueError:  # rows of different lengths
         mask = np.empty(0, object)
     if mask.dtype != bool or mask.ndim != 1:
         raise InputError(f"mask must be (views,) bools, got shape {mask.shape} and type {mask.dtype}")
@@ -165,7 +166,7 @@ def _mask(given: Any) -> np.ndarray:
 
 
 def _constant(pose: np.ndarray):
-    """A motion with one pose at every time."""
+    """Constant motion, with one pose."""
     return lambda time: pose
 
 

@@ -101,15 +101,21 @@ def _unpack(rows: np.ndarray, chunks: np.ndarray, coloured: bool) -> dict[str, n
 def _check(header: Header, name: str, properties, kind: str, count: int) -> None:
     element = header.elements.get(name)
     if element is None:
-        raise InputError(f"{header.path}: the compressed PLY lacks the element {name}")
+        raise InputError(f"{header.path}: a compressed PLY must have the element {name}, got none")
     missing = [p for p in properties if p not in element.properties]
     if missing:
-        raise InputError(f"{header.path}: the compressed PLY's element {name} lacks {', '.join(missing)}")
+        raise InputError(
+            f"{header.path}: the element {name} of a compressed PLY must have {', '.join(missing)}"
+        )
     wrong = [p for p in properties if element.dtype[p] != np.dtype(kind)]
     if wrong:
-        raise InputError(f"{header.path}: wrong type of {', '.join(wrong)} in the compressed element {name}")
+        raise InputError(
+            f"{header.path}: the element {name} of a compressed PLY has a wrong type of {', '.join(wrong)}"
+        )
     if element.count != count:
-        raise InputError(f"{header.path}: the compressed PLY has {element.count} rows of {name}, not {count}")
+        raise InputError(
+            f"{header.path}: a compressed PLY must have {count} rows of {name}, got {element.count}"
+        )
 
 
 def _unit_fractions(words: np.ndarray, *widths: int) -> np.ndarray:

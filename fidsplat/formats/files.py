@@ -29,13 +29,13 @@ class Format:
     name: str
     load: Callable[[Path], SplatCloud]
     save: Callable[[SplatCloud, Path], None] | None
-    """None: it is read only"""
+    """None for read-only formats"""
     labels: bool = False
     coplanar_groups: bool = False
     harmonics: bool = True
     origin: bool = False
     rounds: str = ""
-    """what it keeps with fewer bits than float32"""
+    """values stored with fewer bits than float32"""
 
 
 _USD = Format("OpenUSD ParticleField", load_usd, save_usd, labels=True, coplanar_groups=True)
@@ -58,7 +58,7 @@ FORMATS = {
     ".usd": _USD,
     ".sog": Format("SOG", load_sog, None),
 }
-"""by their endings"""
+"""formats by suffix"""
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:

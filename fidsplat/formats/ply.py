@@ -13,10 +13,10 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
 
 ORIGIN_COMMENT = "fidsplat origin"
-"""a header comment of this beginning and three numbers holds the origin that x, y, z are relative to"""
+"""prefix of the header comment with the three coordinates of the origin"""
 
 FILTER = "filter_3D"
-"""standard deviation in metres by which Mip-Splatting widens a splat in space, beside its scales"""
+"""property with the standard deviation [m] of Mip-Splatting's 3D smoothing filter"""
 
 _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1")
 _NEEDED += ("rot_0", "rot_1", "rot_2", "rot_3")

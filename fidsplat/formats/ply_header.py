@@ -13,7 +13,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import open_input, path_of
 
 MAX_HEADER = 65536
-"""bytes; a splat file's header has some 2,000"""
+"""maximum bytes of a header; that of a splat file has about 2,000"""
 
 _TYPES = {
     "char": "<i1",
@@ -57,7 +57,7 @@ class Header:
     elements: dict[str, Element]
     comments: tuple[str, ...]
     text: bool = False
-    """whether the rows are lines of text; ``offset`` is then where the first element's begin, for all"""
+    """whether rows are lines of text; `offset` is then that of the first element for all elements"""
 
     def rows(self, name: str, first: int, end: int) -> np.ndarray:
         """Rows [first, end) of an element as a read-only structured array, memory-mapped if the file is

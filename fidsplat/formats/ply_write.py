@@ -13,7 +13,7 @@ from fidsplat.util.files import atomic_write
 
 _BLOCK = 65536
 MAX_LOGIT = 100.0
-"""opacity 0 and 1 are written as logit -100 and 100, which every reader turns back into 0 and 1 in float32"""
+"""logit of opacity 1, and -100 of opacity 0, whose sigmoid is 1 and 0 in float32"""
 
 
 def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool = False) -> None:

@@ -26,7 +26,7 @@ MAX_PART, MAX_META = 2**30, 2**24
 SPARE = 2**16
 """pixels that an image may have in addition to one for each splat: writers pad the last rows"""
 _ROW = 64  # palette entries in a row of the image of centroids
-MOST_ENTRIES = 2**16
+MAX_ENTRIES = 2**16
 """maximum number of palette entries: labels have 16 bits"""
 _SPLAT, _BAND = 160, 28
 """bytes of memory for each splat while a file is read, and for each SH coefficient above degree 0"""
@@ -105,7 +105,7 @@ def _book(part: dict[str, Any]) -> np.ndarray:
 def _higher(path: Path, archive: zipfile.ZipFile, part: dict[str, Any], labels: np.ndarray) -> np.ndarray:
     """SH coefficients (n, k, 3) above degree 0, from the palette."""
     name, k = part["files"][0], _COEFFICIENTS[part["bands"]]
-    palette = _image(path, archive, name, MOST_ENTRIES * k)
+    palette = _image(path, archive, name, MAX_ENTRIES * k)
     if palette.shape[1] != _ROW * k:
         raise InputError(
             f"{path}: the width of {name} must be {_ROW * k} pixels for {part['bands']} bands, got "

@@ -18,8 +18,8 @@ from fidsplat.util.files import atomic_write, regular_file
 from fidsplat.util.limits import check_expansion
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-_SEEN = 4096
-"""rows that are looked at before the others are read: nothing else tells what the file is"""
+_CHECKED_ROWS = 4096
+"""rows that are validated before the rest is read, since the format has no magic number"""
 
 
 def load_splat(path: Path) -> SplatCloud:
@@ -32,7 +32,7 @@ def load_splat(path: Path) -> SplatCloud:
         )
     check_expansion(path, 4 * size, f"{size // _ROW.itemsize:,} splats")
     rows = np.memmap(path, _ROW, "r").view(np.ndarray)
-    means, scales = rows["means"][:_SEEN], rows["scales"][:_SEEN]
+    means, scales = rows["means"][:_CHECKED_ROWS], rows["scales"][:_CHECKED_ROWS]
     if not (np.isfinite(means).all(1) & np.isfinite(scales).all(1) & (scales > 0).any(1)).any():
         raise InputError(f"{path} is not a .splat file: none of its first {len(means)} rows is a splat")
     rgba = rows["rgba"].astype(np.float32) / 255

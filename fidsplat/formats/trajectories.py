@@ -25,11 +25,11 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, path_of, read_input
 
 MAX_BYTES = 2**28
-"""of a file: TUM's two million poses"""
+"""maximum bytes of a file; about two million poses in TUM's format"""
 RATE = 10.0
-"""poses a second of files that hold no times, as KITTI's were taken"""
+"""poses a second for files without times, the rate of KITTI"""
 ROUNDED = 1e-3
-"""how far a file's rotation may be from one: six digits are common"""
+"""tolerance of rotations: files often have six digits"""
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenGL's and OpenCV's camera axes
 _SUFFIXES = ".tum and .txt (TUM), .kitti, .json (transforms.json), or a folder (COLMAP)"
 

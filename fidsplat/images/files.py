@@ -168,9 +168,9 @@ def pixels_of(image: np.ndarray) -> np.ndarray:
 
 
 _BLOCK = 1 << 14
-"""values of a block: few enough to stay in a core's cache between the steps"""
+"""number of values of a block: few enough to stay in a core's cache between the steps"""
 _TASK = 16 * _BLOCK
-"""values of a thread's task"""
+"""number of values of a thread's task"""
 _MIN_TASKS, _THREADS = 8, 4
 """minimum number of tasks for which threads are faster (900 x 800 pixels); maximum number of threads"""
 

@@ -1,6 +1,7 @@
-"""Boards of tags, as OpenCV's board detectors and Kalibr know them: ChArUco, grid boards and AprilGrids.
+"""Boards of tags of OpenCV and Kalibr: ChArUco, grid boards and AprilGrids.
 
-All are made of whole modules, so that they are cut into rectangles like any other marker. Ids count from 0.
+All lengths are whole modules, so that boards are partitioned into rectangles like other markers. Ids start at
+0.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from fidsplat.markers.spec import Kind, Spec
 from fidsplat.util.errors import InputError
 
 GAP = 2
-"""Modules between the tags of a grid, and by which a ChArUco board's squares are larger than its tags."""
+"""Modules between the tags of a grid, and between the edges of squares and tags of ChArUco in total."""
 
 MAX_TAGS = 64
-"""Most tags or squares along an edge."""
+"""Maximum number of tags or squares along an edge."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +33,9 @@ def _parse(text: str, head: str, rest: str) -> BoardSpec:
     kind = head.lower()
     found = re.fullmatch(r"([0-9]{1,4})[xX]([0-9]{1,4}):(.+)", rest)
     if not found:
-        raise InputError(f"{text!r} is not COLUMNSxROWS:FAMILY; write for example {kind}:{_EXAMPLES[kind]}")
+        raise InputError(
+            f"a board must be COLUMNSxROWS:FAMILY, got {text!r}; for example {kind}:{_EXAMPLES[kind]}"
+        )
     columns, rows = int(found[1]), int(found[2])
     smallest = 2 if kind == "charuco" else 1
     if not (smallest <= columns <= MAX_TAGS and smallest <= rows <= MAX_TAGS):
@@ -56,18 +59,20 @@ def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
 
 
 def _bits(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
-    """A board's modules: its tags, over dark squares in turn with white ones (the top left one dark), none,
-    or one at each corner of a tag."""
+    """Modules of a board: tags, with the chessboard of ChArUco (top left square dark), or AprilGrid's corner
+    squares."""
     from fidsplat.images.tag_dictionaries import dictionary_bits, families, parse_family
 
     kind, family = parse_family(spec.family or "")
     if kind != "apriltag" and spec.kind == "aprilgrid":
-        raise InputError(f"{spec.text!r}: an AprilGrid has AprilTags, e.g. {_EXAMPLES['aprilgrid']}")
+        raise InputError(
+            f"the family of an AprilGrid must be AprilTags, got {spec.text!r}; e.g. {_EXAMPLES['aprilgrid']}"
+        )
     side, known = families(kind)[family]
     places, step = tag_places(spec, side), side + GAP
     if len(places) > known:
         raise InputError(
-            f"{spec.text!r} needs {len(places)} tags, but {family} has {known}: take a smaller board"
+            f"{spec.text!r} needs {len(places)} tags, but {family} has {known}; use a smaller board"
         )
     beyond = {"charuco": 0, "gridboard": -GAP, "aprilgrid": GAP}[spec.kind]
     y, x = np.indices((spec.rows * step + beyond, spec.columns * step + beyond))

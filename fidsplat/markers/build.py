@@ -1,4 +1,4 @@
-"""marker(): from a spec to splats."""
+"""Construction of markers: from a spec to splats."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 from fidsplat.splats.cloud import SplatCloud
 
 MAX_MODULES = 4096
-"""Longest edge of a grid with its quiet zone."""
+"""Maximum edge of a grid with its quiet zone, in modules."""
 
 
 class Rectangle(NamedTuple):
@@ -57,46 +57,47 @@ class Rectangle(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Marker(PickledByFields):
-    """A fiducial marker and the splats that show it, made by `marker`."""
+    """A fiducial marker and its splats, made by `marker`."""
 
     spec: str
-    """the text that it was made from"""
+    """text of the spec"""
     kind: str
     """name of its kind: "apriltag", "aruco", "qr", "image", "svg", "charuco", "gridboard", "aprilgrid", or
-    of one that was registered"""
+    a registered one"""
     family: str | None
-    """tag family, of a board too, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for images"""
+    """tag family of a tag or board, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for images"""
     id: int | None
-    """tag id, None for all but tags"""
+    """tag id; None for other kinds"""
     payload: str | None
-    """text of a QR code, path of an image or an SVG drawing, None for tags and boards"""
+    """text of a QR code, path of an image or an SVG drawing; None for tags and boards"""
     bits: np.ndarray
-    """(h, w) uint8, 1 = dark, the code alone; of a drawing indices into ``palette``"""
+    """(h, w) uint8, 1 = dark, the code without quiet zone; indices of `palette` for drawings"""
     quiet_zone: int
     """modules of white around the code"""
     size: float
-    """metres, the code's edge; its width where it is not square"""
+    """edge of the code in metres; its width if it is not square"""
     mixture: str
     """"exact", "fitted", "facets", "paper", or "refined" (`fidsplat.train.refine`)"""
     quality: MarkerQuality
-    """the quality settings; `growth` is None for the mixture's default"""
+    """quality settings; `growth` is None for the mixture's default"""
     grid: np.ndarray = field(repr=False)
     """(H, W) uint8, the code with its quiet zone"""
     boxes: np.ndarray = field(repr=False)
-    """(n, 4) int64 x0, y0, x1, y1: the minimum partition of the grid, in modules; float64 of a drawing that
-    has slanted or curved edges, before rotation by ``angles``"""
+    """(n, 4) int64 x0, y0, x1, y1: the minimum partition of the grid, in modules; float64 for drawings with
+    slanted or curved edges, before rotation by `angles`"""
     values: np.ndarray = field(repr=False)
-    """(n,) uint8, the value (index into ``palette``) of each rectangle"""
+    """(n,) uint8, index of `palette` of each rectangle"""
     angles: np.ndarray | None = field(repr=False)
     """(n,) radians, rotation of each about its centre, from x to y; None: no rotation"""
     regions: tuple[MultiPolygon, ...] | None = field(repr=False)
-    """the region of each value of such a drawing, in modules of the grid; None for other markers"""
+    """region of each value for drawings with slanted or curved edges, in modules of the grid; else None"""
     labels: np.ndarray = field(repr=False)
     """(H, W) int32, the 4-connected component of each module of the grid"""
     components: int
     """number of components, all colours"""
     palette: np.ndarray = field(repr=False)
-    """(k, 3) float32 RGB, colours of the grid's values: white and black, or a drawing's, paper first"""
+    """(k, 3) float32 RGB, colours of the grid's values: white and black, or those of a drawing, paper
+    first"""
     cloud: SplatCloud = field(repr=False)
     """the splats in the marker's frame: plane z = 0, x right, y down as printed, origin at the code's
     centre
@@ -104,7 +105,7 @@ class Marker(PickledByFields):
     seconds: float
     """time from the spec to the cloud"""
     max_splats: int = MAX_SPLATS
-    """most splats that it may be made of"""
+    """maximum number of splats"""
 
     def __repr__(self) -> str:
         return (
@@ -118,10 +119,10 @@ class Marker(PickledByFields):
 
     @cached_property
     def gaussians(self) -> SplatCloud:
-        """Splats that every renderer can draw: ``cloud``, or the mixture `fitted` in place of `exact`.
+        """Gaussians for other renderers: `cloud`, or the mixture `fitted` instead of the boxes of `exact`.
 
         Raises:
-            InputError: these are more than ``max_splats``.
+            InputError: more than `max_splats`.
         """
         if self.mixture != "exact":
             return self.cloud
@@ -135,19 +136,19 @@ class Marker(PickledByFields):
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
-        """The minimum partition of every component of each colour, in raster order; of a drawing with slanted
-        edges what covers it, before ``angles``."""
+        """Minimum partition of all components, in raster order; for drawings with slanted edges their cover,
+        before rotation by `angles`."""
         dark = self.is_dark
         return [Rectangle(*row) for row in zip(*self.boxes.T.tolist(), dark.tolist(), strict=True)]
 
     @property
     def is_dark(self) -> np.ndarray:
-        """(n,) bool, the rectangles that are nearer to black than to white."""
+        """Which rectangles are nearer to black than to white, (n,) bool."""
         return (self.palette.mean(1) < 0.5)[self.values]
 
     @cached_property
     def polygons(self) -> list[Polygon]:
-        """Each component as a shapely polygon with holes, in modules of the grid (needs shapely)."""
+        """Polygons with holes of the components, in modules of the grid (needs shapely)."""
         if self.regions is not None:
             return [polygon for region in self.regions for polygon in region.geoms]
         return polygons(self.grid, self.labels, self.components)
@@ -183,25 +184,24 @@ def marker(
         spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png, svg:FILE.svg,
             charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11, or a registered kind.
         size: metres, edge of the code itself, without quiet zone (the width of a board or an image).
-        mixture: "exact" (default), one box for each rectangle, which only this renderer supports
-            (`SplatCloud.with_boxes`; `Marker.gaussians` are for others and for files); "fitted" or "paper":
-            Gaussians; "facets": Gaussians for renderers that composite by depth at each pixel, modules only.
-        quiet_zone: modules of white around it; default 1 for tags, 4 for QR, 2 for boards, 0 for images and
-            drawings.
+        mixture: "exact" (default), a box for each rectangle, which only fidsplat renders
+            (`SplatCloud.with_boxes`; `Marker.gaussians` are for other renderers and for files); "fitted" or
+            "paper": Gaussians; "facets": Gaussians for renderers that sort by depth at each pixel, modules
+            only.
+        quiet_zone: width of the white margin in modules; default 1 for tags, 4 for QR, 2 for boards, 0 for
+            images and drawings.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
         template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
             rectangle, 1, 5, 9, 13, 25, 41, 121 or 562; default 25.
-        growth: modules, 0 to 1, by which a rectangle reaches into its own colour beyond a side that is wholly
-            shared with it, against seams; default what the fitted templates were optimised with, and 0 for
-            paper.
-        quality: what mixture, levels, density, growth and template are where they are left out
-            (`Quality.marker`); what does not concern the mixture is let be.
-        max_splats: largest number of splats; an image of noise easily needs tens of millions.
-        progress: called with what is being done and the share of it that is done, 0 to 1.
+        growth: modules, 0 to 1, by which a rectangle extends across a side that borders only its own colour,
+            against seams; default the value that the fitted templates were optimised with, and 0 for paper.
+        quality: defaults of mixture, levels, density, growth and template (`Quality.marker`); settings of
+            other mixtures are ignored.
+        max_splats: maximum number of splats; an image of noise can need tens of millions.
+        progress: callback of the current task and its completed share, 0 to 1.
 
     Raises:
-        InputError: a value above that cannot be used; the message gives the valid range. More splats than
-            ``max_splats``, mostly before the work begins.
+        InputError: an invalid argument, or more splats than `max_splats`.
     """
     start = time.perf_counter()
     progress = _no_progress if progress is None else progress
@@ -209,7 +209,7 @@ def marker(
     parsed = parse_spec(spec)
     given = {"levels": levels, "density": density, "growth": growth, "template": template}
     if not isinstance(duplicates, bool | None):
-        raise InputError(f"duplicates is {duplicates!r}; it must be True or False")
+        raise InputError(f"duplicates must be True or False, got {duplicates!r}")
     chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, duplicates, given)
     templates, growth = _mixture(chosen, bool(duplicates))
     _check_size(size)
@@ -267,18 +267,18 @@ def marker(
 
 
 def _quiet_zone(spec: str, parsed: Spec, bits: np.ndarray, modules: int | None) -> int:
-    """Modules of white around these; None: as many as the kind has."""
+    """Validated width of the quiet zone in modules; None: the default of the kind."""
     longest = MAX_MODULES - max(bits.shape)
     if longest < 0:
         raise InputError(
-            f"{spec} has {bits.shape[1]} x {bits.shape[0]} modules; at most {MAX_MODULES} a side are made"
+            f"{spec} must have at most {MAX_MODULES} modules a side, got {bits.shape[1]} x {bits.shape[0]}"
         )
     width = kind_of(parsed).quiet_zone if modules is None else modules
     return whole_number("the quiet zone", width, 0, longest // 2)
 
 
 def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette: np.ndarray) -> Printed:
-    """The modules cut into rectangles, or the rectangles that cover a drawing's shapes."""
+    """Rectangles of a marker: the partition of its modules, or the cover of a drawing's shapes."""
     if parsed.regions is None:
         boxes = partition_colors(grid)
         return Printed(grid, boxes, grid[boxes[:, 1], boxes[:, 0]], None, None, module, palette)
@@ -299,9 +299,7 @@ def _chosen(
 ) -> MarkerQuality:
     """Quality settings, with the given ones (not None) replaced."""
     if not isinstance(quality, MarkerQuality):
-        raise InputError(
-            f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"
-        )
+        raise InputError(f"quality must be an fs.MarkerQuality, e.g. fs.Quality(...).marker, got {quality!r}")
     name = quality.mixture if mixture is None else text("mixture", mixture)
     if name == "refined":
         raise InputError(
@@ -323,16 +321,18 @@ def _chosen(
             "template must be given with another mixture than 'paper'; give levels and density instead"
         )
     if "template" in given and name == "facets":
-        raise InputError("template: the mixture 'facets' has none; leave it out, or write mixture='fitted'")
+        raise InputError(
+            "template must not be given with mixture='facets'; leave it out, or write mixture='fitted'"
+        )
     if "growth" in given and name in ("exact", "facets"):
         raise InputError(
-            f"growth: the mixture {name!r} has no seams to close; leave it out, or write mixture='fitted'"
+            f"growth must not be given with mixture={name!r}; leave it out, or write mixture='fitted'"
         )
     return replace(quality, mixture=name, **given)
 
 
 def _mixture(quality: MarkerQuality, duplicates: bool) -> tuple[tuple[Template, ...], float]:
-    """Templates and growth; of `exact` those of the Gaussians that stand in for its boxes."""
+    """Templates and growth of a mixture; for `exact` those of its replacement by Gaussians."""
     if quality.mixture == "paper":
         whole = paper_template(quality.levels, quality.density, duplicates)
         templates, growth = (Template(math.inf, whole),), 0.0
@@ -342,6 +342,6 @@ def _mixture(quality: MarkerQuality, duplicates: bool) -> tuple[tuple[Template, 
 
 
 def _check_size(size: float) -> None:
-    # beyond these, a module or a splat's scale leaves the range of float32
+    # outside, a module or a splat's scale would exceed the range of float32
     if not (isinstance(size, Real) and 1e-9 <= size <= 1e9):
-        raise InputError(f"the marker's size is {size!r}; it must be a length from 1e-9 to 1e9 metres")
+        raise InputError(f"size must be a length from 1e-9 to 1e9 metres, got {size!r}")

@@ -1,8 +1,8 @@
 """Maximum independent set of the chords' conflict graph: a maximum matching, then Koenig's theorem.
 
-Images of noise have a million chords, nearly all in small tree-like components. A vertex
-with one neighbour left is matched to it, which some maximum matching does too; whole rounds of them at once
-solve the trees. What is left holds cycles, and networkx's Hopcroft-Karp matches it.
+Images of noise have a million chords, nearly all in small trees. A vertex with one unmatched neighbour is
+matched to it, which keeps the matching maximum; vectorized rounds of this solve the trees. networkx's
+Hopcroft-Karp matches the rest, which has cycles.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import numpy as np
 
 ROUNDS = 64
-"""Steps along a path that are taken for all paths at once; few are longer."""
+"""Maximum number of vectorized rounds; few paths are longer."""
 
 _limit = threading.Lock()
 
@@ -23,12 +23,12 @@ _limit = threading.Lock()
 def maximum_independent_set(
     n_left: int, n_right: int, left: np.ndarray, right: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The largest set of vertices of a bipartite graph no two of which are joined.
+    """Maximum independent set of a bipartite graph.
 
-    left, right: (e,) the ends of each edge. Returns masks (n_left,) and (n_right,) bool.
+    left, right: (e,) vertices of each edge. Returns masks (n_left,) and (n_right,) bool.
 
-    By Koenig's theorem it is the left vertices that alternating paths from unmatched left vertices reach,
-    and the right ones that none of these is joined to. It is the same for every maximum matching.
+    By Koenig's theorem the set has the left vertices on alternating paths from unmatched left vertices, and
+    the right vertices without an edge to these. It does not depend on the choice of the maximum matching.
     """
     order = np.argsort(left, kind="stable")
     left, right = left[order], right[order]
@@ -41,14 +41,14 @@ def maximum_independent_set(
 def _matching(
     n_left: int, n_right: int, left: np.ndarray, right: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A maximum matching: the partner of each left and of each right vertex, -1 for none."""
+    """Maximum matching: partners of the left and of the right vertices, -1 for none."""
     of_left, of_right = np.full(n_left, -1), np.full(n_right, -1)
     for _ in range(ROUNDS):
         alone_left = np.bincount(left, minlength=n_left)[left] == 1
         single = np.flatnonzero(alone_left | (np.bincount(right, minlength=n_right)[right] == 1))
         if not len(single):
             break
-        # of those that hang on one vertex, one is matched to it
+        # one of the leaves of a vertex is matched to it
         shared = np.where(alone_left, right + n_left, left)[single]
         matched = single[np.unique(shared, return_index=True)[1]]
         of_left[left[matched]], of_right[right[matched]] = right[matched], left[matched]
@@ -61,9 +61,9 @@ def _matching(
 
 
 def _reached(left: np.ndarray, right: np.ndarray, of_left: np.ndarray, of_right: np.ndarray) -> np.ndarray:
-    """Left vertices at the ends of alternating paths from those without a partner: (n_left,) bool.
+    """Left vertices on alternating paths from unmatched left vertices, (n_left,) bool.
 
-    left is sorted, so that the edges of a vertex follow one another.
+    left: sorted, so that the edges of a vertex are contiguous.
     """
     first = np.searchsorted(left, np.arange(len(of_left) + 1))
     reached = of_left < 0
@@ -71,7 +71,7 @@ def _reached(left: np.ndarray, right: np.ndarray, of_left: np.ndarray, of_right:
     for _ in range(ROUNDS):
         count = first[now + 1] - first[now]
         edge = np.arange(count.sum()) + np.repeat(first[now] - (np.cumsum(count) - count), count)
-        now = np.unique(of_right[right[edge]])  # none is without a partner, or the matching were not maximum
+        now = np.unique(of_right[right[edge]])  # all are matched, else the matching would not be maximum
         now = now[~reached[now]]
         if not len(now):
             return reached
@@ -87,12 +87,12 @@ def _reached(left: np.ndarray, right: np.ndarray, of_left: np.ndarray, of_right:
 
 
 def _hopcroft_karp(left: np.ndarray, right: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of a maximum matching; the numbers of left and right vertices differ."""
-    import networkx as nx  # late: it takes longer to load than most markers to make
+    """Pairs of a maximum matching. Left and right vertices have disjoint numbers."""
+    import networkx as nx  # here: the import takes longer than most markers
 
     graph = nx.Graph(zip(left.tolist(), right.tolist(), strict=True))
     lefts = set(left.tolist())
-    # it recurses once for each matched pair on an augmenting path, which stays within a component
+    # the recursion depth is the number of matched pairs on an augmenting path of a component
     with _recursion(max(map(len, nx.connected_components(graph)))):
         partner = nx.bipartite.hopcroft_karp_matching(graph, lefts)
     return [(u, v) for u, v in partner.items() if u in lefts]
@@ -100,7 +100,7 @@ def _hopcroft_karp(left: np.ndarray, right: np.ndarray) -> list[tuple[int, int]]
 
 @contextmanager
 def _recursion(depth: int) -> Iterator[None]:
-    """Raise the recursion limit by that many calls. One thread at a time: the limit is the interpreter's."""
+    """Raise the recursion limit temporarily, in one thread at a time: the limit is global."""
     with _limit:
         before = sys.getrecursionlimit()
         sys.setrecursionlimit(before + depth)

@@ -1,9 +1,8 @@
-"""Cover of regions with slanted and curved edges by rectangles: rotated bands along the edges, and whole
-modules inside.
+"""Cover of regions with slanted or curved edges by rectangles: rotated bands along the edges, whole modules
+inside.
 
-The bands of two colours meet at the edge between them, so it is as sharp as the edge of a box. A band is as
-wide as the distance to the medial axis, at most `BAND`. Rectangles of one
-colour overlap within it; at its edges only at corners.
+Bands of two colours share an edge, which is therefore as sharp as that of a box. The width of a band is the
+distance to the medial axis, at most `BAND`. Rectangles of one colour overlap.
 """
 
 from __future__ import annotations
@@ -17,35 +16,36 @@ from fidsplat.markers.partition import partition
 from fidsplat.util import interrupts
 
 BAND = 2.5
-"""Modules, the widest. A whole module that reaches out of such bands is a module or more from any edge."""
+"""Maximum width of a band in modules. Whole modules outside of the bands are a module or more from any
+edge."""
 
 SHORTEST = 1 / 64
-"""Modules: edges are not cut into shorter pieces."""
+"""Minimum length of a piece of an edge, in modules."""
 
 SHARP = np.radians(10)
 """Corners with a smaller angle get no extra rectangles."""
 
 SLACK = 1e-6
-"""Modules by which a rectangle may exceed its region."""
+"""Tolerance in modules by which a rectangle may exceed its region."""
 
 
 class _Sides(NamedTuple):
-    """Pieces of edges, and at concave corners the rotation from one edge to the next."""
+    """Pieces of the edges, and the rotation to the next edge at concave corners."""
 
     start: np.ndarray
     """(n, 2) modules"""
     stop: np.ndarray
-    """(n, 2); the same as ``start`` at a corner"""
+    """(n, 2) modules; equal to `start` at a corner"""
     inward: np.ndarray
-    """(n,) radians, direction of the normal into the region, which lies to the left from start to stop"""
+    """(n,) radians, direction of the normal into the region, which is to the left from start to stop"""
     turn: np.ndarray
-    """(n,) radians, clockwise rotation of the normal at ``stop``, up to a quarter turn"""
+    """(n,) radians, clockwise rotation of the normal at `stop`, up to 90 degrees"""
 
 
 def cover_all(
     regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rectangles and angles as from `cover` for several regions, and (n,) uint8, the region of each."""
+    """Cover of several regions: rectangles and angles like `cover`, and the region of each, (n,) uint8."""
     covers = {value: cover(region, shape) for value, region in enumerate(regions) if not region.is_empty}
     boxes, angles = (np.concatenate(parts) for parts in zip(*covers.values(), strict=True))
     values = np.repeat(np.array(list(covers), np.uint8), [len(own) for _, own in covers.values()])
@@ -53,13 +53,13 @@ def cover_all(
 
 
 def cover(region: shapely.MultiPolygon, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Rectangles whose union is a region, a polygon or several, of a grid of (h, w) modules.
+    """Rectangles whose union is a region of a grid of (h, w) modules.
 
-    Returns (n, 4) float64 x0, y0, x1, y1 in modules, each before its rotation about its centre,
-    and (n,) the angles in radians, from x to y.
+    Returns (n, 4) float64 x0, y0, x1, y1 in modules before the rotation about the centre, and (n,) angles in
+    radians, from x to y.
     """
     corners = np.concatenate([_bands(region), _modules(region, shape)])
-    # the tips of corners, for which edges would be cut ever shorter
+    # tips of corners, which would be subdivided without end
     left = shapely.get_parts(region - shapely.union_all(shapely.polygons(corners)))
     left = shapely.oriented_envelope(left[shapely.area(left) > SHORTEST**3])
     rest = [shapely.get_coordinates(part)[:4] for part in left if isinstance(part, shapely.Polygon)]
@@ -71,16 +71,15 @@ def cover(region: shapely.MultiPolygon, shape: tuple[int, int]) -> tuple[np.ndar
 
 
 def _modules(region: shapely.MultiPolygon, shape: tuple[int, int]) -> np.ndarray:
-    """Rectangles of whole modules over the interior beyond the bands: (n, 4, 2) corners."""
-    interior = _met(shapely.buffer(region, -BAND), shape)
+    """Rectangles of whole modules over the interior without the bands: corners (n, 4, 2)."""
+    interior = _intersecting(shapely.buffer(region, -BAND), shape)
     boxes = partition(interior)
     x0, y0, x1, y1 = boxes[interior[boxes[:, 1], boxes[:, 0]] == 1].T.astype(np.float64)
     return np.stack([x0, y0, x1, y0, x1, y1, x0, y1], 1).reshape(-1, 4, 2)
 
 
-def _met(region: shapely.Geometry, shape: tuple[int, int]) -> np.ndarray:
-    """Which of (h, w) modules a region meets, 0 or 1: of squares that it neither covers nor leaves out, each
-    quarter in turn."""
+def _intersecting(region: shapely.Geometry, shape: tuple[int, int]) -> np.ndarray:
+    """Modules (h, w) that intersect a region, 0 or 1, by quadtree subdivision."""
     shapely.prepare(region)
     grid, side = np.zeros(shape, np.uint8), 1 << max(shape).bit_length()
     x = y = np.zeros(1, int)
@@ -98,7 +97,7 @@ def _met(region: shapely.Geometry, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _bands(region: shapely.MultiPolygon) -> np.ndarray:
-    """Rectangles over the bands along the edges: (n, 4, 2) corners."""
+    """Rectangles over the bands along the edges: corners (n, 4, 2)."""
     edges, sides = _sides(region)
     tree = shapely.STRtree(list(shapely.get_parts(shapely.linestrings(edges))))
     within = shapely.buffer(region, SLACK, join_style="mitre")
@@ -115,7 +114,7 @@ def _bands(region: shapely.MultiPolygon) -> np.ndarray:
 
 
 def _sides(region: shapely.MultiPolygon) -> tuple[np.ndarray, _Sides]:
-    """A region's edges, (n, 2, 2), and what bands are laid along."""
+    """Edges (n, 2, 2) of a region, and their pieces for bands."""
     starts, stops, inward, angles = [], [], [], []
     for polygon in region.geoms:
         rings = [polygon.exterior, *polygon.interiors]
@@ -141,11 +140,13 @@ def _sides(region: shapely.MultiPolygon) -> tuple[np.ndarray, _Sides]:
 
 
 def _widths(sides: _Sides, edges: np.ndarray, tree: shapely.STRtree) -> np.ndarray:
-    """How far the points are to which a side is nearest, at most BAND: the largest of some places, (n,).
+    """Widths (n,) of the bands: the distance to the medial axis, at most BAND, maximum over samples.
 
-    At each of them a ball that touches it from inside shrinks until it holds no other part of the edges.
+    At each sample an inscribed circle that touches the side shrinks until it has no other edges inside.
     """
-    share = (1 - np.cos(np.pi * (np.arange(9) + 0.5) / 9)) / 2  # more of them near corners, where it varies
+    share = (
+        1 - np.cos(np.pi * (np.arange(9) + 0.5) / 9)
+    ) / 2  # more samples near corners, where the width varies
     share = np.append(share, (1, 1))
     bend = np.append(np.zeros(9), (0.5, 1))
     at = sides.start[:, None] + share[:, None] * (sides.stop - sides.start)[:, None]
@@ -168,7 +169,7 @@ def _widths(sides: _Sides, edges: np.ndarray, tree: shapely.STRtree) -> np.ndarr
 
 
 def _rectangles(sides: _Sides, width: np.ndarray) -> np.ndarray:
-    """Corners (n, 4, 2) of a rectangle over each side, of that width and over the sector of its turn."""
+    """Corners (n, 4, 2) of rectangles over each side with its width and the sector at its concave corner."""
     inward = width[:, None] * np.column_stack([np.cos(sides.inward), np.sin(sides.inward)])
     ahead = np.sin(sides.turn)[:, None] * np.column_stack([inward[:, 1], -inward[:, 0]])
     stop = sides.stop + ahead
@@ -176,7 +177,7 @@ def _rectangles(sides: _Sides, width: np.ndarray) -> np.ndarray:
 
 
 def _halves(sides: _Sides, long: np.ndarray) -> _Sides:
-    """Edges cut in two; short ones keep only their corner."""
+    """Split long edges in halves; short ones are reduced to their corner."""
     start, stop, inward, turn = sides
     middle = np.where(long[:, None], (start + stop) / 2, stop)
     bend = np.where(long, 0, turn / 2)
@@ -185,15 +186,15 @@ def _halves(sides: _Sides, long: np.ndarray) -> _Sides:
     return _Sides(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
 
 
-def grow_turned(
+def grow_rotated(
     regions: tuple[shapely.MultiPolygon, ...],
     values: np.ndarray,
     boxes: np.ndarray,
     angles: np.ndarray,
     growth: float,
 ) -> np.ndarray:
-    """Rectangles of `cover_all` that reach further across sides where that stays in their region: by growth
-    modules, or as much of their width."""
+    """Extend rectangles of `cover_all` across sides if the extension stays in their region, by `growth`
+    modules or the same share of their width."""
     grown = boxes.copy()
     for value, region in enumerate(regions):
         shapely.prepare(region)
@@ -208,7 +209,7 @@ def grow_turned(
 
 
 def rotated(boxes: np.ndarray, about: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Corners (n, 4, 2) of boxes, each turned about the middle of another."""
+    """Corners (n, 4, 2) of boxes, each rotated about the centre of another box."""
     middle = (about[:, None, :2] + about[:, None, 2:]) / 2
     x, y = np.moveaxis(boxes[:, [[0, 1], [2, 1], [2, 3], [0, 3]]] - middle, -1, 0)
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]

@@ -1,12 +1,11 @@
-"""`facets`: Gaussians that are opaque and end in straight lines, because they lie in the planes of a dish.
+"""Mixture `facets`: opaque Gaussians with straight edges, in the planes of a shallow dish.
 
-Ordered by depth per pixel, of two opaque splats that cross the nearer one is visible on either side of the
-line in which they do. So each module has a splat much larger than itself, in a plane of its own: the planes
-are those of the facets of a shallow dish, of which at every point the module's own is the nearest. What a
-Gaussian lacks towards the corners of its module its copies make up, and what still comes through shows its
-neighbours.
+With sorting by depth at each pixel, two opaque splats that intersect have a straight visible border at the
+line of intersection. Each module has a splat much larger than itself, in the plane of a facet of a shallow
+dish; at every point the module's own facet is nearest. Copies fill up the opacity of a Gaussian towards the
+corners of its module.
 
-It requires compositing by depth at each pixel (docs/correctness.md). With the depth of centres the same
+The mixture requires sorting by depth at each pixel (docs/correctness.md). With the depth of centres the
 splats occlude each other (devlog/marker-opacity.md).
 """
 
@@ -19,34 +18,33 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
 
 DISH = 0.005
-"""by how much the middles of the dish's longest edges lie before its middle, in those edges"""
+"""depth of the dish between its centre and the centres of its longest edges, relative to these edges"""
 RIM = (0.3, 1.5)
-"""modules from the sheet's edge at which its two outermost rings of modules are cut: small facets reach
-little outside, dark ones behind a quiet zone of one module too"""
+"""modules from the sheet's edge at which its two outermost rings of modules are cut: small facets extend
+little beyond the sheet, also dark ones behind a quiet zone of one module"""
 SIGMA = 0.9
-"""standard deviation of a facet's Gaussians, in its widths"""
+"""standard deviation of a facet's Gaussians, relative to its width"""
 COPIES = 3
-"""Gaussians of a facet: those of one let 27 % through at its corners, of three 2 %"""
+"""Gaussians of a facet: one transmits 27 % at the corners, three transmit 2 %"""
 
 
 def count_facets(shape: tuple[int, ...]) -> int:
-    """How many splats `facet_cloud` makes of a grid of modules."""
+    """Number of splats of `facet_cloud` for a grid of modules."""
     return COPIES * int(np.prod([len(_lines(edge)) - 1 for edge in shape]))
 
 
 def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
     """Three Gaussians for each module, in the planes of a dish that opens towards the viewer.
 
-    Its mean depth is that of the plane z = 0; its corners lie at most `DISH` of the longest edge and a third
-    before that. Splats of one facet are printed on one plane.
+    The mean depth of the dish is the plane z = 0; its corners are at most `DISH` times the longest edge and a
+    third in front of it. The splats of a facet are a coplanar group.
 
     Raises:
         InputError: a drawing with edges off its module grid.
     """
     if printed.angles is not None:
         raise InputError(
-            f"{spec} has edges across its modules, which mixture='facets' has no splats for; take 'exact' or "
-            "'fitted'"
+            f"mixture='facets' requires edges along modules, got {spec}; use 'exact' or 'fitted'"
         )
     progress("splats", 0.0)
     rows, columns = printed.grid.shape
@@ -74,17 +72,16 @@ def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
 
 
 def _lines(edge: int) -> np.ndarray:
-    """Where facets meet along an edge of so many modules, from its middle."""
+    """Positions of the borders of facets along an edge of some modules, from its centre."""
     rim = np.array([cut for cut in RIM if cut < edge])
     return np.unique(np.concatenate([np.arange(edge + 1), rim, edge - rim])) - edge / 2
 
 
 def _axis(edge: int, steepness: float) -> np.ndarray:
-    """Middle, width, depth at the middle and slope of the facets along an edge, (4, n), in modules.
+    """Centre, width, depth at the centre and slope of the facets along an edge, (4, n), in modules.
 
-    The profile is a parabola of mean 0 and this steepness that opens towards the viewer, interpolated
-    linearly between the lines where facets meet. It is convex: if every facet were extended to a plane, each
-    would be the nearest one within its own width.
+    The profile is a parabola of mean 0 that opens towards the viewer, interpolated linearly between the
+    borders of facets. It is convex: the plane of each facet is the nearest one within its width.
     """
     lines = _lines(edge)
     depth = steepness * (edge**2 / 12 - lines**2)

@@ -12,7 +12,7 @@ from fidsplat.util.errors import InputError
 
 def _parse(text: str, head: str, rest: str) -> Spec:
     if not rest:
-        raise InputError(f"{text!r} names no file; write image:FILE.png")
+        raise InputError(f"the spec of an image must be image:FILE.png, got {text!r}")
     return Spec(text=text, kind="image", payload=rest)
 
 

@@ -1,4 +1,4 @@
-"""The kinds of markers that specs can name."""
+"""Registry of the kinds of markers, and parsing of specs."""
 
 from __future__ import annotations
 
@@ -14,39 +14,37 @@ _kinds = {kind.name: kind for module in (tags, qr, images, svg, boards) for kind
 
 
 def register(kind: Kind) -> None:
-    """Let specs name one more kind of marker, in this process.
+    """Add a kind of marker for specs in this process.
 
     Raises:
-        InputError: its name is taken, or cannot begin a spec.
+        InputError: a name that exists or is invalid.
     """
     if kind.name in _kinds:
-        raise InputError(f"there is a kind of marker {kind.name!r} already; give yours another name")
+        raise InputError(f"the name of a kind must be new, got {kind.name!r}; use another name")
     if not kind.name.isalnum() or kind.name != kind.name.lower():
-        raise InputError(
-            f"{kind.name!r} cannot begin a spec; a kind's name has lower-case letters and digits"
-        )
+        raise InputError(f"the name of a kind must be lower-case letters and digits, got {kind.name!r}")
     _kinds[kind.name] = kind
 
 
 def kind_of(spec: Spec) -> Kind:
-    """The kind that a spec names."""
+    """The kind of a spec."""
     return _kinds[spec.kind]
 
 
 def parse_spec(text: str) -> Spec:
-    """Take a marker spec apart: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png,
+    """Parse a marker spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png,
     svg:FILE.svg, charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11.
 
-    A QR spec may leave out version (the smallest that holds the text) or level (L).
+    A QR spec may omit the version (default the smallest for the text) or the level (L).
 
     Raises:
-        InputError: not a spec, an unknown version or level, an id that is not a number.
+        InputError: an invalid spec, an unknown version or level, an id that is not a number.
     """
     if not isinstance(text, str):
-        raise InputError(f"a marker spec is text ({_forms()}), not {text!r}")
+        raise InputError(f"a marker spec must be text ({_forms()}), got {text!r}")
     head, colon, rest = text.partition(":")
     if not colon:
-        raise InputError(f"{text!r} is not a marker spec; write {_forms()}")
+        raise InputError(f"a marker spec must be one of {_forms()}, got {text!r}")
     kind = _named(head)
     if kind is None:
         raise InputError(f"unknown kind of marker {head.lower()!r}; write {_forms()}")
@@ -64,14 +62,14 @@ def bits_of(spec: Spec) -> tuple[Spec, np.ndarray]:
 
 
 def with_file(text: str, change: Callable[[str], str]) -> str:
-    """A spec whose file, if it names one, is put elsewhere."""
+    """Replace the file in a spec, if it has one."""
     head, colon, rest = text.partition(":")
     kind = _named(head)
     return head + colon + change(rest) if rest and kind is not None and kind.is_file else text
 
 
 def _named(head: str) -> Kind | None:
-    """The kind that the head of a spec names, its options left out."""
+    """The kind in the head of a spec, without options."""
     return _kinds.get(head.lower()) or _kinds.get(head.lower().partition("-")[0])
 
 

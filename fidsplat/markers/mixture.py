@@ -1,9 +1,8 @@
-"""Mixtures: how one rectangle becomes 2D Gaussians.
+"""Mixtures: approximation of a rectangle by 2D Gaussians.
 
-A template lists the Gaussians of a rectangle whose half sizes are 1: rows of x, y, sigma_x, sigma_y,
-opacity. `paper` (`paper_template`) is the construction of the paper's section 3.2. `fitted`
-(`fitted_templates`) are templates that tools/fit_templates.py has optimised off line for whole markers; see
-docs/markers.md.
+A template has the Gaussians of a rectangle with half sizes of 1: rows of x, y, sigma_x, sigma_y, opacity.
+`paper` (`paper_template`) is the construction of the paper's section 3.2. `fitted` (`fitted_templates`) are
+templates optimised by tools/fit_templates.py for complete markers; see docs/markers.md.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ GAMMA = 3.0
 """The paper's cut-off: a Gaussian ends at 3 standard deviations."""
 
 OVERLAP = 0.2
-"""Widths by which the pieces of a long rectangle reach into each other."""
+"""Overlap of the pieces of a long rectangle, relative to its width."""
 
 
 class Template(NamedTuple):
-    """Gaussians of rectangles up to an aspect ratio, in units of the rectangle's half sizes."""
+    """Gaussians for rectangles up to an aspect ratio, in units of the rectangle's half sizes."""
 
     max_aspect: float
-    """longest over shortest side up to which it is used"""
+    """maximum ratio of the longer to the shorter side"""
     gaussians: np.ndarray
-    """(n, 5) float64: place along the long side, along the short side, sigma along each, opacity"""
+    """(n, 5) float64: position along the long side and the short side, sigma along each, opacity"""
 
 
 def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) -> np.ndarray:
@@ -43,11 +42,11 @@ def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) 
 
     Args:
         levels: L of the paper, 1 to 8.
-        density: rho of the paper, a whole number of copies. Which levels are the "early" ones it does not
-            say; here all but the last are repeated (with one level, nothing is).
-        duplicates: the paper mirrors the first quadrant across both axes, and the arms' first Gaussians lie
-            on an axis: taken at its word each of them comes twice. True keeps the twins,
-            2^(L+2) + 4 L - 11 Gaussians at density 1; False leaves them out, 2^(L+2) - 7.
+        density: rho of the paper, a whole number of copies of the "early" levels; here all but the last (none
+            with one level).
+        duplicates: the paper mirrors the first quadrant across both axes, which duplicates the first
+        Gaussians of the arms, on the axes. True keeps the duplicates, 2^(L+2) + 4 L - 11 Gaussians at density
+        1; False omits them, 2^(L+2) - 7.
 
     Raises:
         InputError: levels or density out of range.
@@ -98,18 +97,18 @@ def _mirrors(row: list[float]) -> list[list[float]]:
 
 
 def fitted_templates(size: int = MarkerQuality.template) -> tuple[Template, ...]:
-    """The shipped templates of a size (`TEMPLATE_SIZES`) in rising order of aspect ratio. Longer rectangles
-    than the last is for are cut, see `place`."""
+    """The shipped templates of a size (`TEMPLATE_SIZES`) by increasing aspect ratio; `place` cuts longer
+    rectangles."""
     return _nested(size) if size in LADDERS else _fitted()[0][size]
 
 
 def fitted_growth() -> float:
-    """Modules by which the shipped templates expect rectangles to reach into their own colour."""
+    """Growth of rectangles in modules that the shipped templates were optimised with."""
     return _fitted()[1]
 
 
 def count_gaussians(aspect: np.ndarray, templates: tuple[Template, ...]) -> np.ndarray:
-    """How many Gaussians `place` makes of each of n rectangles, (n,) int64."""
+    """Number of Gaussians that `place` makes of each of n rectangles, (n,) int64."""
     parts = _parts(aspect, templates[-1].max_aspect)
     counts = np.array([len(t.gaussians) for t in templates])
     return parts * counts[_which(np.maximum(aspect, 1 / aspect) / parts, templates)]
@@ -118,18 +117,17 @@ def count_gaussians(aspect: np.ndarray, templates: tuple[Template, ...]) -> np.n
 def place(
     rectangles: np.ndarray, aspect: np.ndarray, templates: tuple[Template, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The Gaussians of n rectangles, in the order of the rectangles.
+    """Place templates on n rectangles; the Gaussians are in the order of the rectangles.
 
-    rectangles: (n, 4) float64 x0, y0, x1, y1. aspect: (n,) width over height, which chooses the template;
-    its first axis goes along the longer side. Rectangles longer than any template is for are cut into equal
-    pieces. Returns (m, 5) float64 x, y, sigma_x, sigma_y, opacity and (m,) int64 the rectangle that each
-    belongs to.
+    rectangles: (n, 4) float64 x0, y0, x1, y1. aspect: (n,) width over height, which selects the template; its
+    first axis is along the longer side. Rectangles that are too long for all templates are cut into equal
+    pieces. Returns (m, 5) float64 x, y, sigma_x, sigma_y, opacity and (m,) int64 the rectangle of each.
     """
     pieces, aspect, source = in_pieces(rectangles, aspect, templates[-1].max_aspect)
     upright = aspect < 1
     which = _which(np.maximum(aspect, 1 / aspect), templates)
     counts = np.array([len(t.gaussians) for t in templates])
-    # every template twice: as it is, and turned for upright rectangles
+    # each template in two orientations, the second for upright rectangles
     lying = np.concatenate([t.gaussians for t in templates])
     table = np.concatenate([lying, lying[:, [1, 0, 3, 2, 4]]]).T.copy()
     first = np.cumsum(counts) - counts
@@ -137,7 +135,7 @@ def place(
     n = counts[which]
     start = first[which] + np.where(upright, len(lying), 0)
     row = np.arange(n.sum()) + np.repeat(start - (np.cumsum(n) - n), n)
-    out = np.empty((5, len(row)))  # column by column, so that a hundred million rows need no temporary copy
+    out = np.empty((5, len(row)))  # column by column, without a temporary copy of a hundred million rows
     for axis in (0, 1):
         low, high = pieces[:, axis], pieces[:, axis + 2]
         half = np.repeat((high - low) / 2, n)
@@ -153,9 +151,9 @@ def in_pieces(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cut n rectangles across their longer sides into the fewest equal pieces of at most an aspect ratio.
 
-    rectangles: (n, 4) float64 x0, y0, x1, y1. aspect: (n,) width over height, which decides. Returns (m, 4)
-    pieces, (m,) their aspect and (m,) int64 the rectangle that each is of. Templates fade towards their ends,
-    so at a cut pieces reach into each other, `OVERLAP` of their width each.
+    rectangles: (n, 4) float64 x0, y0, x1, y1. aspect: (n,) width over height. Returns pieces (m, 4), their
+    aspect (m,) and the rectangle of each, (m,) int64. Templates fade towards their ends, so pieces overlap at
+    cuts, each by `OVERLAP` of its width.
     """
     parts = _parts(aspect, longest)
     owner = np.repeat(np.arange(len(parts)), parts)
@@ -171,10 +169,10 @@ def in_pieces(
 
 
 def _parts(aspect: np.ndarray, longest: float) -> np.ndarray:
-    """The fewest equal pieces, none longer than that, of rectangles of these aspect ratios."""
+    """Minimum number of equal pieces, each at most `longest`, for rectangles of these aspect ratios."""
     return np.maximum(np.ceil(np.maximum(aspect, 1 / aspect) * (1 - 1e-9) / longest), 1).astype(np.int64)
 
 
 def _which(aspect: np.ndarray, templates: tuple[Template, ...]) -> np.ndarray:
-    """The template for each aspect ratio, at least 1."""
+    """Index of the template for each aspect ratio of 1 or more."""
     return np.searchsorted([t.max_aspect for t in templates], aspect * (1 - 1e-9))

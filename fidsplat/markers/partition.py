@@ -1,17 +1,16 @@
 """Minimum rectilinear partition of both colours of a grid at once (Ferrari et al. 1984; the paper's
 Algorithm 1).
 
-Every decision is made on integers. A grid line's *unit edge* is between two neighbouring cells and is
-interior to a component when both cells have its colour. At an inner grid vertex the four cells around it say
-everything: three of one colour and one of the other is a concave vertex of the three (outer boundary or hole
-alike); two and two on the diagonal is a checkerboard vertex, convex twice and concave for none. Exactly one
-of a concave vertex's two horizontal unit edges is interior, and exactly one of its two vertical ones.
+All arithmetic is on integers. A *unit edge* of a grid line is between two neighbouring cells; it is interior
+to a component if both cells have its colour. The four cells around an inner grid vertex determine its type:
+three of one colour and one of the other make a concave vertex of the three (of outer boundaries and holes);
+two and two on the diagonals make a checkerboard vertex, which is convex twice. Of the two horizontal unit
+edges of a concave vertex exactly one is interior, and of the two vertical ones as well.
 
-So the axis-parallel chords of the paper are simply those maximal runs of interior unit edges on a grid line
-whose two end vertices are both concave: all of them come out of one pass over the grid, no pair of vertices
-is ever compared, and a chord between vertices that are not neighbours on their line cannot arise. A vertex
-is on at most one horizontal and at most one vertical chord, so the pairs that conflict (cross, or share
-an end) are the vertices covered by both.
+The axis-parallel chords of the paper are therefore the maximal runs of interior unit edges on a grid line
+whose end vertices are both concave. One pass over the grid finds all of them without comparing pairs of
+vertices. A vertex is on at most one horizontal and one vertical chord, so the conflicts (chords that cross or
+share an end) are the vertices covered by both.
 """
 
 from __future__ import annotations
@@ -64,14 +63,14 @@ def interior_runs(grid: np.ndarray, concave: np.ndarray, cuts: np.ndarray | None
 
 
 def chords(grid: np.ndarray, concave: np.ndarray) -> np.ndarray:
-    """Horizontal chords of an (h, w) 0/1 grid: (n, 3) ints y, x0, x1, in raster order."""
+    """Horizontal chords (n, 3) of an (h, w) 0/1 grid: ints y, x0, x1, in raster order."""
     runs = interior_runs(grid, concave)
     both = runs.start_concave & runs.stop_concave
     return np.stack([runs.line[both], runs.start[both], runs.stop[both]], 1)
 
 
 def _cover(found: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """For every vertex the horizontal chord that covers it, ends included, or -1: ``shape`` int32."""
+    """Index of the horizontal chord that covers each vertex, ends included, or -1: `shape` int32."""
     owner = np.full(shape, -1, np.int32)
     length = found[:, 2] - found[:, 1] + 1
     which = np.repeat(np.arange(len(found), dtype=np.int32), length)
@@ -81,7 +80,7 @@ def _cover(found: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def independent_chords(grid: np.ndarray, concave: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A maximum set of chords no two of which meet.
+    """Maximum set of chords without conflicts.
 
     Returns (n, 3) horizontal chords y, x0, x1 and (m, 3) vertical chords x, y0, y1. The conflicts form a
     bipartite graph; its maximum matching gives a minimum vertex cover (Koenig), and the rest is the
@@ -99,13 +98,13 @@ def independent_chords(grid: np.ndarray, concave: np.ndarray) -> tuple[np.ndarra
 
 
 def minimum_rectangles(grid: np.ndarray) -> int:
-    """A number of rectangles below which no partition of an (h, w) uint8 0/1 grid comes, from one look at it.
+    """Lower bound of the rectangles of a partition of an (h, w) uint8 0/1 grid, in one pass.
 
-    Of all components' corners, convex and concave, it is a quarter: independent chords end at two concave
-    corners each and share none, and convex - concave = 4 (components - holes).
+    The bound is a quarter of all corners, convex and concave: each independent chord ends at two concave
+    corners and shares none, and convex - concave = 4 (components - holes).
     """
     dark = (grid[:-1, :-1] + grid[:-1, 1:]) + (grid[1:, :-1] + grid[1:, 1:])
-    corners = 2 * np.count_nonzero(dark & 1)  # one concave, and one convex of the other colour
+    corners = 2 * np.count_nonzero(dark & 1)  # a concave one, and a convex one of the other colour
     corners += 4 * np.count_nonzero((dark == 2) & (grid[:-1, :-1] == grid[1:, 1:]))
     for edge in (grid[0], grid[-1], grid[:, 0], grid[:, -1]):
         corners += 2 * np.count_nonzero(edge[1:] != edge[:-1])
@@ -116,21 +115,21 @@ def partition(grid: np.ndarray) -> np.ndarray:
     """Minimum partition of every 4-connected component of an (h, w) uint8 0/1 grid into rectangles.
 
     Returns (n, 4) int64 rectangles x0, y0, x1, y1 in cells, half-open, in raster order of their first cell;
-    the colour of rectangle i is ``grid[y0, x0]``. Disjoint, exactly covering, and per component of the
-    minimum number: concave vertices - independent chords - holes + 1.
+    the colour of rectangle i is `grid[y0, x0]`. They are disjoint, cover the grid, and their number is the
+    minimum for each component: concave vertices - independent chords - holes + 1.
 
-    After the independent chords, each concave vertex that none of them ends at sends one segment into its
-    component until it meets the boundary or an earlier cut (the paper's greedy completion). Sent
-    horizontally, all of them at once: parallel segments cannot cross, and none can join two such vertices,
-    because a chord that meets no vertical one of a maximum set would be in the set. The chosen horizontal
-    chords are cut by the same rule, so only the vertical ones need to be known.
+    After the independent chords, a cut starts at each remaining concave vertex and ends at the boundary or at
+    another cut (the paper's greedy completion). All of these cuts are horizontal and made at once: parallel
+    segments cannot cross, and none can connect two such vertices, because a chord without conflicts would be
+    in the maximum set. The same rule makes the chosen horizontal chords, so only the vertical ones are
+    needed.
     """
     h, w = grid.shape
     concave = concave_vertices(grid)
     _, down = independent_chords(grid, concave)
 
     cut = _cover(down, concave.shape[::-1]).T >= 0
-    walls_x = np.ones((h, w + 1), bool)  # walls_x[y, x]: a wall on the left of cell (y, x)
+    walls_x = np.ones((h, w + 1), bool)  # walls_x[y, x]: a cut on the left of cell (y, x)
     walls_x[:, 1:-1] = grid[:, :-1] != grid[:, 1:]
     line, along = _unit_edges(down[:, 0], down[:, 1], down[:, 2])
     walls_x[along, line] = True
@@ -139,7 +138,7 @@ def partition(grid: np.ndarray) -> np.ndarray:
     cuts = (runs.start_concave & ~cut[runs.line, runs.start]) | (
         runs.stop_concave & ~cut[runs.line, runs.stop]
     )
-    walls_y = np.ones((h + 1, w), bool)  # walls_y[y, x]: a wall above cell (y, x)
+    walls_y = np.ones((h + 1, w), bool)  # walls_y[y, x]: a cut above cell (y, x)
     walls_y[1:-1] = grid[:-1] != grid[1:]
     line, along = _unit_edges(runs.line[cuts], runs.start[cuts], runs.stop[cuts])
     walls_y[line, along] = True
@@ -153,7 +152,7 @@ def partition(grid: np.ndarray) -> np.ndarray:
 
 
 def partition_colors(grid: np.ndarray) -> np.ndarray:
-    """The same as `partition` for an (h, w) uint8 grid of any number of colours."""
+    """Minimum partition of an (h, w) uint8 grid of any number of colours."""
     if grid.max() <= 1:
         return partition(grid)
     boxes = []
@@ -166,7 +165,7 @@ def partition_colors(grid: np.ndarray) -> np.ndarray:
 
 
 def _unit_edges(line: np.ndarray, start: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The unit edges of segments on grid lines: their lines and their positions along them."""
+    """Unit edges of segments on grid lines: lines and positions along them."""
     length = stop - start
     which = np.repeat(np.arange(len(length)), length)
     offset = np.arange(len(which)) - np.repeat(np.cumsum(length) - length, length)

@@ -11,27 +11,29 @@ Rings = list[np.ndarray]
 """closed outlines, each (n, 2) float64 x, y, the last point joined to the first"""
 
 PIECES = 64
-"""Straight pieces of a curve."""
+"""Number of straight pieces of a curve."""
 
 FARTHEST = 1e9
-"""Largest magnitude of a number in a drawing."""
+"""Maximum magnitude of a number in a drawing."""
 
 _TOKEN = re.compile(r"([MmLlHhVvCcSsQqTtAaZz])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
 _BETWEEN = re.compile(r"[\s,]*")
-_FLAG = re.compile(r"()([01])")  # of an arc: a single digit, with nothing between it and the next number
+_FLAG = re.compile(
+    r"()([01])"
+)  # flag of an arc: a single digit, optionally without a separator to the next number
 _NUMBERS = {"M": 2, "L": 2, "H": 1, "V": 1, "C": 6, "S": 4, "Q": 4, "T": 2, "A": 7, "Z": 0}
 
 
 def number(text: str) -> float:
-    """A number of a drawing, in pixels. Raises ValueError for another text, or one beyond `FARTHEST`."""
+    """Parse a number of a drawing, in pixels. Raises ValueError for another text, or beyond `FARTHEST`."""
     value = float(text.removesuffix("px"))
     if not abs(value) <= FARTHEST:
-        raise ValueError(f"{text[:20]} is too far out; a number is at most {FARTHEST:g}")
+        raise ValueError(f"a number must be at most {FARTHEST:g}, got {text[:20]}")
     return value
 
 
 def polygon_rings(points: str) -> Rings:
-    """The ring of a polygon's ``points``. Raises ValueError for an odd number of them."""
+    """Ring of a polygon's `points`. Raises ValueError for an odd number of coordinates."""
     numbers = [number(text) for _, text in _TOKEN.findall(points)]
     if len(numbers) % 2:
         raise ValueError("an odd number of coordinates")
@@ -39,31 +41,31 @@ def polygon_rings(points: str) -> Rings:
 
 
 def circle_rings(cx: float, cy: float, rx: float, ry: float) -> Rings:
-    """The ring of an ellipse."""
+    """Ring of an ellipse."""
     turn = np.linspace(0, 2 * np.pi, 4 * PIECES, endpoint=False)
     return [np.column_stack([cx + rx * np.cos(turn), cy + ry * np.sin(turn)])]
 
 
 def rectangle_rings(x: float, y: float, w: float, h: float, rx: float, ry: float) -> Rings:
-    """The ring of a rectangle, its corners quarters of an ellipse."""
+    """Ring of a rectangle with rounded corners."""
     if not (w > 0 and h > 0):
         return []
     rx, ry = min(rx, w / 2), min(ry, h / 2)
     if not (rx > 0 and ry > 0):
         return [np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])]
     turn = np.linspace(0, np.pi / 2, PIECES + 1)
-    middles = ((x + w - rx, y + h - ry), (x + rx, y + h - ry), (x + rx, y + ry), (x + w - rx, y + ry))
+    centres = ((x + w - rx, y + h - ry), (x + rx, y + h - ry), (x + rx, y + ry), (x + w - rx, y + ry))
     corners = [
         np.column_stack([cx + rx * np.cos(turn + i * np.pi / 2), cy + ry * np.sin(turn + i * np.pi / 2)])
-        for i, (cx, cy) in enumerate(middles)
+        for i, (cx, cy) in enumerate(centres)
     ]
     return [np.concatenate(corners)]
 
 
 def path_rings(text: str) -> Rings:
-    """The rings of a path's ``d``: every subpath closed, as filling does, curves in straight pieces.
+    """Rings of a path's `d`: closed subpaths, with curves as polylines.
 
-    Raises ValueError where a command lacks numbers, or the path does not begin with a move.
+    Raises ValueError for a command with too few numbers, or a path that does not begin with a move.
     """
     rings: Rings = []
     points: list[np.ndarray] = []
@@ -92,7 +94,7 @@ def path_rings(text: str) -> Rings:
             here = end
         else:
             given = v.reshape(-1, 2) + base
-            if kind in "ST":  # the control point that mirrors the one before
+            if kind in "ST":  # reflection of the previous control point
                 smooth = before in ("CS" if kind == "S" else "QT")
                 given = np.vstack([2 * here - control if smooth else here, given])
             curve = np.vstack([here, given])
@@ -103,7 +105,7 @@ def path_rings(text: str) -> Rings:
 
 
 def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Each command with as many numbers as one of its kind takes; a move's further pairs are lines."""
+    """Commands with their arguments; further pairs of a move are lines."""
     command, numbers = "", []
     place = _skip(text, 0)
     while place <= len(text):
@@ -131,13 +133,13 @@ def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _skip(text: str, place: int) -> int:
-    """Where the next number or letter begins."""
+    """Position of the next number or letter."""
     between = _BETWEEN.match(text, place)
     return place if between is None else between.end()
 
 
 def _bezier(control: np.ndarray) -> np.ndarray:
-    """Points (PIECES, 2) along a curve of 3 or 4 control points, its start left out."""
+    """Points (PIECES, 2) along a curve of 3 or 4 control points, without its start."""
     t = np.linspace(0, 1, PIECES + 1)[1:, None, None]
     points = np.repeat(control[None], PIECES, 0)
     while points.shape[1] > 1:
@@ -148,7 +150,7 @@ def _bezier(control: np.ndarray) -> np.ndarray:
 def _arc(
     start: np.ndarray, end: np.ndarray, rx: float, ry: float, turn: float, large: bool, sweep: bool
 ) -> list[np.ndarray]:
-    """Points along an elliptical arc, its start left out (SVG 1.1, appendix F.6)."""
+    """Points along an elliptical arc, without its start (SVG 1.1, appendix F.6)."""
     if not (rx and ry) or np.array_equal(start, end):
         return [end]
     to_axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])

@@ -1,4 +1,4 @@
-"""From the rectangles of a grid to splats on the marker's plane: a box each, or Gaussians of a mixture."""
+"""Conversion of rectangles to splats on the marker's plane: boxes, or Gaussians of a mixture."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ if TYPE_CHECKING:
     from shapely import MultiPolygon
 
 MAX_SPLATS = 1_000_000
-"""Most splats of a marker unless the caller allows more."""
+"""Default maximum number of splats of a marker."""
 
 SLIVER = 1 / 64
-"""Modules: thinner rectangles of a drawing have no Gaussians."""
+"""Modules: thinner rectangles of a drawing become no Gaussians."""
 
 CHUNK = 1 << 18
-"""Splats that are placed at a time: intermediate results are in float64 and several."""
+"""Splats of a part: bounds the memory of float64 temporaries."""
 
 Progress = Callable[[str, float], Any]
-"""Called with what is being done and the share of it that is done, 0 to 1."""
+"""Callback of the current task and its completed share, 0 to 1."""
 
 
 class Printed(NamedTuple):
-    """The rectangles of a marker, where they are printed."""
+    """Rectangles of a marker with their colours and positions in metres."""
 
     grid: np.ndarray
     """(H, W) uint8, values of modules"""
     boxes: np.ndarray
     """(n, 4) x0, y0, x1, y1 in modules"""
     values: np.ndarray
-    """(n,) uint8, the value of each"""
+    """(n,) uint8, value of each rectangle"""
     angles: np.ndarray | None
-    """(n,) radians by which each is turned about its middle; None: not at all"""
+    """(n,) radians, rotation of each about its centre; None: no rotation"""
     regions: tuple[MultiPolygon, ...] | None
-    """of each value what it covers, where that is more than whole modules"""
+    """region of each value for drawings with slanted or curved edges; else None"""
     module: float
-    """metres"""
+    """size of a module in metres"""
     palette: np.ndarray
-    """(k, 3) float32, colours of the values"""
+    """(k, 3) float32 RGB, colours of the values"""
 
 
 def refuse_more(spec: str, count: int, max_splats: int, words: str = "") -> None:
-    """Raise InputError where a marker becomes more splats than are allowed."""
+    """Raise InputError for a marker of more splats than `max_splats`."""
     if count > max_splats:
         raise InputError(
             f"{spec} must have at most {max_splats:,} splats, got {words}{count:,}; use a smaller image or a "
-            "mixture of fewer, or allow them by max_splats (--max-splats N)"
+            "smaller mixture, or increase max_splats (--max-splats N)"
         )
 
 
 def box_cloud(printed: Printed, progress: Progress) -> SplatCloud:
-    """One box for each rectangle."""
+    """Cloud of one box for each rectangle."""
     boxes = printed.boxes
 
     def make(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
@@ -70,8 +70,8 @@ def box_cloud(printed: Printed, progress: Progress) -> SplatCloud:
 
 
 def without_slivers(printed: Printed) -> Printed:
-    """The rectangles that become Gaussians: without slivers of a drawing, between curves that
-    touch, which thousands of Gaussians each would fill."""
+    """Remove slivers between touching curves of a drawing, each of which would need thousands of
+    Gaussians."""
     if printed.angles is None:
         return printed
     sides = printed.boxes[:, 2:] - printed.boxes[:, :2]
@@ -84,14 +84,14 @@ def without_slivers(printed: Printed) -> Printed:
 
 
 def aspect_of(boxes: np.ndarray) -> np.ndarray:
-    """Width over height of (n, 4) rectangles."""
+    """Aspect ratios, width over height, of (n, 4) rectangles."""
     return (boxes[:, 2] - boxes[:, 0]) / (boxes[:, 3] - boxes[:, 1])
 
 
 def gaussian_cloud(
     printed: Printed, templates: tuple[Template, ...], growth: float, progress: Progress
 ) -> SplatCloud:
-    """The Gaussians of a mixture."""
+    """Cloud of the Gaussians of a mixture."""
     aspect = aspect_of(printed.boxes)
     grown = _grown(printed, growth)
     ends = np.cumsum(count_gaussians(aspect, templates))
@@ -104,12 +104,12 @@ def gaussian_cloud(
 
 
 def _grown(printed: Printed, growth: float) -> np.ndarray:
-    """`grow` for each colour of a drawing."""
+    """Rectangles extended by `growth`, for each colour of a drawing."""
     grid, boxes, values = printed.grid, printed.boxes, printed.values
     if printed.regions is not None and printed.angles is not None:
-        from fidsplat.markers.cover import grow_turned  # late, as shapely is
+        from fidsplat.markers.cover import grow_rotated  # here, since it imports shapely
 
-        return grow_turned(printed.regions, values, boxes, printed.angles, growth)
+        return grow_rotated(printed.regions, values, boxes, printed.angles, growth)
     if len(printed.palette) <= 2:
         return grow(grid, boxes, growth)
     grown = boxes.astype(np.float64)
@@ -127,9 +127,9 @@ def _cloud(
 ) -> SplatCloud:
     """Splats in the colours of their rectangles.
 
-    ends: (n,) splats of each rectangle and all before it. make: the splats of the rectangles from one to
-    another: rows (m, 5) of place and scale in modules and opacity, and (m,) the rectangle of each. They are
-    filled in part by part, two at a time, so that memory stays near that of the cloud.
+    ends: (n,) cumulative number of splats by rectangle. make: returns the splats of a range of rectangles:
+    rows (m, 5) of position and scale in modules and opacity, and (m,) the rectangle of each. Two threads fill
+    the cloud part by part, so that memory stays near that of the cloud.
     """
     module, angles = printed.module, printed.angles
     total = int(ends[-1])
@@ -162,8 +162,8 @@ def _cloud(
                 progress("splats", done / total)
     arrays = (means, quats, scales, opacities, colors)
     for array in arrays:
-        array.flags.writeable = False  # a cloud takes these as they are
-    # one sheet of paper: where its splats meet, their order means nothing
+        array.flags.writeable = False  # without a copy by SplatCloud
+    # one sheet of paper: the order of its splats does not matter
     cloud = SplatCloud.of_checked(
         means, quats, scales, opacities, colors=colors, origin=np.zeros(3), dropped={}
     )
@@ -171,7 +171,7 @@ def _cloud(
 
 
 def _parts(ends: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Rectangles from one to another that have some `CHUNK` splats together."""
+    """Ranges of rectangles of about `CHUNK` splats."""
     start = 0
     while start < len(ends):
         before = int(ends[start - 1]) if start else 0

@@ -1,4 +1,4 @@
-"""QR codes, made by segno in byte mode."""
+"""QR codes, encoded by segno in byte mode."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _DEFAULT_LEVEL = "L"
 
 @dataclass(frozen=True, kw_only=True)
 class QrSpec(Spec):
-    """A QR code's spec."""
+    """Spec of a QR code."""
 
     version: int | None = None
-    """1 to 40, if the spec asks for one"""
+    """1 to 40; None for the smallest"""
     level: str = _DEFAULT_LEVEL
     """error level, one of L, M, Q, H"""
 
@@ -33,19 +33,17 @@ def _parse(text: str, head: str, rest: str) -> QrSpec:
     version, level = code["version"], code["level"]
     number = None if version is None else int(version)
     if number is not None and number not in _VERSIONS:
-        raise InputError(
-            f"QR version {number} does not exist; versions are {_VERSIONS[0]} to {_VERSIONS[-1]}"
-        )
+        raise InputError(f"the version of a QR code must be {_VERSIONS[0]} to {_VERSIONS[-1]}, got {number}")
     level = (level or _DEFAULT_LEVEL).upper()
     if level not in _LEVELS:
-        raise InputError(f"QR error level {level!r} does not exist; levels are {', '.join(_LEVELS)}")
+        raise InputError(f"the error level of a QR code must be {', '.join(_LEVELS)}, got {level!r}")
     if not rest:
-        raise InputError(f"{text!r} holds no text to encode")
+        raise InputError(f"a QR spec must have a text, got {text!r}")
     return QrSpec(text=text, kind="qr", payload=rest, version=number, level=level)
 
 
 def _bits(spec: QrSpec) -> tuple[Spec, np.ndarray]:
-    """Byte mode at exactly the requested level; without a requested version the smallest that fits."""
+    """Modules of a QR code in byte mode, at exactly the requested level; by default the smallest version."""
     import segno
     from segno.encoder import DataOverflowError
 
@@ -57,19 +55,19 @@ def _bits(spec: QrSpec) -> tuple[Spec, np.ndarray]:
     except DataOverflowError:
         version, size = spec.version or _VERSIONS[-1], len(payload.encode(_encoding(payload)))
         raise InputError(
-            f"the text takes {size} bytes, but a QR code of version {version} at level {spec.level} "
-            f"holds {qr_capacity(version, spec.level)}; shorten it"
-            + ("" if version == _VERSIONS[-1] else ", or ask for a higher version")
+            f"the text must have at most {qr_capacity(version, spec.level)} bytes in a QR code of version "
+            f"{version} at level {spec.level}, got {size}; shorten it"
+            + ("" if version == _VERSIONS[-1] else ", or use a higher version")
             + ("" if spec.level == "L" else ", or a lower level")
         ) from None
     except UnicodeEncodeError:
-        raise InputError(f"{spec.text!r} holds characters that cannot be encoded as UTF-8") from None
+        raise InputError(f"a QR text must be encodable as UTF-8, got {spec.text!r}") from None
     bits = np.array([list(row) for row in code.matrix], np.uint8)
     return replace(spec, family=f"v{code.version}-{code.error}", version=int(code.version)), bits
 
 
 def _encoding(text: str) -> str:
-    """ISO 8859-1, which readers assume, where the text fits into it; else UTF-8, which they recognise."""
+    """Encoding of a text: ISO 8859-1, the default of readers, if possible, else UTF-8, which they detect."""
     try:
         text.encode("iso-8859-1")
     except UnicodeEncodeError:
@@ -78,7 +76,7 @@ def _encoding(text: str) -> str:
 
 
 def qr_capacity(version: int, level: str) -> int:
-    """Bytes that a QR code of that version (1 to 40) and level (L, M, Q, H) holds in byte mode."""
+    """Capacity in bytes of a QR code of a version (1 to 40) and level (L, M, Q, H) in byte mode."""
     from segno import consts
 
     bits = consts.SYMBOL_CAPACITY[version][consts.ERROR_MAPPING[level]]

@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 def label_components(grid: np.ndarray) -> tuple[np.ndarray, int]:
     """4-connected components of equal cells of an (h, w) 0/1 grid.
 
-    Returns (h, w) int32 labels, numbered from 0 in raster order of their first cell, and their count. Runs of
-    equal cells in a row are joined with the runs below them by union-find, all pairs at once in each round.
+    Returns (h, w) int32 labels, numbered from 0 in raster order of their first cell, and their count.
+    Union-find joins runs of equal cells with the runs of the next row, vectorized over all pairs.
     """
     h, w = grid.shape
     starts = np.ones((h, w), bool)
     starts[:, 1:] = grid[:, 1:] != grid[:, :-1]
     run = (np.cumsum(starts.ravel()) - 1).reshape(h, w)
     below = grid[1:] == grid[:-1]
-    # one pair of runs meets along a stretch of cells; keep the first cell of each stretch
+    # two runs may share several cells; keep the first of them
     fresh = below.copy()
     fresh[:, 1:] &= starts[1:, 1:] | starts[:-1, 1:] | ~below[:, :-1]
     a, b = run[:-1][fresh], run[1:][fresh]
@@ -46,11 +46,11 @@ def label_components(grid: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def polygons(grid: np.ndarray, labels: np.ndarray, count: int) -> list[Polygon]:
-    """Each component of an (h, w) grid as a shapely polygon with holes, in cells: x right, y down, from the
+    """Shapely polygons with holes of the components of an (h, w) grid, in cells: x right, y down, from the
     top left.
 
-    A component that touches itself at a corner gives a hole that touches the shell, or two holes that
-    touch, at that point, as the OGC rules for valid polygons want it.
+    A component that touches itself at a corner has a hole that touches the shell, or two holes that touch, as
+    the OGC rules for valid polygons require.
     """
     import shapely
 

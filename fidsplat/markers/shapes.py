@@ -1,4 +1,4 @@
-"""Shapes that are painted one over the other, as polygons with holes: one region for each colour."""
+"""Visible regions of overlapping painted shapes: polygons with holes, one region for each colour."""
 
 from __future__ import annotations
 
@@ -11,50 +11,50 @@ from fidsplat.markers.paths import Rings
 from fidsplat.util.errors import InputError
 
 FLAT = 0.005
-"""Modules by which straight pieces may miss a curve."""
+"""Tolerance of polylines for curves, in modules."""
 
 GRID = 1e-6
-"""Modules to which cuts between shapes are rounded."""
+"""Grid in modules to which intersections of shapes are rounded."""
 
 
-MOST_OVERLAPS = 50_000
-"""Pairs of shapes whose bounds overlap."""
+MAX_OVERLAPS = 50_000
+"""Maximum number of pairs of shapes whose bounds overlap."""
 
 
-MOST_CROSSINGS = 5_000
-"""Places where the pieces of outlines cross."""
+MAX_CROSSINGS = 5_000
+"""Maximum number of crossings of outlines."""
 
 
-MOST_NEIGHBORS = 5_000_000
-"""Pairs of straight pieces of outlines whose bounds overlap."""
+MAX_NEIGHBORS = 5_000_000
+"""Maximum number of pairs of straight pieces of outlines whose bounds overlap."""
 
 
 def refuse_tangles(rings: Rings, name: str | None) -> None:
-    """Raise InputError where outlines cross in more places than polygons should be made of."""
+    """Raise InputError for outlines with too many crossings for polygons."""
     pieces = np.concatenate(
         [np.zeros((0, 2, 2)), *(np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings)]
     )
     lines = np.array(shapely.linestrings(pieces))
     tree, neighbors, crossings = shapely.STRtree(list(lines)), 0, 0
-    for start in range(0, len(lines), 256):  # few at a time, as each may cross all
+    for start in range(0, len(lines), 256):  # few at a time, since each may cross all others
         one, other = tree.query(lines[start : start + 256])
         one, other = np.array([one + start, other])[:, other > one + start]
         neighbors += len(one)
-        if neighbors <= MOST_NEIGHBORS:
+        if neighbors <= MAX_NEIGHBORS:
             crossings += int(_crosses(pieces[one], pieces[other]).sum())
-        if crossings > MOST_CROSSINGS:
+        if crossings > MAX_CROSSINGS:
             raise InputError(
-                f"{name} has outlines that cross in over {MOST_CROSSINGS} places: simplify the drawing"
+                f"outlines of {name} must cross in at most {MAX_CROSSINGS} places; simplify the drawing"
             )
-        if neighbors > MOST_NEIGHBORS:
+        if neighbors > MAX_NEIGHBORS:
             raise InputError(
-                f"{name} must have outlines with at most {MOST_NEIGHBORS:,} pairs of pieces near each other; "
+                f"{name} must have outlines with at most {MAX_NEIGHBORS:,} pairs of pieces near each other; "
                 "simplify the drawing"
             )
 
 
 def _crosses(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(n,) whether the insides of segments (n, 2 ends, 2) meet in a point."""
+    """Whether the interiors of segments (n, 2 ends, 2) intersect, (n,) bool."""
 
     def sides(segments: np.ndarray, ends: np.ndarray) -> np.ndarray:
         along, to = segments[:, 1] - segments[:, 0], ends - segments[:, :1]
@@ -64,7 +64,7 @@ def _crosses(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
-    """What closed rings of (n, 2) points x, y enclose.
+    """Filled region of closed rings of points (n, 2).
 
     rule: "nonzero" (the winding number) or "evenodd" (the number of crossings).
     """
@@ -85,19 +85,21 @@ def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
 def visible(
     shapes: Sequence[tuple[shapely.Geometry, int]], shape: tuple[int, int]
 ) -> tuple[shapely.MultiPolygon, ...]:
-    """Visible region of each value, for shapes painted one over the other on a sheet of (h, w) modules; the
-    value of the sheet is 0.
+    """Visible region of each value, for shapes painted in order on a sheet of (h, w) modules with the value
+    0.
 
     Raises InputError if too many shapes overlap."""
     geometries = np.array([painted for painted, _ in shapes], object)
     tree, sheet = shapely.STRtree(geometries), shapely.box(0, 0, shape[1], shape[0])
-    if tree.query(geometries).shape[1] > 2 * MOST_OVERLAPS:
-        raise InputError(f"more than {MOST_OVERLAPS} pairs of shapes overlap: simplify the drawing")
+    if tree.query(geometries).shape[1] > 2 * MAX_OVERLAPS:
+        raise InputError(
+            f"a drawing must have at most {MAX_OVERLAPS} pairs of overlapping shapes; simplify it"
+        )
     parts: list[list[shapely.Geometry]] = [[] for _ in range(1 + max((v for _, v in shapes), default=0))]
     for number, (painted, value) in enumerate(shapes):
         above = tree.query(painted)
         over = shapely.union_all(geometries[above[above > number]], grid_size=GRID)
-        # a shape that only touches the sheet, or a shape above it, leaves lines, which cannot be cut further
+        # a shape that only touches the sheet or another shape leaves lines, which further cuts reject
         parts[value].append(_polygons(shapely.difference(painted, over, grid_size=GRID) & sheet))
     visible = [_polygons(shapely.union_all(some, grid_size=GRID)) for some in parts]
     visible[0] = _polygons(shapely.difference(sheet, shapely.union_all(visible[1:]), grid_size=GRID))
@@ -107,7 +109,7 @@ def visible(
 def with_margin(
     regions: tuple[shapely.MultiPolygon, ...], modules: int, shape: tuple[int, int]
 ) -> tuple[shapely.MultiPolygon, ...]:
-    """The same regions on a sheet of (h, w) modules that shows that many more of value 0 on each side."""
+    """Regions on a sheet of (h, w) modules, enlarged on each side by a margin of value 0."""
     h, w = shape
     moved = [shapely.transform(region, lambda points: points + modules) for region in regions]
     frame = shapely.box(0, 0, w, h) - shapely.box(modules, modules, w - modules, h - modules)
@@ -116,7 +118,7 @@ def with_margin(
 
 
 def is_whole(regions: tuple[shapely.MultiPolygon, ...]) -> bool:
-    """Whether all edges lie on the lines between modules."""
+    """Whether all edges are on the lines between modules."""
     rings = shapely.get_rings(shapely.get_parts(regions))
     points, ring = shapely.get_coordinates(rings, return_index=True)
     step = np.abs(np.diff(points, axis=0))[np.diff(ring) == 0]
@@ -124,7 +126,7 @@ def is_whole(regions: tuple[shapely.MultiPolygon, ...]) -> bool:
 
 
 def modules(regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]) -> np.ndarray:
-    """Which region holds the centre of each of (h, w) modules, uint8; of several the last."""
+    """Index of the region at the centre of each of (h, w) modules, uint8; the last of several."""
     grid = np.zeros(shape, np.uint8)
     for value, region in enumerate(regions):
         if region.is_empty:
@@ -138,5 +140,5 @@ def modules(regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]) -
 
 
 def _polygons(region: shapely.Geometry) -> shapely.MultiPolygon:
-    """A region without the points and lines that cuts may leave."""
+    """A region without the points and lines that cuts can leave."""
     return shapely.MultiPolygon([part for part in shapely.get_parts(region) if part.area])

@@ -1,4 +1,4 @@
-"""What a marker spec says once it is taken apart, and what a kind of marker has to offer."""
+"""Data classes of parsed marker specs and of kinds of markers."""
 
 from __future__ import annotations
 
@@ -14,38 +14,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Spec:
-    """A marker spec taken apart. Kinds that have more to say extend it."""
+    """A parsed marker spec; kinds with more fields extend it."""
 
     text: str
-    """the spec as it was written"""
+    """text of the spec"""
     kind: str
     """name of the kind of marker, e.g. "apriltag\""""
     family: str | None = None
-    """tag family as OpenCV's dictionaries name it; for QR "v5-L" once the code is made"""
+    """tag family, a name of OpenCV's dictionaries; "v5-L" for a QR code once it is encoded"""
     id: int | None = None
     """tag id"""
     payload: str | None = None
     """QR text, or the path of an image or an SVG drawing"""
     colors: tuple[tuple[float, float, float], ...] | None = None
-    """RGB of modules of the values 0, 1, ..., once they are made; None: white and black"""
+    """RGB of the values 0, 1, ... once modules are made; None: white and black"""
     regions: tuple[MultiPolygon, ...] | None = None
-    """of each value what it covers, in modules from the top left, where it is more than whole modules"""
+    """region of each value for drawings with slanted or curved edges, in modules from the top left; else
+    None"""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of marker. `fidsplat.markers.register` adds one, after which its specs work in that process."""
+    """A kind of marker, added by `fidsplat.markers.register`."""
 
     name: str
-    """what its specs begin with, in lower case; options may follow after a dash: "qr", "qr-v22-L\""""
+    """prefix of its specs, in lower case; options may follow after a dash: "qr", "qr-v22-L\""""
     form: str
-    """what a spec looks like, for messages: "apriltag:FAMILY:ID\""""
+    """form of its specs for messages: "apriltag:FAMILY:ID\""""
     quiet_zone: int
-    """modules of white around it unless the caller says otherwise"""
+    """default width of the quiet zone in modules"""
     parse: Callable[[str, str, str], Spec]
-    """called with the spec, its part before the first colon and the part after it; raises InputError"""
+    """parses a spec: called with the spec and its parts before and after the first colon; raises
+    InputError"""
     bits: Callable[[Any], tuple[Spec, np.ndarray]]
-    """called with what ``parse`` gave; returns it, its family set, and the modules without quiet zone,
-    (h, w) uint8, 1 = dark or an index into the spec's colours; raises InputError"""
+    """called with the result of `parse`; returns it with the family, and the modules without quiet zone, (h,
+    w) uint8, 1 = dark or an index of the spec's colours; raises InputError"""
     is_file: bool = False
     """whether the part after the colon is a file name, relative to the scene file"""

@@ -1,4 +1,4 @@
-"""How an SVG file says what a shape looks like: colours by name, and a style sheet's rules."""
+"""SVG styles: colours by name, and rules of style sheets."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ springgreen 00ff7f steelblue 4682b4 tan d2b48c teal 008080 thistle d8bfd8 tomato
 40e0d0 violet ee82ee wheat f5deb3 white ffffff whitesmoke f5f5f5 yellow ffff00 yellowgreen 9acd32
 """
 COLORS = dict(zip(_NAMES.split()[::2], _NAMES.split()[1::2], strict=True))
-"""the names of CSS, six digits each"""
+"""CSS colours by name, six digits each"""
 
 _COMMENT = re.compile(r"/\*.*?\*/|<!--|-->", re.DOTALL)
 _RULE = re.compile(r"([^{}]*)\{([^{}]*)\}")
@@ -43,21 +43,21 @@ _SELECTOR = re.compile(r"(\*|[\w-]+)?((?:[.#][\w-]+)*)")
 
 
 class Rule(NamedTuple):
-    """What a style sheet says of some elements."""
+    """A rule of a style sheet: selector and declarations."""
 
     rank: tuple[int, int, int]
-    """ids, classes and tags that it names: the higher holds, of equals the later"""
+    """specificity: numbers of ids, classes and tags; of equal rules the later applies"""
     tag: str
     """"" for any"""
     id: str
     """"" for any"""
     classes: frozenset[str]
-    """it has all of these"""
+    """required classes"""
     look: dict[str, str]
 
 
 def declarations(text: str) -> dict[str, str]:
-    """Declarations of a ``style``: names and values. Raises ValueError for !important."""
+    """Parse the declarations of a `style`: names and values. Raises ValueError for !important."""
     parts = (part.partition(":") for part in _COMMENT.sub("", text).split(";"))
     found = {key.strip().lower(): value.strip() for key, colon, value in parts if colon}
     if any("!" in value for value in found.values()):
@@ -66,8 +66,8 @@ def declarations(text: str) -> dict[str, str]:
 
 
 def rules(text: str) -> list[Rule]:
-    """The rules of a style sheet, lowest specificity first. Raises ValueError for a selector of another kind
-    than ``tag``, ``.class``, ``#id`` and these together, and for at-rules."""
+    """Parse the rules of a style sheet, lowest specificity first. Raises ValueError for at-rules and for
+    selectors other than `tag`, `.class`, `#id` and their combinations."""
     text = _COMMENT.sub("", text)
     left = _RULE.sub("", text).strip()
     if left:
@@ -89,7 +89,7 @@ def rules(text: str) -> list[Rule]:
 
 
 def styled(sheet: Iterable[Rule], tag: str, attributes: dict[str, str]) -> dict[str, str]:
-    """What rules and its own ``style`` say of an element. Raises ValueError as `declarations`."""
+    """Style of an element by rules and its `style` attribute. Raises ValueError for !important."""
     classes, look = set(attributes.get("class", "").split()), {}
     for rule in sheet:
         if rule.tag in ("", tag) and rule.id in ("", attributes.get("id")) and rule.classes <= classes:

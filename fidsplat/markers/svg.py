@@ -1,8 +1,8 @@
-"""SVG drawings: the filled shapes of a file in their colours, as polygons with holes.
+"""SVG drawings: the filled shapes of a file with their colours, as polygons with holes.
 
-The splats cover the polygons themselves; `Marker.bits` has in each module the topmost shape at its centre.
-Shapes filled with one colour are supported. Everything else (text, strokes, gradients, images) is an error,
-so that a marker never differs from its drawing.
+The splats cover the polygons; `Marker.bits` has the topmost shape at the centre of each module. Only shapes
+with a plain fill are supported; everything else (text, strokes, gradients, images) is an error, so that a
+marker never differs from its drawing.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import read_input
 
 MODULES = 256
-"""Modules across a drawing unless its spec says otherwise."""
+"""Default number of modules across a drawing."""
 
-MOST_MODULES, MOST_BYTES, MOST_COLORS, MOST_POINTS = 2048, 2_000_000, 64, 200_000
+MAX_MODULES, MAX_BYTES, MAX_COLORS, MAX_POINTS = 2048, 2_000_000, 64, 200_000
 
 _HEAD = re.compile(r"svg(?:-(?P<modules>[0-9]{1,5}))?", re.IGNORECASE)
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -41,7 +41,7 @@ _GROUPS = ("svg", "g", "a", "switch")
 _SILENT = ("title", "desc", "metadata", "defs", "style", "namedview")
 _REFUSED = ("stroke", "filter", "mask", "clip-path", "mix-blend-mode")
 _PLACES = ("x", "y", "width", "height", "viewBox")
-# what a style sheet may place shapes by, where we read attributes
+# geometry properties, which are supported only as attributes
 _OF_SHAPES = ("d", "x", "y", "width", "height", "r", "rx", "ry", "cx", "cy")
 _MOVES = ("transform", "transform-origin", "translate", "rotate", "scale")
 
@@ -56,7 +56,7 @@ class DrawingSpec(Spec):
 
 @dataclass(frozen=True)
 class _Style:
-    """What shapes inherit."""
+    """Style properties that shapes inherit."""
 
     fill: str = "black"
     rule: str = "nonzero"
@@ -76,29 +76,29 @@ def _parse(text: str, head: str, rest: str) -> DrawingSpec:
     if found is None:
         raise InputError(f"a drawing must be svg:FILE.svg or svg-512:FILE.svg, got {head!r}")
     modules = int(found["modules"] or MODULES)
-    if not 1 <= modules <= MOST_MODULES:
-        raise InputError(f"{text!r}: a drawing has 1 to {MOST_MODULES} modules across")
+    if not 1 <= modules <= MAX_MODULES:
+        raise InputError(f"a drawing must have 1 to {MAX_MODULES} modules across, got {text!r}")
     if not rest:
-        raise InputError(f"{text!r} names no file; write svg:FILE.svg")
+        raise InputError(f"the spec of a drawing must be svg:FILE.svg, got {text!r}")
     return DrawingSpec(text=text, kind="svg", payload=rest, modules=modules)
 
 
 def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
-    """Indices (h, w) uint8 into the spec's colours, the first of which is the paper's white."""
+    """Modules (h, w) uint8 of a drawing: indices of the spec's colours, of which the first is white."""
     from fidsplat.markers.shapes import (
         filled,
         is_whole,
         modules,
         refuse_tangles,
         visible,
-    )  # late, as shapely is
+    )  # here, since it imports shapely
 
     root, name = _root(Path(spec.payload or "")), spec.payload
     x, y, width, height = _view(root, name)
     scale = spec.modules / width
     rows = round(height * scale)
-    if not 1 <= rows <= MOST_MODULES:
-        raise InputError(f"{name} would have {rows} rows of modules; 1 to {MOST_MODULES} are made")
+    if not 1 <= rows <= MAX_MODULES:
+        raise InputError(f"{name} must have 1 to {MAX_MODULES} rows of modules, got {rows}")
     to_modules = np.array([[scale, 0, -x * scale], [0, scale, -y * scale], [0, 0, 1]])
     colors, points = [(1.0, 1.0, 1.0)], 0
     outlines: list[tuple[Rings, str, int]] = []
@@ -106,9 +106,9 @@ def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
         if color not in colors:
             colors.append(color)
         points += sum(map(len, rings))
-        if len(colors) > MOST_COLORS or points > MOST_POINTS:
+        if len(colors) > MAX_COLORS or points > MAX_POINTS:
             raise InputError(
-                f"{name} has more than {MOST_COLORS} colours or {MOST_POINTS} points: simplify the drawing"
+                f"{name} must have at most {MAX_COLORS} colours and {MAX_POINTS} points; simplify the drawing"
             )
         outlines.append((rings, rule, colors.index(color)))
     refuse_tangles([ring for rings, _, _ in outlines for ring in rings], name)
@@ -120,7 +120,7 @@ def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
 
 def _root(path: Path) -> ElementTree.Element:
     try:
-        root = ElementTree.fromstring(read_input(path, MOST_BYTES))
+        root = ElementTree.fromstring(read_input(path, MAX_BYTES))
     except ElementTree.ParseError as error:
         raise InputError(f"cannot read {path} as SVG: {error}") from None
     if _tag(root) != "svg":
@@ -129,26 +129,24 @@ def _root(path: Path) -> ElementTree.Element:
 
 
 def _view(root: ElementTree.Element, name: str | None) -> tuple[float, float, float, float]:
-    """The view box: x, y, width, height."""
+    """View box: x, y, width, height."""
     box = [float(side) for side in re.findall(_NUMBER, root.get("viewBox", ""))]
     if not box:
         sides = [re.match(_NUMBER, root.get(side, "")) for side in ("width", "height")]
         box = [0.0, 0.0, *(float(side[0]) for side in sides if side)]
     if len(box) != 4 or not (min(box[2:]) >= 1 / FARTHEST and np.abs(box).max() <= FARTHEST):
-        raise InputError(
-            f"{name}: it has no viewBox, nor a width and height, above 0 (and no number beyond {FARTHEST:g})"
-        )
+        raise InputError(f"{name} must have a viewBox, or width and height, above 0 and at most {FARTHEST:g}")
     return box[0], box[1], box[2], box[3]
 
 
 def _sheet(root: ElementTree.Element, name: str | None) -> list[Rule]:
-    """The rules of its style sheets."""
+    """Rules of the style sheets of a document."""
     text = "".join("".join(element.itertext()) for element in root.iter() if _tag(element) == "style")
     try:
         return rules(text)
     except ValueError as error:
         raise InputError(
-            f"{name}: its style sheet has {error}; only rules for .class, #id and tags are understood"
+            f"{name}: its style sheet must only have rules for .class, #id and tags, got {error}"
         ) from None
 
 
@@ -163,16 +161,16 @@ def _shapes(
     if look.get("display") == "none":
         return
     if depth > 100:
-        raise InputError(f"{name}: groups are nested deeper than 100")
+        raise InputError(f"{name}: groups must be nested at most 100 deep, got more; flatten them")
     if tag == "svg" and depth and any(key in element.attrib for key in _PLACES):
-        raise InputError(f"{name}: a nested <svg> is not supported; make it a group")
+        raise InputError(f"{name}: an <svg> must not be nested; make it a group")
     for what in _REFUSED:
         if look.get(what, "none") not in ("none", "normal"):
-            raise InputError(f"{name}: <{tag}> has a {what}; convert it to filled paths")
+            raise InputError(f"{name}: <{tag}> must not have a {what}; convert it to filled paths")
     if any(not _is_one(look.get(what, "1")) for what in ("opacity", "fill-opacity")):
-        raise InputError(f"{name}: <{tag}> is translucent; a print is opaque")
+        raise InputError(f"{name}: <{tag}> must be opaque; remove its opacity")
     style = _inherited(style, look)
-    with np.errstate(all="ignore"):  # what reaches too far is refused below
+    with np.errstate(all="ignore"):  # checked below
         to_modules = to_modules @ _transform(element.get("transform", ""), name)
     if tag in _GROUPS:
         for child in _first(element) if tag == "switch" else element:
@@ -183,7 +181,7 @@ def _shapes(
         with np.errstate(all="ignore"):
             moved = [ring @ to_modules[:2, :2].T + to_modules[:2, 2] for ring in rings]
         if not all((np.abs(ring) <= FARTHEST).all() for ring in moved):
-            raise InputError(f"{name}: <{tag}> reaches too far beyond the drawing")
+            raise InputError(f"{name}: <{tag}> must not extend so far beyond the drawing")
         yield moved, _color(style.color if style.fill == "currentColor" else style.fill, name), style.rule
 
 
@@ -220,16 +218,16 @@ def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
             rx, ry = side("rx", side("r")), side("ry", side("r"))
             return circle_rings(side("cx"), side("cy"), rx, ry)
     except ValueError as error:
-        raise InputError(f"{name}: <{tag}> cannot be read: {error}") from None
+        raise InputError(f"{name}: cannot read <{tag}>: {error}") from None
     raise InputError(f"{name}: <{tag}> must be a filled shape; convert it to a path")
 
 
 def _look(element: ElementTree.Element, tag: str, file: _File) -> dict[str, str]:
-    """Attributes, and over them what style sheets and ``style`` say."""
+    """Attributes of an element, overridden by style sheets and `style`."""
     try:
         said = styled(file.sheet, tag, element.attrib)
     except ValueError as error:
-        raise InputError(f"{file.name}: the style of <{tag}> has {error}, which is not understood") from None
+        raise InputError(f"{file.name}: the style of <{tag}> must not have {error}") from None
     for key in (*_MOVES, *(() if tag in _GROUPS else _OF_SHAPES)):
         if key in said or (key == "transform-origin" and key in element.attrib):
             raise InputError(f"{file.name}: {key} of <{tag}> must be an attribute, got a style property")
@@ -260,11 +258,13 @@ def _transform(text: str, name: str | None) -> np.ndarray:
     matrix = np.eye(3)
     left = re.sub(r"\w+\s*\([^)]*\)|[\s,]", "", text)
     if left:
-        raise InputError(f"{name}: the transform {text[:40]!r} is not understood")
+        raise InputError(f"{name}: cannot parse the transform {text[:40]!r}")
     for word, inner in re.findall(r"(\w+)\s*\(([^)]*)\)", text):
         v = [float(value) for value in re.findall(_NUMBER, inner)]
         if any(abs(value) > FARTHEST for value in v):
-            raise InputError(f"{name}: the transform {word}({inner}) has a number beyond {FARTHEST:g}")
+            raise InputError(
+                f"{name}: numbers of a transform must be at most {FARTHEST:g}, got {word}({inner})"
+            )
         plain = not re.sub(r"[\s,]", "", re.sub(_NUMBER, "", inner))
         if word == "matrix" and len(v) == 6 and plain:
             step = np.array([[v[0], v[2], v[4]], [v[1], v[3], v[5]], [0, 0, 1]])
@@ -279,7 +279,7 @@ def _transform(text: str, name: str | None) -> np.ndarray:
             step, at = np.eye(3), (0, 1) if word == "skewX" else (1, 0)
             step[at] = np.tan(np.radians(v[0]))
         else:
-            raise InputError(f"{name}: the transform {word}({inner}) is not understood")
+            raise InputError(f"{name}: cannot parse the transform {word}({inner})")
         matrix = matrix @ step
     return matrix
 

@@ -1,4 +1,4 @@
-"""AprilTags and ArUco tags: the dictionaries that OpenCV predefines."""
+"""AprilTags and ArUco tags of OpenCV's predefined dictionaries."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def _parse(text: str, head: str, rest: str) -> Spec:
     kind = head.lower()
     family, _, number = rest.rpartition(":")
     if not family:
-        raise InputError(f"{text!r} lacks a family or an id; write {kind}:FAMILY:ID")
+        raise InputError(f"the spec of a tag must be {kind}:FAMILY:ID, got {text!r}")
     if not re.fullmatch(r"[0-9]{1,9}", number):
-        raise InputError(f"{text!r}: the id {number!r} is not a whole number from 0")
+        raise InputError(f"the id of {text!r} must be a whole number from 0, got {number!r}")
     return Spec(text=text, kind=kind, family=family.lower(), id=int(number))
 
 

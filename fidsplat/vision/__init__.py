@@ -1,4 +1,4 @@
-"""Detection of markers in images, their poses, ground truth, and comparison of the two."""
+"""Detection of markers in images, pose estimation, ground truth, and errors."""
 
 import fidsplat.images  # noqa: F401  sets OpenCV's limits before cv2 is loaded
 

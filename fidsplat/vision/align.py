@@ -1,9 +1,9 @@
-"""Subpixel corner refinement: the known modules of a code are fitted to the image by least squares.
+"""Subpixel corner refinement: least-squares fit of the known modules of a code to the image.
 
-Every dark-light edge inside the code contributes, so the corners of a QR code, whose outer edge is mostly
-broken, are as accurate as those of a tag. The model is the box average of the pattern over each pixel, as a
-camera records it. Image and model are blurred alike before the comparison, so the blur that stabilises the
-steps moves no edge. Accuracy: a few hundredths of a pixel.
+Every dark-light edge inside the code contributes, so the corners of a QR code, whose outer edge is
+interrupted, are as accurate as those of a tag. The model is the box average of the pattern over each pixel.
+Image and model are blurred equally for stability, so the blur does not move edges. Accuracy: a few hundredths
+of a pixel.
 """
 
 from collections.abc import Iterable
@@ -11,34 +11,34 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-ITERATIONS = 8  # in each of three rounds: blurred, sharp, sharp with robust weights
-SETTLED = 0.003  # pixels: largest move of a corner in the last step
-FINE_BLUR = 0.7  # pixels, standard deviation
+ITERATIONS = 8  # maximum steps of the three rounds: blurred, sharp, sharp with robust weights
+SETTLED = 0.003  # pixels: maximum motion of a corner in the last step
+FINE_BLUR = 0.7  # pixels, standard deviation of the blur
 # difference from the model, as a share of the contrast, at which the weight of a pixel falls (occlusion)
 TOLERANCE = 0.25
 # a fit with a lower correlation has converged to another place
 MIN_CORRELATION = 0.7
 _POINTS = 3  # the pattern is averaged over 3 x 3 points of each pixel
 _LARGE = 150_000  # pixels above which the image is downsampled before the comparison
-_SMALL = 10_000  # the same for a search over many places
+_SMALL = 10_000  # the same for a grid search
 _COARSE_MODULE = 4.0  # pixels: smallest module after downsampling
 # the code spans [-1, 1]: well-conditioned parameters
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)
-_LARGEST_MODULE = 64  # points of the pattern
-_QUIET = 1  # modules of light ground around the code that the model includes
+_LARGEST_MODULE = 64  # samples of the pattern for each module
+_QUIET = 1  # width of the quiet zone in the model, in modules
 
 
 def align(
     grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure: Iterable[int] = ()
 ) -> np.ndarray | None:
-    """Refined corners of a code with known modules and rough corners.
+    """Refine rough corners of a code with known modules.
 
     Args:
         grey: (h, w) uint8.
         corners: (4, 2) pixel coordinates TL, TR, BR, BL of the code's outer edge, within half a module.
         bits: (n, n) uint8, 1 = dark, without quiet zone.
-        unsure: indices of corners of which one may be off by two modules; each is searched for if the fit
-            from the given corners does not converge.
+        unsure: indices of corners of which one may be wrong by two modules; if the fit from the given corners
+            does not converge, a grid search for each of them follows.
 
     Returns (4, 2) float64, or None if the fit does not converge near the given corners.
     """
@@ -52,8 +52,8 @@ def align(
 
 
 def fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> float:
-    """Correlation of the pattern with the image between these corners, at most 1; -1 if it is undefined.
-    Arguments: as in `align`."""
+    """Correlation of the pattern with the image, at most 1; -1 if it is undefined. Arguments: as in
+    `align`."""
     window = _window(grey, corners, bits, _LARGE)
     if window is None:
         return -1.0
@@ -97,7 +97,7 @@ def _settled(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndar
 
 
 def _best_start(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure: int) -> np.ndarray:
-    """The corners after a grid search, in steps of half a module, for the unsure one."""
+    """Corners with the best correlation in a grid search for one of them, in steps of half a module."""
     window = _window(grey, corners, bits, _SMALL)
     if window is None:
         return corners
@@ -123,22 +123,21 @@ class _Model:
 
     def __init__(self, bits: np.ndarray, shape: tuple[int, ...], module: float) -> None:
         self.shape = shape
-        # Each module is made so large that OpenCV's linear ramp between two of its points is as wide as the
-        # step between the points of a pixel: an edge along the rows then moves the model evenly, not in
-        # jumps.
+        # The pattern has as many samples that OpenCV's linear ramp between two of them is as wide as the step
+        # between the samples of a pixel: the model then moves continuously with an edge along the rows.
         k = int(np.clip(np.ceil(_POINTS * module), 1, _LARGEST_MODULE))
         self.pattern = np.kron(1 - np.pad(bits, _QUIET), np.ones((k, k))).astype(np.float32)
         n = bits.shape[0]
-        # [-1, 1] to OpenCV's numbers of the pattern's points, of which the first has its centre at 0
+        # [-1, 1] to OpenCV's indices of the pattern's samples; index 0 is the centre of the first
         half, shift = k * n / 2, k * (n / 2 + _QUIET) - 0.5
         self.to_pattern = np.array([[half, 0, shift], [0, half, shift], [0, 0, 1]])
-        self.reach = 1 + _QUIET / n  # half of the quiet module: blurred ground from further out stays outside
+        self.reach = 1 + _QUIET / n  # half of the quiet module: excludes the blurred surroundings
         rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]]
         self.pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(shape)]).reshape(3, -1)
 
     def render(self, homography: np.ndarray, blur: float) -> np.ndarray:
         k = _POINTS
-        fine = np.array([[k, 0, -0.5], [0, k, -0.5], [0, 0, 1]])  # pixels to numbers of the fine grid
+        fine = np.array([[k, 0, -0.5], [0, k, -0.5], [0, 0, 1]])  # pixels to indices of the fine grid
         warp = fine @ homography @ np.linalg.inv(self.to_pattern)
         size = (self.shape[1] * k, self.shape[0] * k)
         rendered = cv2.warpPerspective(self.pattern, warp, size, flags=cv2.INTER_LINEAR, borderValue=1.0)
@@ -146,7 +145,7 @@ class _Model:
         return cv2.GaussianBlur(rendered, (0, 0), blur)
 
     def inside(self, homography: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the pixels on the code, and their (s, t) in [-1, 1]."""
+        """Indices of the pixels inside the code, and their (s, t) in [-1, 1]."""
         u, v, w = np.linalg.inv(homography) @ self.pixels
         # the sign of w distinguishes the two sides of the horizon
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -164,7 +163,8 @@ class _Model:
 
 
 def _step(model: _Model, smooth: np.ndarray, homography: np.ndarray, blur: float, robust: bool):
-    """The (3, 3) change X of one Gauss-Newton step, homography (I + X), or None if it is undetermined."""
+    """Gauss-Newton step (3, 3) X, which changes the homography to homography (I + X); None if it is
+    singular."""
     keep, (s, t) = model.inside(homography)
     if keep.size < 16:
         return None
@@ -202,14 +202,14 @@ def _contrast(ideal: np.ndarray, observed: np.ndarray, weight: np.ndarray) -> tu
 
 
 def _module(corners: np.ndarray, bits: np.ndarray) -> float:
-    """Pixels of a module on the code's shortest side."""
+    """Size of a module in pixels on the code's shortest side."""
     return float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min() / bits.shape[0])
 
 
 def _window(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, large: int):
-    """The image around the code (h, w) float32 in [0, 1], its origin (2,) and its pixel size in ``grey``.
+    """Crop around the code (h, w) float32 in [0, 1], its origin (2,) and pixel size in `grey`.
 
-    None if the code is outside.
+    None if the code is outside of the image.
     """
     low, high = corners.min(0), corners.max(0)
     margin = 2.0 * (high - low).max() / bits.shape[0] + 4.0
@@ -227,7 +227,7 @@ def _window(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, large: int)
 
 
 def _homography(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(3, 3) that maps four points (4, 2) onto four others; float64, unlike OpenCV's."""
+    """Homography (3, 3) between four points (4, 2) and four others; in float64, unlike OpenCV's."""
     rows = []
     for (s, t), (x, y) in zip(source, target, strict=True):
         rows.append([s, t, 1, 0, 0, 0, -x * s, -x * t])

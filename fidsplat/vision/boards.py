@@ -1,4 +1,4 @@
-"""Boards of tags: one pose from all detected tags."""
+"""Pose of a board of tags from all detected tags."""
 
 from collections.abc import Iterable
 
@@ -17,16 +17,18 @@ BOARDS = ("charuco", "gridboard", "aprilgrid")
 """kinds of markers that are boards"""
 
 ENOUGH = 6
-"""Corners between squares from which a ChArUco board's pose is taken; its tags' where there are fewer."""
+"""Minimum number of chessboard corners for the pose of a ChArUco board; with fewer its tags are used."""
 
 
 def board_pose(
     image: np.ndarray, tags: Iterable[Detection], placed: PlacedMarker, camera: Camera
 ) -> tuple[tuple[Detection, np.ndarray] | None, list[Detection]]:
-    """A board as one detection, its corners as its pose has them, with camera_from_marker (4, 4), or None;
-    and the tags that are not its own.
+    """Combine the tags of a board to one detection with projected corners and camera_from_marker (4, 4).
 
-    image: (h, w, 3) uint8. tags: found in it; of several of one id the nearest to the board's true place.
+    Returns the detection and pose, or None, and the tags of other markers.
+
+    image: (h, w, 3) uint8. tags: detections in it; of several with one id the nearest to the true position is
+    used.
     """
     marker, left = placed.marker, list(tags)
     spec = parse_spec(marker.spec)
@@ -64,7 +66,7 @@ def board_pose(
 
 
 def _chess_corners(image: np.ndarray, spec: BoardSpec, side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Corners between the squares of a ChArUco board that OpenCV finds: (n, 2) modules and (n, 2) pixels."""
+    """Chessboard corners of a ChArUco board detected by OpenCV: (n, 2) modules and (n, 2) pixels."""
     square = side + GAP
     dictionary = predefined(*parse_family(spec.family or ""))
     board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), square, side, dictionary)
@@ -73,5 +75,5 @@ def _chess_corners(image: np.ndarray, spec: BoardSpec, side: int) -> tuple[np.nd
     if ids is None or found is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     row, column = np.divmod(np.asarray(ids).ravel(), spec.columns - 1)
-    # OpenCV counts from the centre of the first pixel
+    # OpenCV's origin is the centre of the first pixel
     return np.column_stack([column + 1, row + 1]) * float(square), np.asarray(found).reshape(-1, 2) + 0.5

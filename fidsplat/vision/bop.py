@@ -1,4 +1,4 @@
-"""Images and ground truth in the format of the BOP challenge
+"""Writer of images and ground truth in the format of the BOP challenge
 (https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md)."""
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from fidsplat.vision.truth import Box, MarkerTruth, Truth
 from fidsplat.vision.visible import outline
 
 PIXEL = 0.5
-"""what BOP counts less than we do: the centre of its first pixel is at 0"""
+"""offset to the pixel coordinates of BOP, whose first pixel centre is at 0"""
 DEPTH_SCALE = 0.1
-"""millimetres of a step of the depth's 16 bits, which then reach 6.5 m"""
+"""millimetres of a depth step; 16 bits have a range of 6.5 m"""
 
 
 class BopScene:
@@ -34,13 +34,13 @@ class BopScene:
             is written two folders above.
 
     Raises:
-        InputError: a folder that cannot be written, or that holds a scene already.
+        InputError: a folder that cannot be written, or that already has a scene.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self._folder = writable_folder(folder)
         if (self._folder / "scene_gt.json").exists():
-            raise InputError(f"{self._folder} holds a scene already; give another folder")
+            raise InputError(f"the folder must not have a scene yet, got {self._folder}; give another one")
         for name in ("rgb", "depth", "mask_visib"):
             (self._folder / name).mkdir(exist_ok=True)
         self._cameras: dict[str, Any] = {}
@@ -56,11 +56,11 @@ class BopScene:
             self.save()
 
     def add(self, frame: Mapping[str, np.ndarray], truth: Truth) -> None:
-        """Write a frame: `rgb`, and `depth` and `label` if present. Depths beyond what 16 bits
-        hold are written as 0, which is unknown.
+        """Write a frame: `rgb`, and `depth` and `label` if present. Depths that exceed 16 bits become 0
+        (unknown).
 
         Raises:
-            InputError: a camera with a lens, which BOP cannot say.
+            InputError: a camera with a lens, which BOP does not support.
         """
         camera = truth.camera
         if camera.lens is not None:
@@ -101,16 +101,17 @@ class BopScene:
         """Write the JSON files.
 
         Raises:
-            InputError: one cannot be written, or another scene of the data set has another marker under the
-                same label.
+            InputError: a file that cannot be written, or a label that another scene of the data set uses for
+                another marker.
         """
         models = writable_folder(self._folder.resolve().parent.parent / "models") / "models_info.json"
         known = _known(models)
         for label, model in self._models.items():
             if known.get(label, model) != model:
                 raise InputError(
-                    f"{models}: object {label} is {known[label].get('spec')} there, and {model['spec']} "
-                    "here; give markers the same labels in every scene, or this one a data set of its own"
+                    f"{models}: object {label} must be {known[label].get('spec')}, got {model['spec']}; "
+                    "use the "
+                    "same labels in all scenes, or another data set"
                 )
         for name, content in (
             ("scene_camera.json", self._cameras),
@@ -133,7 +134,7 @@ def _seen(marker: MarkerTruth, truth: Truth, mask: np.ndarray) -> dict[str, Any]
 
 
 def _box(box: Box | None) -> list[float]:
-    """x, y, width, height; -1 for nothing, as BOP has it."""
+    """BOP's box: x, y, width, height; -1 for an empty box."""
     return [-1, -1, -1, -1] if box is None else [box[0], box[1], box[2] - box[0], box[3] - box[1]]
 
 
@@ -149,7 +150,7 @@ def _model(marker: MarkerTruth) -> dict[str, Any]:
 
 
 def _known(path: Path) -> dict[str, dict[str, Any]]:
-    """The models that other scenes have written."""
+    """Models written by other scenes."""
     try:
         return from_json(read_text(path)) if path.exists() else {}
     except ValueError as error:

@@ -16,17 +16,16 @@ from fidsplat.vision.readback import Reading
 
 @dataclass(frozen=True, eq=False)
 class BundleReading:
-    """A bundle of a scene's markers, where it is, and how it was read. Its frame is that of its first marker
-    in the scene's order."""
+    """True and estimated pose of a bundle of markers. Its frame is that of its first marker in the scene."""
 
     name: str
     markers: int
     found: int
-    """markers that were read"""
+    """number of detected markers"""
     truth: np.ndarray
-    """(4, 4) camera_from_bundle"""
+    """(4, 4) true camera_from_bundle"""
     pose: np.ndarray | None = None
-    """(4, 4) camera_from_bundle from the corners of all markers that were read; None without any"""
+    """(4, 4) camera_from_bundle estimated from the corners of all detected markers; None without any"""
     position_error: float | None = None
     """metres"""
     angle_error: float | None = None
@@ -34,11 +33,11 @@ class BundleReading:
 
     @property
     def distance(self) -> float:
-        """Metres from the camera."""
+        """Distance from the camera in metres."""
         return float(np.linalg.norm(self.truth[:3, 3]))
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: millimetres, degrees; None where nothing was read."""
+        """Values for JSON, in millimetres and degrees; None without a detection."""
         return {
             "bundle": self.name,
             "markers": self.markers,
@@ -51,9 +50,9 @@ class BundleReading:
 
 
 def read_bundles(readings: Iterable[Reading], camera: Camera) -> list[BundleReading]:
-    """The bundles of a scene (`PlacedMarker.bundle`), from the detections of its markers in one image.
+    """Estimate the poses of a scene's bundles (`PlacedMarker.bundle`) from readings of one image.
 
-    camera: that took it; its intrinsics and lens are used.
+    camera: intrinsics and lens of the image.
     """
     members: dict[str, list[Reading]] = {}
     for reading in readings:

@@ -1,4 +1,4 @@
-"""Ground truth of images as COCO annotations (https://cocodataset.org/#format-data)."""
+"""Writer of ground truth as COCO annotations (https://cocodataset.org/#format-data)."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class CocoAnnotations:
     """Annotations of many images: for each visible marker its box, mask and corners as keypoints, for
     each named group of splats its box and mask.
 
-    A category is a marker's spec, `apriltag:36h11:5` say, or a group's name. In addition to COCO's fields a
-    marker's annotation has `camera_from_marker`, `visible`, `distance_m` and `tilt_deg`.
+    A category is the spec of a marker, e.g. `apriltag:36h11:5`, or the name of a group. In addition to COCO's
+    fields an annotation of a marker has `camera_from_marker`, `visible`, `distance_m` and `tilt_deg`.
 
     Args:
         groups: {label: name} of groups of splats to annotate.
@@ -40,14 +40,12 @@ class CocoAnnotations:
         """Annotate an image. file_name: its name in the annotations.
 
         Raises:
-            InputError: the image is annotated already.
+            InputError: an image that is already annotated.
         """
         text("file_name", file_name)
         instance("truth", truth, Truth, "what truth_of returns")
         if any(image["file_name"] == file_name for image in self._images):
-            raise InputError(
-                f"file_name must be new, got {file_name!r}, which is annotated already; use another name"
-            )
+            raise InputError(f"file_name must be new, got {file_name!r} again; use another name")
         camera = truth.camera
         image = {"id": len(self._images) + 1, "file_name": file_name}
         self._images.append(image | {"width": camera.width, "height": camera.height})
@@ -59,7 +57,7 @@ class CocoAnnotations:
                 self._keep(image["id"], name, _of_group(truth.groups[label]), False)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all of it as JSON. Raises InputError when the file cannot be written."""
+        """Write the annotations as JSON. Raises InputError for a file that cannot be written."""
         content = {
             "info": {"description": "rendered by fidsplat"},
             "images": self._images,
@@ -121,7 +119,7 @@ def _of_group(group: GroupTruth) -> dict[str, Any]:
 
 
 def run_lengths(mask: np.ndarray) -> list[int]:
-    """COCO's uncompressed run lengths of a mask (h, w) bool: column by column, False first."""
+    """Encode a mask (h, w) bool as COCO's uncompressed run lengths: column by column, False first."""
     flat = np.concatenate([[False], mask.ravel(order="F"), [False]])
     edges = np.flatnonzero(flat[1:] != flat[:-1])
     lengths = np.diff(np.concatenate([[0], edges])).tolist()

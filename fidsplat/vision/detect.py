@@ -1,7 +1,6 @@
-"""Detection of AprilTag, ArUco and QR codes with off-the-shelf detectors: OpenCV's aruco module and
-zxing-cpp.
+"""Detection of AprilTag, ArUco and QR codes by OpenCV's aruco module and zxing-cpp.
 
-The detectors find and decode the codes; `align` then refines the corners by the edges of the decoded code.
+`align` refines the corners by the edges of the decoded code.
 """
 
 from collections.abc import Iterable
@@ -17,19 +16,18 @@ from fidsplat.util.arguments import invalid, items
 from fidsplat.util.errors import InputError
 from fidsplat.vision.align import align, fit
 
-# One family for every grid that people print; with each, a random dark square reads as a tag less than once
-# in 300 times. 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or more false tags: searched
-# on request.
+# One family for each common grid; a random dark square decodes as a tag of them less than once in 300 times.
+# 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or have more false positives: only on request.
 DEFAULT_FAMILIES = ("36h11", "25h9", "4x4_50", "5x5_100", "6x6_250", "7x7_250")
 
 MIN_SIDE = 8
-"""pixels: the smallest tag has six modules"""
+"""minimum side of an image in pixels: the smallest tag has six modules"""
 MAX_SIDE = 32767
-"""pixels, of OpenCV's detector"""
+"""maximum side in pixels for OpenCV's detector"""
 MAX_QR_SIDE = 65535
-"""pixels, of zxing-cpp"""
-# how much taller or wider the image is made when the first pass finds no QR code: a tilted one has flat
-# modules
+"""maximum side in pixels for zxing-cpp"""
+# factors by which the image is stretched if the first pass finds no QR code: modules of a tilted code are
+# foreshortened
 STRETCHES = (1.5, 2.0, 3.0, 4.0)
 QR_ONLY = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
 
@@ -43,7 +41,7 @@ class Detection:
     family: str
     """the tag's dictionary, e.g. "36h11"; of a QR code its version and error level, e.g. "v2-L" """
     id: int | None
-    """of a tag; None for QR codes and boards"""
+    """id of a tag; None for QR codes and boards"""
     payload: str | None
     """text of a QR code, "7x5:4x4_50" of a board; None for a tag"""
     corners: np.ndarray
@@ -52,31 +50,31 @@ class Detection:
 
     @property
     def name(self) -> str:
-        """Marker spec of the code: "apriltag:36h11:5", "qr:some text"."""
+        """Marker spec of the code, e.g. "apriltag:36h11:5" or "qr:some text"."""
         return f"{self.kind}:{self.payload if self.id is None else f'{self.family}:{self.id}'}"
 
 
 def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = True) -> list[Detection]:
-    """All codes in an image: tags in the order of ``families`` and their ids, then QR codes.
+    """Detect all codes in an image: tags in the order of `families` and ids, then QR codes.
 
     Args:
         image: (h, w, 3) RGB or (h, w) grey, uint8.
-        families: tag families to look for ("36h11" or "apriltag:36h11"); None for `DEFAULT_FAMILIES`; ()
-            for none.
-        qr: whether to look for QR codes.
+        families: tag families to detect ("36h11" or "apriltag:36h11"); None for `DEFAULT_FAMILIES`; () for
+            none.
+        qr: whether to detect QR codes.
 
-    A square that reads in two families (the small ArUco ones are parts of the large ones) is given once, in
-    the family named first. Raises InputError for an unknown family and for another kind of array.
+    A tag that decodes in two families (the small ArUco families are parts of the large ones) is reported
+    once, in the first of them. Raises InputError for an unknown family or an invalid array.
     """
     pixels = pixels_of(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
-        raise InputError(f"detect needs uint8 (h, w) or (h, w, 3), not {pixels.dtype} {pixels.shape}")
+        raise InputError(f"the image must be uint8 (h, w) or (h, w, 3), got {pixels.dtype} {pixels.shape}")
     if isinstance(families, str):
         raise invalid("families", "several names", families, "write ('36h11',)")
     if families is not None:
         families = items("families", families, str, "several names, as ('36h11',)")
     if not isinstance(qr, bool | np.bool_ | int):
-        raise InputError(f"qr must be True or False, not {type(qr).__name__}")
+        raise InputError(f"qr must be True or False, got a {type(qr).__name__}")
     requested = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
     if min(pixels.shape[:2]) < MIN_SIDE:
         return []
@@ -96,19 +94,19 @@ def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
     """Tags of one family, sorted by id."""
     found: list[Detection] = []
     loose: list[Detection] = []
-    # OpenCV's other way to squares, that of the AprilTag library, bridges a hair across the white ring, which
-    # opens a contour; at half size, where it costs no more than the first and small tags are the first one's
+    # OpenCV's AprilTag method finds tags whose white margin is crossed by a thin dark line, which breaks the
+    # contours of the first method. At half size it costs no more; the first method finds the small tags.
     for refinement, decimate in (
         (cv2.aruco.CORNER_REFINE_SUBPIX, 0.0),
         (cv2.aruco.CORNER_REFINE_APRILTAG, 2.0),
     ):
         _read_tags(grey, kind, family, refinement, decimate, found, loose)
     if any(not _known(tag, found) for tag in loose):
-        # A contour becomes four points to within 3 % of its length: on a steep tag several corners lie
-        # modules away along the long sides, where no window around them reaches the true ones. Lines through
-        # the sides do, but a dark line that touches the tag rotates them.
+        # OpenCV approximates a contour by four points to within 3 % of its length: on a steeply tilted tag
+        # corners can be modules away from the true ones, outside the window of the refinement. Fitting lines
+        # to the sides solves this, but dark lines that touch the tag rotate them.
         _read_tags(grey, kind, family, cv2.aruco.CORNER_REFINE_CONTOUR, 0.0, found, loose)
-    # the pattern settles from none of the corners: those that it fits best
+    # the fit converges from none of the corners: use those with the best correlation
     bits = {tag.id: dictionary_bits(kind, family, int(tag.id or 0)) for tag in loose}
     for tag in sorted(loose, key=lambda tag: -fit(grey, tag.corners, bits[tag.id])):
         if not _known(tag, found):
@@ -125,8 +123,10 @@ def _read_tags(
     found: list[Detection],
     loose: list[Detection],
 ) -> None:
-    """Adds the tags that OpenCV reads with this refinement of its corners and that are not found yet: to
-    `found` with corners on which their pattern settles, else to `loose` with OpenCV's own."""
+    """Detect further tags with a method of corner refinement.
+
+    Tags whose alignment converges are appended to `found`, others to `loose` with OpenCV's corners.
+    """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = refinement
     parameters.aprilTagQuadDecimate = decimate
@@ -136,7 +136,7 @@ def _read_tags(
         rough = quad.reshape(4, 2).astype(np.float64) + 0.5
         tag = Detection(kind, family, int(tag_id), None, rough)
         if not _known(tag, found):
-            # a dark line that touches a corner can pull it a module away
+            # a dark line that touches a corner can shift it by a module
             better = align(grey, rough, dictionary_bits(kind, family, int(tag_id)), unsure=range(4))
             (loose if better is None else found).append(
                 tag if better is None else replace(tag, corners=better)
@@ -155,7 +155,7 @@ def _same_place(one: Detection, other: Detection) -> bool:
 def _qr_codes(grey: np.ndarray) -> list[Detection]:
     codes = _read_qr(grey, 1.0, 1.0)
     for factor in STRETCHES:
-        # the wider image is tried after the taller one: boards are tilted back more often than sideways
+        # taller first: codes are tilted backwards more often than sideways
         codes = codes or _read_qr(grey, 1.0, factor) or _read_qr(grey, factor, 1.0)
     return sorted(codes, key=lambda code: (code.payload or "", tuple(code.corners[0])))
 
@@ -172,7 +172,7 @@ def _read_qr(grey: np.ndarray, wider: float, taller: float) -> list[Detection]:
 
 
 def corners_of(code: zxingcpp.Barcode) -> np.ndarray:
-    """(4, 2) pixels, TL, TR, BR, BL as printed; zxing-cpp counts from the first pixel's corner, as we do."""
+    """Corners of a barcode, (4, 2) pixels, TL, TR, BR, BL as printed."""
     place = code.position
     points = (place.top_left, place.top_right, place.bottom_right, place.bottom_left)
     return np.array([(point.x, point.y) for point in points], np.float64)
@@ -181,7 +181,9 @@ def corners_of(code: zxingcpp.Barcode) -> np.ndarray:
 def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detection:
     rough = corners_of(code) * scale
     bits = (np.array(code.to_image(scale=1, add_quiet_zones=False)) == 0).astype(np.uint8)
-    # its fourth corner has no finder pattern and, in the smallest codes, nothing else: it can be a module off
+    # the fourth corner has no finder pattern, and in the smallest codes no alignment pattern: it can be off
+    # by
+    # a module
     better = align(grey, rough, bits, unsure=(2,))
     version = (bits.shape[0] - 17) // 4
     family = f"v{version}-{code.ec_level}"

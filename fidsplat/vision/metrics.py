@@ -1,9 +1,8 @@
-"""Image metrics: PSNR, SSIM, FLIP, LPIPS, of display values in [0, 1].
+"""Image metrics PSNR, SSIM, FLIP and LPIPS of display values in [0, 1].
 
-LPIPS (Zhang et al. 2018) is computed with AlexNet, in NumPy, by weights that the user has: they are no part
-of fidsplat, and nothing here fetches them. `load_lpips` reads a NumPy file with the five convolutions of
-torchvision's AlexNet and the five linear layers of LPIPS version 0.1; docs/experiments.md says how it is
-written with PyTorch and the lpips package.
+LPIPS (Zhang et al. 2018) uses AlexNet in NumPy with weights that the user provides. `load_lpips` reads a
+NumPy file with the five convolutions of torchvision's AlexNet and the five linear layers of LPIPS version
+0.1; docs/experiments.md has the conversion by PyTorch and the package lpips.
 """
 
 from __future__ import annotations
@@ -55,12 +54,12 @@ def ssim(image: np.ndarray, truth: np.ndarray) -> float:
 
 
 def has_flip() -> bool:
-    """Whether FLIP can be measured: the package flip-evaluator is installed."""
+    """Whether the package flip-evaluator, for FLIP, is installed."""
     return find_spec("flip_evaluator") is not None
 
 
 def metric_versions() -> dict[str, str]:
-    """Versions of the packages that metrics come from."""
+    """Versions of the packages of metrics."""
     return {"flip-evaluator": version("flip-evaluator")} if has_flip() else {}
 
 
@@ -81,15 +80,15 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
 # stride and padding of each convolution, and whether a 3 x 3 pooling with stride 2 comes before it
 _LAYERS = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))
 _CHANNELS = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
-# the network's input: what LPIPS calls its scaling layer
+# input normalization, LPIPS's scaling layer
 _SHIFT = np.array([-0.030, -0.088, -0.188]).reshape(3, 1, 1)
 _SCALE = np.array([0.458, 0.448, 0.450]).reshape(3, 1, 1)
 _EPSILON = 1e-10
 
 
 def weights_name(file: Path) -> str:
-    """Identity of LPIPS weights in results: the start of the file's hash. Raises InputError when it cannot be
-    read."""
+    """Identity of LPIPS weights in results: the start of the file's hash. Raises InputError for an unreadable
+    file."""
     try:
         return hashlib.sha256(read_input(file)).hexdigest()[:12]
     except InputError as error:
@@ -97,9 +96,9 @@ def weights_name(file: Path) -> str:
 
 
 def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
-    """LPIPS of two (h, w) images of display values in [0, 1], by the weights in a .npz file.
+    """Load LPIPS from weights in a .npz file: a function of two (h, w) images of display values in [0, 1].
 
-    Raises InputError when the file cannot be read or lacks an array or one has another shape.
+    Raises InputError for a file that cannot be read, a missing array, or one of another shape.
     """
     try:
         arrays = load_npz(file)
@@ -116,7 +115,9 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
         }
         for name, shape in shapes.items():
             if name not in weights or weights[name].shape != shape:
-                raise InputError(f"{file} needs an array {name} of shape {shape} (see docs/experiments.md)")
+                raise InputError(
+                    f"{file} must have an array {name} of shape {shape}; see docs/experiments.md"
+                )
             if not np.isfinite(weights[name]).all():
                 raise InputError(f"the array {name} of {file} must be finite; see docs/experiments.md")
 
@@ -142,7 +143,7 @@ def _features(grey: np.ndarray, weights: dict[str, np.ndarray]) -> list[np.ndarr
 
 
 def _convolve(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray, stride: int, padding: int) -> np.ndarray:
-    """(channels, h, w) with (out, channels, k, k), as PyTorch's Conv2d."""
+    """Convolution of (channels, h, w) with (out, channels, k, k), equal to PyTorch's Conv2d."""
     padded = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, kernel.shape[2:], (1, 2))
     return np.tensordot(kernel, windows[:, ::stride, ::stride], ((1, 2, 3), (0, 3, 4))) + bias[:, None, None]

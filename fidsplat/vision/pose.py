@@ -1,4 +1,4 @@
-"""Pose of a planar marker from its corners in an image (PnP)."""
+"""Pose of a marker from its corners in an image (PnP)."""
 
 import math
 
@@ -9,25 +9,25 @@ from fidsplat.cameras import Camera
 from fidsplat.util.arguments import LARGEST, real_array
 from fidsplat.util.errors import InputError
 
-# OpenCV's square has y up and z towards the viewer, ours y down and z away (docs/conventions.md)
+# OpenCV's marker frame has y up and z towards the viewer, ours y down and z away (docs/conventions.md)
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 SAME = 1e-6
-"""Pixels by which a pose must fit better to be another."""
+"""Minimum improvement in pixels for the second pose to replace the first."""
 
 LOOSE = 0.1
-"""Share of the points' spread by which a stand-in may miss them."""
+"""Tolerance of the plane that replaces points, relative to their spread."""
 
 SMALLEST = 1e-9
-"""Metres of a code's edge."""
+"""Minimum edge of a code in metres."""
 
 
 def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
-    """camera_from_marker, (4, 4) float64, metres.
+    """Estimate camera_from_marker, (4, 4) float64, in metres.
 
-    IPPE (Collins and Bartoli 2014) gives the two poses that a square can nearly be confused between; both are
-    settled by Levenberg-Marquardt on the reprojection error and the one with the lower error is returned; NaN
-    if neither is in front of the camera.
+    IPPE (Collins and Bartoli 2014) has two solutions for a nearly ambiguous square; Levenberg-Marquardt
+    minimizes the reprojection error of both, and the pose with the lower error is returned. NaN if neither is
+    in front of the camera.
 
     Args:
         corners: (4, 2) pixels, TL, TR, BR, BL as printed.
@@ -35,37 +35,42 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
         camera: its intrinsics and lens are used, not its pose.
 
     Raises:
-        InputError: corners of another shape, a size that is not above 0, or an orthographic camera, in which
-            the distance of a marker is undetermined.
+        InputError: corners of another shape, a size of 0 or less, or an orthographic camera, where the
+        distance of a marker is undetermined.
     """
     corners, edge = real_array("corners", corners), real_array("size", size)
     if corners.shape != (4, 2):
-        raise InputError(f"corners must be (4, 2) pixels, not {corners.shape}")
+        raise InputError(f"corners must be (4, 2) pixels, got {corners.shape}")
     if edge.shape != () or not SMALLEST <= edge < LARGEST:
         raise InputError(f"size must be a positive length in metres, {SMALLEST:g} or more, got {size!r}")
     if not isinstance(camera, Camera):
-        raise InputError(f"camera must be a Camera, not {type(camera).__name__}")
+        raise InputError(f"camera must be a Camera, got a {type(camera).__name__}")
     half = float(edge) / 2
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]], np.float64)
     return _pose(square, corners, camera, cv2.SOLVEPNP_IPPE_SQUARE)
 
 
 def plane_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """`marker_pose` from any points of a marker's plane, at least four that are not collinear: (n, 2)
-    metres x right, y down as printed, and (n, 2) pixels."""
+    """Estimate camera_from_marker from coplanar points by IPPE.
+
+    points: (n, 2) metres on the marker, x right, y down as printed; four or more that are not collinear.
+    corners: (n, 2) pixels.
+    """
     return _pose(
         np.column_stack([points * [1, -1], np.zeros(len(points))]), corners, camera, cv2.SOLVEPNP_IPPE
     )
 
 
 def points_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """`marker_pose` from at least four points of a rigid body: (n, 3) metres and (n, 2) pixels. SQPnP
-    (Terzakis and Lourakis 2020) gives the poses that are settled."""
+    """Estimate the pose of a rigid body from four or more points, (n, 3) metres and (n, 2) pixels.
+
+    SQPnP (Terzakis and Lourakis 2020) has the initial poses.
+    """
     return _pose(points * [1, -1, -1], corners, camera, cv2.SOLVEPNP_SQPNP)
 
 
 def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) -> np.ndarray:
-    """camera_from_marker from points (n, 3) in OpenCV's axes."""
+    """Estimate camera_from_marker from points (n, 3) in OpenCV's axes."""
     observed, matrix, rotated = np.ascontiguousarray(corners, np.float64), camera.matrix, np.eye(4)
     if camera.lens is not None:
         observed, matrix, rotated = _flattened(observed, camera)
@@ -73,7 +78,7 @@ def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) 
         return np.full((4, 4), np.nan)
     best, smallest = np.full((4, 4), np.nan), math.inf
     spread = float(np.linalg.norm(observed - observed.mean(0)))
-    # face to face OpenCV's IPPE divides by next to nothing: its poses may be NaN, or anything
+    # OpenCV's IPPE divides by almost 0 for a frontal marker: its poses can be NaN or arbitrary
     for way in dict.fromkeys((method, cv2.SOLVEPNP_SQPNP)):
         count, rotations, translations, _ = cv2.solvePnPGeneric(points, observed, matrix, None, flags=way)
         for rotation, translation in zip(rotations[:count], translations[:count], strict=True):
@@ -90,7 +95,8 @@ def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) 
 
 
 def _flattened(corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners as a pinhole sees them that looks at their middle; its matrix; camera_from_pinhole (4, 4)."""
+    """Undistort corners to a pinhole that looks at their centre; returns corners, intrinsics and
+    camera_from_pinhole (4, 4)."""
     rays = camera.rays(corners)
     axis = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).sum(0)
     axis /= np.linalg.norm(axis)

@@ -1,4 +1,4 @@
-"""Detection of a scene's markers in an image, compared with their true poses."""
+"""Detection of a scene's markers in an image, and errors of their poses."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,12 +21,12 @@ from fidsplat.vision.truth import MarkerTruth, at_shutter, marker_truth
 
 @dataclass(frozen=True, eq=False)
 class Reading(MarkerTruth):
-    """One marker of a scene, where it is, and how it was read."""
+    """True and estimated pose of a marker, with their difference."""
 
     detection: Detection | None = None
-    """None when the marker was not found"""
+    """None if the marker was not detected"""
     pose: np.ndarray | None = None
-    """(4, 4) camera_from_marker from what was detected"""
+    """(4, 4) estimated camera_from_marker"""
     position_error: float | None = None
     """metres"""
     angle_error: float | None = None
@@ -35,7 +35,7 @@ class Reading(MarkerTruth):
     """pixels, root mean square over the four corners"""
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: millimetres, degrees, pixels; None where the marker was not found."""
+        """Values for JSON, in millimetres, degrees and pixels; None if the marker was not detected."""
         return {
             "marker": self.placed.marker.spec,
             "label": self.placed.label,
@@ -53,12 +53,12 @@ class Reading(MarkerTruth):
 
 
 class ReadBack(NamedTuple):
-    """What `read_back` returns."""
+    """Result of `read_back`: readings of the scene's markers, and other detections."""
 
     readings: list[Reading]
-    """of each marker of the scene, in its order"""
+    """one of each marker of the scene, in order"""
     others: list[Detection]
-    """detected codes that the scene does not have"""
+    """detected codes that are not in the scene"""
 
 
 def read_back(
@@ -67,17 +67,17 @@ def read_back(
     camera: Camera | None = None,
     families: Iterable[str] | None = None,
 ) -> ReadBack:
-    """Detect every marker of a scene in its image: id, corners, pose, and their errors.
+    """Detect the markers of a scene in its image, and compare corners and poses with the truth.
 
-    Boards (charuco, gridboard, aprilgrid) have one pose each, from all detected tags. Drawings and
-    images are not looked for.
+    Boards (charuco, gridboard, aprilgrid) have one pose each, from all detected tags. Drawings and images are
+    not detected.
 
     Args:
         frame: a `Frame` with `rgb`, and with `label` if `Reading.visible` is to include occlusion; or
             images by name; or (h, w, 3) uint8, or float in [0, 1].
-        scene, camera: as of `truth_of`: the truth is where the Frame's own capture has the camera and the
-            markers, or the scene's capture for other images.
-        families: tag families to look for, see `detect`; default the scene's.
+        scene, camera: as in `truth_of`: the poses of camera and markers are those of the frame's capture, or
+        of the scene's capture for other images.
+        families: tag families to detect, see `detect`; default the scene's.
 
     Raises:
         InputError: no camera, or one of another size than the image.
@@ -99,10 +99,11 @@ def read_back(
 def match(
     detections: Iterable[Detection], markers: Sequence[PlacedMarker], camera: Camera
 ) -> tuple[list[tuple[Detection, np.ndarray] | None], list[Detection]]:
-    """For each marker its detection and camera_from_marker, or None; and the detections that belong to none.
+    """Assign detections to markers.
 
-    A detection belongs to a marker of the same kind and id or payload; of several such, the nearest pairs
-    go first.
+    A detection can belong to a marker of the same kind and id or payload; of several, the nearest pairs are
+    assigned first. Returns the detection and camera_from_marker of each marker, or None, and the unassigned
+    detections.
     """
     left = list(detections)
     expected = [camera.project(placed.corners) for placed in markers]
@@ -125,26 +126,28 @@ def match(
 
 
 def own_code(made: Marker, image: np.ndarray) -> Detection | None:
-    """The detection of a marker's code in an image, (h, w) or (h, w, 3) display values; None if not found."""
+    """Detect a marker's code in an image, (h, w) or (h, w, 3) display values; None if not found."""
     found = detect(to_uint8(image), families_of([made]), qr=made.kind == "qr")
     return next((code for code in found if _same(code, made)), None)
 
 
 def corner_error(code: Detection, corners: np.ndarray) -> float:
-    """Pixels between a code's corners and where they are, (4, 2): root mean square over the four."""
+    """Root mean square distance in pixels between the corners of a detection and the true ones (4, 2)."""
     return float(np.sqrt(((code.corners - corners) ** 2).sum(1).mean()))
 
 
 def families_of(markers: Iterable[Marker]) -> tuple[str, ...]:
-    """Families of those that are tags or boards of tags, each once, for `detect`."""
+    """Distinct tag families of markers, for `detect`."""
     tags = (made for made in markers if made.kind in ("apriltag", "aruco", *BOARDS))
     return tuple(dict.fromkeys(":".join(parse_family(str(tag.family))) for tag in tags))
 
 
 def means(readings: Sequence[Reading]) -> dict[str, Any]:
-    """How many markers were found of how many that could be, and the means of their errors, as
-    `Reading.as_dict` has them; None where none was found. Markers that are not visible (from behind, out
-    of the image, occluded) are counted apart, in `not_visible`."""
+    """Numbers of found and missed markers, and means of the errors of `Reading.as_dict`; None if none was
+    found.
+
+    Markers that are not visible (from behind, outside of the image, occluded) count as `not_visible`.
+    """
     could_be = [reading for reading in readings if reading.visible > 0 or reading.detection is not None]
     facts = [reading.as_dict() for reading in could_be if reading.detection is not None]
     keys = ("position_error_mm", "angle_error_deg", "corner_error_px")
@@ -154,7 +157,7 @@ def means(readings: Sequence[Reading]) -> dict[str, Any]:
 
 
 def _same(found: Detection, made: Marker) -> bool:
-    if found.kind == "qr":  # whose family is its version
+    if found.kind == "qr":  # its family is its version
         return (found.kind, found.payload) == (made.kind, made.payload)
     return (found.kind, found.family, found.id) == (made.kind, made.family, made.id)
 

@@ -1,6 +1,6 @@
-"""Off-the-shelf detectors with their defaults: does each one find and decode a given code?
+"""Off-the-shelf detectors with their defaults, for experiments on what each one detects and decodes.
 
-Unlike `detect`, which combines them and refines corners, these are for measuring how far each detector goes.
+`detect` combines detectors and refines corners.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from fidsplat.images.tag_dictionaries import predefined
 from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import QR_ONLY, corners_of
 
-# how much larger the image is made, and how much taller in addition, until zxing-cpp reads the code: all
-# heights at the image's own size first, then twice as large
+# scale factors of the image and additional factors of its height that are tried for zxing-cpp: all heights at
+# the original size first, then at twice the size
 UNFORESHORTEN = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 ENLARGE = (1.0, 2.0)
-# a quadrilateral is that of the code when it shares more than this part of their union with it
+# minimum intersection over union with the code
 MIN_OVERLAP = 0.5
 _MARGIN = 16  # margin in pixels around the foreground
 
@@ -35,7 +35,7 @@ _idle: dict[str, deque] = {}
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The code in an image."""
+    """The code to detect in an image."""
 
     kind: str
     """"apriltag" or "qr\""""
@@ -44,7 +44,7 @@ class Target:
     id: int | None
     payload: str | None
     corners: np.ndarray
-    """(4, 2) pixels, the code's outer edge, where it truly is"""
+    """(4, 2) pixels, true corners of the code's outer edge"""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class Attempt:
     """The result of one detector for one image."""
 
     found: bool
-    """a quadrilateral that overlaps the code (`MIN_OVERLAP`), decoded or not"""
+    """whether a quadrilateral overlaps the code (`MIN_OVERLAP`), decoded or not"""
     read: bool
-    """exactly this id or text was decoded"""
+    """whether exactly this id or text was decoded"""
 
 
 def _aruco(grey: np.ndarray, target: Target) -> Attempt:
@@ -70,10 +70,10 @@ def _pupil(grey: np.ndarray, target: Target) -> Attempt:
     """The AprilTag library at full resolution. It reports only decoded tags."""
     idle = _idle.setdefault(target.family, deque())
     try:
-        detector = idle.pop()  # one image at a time: the library keeps scratch memory in it
+        detector = idle.pop()  # one image at a time: a detector has scratch memory
     except IndexError:
         detector = _pupil_detector("tag" + target.family)
-    found: Any = detector.detect(grey)  # its annotation says one, it is a list
+    found: Any = detector.detect(grey)  # a list, in spite of the annotation
     read = any(tag.tag_id == target.id for tag in found)
     idle.append(detector)
     return Attempt(read, read)
@@ -83,8 +83,8 @@ def _pupil_detector(family: str):
     import pupil_apriltags  # type: ignore[import-not-found]  # of the extra `experiments`
 
     class Detector(pupil_apriltags.Detector):
-        # theirs frees the family and then the detector, which looks into it: a crash, now and then. As many
-        # as there are threads are made, and kept.
+        # the library frees the family before the detector that uses it, which can crash: one detector for
+        # each thread is never freed
         def __del__(self) -> None:
             pass
 
@@ -115,7 +115,7 @@ def _zxing_tall(grey: np.ndarray, target: Target) -> Attempt:
     moved = Target(target.kind, target.family, target.id, target.payload, target.corners - (0.0, top))
     found = False
     for across, taller in product(ENLARGE, UNFORESHORTEN):
-        # cubic: modules of one pixel keep their contrast, which linear interpolation takes from them
+        # cubic interpolation preserves the contrast of modules of one pixel
         tall = cv2.resize(part, None, fx=across, fy=across * taller, interpolation=cv2.INTER_CUBIC)
         attempt = _zxing(tall, moved, (across, tall.shape[0] / part.shape[0]))
         found = found or attempt.found
@@ -136,11 +136,11 @@ TITLES = {
     "zxing": "zxing-cpp",
     "zxing-tall": "zxing-cpp, un-foreshortened",
 }
-"""every detector's name in words"""
+"""titles of the detectors"""
 
 
 def readers(kind: str) -> tuple[str, ...]:
-    """Names of the detectors for "apriltag" or "qr" that are installed here."""
+    """Names of the installed detectors for "apriltag" or "qr"."""
     return tuple(name for name in _READERS[kind] if find_spec(_PACKAGES.get(name, "zxingcpp")) is not None)
 
 
@@ -148,7 +148,7 @@ def attempt(name: str, grey: np.ndarray, target: Target) -> Attempt:
     """Run one detector on an image. Thread-safe.
 
     Args:
-        name: one of `readers` of the target's kind.
+        name: a name from `readers` for the target's kind.
         grey: (h, w) uint8.
 
     Raises InputError for an unknown name.
@@ -183,7 +183,7 @@ def _any_over(quads: Iterable[np.ndarray], target: Target) -> bool:
 
 
 def _content_rows(grey: np.ndarray) -> tuple[int, int]:
-    """The rows that hold anything but the level of the image's first pixel, and a margin."""
+    """Range of rows that differ from the level of the first pixel, with a margin."""
     level = int(grey[0, 0])
     rows = np.flatnonzero((grey.max(1) > level + 2) | (grey.min(1) < level - 2))
     if rows.size == 0:

@@ -37,13 +37,13 @@ class MarkerTruth:
 
     @property
     def distance(self) -> float:
-        """Metres from the camera to the middle of the marker."""
+        """Distance in metres from the camera to the centre of the marker."""
         return float(np.linalg.norm(self.truth[:3, 3]))
 
     @property
     def tilt(self) -> float:
-        """Radians between the marker's normal and the line to the camera: 0 is frontal, above pi / 2 is from
-        behind."""
+        """Angle in radians between the marker's normal and the line to the camera: 0 is frontal, more than pi
+        / 2 is from behind."""
         distance = self.distance
         towards = float(self.truth[:3, 2] @ self.truth[:3, 3])
         return math.acos(max(-1.0, min(1.0, towards / distance))) if distance else 0.0
@@ -51,25 +51,25 @@ class MarkerTruth:
 
 @dataclass(frozen=True, eq=False)
 class GroupTruth:
-    """The pixels of the splats of one label."""
+    """Mask and box of the splats of one label."""
 
     label: int
     mask: np.ndarray
     """(h, w) bool"""
     box: Box
-    """around them"""
+    """bounding box of the mask"""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What `truth_of` returns."""
+    """Result of `truth_of`: camera, markers and groups of splats."""
 
     camera: Camera
-    """of the image, at its pose"""
+    """camera of the image, at its pose"""
     markers: list[MarkerTruth]
-    """of each marker of the scene, in its order"""
+    """one of each marker of the scene, in order"""
     groups: dict[int, GroupTruth]
-    """by label, of those in the image; empty for a frame without labels"""
+    """groups in the image by label; empty for a frame without labels"""
 
 
 def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | None = None) -> Truth:
@@ -78,8 +78,8 @@ def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | Non
     Args:
         frame: a Frame, whose own capture has the poses of camera and markers; or images by name,
             rendered with the scene's capture. `label` brings occlusion and masks.
-        scene: the one that was rendered. What moves is where it was at the shutter's time.
-        camera: takes the place of the capture's, with its pose.
+        scene: the rendered scene; poses are those at the shutter's time.
+        camera: replaces the capture's camera, with its pose.
 
     Raises:
         InputError: no camera, or one of another size than the image.
@@ -99,8 +99,10 @@ def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | Non
 def at_shutter(
     frame: Any, scene: Scene, camera: Camera | None, shape: Sequence[int]
 ) -> tuple[Camera, list[PlacedMarker]]:
-    """The camera and the markers at the shutter's time of the capture that made an image of that shape: a
-    Frame's own capture, for other images the scene's. Arguments and errors: as `truth_of`."""
+    """Camera and markers at the shutter's time of an image: by the capture of a Frame, else of the scene.
+
+    shape: shape of the image. Other arguments and errors: as `truth_of`.
+    """
     instance("scene", scene, Scene, remedy="fs.Scene([cloud]) makes one of splats")
     if camera is not None:
         instance("camera", camera, Camera, "a Camera or None")
@@ -109,13 +111,14 @@ def at_shutter(
     if camera is None:
         camera = capture.camera and capture.motion.moved(capture.camera, time)
     if camera is None:
-        raise InputError("the scene has no camera, so the pose of its markers is unknown; give one")
+        raise InputError("the scene must have a camera, got none; give camera=")
     if len(shape) < 2:
         raise InputError(f"the image must be an array (h, w) or (h, w, 3), got the shape {tuple(shape)}")
     if (camera.height, camera.width) != tuple(shape[:2]):
         raise InputError(
-            f"the image has {shape[1]} x {shape[0]} pixels and the camera {camera.width} x "
-            f"{camera.height}; give the image that this scene was rendered to"
+            f"the image must have the camera's size, {camera.width} x {camera.height} pixels, got "
+            f"{shape[1]} x "
+            f"{shape[0]}"
         )
     groups = dict(capture.motion.groups_at(time))
     markers = [replace(m, pose=groups[m.label] @ m.pose) if m.label in groups else m for m in scene.markers]
@@ -143,13 +146,13 @@ def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
 
 
 def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """World points (h, w, 3) float64 of the pixels, from any of a frame's depths (`depth`, `depth_median`,
-    `depth_first`); NaN where that is 0."""
+    """World points (h, w, 3) float64 of the pixels of a depth output (`depth`, `depth_median`,
+    `depth_first`); NaN where the depth is 0."""
     instance("camera", camera, Camera)
     depth = real_array("depth", depth)
     if depth.shape != (camera.height, camera.width):
         raise InputError(
-            f"the depth has the shape {depth.shape}; the camera's have {(camera.height, camera.width)}"
+            f"the depth must have the camera's shape {(camera.height, camera.width)}, got {depth.shape}"
         )
     y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
     pixels = np.stack([x.ravel(), y.ravel()], 1)
@@ -173,13 +176,13 @@ def optical_flow(
     second camera.
 
     Args:
-        depth: (h, w) of the first image, any of a frame's depths; `depth_first` mixes the fewest surfaces at
-        edges. before, after: the cameras of the two images, at their poses.
-        label: (h, w) int32 of the first image, where things move.
-        motions: {label: (4, 4)}: the motion of the world that its splats make between the images.
+        depth: (h, w) of the first image; `depth_first` mixes the fewest surfaces at edges.
+        before, after: cameras of the two images.
+        label: (h, w) int32 of the first image, required with `motions`.
+        motions: {label: (4, 4)}: world motion of the splats of a label between the images.
 
     Raises:
-        InputError: sizes that differ, motions without labels or that are not rigid.
+        InputError: different sizes, motions without labels, or motions that are not rigid.
     """
     instance("after", after, Camera)
     if not isinstance(motions, Mapping | None):

@@ -11,19 +11,19 @@ from fidsplat.util.errors import InputError
 
 MAX_FIELD = math.radians(150)
 _NOWHERE = -1e4
-"""pixels outside the lens's field of view"""
+"""coordinate of pixels outside the lens's field of view"""
 
 
 def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: float) -> Camera:
-    """A pinhole at the camera's place whose middle sees `target` (3,), metres; fov_x in radians, up to 150
+    """A pinhole at the camera's position that looks at `target` (3,) [m]; fov_x in radians, up to 150
     degrees.
 
     Raises:
-        InputError: fov_x out of range, or the target is where the camera is.
+        InputError: fov_x out of range, or a target at the camera's position.
     """
     if not 0 < fov_x <= MAX_FIELD:
-        raise InputError(f"fov_x must be above 0 and at most 150 degrees, got {math.degrees(fov_x):.6g}")
-    # the camera's own down is down, unless it looks that way
+        raise InputError(f"fov_x must be more than 0 and at most 150 degrees, got {math.degrees(fov_x):.6g}")
+    # down is the camera's down, unless the target is in that direction
     down, along = camera.world_to_camera[1, :3], np.asarray(target, np.float64) - camera.position
     if np.linalg.norm(np.cross(down, along)) < 1e-3 * np.linalg.norm(along):
         down = camera.world_to_camera[2, :3]
@@ -33,8 +33,7 @@ def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: floa
 
 
 def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
-    """The image of a pinhole at the same place, by bilinear interpolation; 0 where the lens sees
-    nothing.
+    """Resample an image to a pinhole at the same position, by bilinear interpolation; 0 outside of the image.
 
     Args:
         image: (h, w) or (h, w, 3) of uint8 or float32, taken by `camera`.
@@ -46,7 +45,7 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
     """
     if isinstance(camera.lens, Orthographic):
         raise InputError(
-            "undistort: an orthographic camera has no pinhole equivalent; its image is flat as it is"
+            "the camera must not be orthographic, since it has no pinhole equivalent; use its image unchanged"
         )
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
@@ -54,7 +53,7 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
             f"{image.shape[1]} x {image.shape[0]}; give the camera that took the image"
         )
     if not np.allclose(pinhole.position, camera.position, rtol=0, atol=1e-9):
-        raise InputError("undistort: the pinhole camera must have the position of the image's camera")
+        raise InputError("the pinhole must have the position of the image's camera")
     y, x = np.mgrid[0.5 : pinhole.height, 0.5 : pinhole.width]
     rays = pinhole.rays(np.stack([x.ravel(), y.ravel()], 1)) @ pinhole.world_to_camera[:3, :3]
     at = camera.project(camera.position + rays).astype(np.float32) - np.float32(0.5)
@@ -63,12 +62,12 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
 
 
 def flattened(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Undistortion by a pinhole of the same pose, size and focal length, for many images of one lens.
+    """Undistort an image to a pinhole of the same pose, size and focal length, for many images of one lens.
 
-    Returns the image, and (h, w) bool: pixels whose samples are all inside the image and its mask (h, w).
+    Returns the image and (h, w) bool: pixels whose samples are all inside the image and its mask (h, w).
     """
     lens = camera.lens
-    assert lens is not None  # else it is flat
+    assert lens is not None  # already undistorted
     x, y = _found_at(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens)
     counts = cv2.remap(np.where(mask, np.uint8(255), np.uint8(0)), x, y, cv2.INTER_LINEAR)
     return cv2.remap(np.ascontiguousarray(image), x, y, cv2.INTER_LINEAR), counts == 255
@@ -76,10 +75,10 @@ def flattened(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tuple[np.n
 
 @lru_cache(maxsize=2)
 def _found_at(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens) -> np.ndarray:
-    """x and y (2, h, w) float32 in the lens's image of each pixel of a pinhole."""
+    """Positions x, y (2, h, w) float32 in the lens's image of each pixel of a pinhole."""
     at = np.empty((2, height, width), np.float32)
     rays = np.stack([(np.arange(width) + 0.5 - cx) / fx, np.empty(width), np.ones(width)], axis=1)
-    for row in range(height):  # not at once: photographs have millions of pixels
+    for row in range(height):  # in parts: photographs have millions of pixels
         rays[:, 1] = (row + 0.5 - cy) / fy
         with np.errstate(over="ignore"):
             at[:, row] = (lens.image(rays) * (fx, fy) + (cx - 0.5, cy - 0.5)).T

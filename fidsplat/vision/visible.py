@@ -9,26 +9,26 @@ from fidsplat.cameras import Camera, Orthographic
 from fidsplat.scenes import PlacedMarker
 
 MARGIN = 1
-"""Modules of its quiet zone that are looked at with a code; without them no detector need find it."""
+"""Modules of the quiet zone that belong to a marker's outline, since detectors require them."""
 
 POINTS = 16
-"""Places along a side, which a lens makes a curve."""
+"""Samples along a side, which is curved by lenses."""
 
 
 class Visible(NamedTuple):
     """Visible share and bounding box of a marker."""
 
     share: float
-    """0 to 1, of its outline in an unbounded image"""
+    """visible share of its outline in an unbounded image, 0 to 1"""
     box: tuple[float, float, float, float] | None
     """bounding box in pixels x0, y0, x1, y1, without occlusion; None for a share of 0"""
 
 
 def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry, shapely.Geometry]:
-    """A marker's outline in an unbounded image, and its part in the camera's image, in pixels.
+    """Outline of a marker in an unbounded image, and its part in the camera's image, in pixels.
 
-    The outline is the code's with a module of its quiet zone, as far as it has one. Both are empty for a
-    marker that faces away.
+    The outline has one module of the quiet zone, if there is one. Both are empty for a marker that faces
+    away.
     """
     marker = placed.marker
     rows, columns = marker.bits.shape
@@ -49,7 +49,7 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
 
 
 def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> Visible:
-    """The visible part of a marker's outline (`visible_part`).
+    """Visible share and box of a marker's outline.
 
     label: (h, w) int32, the labels of the image; None: no occlusion.
     """
@@ -67,20 +67,20 @@ def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = Non
 
 
 class Outline(NamedTuple):
-    """A marker's outline, as `visible_part` has it."""
+    """Outline of a marker in an image, with its visible part."""
 
     area: float
-    """square pixels, in an unbounded image"""
+    """area in square pixels in an unbounded image"""
     box: tuple[float, float, float, float] | None
     """bounding box in pixels x0, y0, x1, y1; None for a marker that faces away"""
     visible_area: float
     """square pixels of the part in the camera's image"""
     polygons: list[np.ndarray]
-    """that, in (n, 2) pixels"""
+    """polygons (n, 2) in pixels of the visible part"""
 
 
 def outline(placed: PlacedMarker, camera: Camera) -> Outline:
-    """A marker's outline in a camera's image."""
+    """Outline of a marker in a camera's image."""
     whole, part = visible_part(placed, camera)
     parts = [p for p in shapely.get_parts(part) if p.geom_type == "Polygon"]
     box = None if shapely.is_empty(whole) else tuple(shapely.bounds(whole).tolist())
@@ -89,7 +89,7 @@ def outline(placed: PlacedMarker, camera: Camera) -> Outline:
 
 
 def _before(points: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """The part of a polygon (n, 3) where a linear function, of these values at its corners, is above 0."""
+    """Part of a polygon (n, 3) where a linear function is positive; ahead: its values at the corners."""
     clipped = []
     for a, b, at_a, at_b in zip(points, np.roll(points, -1, 0), ahead, np.roll(ahead, -1), strict=True):
         if at_a > 0:

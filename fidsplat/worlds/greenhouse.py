@@ -73,7 +73,7 @@ class Greenhouse(GreenhouseSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.stock is not None and not (self.stock and all(self.stock.values())):
-            raise InputError("stock must have plants of each kind; None generates them")
+            raise InputError("stock must have at least one plant of each kind, got none; None generates them")
 
     @property
     def length(self) -> float:
@@ -81,8 +81,8 @@ class Greenhouse(GreenhouseSettings):
         return self.plants * SPACING
 
     @property
-    def middles(self) -> list[float]:
-        """y of each row."""
+    def row_positions(self) -> list[float]:
+        """y coordinate of each row in metres."""
         return [AISLE * row for row in range(self.rows)]
 
     @cached_property
@@ -93,7 +93,7 @@ class Greenhouse(GreenhouseSettings):
             1280, 720, math.radians(70), eye, (self.length / 2, AISLE / 2, 0.7), (0, 0, 1)
         )
         sky = Gradient(top=(0.55, 0.7, 0.9), bottom=(0.35, 0.4, 0.35), up=(0.0, 0.0, 1.0))
-        clouds = (self._ground(), self._benches(), self._plants(), self._house())
+        clouds = (self._ground(), self._benches(), self._plants(), self._roof())
         return Scene(clouds, camera, tuple(self.markers), background=sky)
 
     @cached_property
@@ -102,7 +102,7 @@ class Greenhouse(GreenhouseSettings):
         row's near end."""
         found, number = [], 0
         half = BENCH[0] / 2 + 0.005
-        for row, y in enumerate(self.middles):
+        for row, y in enumerate(self.row_positions):
             places = [((-0.005, y), (-1, 0)), ((self.length + 0.005, y), (1, 0))]
             count = max(1, round(self.length / TAG_SPACING))
             for k in range(count):
@@ -121,7 +121,7 @@ class Greenhouse(GreenhouseSettings):
         rng = np.random.default_rng([self.seed, 1])
         kinds = list(KINDS if self.stock is None else self.stock)
         found = []
-        for row, y in enumerate(self.middles):
+        for row, y in enumerate(self.row_positions):
             kind = kinds[row % len(kinds)]
             for k in range(self.plants):
                 turn = rng.uniform(0, 2 * math.pi)
@@ -137,7 +137,7 @@ class Greenhouse(GreenhouseSettings):
 
     def _ground(self) -> SplatCloud:
         rng = np.random.default_rng([self.seed, 2])
-        low, high = (-END, -AISLE), (self.length + END, self.middles[-1] + AISLE)
+        low, high = (-END, -AISLE), (self.length + END, self.row_positions[-1] + AISLE)
         sides = [max(2, round((b - a) / 0.15)) for a, b in zip(low, high, strict=True)]
         x, y = np.meshgrid(*(np.linspace(a, b, n) for a, b, n in zip(low, high, sides, strict=True)))
         count = x.size
@@ -153,7 +153,7 @@ class Greenhouse(GreenhouseSettings):
     def _benches(self) -> SplatCloud:
         width, height = BENCH
         found = []
-        for y in self.middles:
+        for y in self.row_positions:
             middle = self.length / 2
             found.append(_panel((middle, y, height), (1, 0, 0), (0, 1, 0), self.length, width, DARK))
             for side in (-1, 1):
@@ -163,9 +163,9 @@ class Greenhouse(GreenhouseSettings):
                 found.append(_panel(at, (0, 1, 0), (0, 0, 1), width, height, FRAME))
         return SplatCloud.concatenate(found)
 
-    def _house(self) -> SplatCloud:
+    def _roof(self) -> SplatCloud:
         """Glass roof and its frame."""
-        low, high = -AISLE, self.middles[-1] + AISLE
+        low, high = -AISLE, self.row_positions[-1] + AISLE
         middle, across = (low + high) / 2, high - low
         long = self.length + 2 * END
         found = [
@@ -183,7 +183,7 @@ class Greenhouse(GreenhouseSettings):
         boxes = "\n".join(
             f'    <geom name="bench {row + 1}" type="box" pos="{self.length / 2:g} {y:g} {height / 2:g}" '
             f'size="{self.length / 2:g} {width / 2:g} {height / 2:g}"/>'
-            for row, y in enumerate(self.middles)
+            for row, y in enumerate(self.row_positions)
         )
         return (
             '<mujoco model="greenhouse">\n'

@@ -42,9 +42,9 @@ def disks(
     normal = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     first = along - (along * normal).sum(1, keepdims=True) * normal
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    turns = np.stack([first, np.cross(normal, first), normal], axis=2)
+    frames = np.stack([first, np.cross(normal, first), normal], axis=2)
     return SplatCloud(
-        centers, quaternions_of(turns), sizes, np.full(len(centers), opacity), colors=np.clip(colors, 0, 1)
+        centers, quaternions_of(frames), sizes, np.full(len(centers), opacity), colors=np.clip(colors, 0, 1)
     )
 
 
@@ -178,7 +178,8 @@ def load_plants(folder: str | Path) -> dict[str, list[SplatCloud]]:
 
 
 def _plain(cloud: SplatCloud) -> SplatCloud:
-    """The cloud with colours instead of SH of degree 0: one cloud with SH makes the complete scene SH."""
+    """The cloud with colours instead of SH of degree 0: a single cloud with SH would give the complete scene
+    SH."""
     colors = cloud.plain_colors
     if cloud.sh is None or colors is None:
         return cloud
@@ -204,9 +205,9 @@ def _nodes(
 ) -> list[tuple[np.ndarray, float, float]]:
     """Position, azimuth and relative height of each leaf base on a stem."""
     shares = np.linspace(low, high, count) + rng.normal(0, 0.01, count)
-    turns = GOLDEN * np.arange(count) + rng.uniform(0, 2 * math.pi) + rng.normal(0, 0.25, count)
+    azimuths = GOLDEN * np.arange(count) + rng.uniform(0, 2 * math.pi) + rng.normal(0, 0.25, count)
     line = [np.interp(shares, np.linspace(0, 1, len(stem)), axis) for axis in stem.T]
-    return list(zip(np.column_stack(line), turns.tolist(), shares.tolist(), strict=True))
+    return list(zip(np.column_stack(line), azimuths.tolist(), shares.tolist(), strict=True))
 
 
 def _arc(length: float, rise: float, bend: float, points: int = 8) -> np.ndarray:

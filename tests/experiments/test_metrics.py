@@ -126,7 +126,7 @@ def test_lpips_weights_that_cannot_be_used(tmp_path):
     with pytest.raises(fs.InputError, match="as LPIPS weights"):
         load_lpips(tmp_path / "text.npz")
     np.savez(tmp_path / "short.npz", **{k: v for k, v in weights().items() if k != "lin3"})
-    with pytest.raises(fs.InputError, match=r"needs an array lin3 of shape \(256,\)"):
+    with pytest.raises(fs.InputError, match=r"must have an array lin3 of shape \(256,\)"):
         load_lpips(tmp_path / "short.npz")
     np.savez(tmp_path / "infinite.npz", **{k: np.full_like(v, np.inf) for k, v in weights().items()})
     with pytest.raises(fs.InputError, match="must be finite"):

@@ -26,7 +26,7 @@ def test_parts_may_be_words_and_left_out():
     ("parts", "message"),
     [
         ({"camera": "front"}, "camera must be a Camera"),
-        ({"outputs": ()}, "outputs is empty; name at least one"),
+        ({"outputs": ()}, "outputs must have at least one name"),
         ({"outputs": (1, 2)}, "outputs must be one or more names"),
         ({"outputs": 7}, "outputs must be one or more names"),
         ({"quality": "fats"}, "did you mean 'fast'"),

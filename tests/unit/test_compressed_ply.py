@@ -193,14 +193,20 @@ def test_a_damaged_chunk_costs_only_its_splats(tmp_path):
 
 DAMAGES = {
     "cut short": (lambda c: c[:-1], "cut short"),
-    "no chunks": (lambda c: c.replace(b"element chunk", b"element bunch"), "lacks the element chunk"),
-    "too few chunks": (lambda c: c.replace(b"chunk 2\n", b"chunk 1\n"), "has 1 rows of chunk, not 2"),
+    "no chunks": (lambda c: c.replace(b"element chunk", b"element bunch"), "must have the element chunk"),
+    "too few chunks": (lambda c: c.replace(b"chunk 2\n", b"chunk 1\n"), "must have 2 rows of chunk, got 1"),
     "missing packed property": (
         lambda c: c.replace(b"packed_scale", b"packed_snail"),
-        "vertex lacks packed_scale",
+        "the element vertex of a compressed PLY must have packed_scale",
     ),
-    "missing limit": (lambda c: c.replace(b"max_scale_y", b"max_snail_y"), "chunk lacks max_scale_y"),
-    "missing colour limit": (lambda c: c.replace(b"max_g", b"max_q"), "chunk lacks max_g"),
+    "missing limit": (
+        lambda c: c.replace(b"max_scale_y", b"max_snail_y"),
+        "the element chunk of a compressed PLY must have max_scale_y",
+    ),
+    "missing colour limit": (
+        lambda c: c.replace(b"max_g", b"max_q"),
+        "the element chunk of a compressed PLY must have max_g",
+    ),
     "wrong type": (
         lambda c: c.replace(b"uint packed_color", b"float packed_color"),
         "wrong type of packed_color",
@@ -208,9 +214,12 @@ DAMAGES = {
     "wrong type of limit": (lambda c: c.replace(b"float min_x", b"int min_x"), "wrong type of min_x"),
     "too little SH": (
         lambda c: c.replace(b"element sh 300", b"element sh 299"),
-        "has 299 rows of sh, not 300",
+        "must have 300 rows of sh, got 299",
     ),
-    "SH of no degree": (lambda c: c.replace(b"property uchar f_rest_8\n", b""), "sh has 8 properties"),
+    "SH of no degree": (
+        lambda c: c.replace(b"property uchar f_rest_8\n", b""),
+        "the element sh must have 9, 24 or 45 properties, got 8",
+    ),
     "SH of another type": (
         lambda c: c.replace(b"uchar f_rest_3", b"char f_rest_3"),
         "wrong type of f_rest_3",

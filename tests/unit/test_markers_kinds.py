@@ -77,7 +77,7 @@ def test_april_grids():
         ("gridboard:0x5:4x4_50", "from 1 to 64"),
         ("gridboard:5x5:4x4_51", "unknown tag family"),
         ("gridboard:8x8:4x4_50", "needs 64 tags, but 4x4_50 has 50"),
-        ("aprilgrid:6x6:4x4_50", "has AprilTags"),
+        ("aprilgrid:6x6:4x4_50", "the family of an AprilGrid must be AprilTags, got 'aprilgrid:6x6:4x4_50';"),
     ],
 )
 def test_errors_say_what_would_be_right(text, says):
@@ -116,7 +116,12 @@ def test_a_kind_from_outside_is_a_marker_like_any_other(toy, tmp_path):
 
 
 def test_names_that_are_no_names_of_kinds(toy):
-    for name, says in (("qr", "already"), ("stripes", "already"), ("a-b", "lower-case"), ("", "lower-case")):
+    for name, says in (
+        ("qr", "the name of a kind must be new"),
+        ("stripes", "the name of a kind must be new"),
+        ("a-b", "lower-case"),
+        ("", "lower-case"),
+    ):
         with pytest.raises(fs.InputError, match=says):
             register(Kind(name, "x:Y", 0, lambda text, *_: Spec(text=text, kind="x"), stripes))
 

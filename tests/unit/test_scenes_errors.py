@@ -92,7 +92,7 @@ CHANGES = [
     ("near = 0.1", "far = 0.001", "camera far (0.001) must be above near"),
     ("near = 0.1", "far = nan", "camera.far must be a finite number"),
     ("empty.ply", "absent.ply", "splats[0].file: cannot read"),
-    ("empty.ply", "scene.toml", "unknown ending of a splat file '.toml'"),
+    ("empty.ply", "scene.toml", "unknown suffix of a splat file '.toml'"),
     ('"empty.ply"', "7", "splats[0].file must be text, got 7"),
     ('"empty.ply"', '""', "splats[0].file must be text"),
     ("scale = 1.0", "scale = 0.0", "splats[0].scale must be above 0"),

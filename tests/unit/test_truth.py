@@ -117,14 +117,14 @@ def test_flow_that_cannot_be(frame, scene):
         optical_flow(frame["depth"], scene.camera, scene.camera, motions={1: np.eye(4)})
     with pytest.raises(fs.InputError, match="motion of label 1 must be rigid"):
         optical_flow(frame["depth"], scene.camera, scene.camera, frame["label"], {1: np.diag([2, 2, 2, 1])})
-    with pytest.raises(fs.InputError, match="the depth has the shape"):
+    with pytest.raises(fs.InputError, match="the depth must have the camera's shape"):
         points_of(frame["depth"][1:], scene.camera)
 
 
 def test_truth_of_a_picture_of_another_size(scene, frame):
-    with pytest.raises(fs.InputError, match="160 x 120 pixels and the camera 80 x 60"):
+    with pytest.raises(fs.InputError, match="must have the camera's size, 80 x 60 pixels, got 160 x 120"):
         truth_of(frame, scene, fs.Camera.pinhole(80, 60, 50, 50, 40, 30))
-    with pytest.raises(fs.InputError, match="the scene has no camera"):
+    with pytest.raises(fs.InputError, match="the scene must have a camera, got none; give camera="):
         truth_of(dict(frame), fs.Scene())
 
 
@@ -142,7 +142,7 @@ def test_coco_reads_what_we_write(tmp_path, truth, scene, frame):
     ours = CocoAnnotations({BOX: "block"})
     ours.add("a.png", truth)
     ours.add("b.png", truth_of({"rgb": frame["rgb"]}, scene))
-    with pytest.raises(fs.InputError, match=r"got 'a\.png', which is annotated"):
+    with pytest.raises(fs.InputError, match=r"got 'a\.png' again"):
         ours.add("a.png", truth)
     ours.save(tmp_path / "truth.json")
     with contextlib.redirect_stdout(io.StringIO()):
@@ -200,7 +200,7 @@ def test_bop_has_what_its_format_asks_for(tmp_path, truth, frame, scene):
     np.testing.assert_array_equal(mask[..., 0] > 0, frame["label"] == 1)
     models = json.loads((tmp_path / "set/models/models_info.json").read_text())
     assert models["1"]["diameter"] == pytest.approx(400 * math.sqrt(2))
-    with pytest.raises(fs.InputError, match="holds a scene already"):
+    with pytest.raises(fs.InputError, match="must not have a scene yet"):
         BopScene(folder)
     again = BopScene(tmp_path / "set/train/000001")
     again.add(frame, truth)
@@ -208,7 +208,9 @@ def test_bop_has_what_its_format_asks_for(tmp_path, truth, frame, scene):
     other = replace(scene.markers[0], marker=fs.marker("apriltag:36h11:6", size=0.4))
     another = BopScene(tmp_path / "set/train/000002")
     another.add(frame, truth_of(frame, replace(scene, markers=(other,))))
-    with pytest.raises(fs.InputError, match="object 1 is apriltag:36h11:5 there, and apriltag:36h11:6 here"):
+    with pytest.raises(
+        fs.InputError, match="object 1 must be apriltag:36h11:5, got apriltag:36h11:6; use the same"
+    ):
         another.save()
     assert json.loads((tmp_path / "set/models/models_info.json").read_text()) == models
 
