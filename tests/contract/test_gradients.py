@@ -108,6 +108,17 @@ def test_opaque_splats_have_derivatives(backend):
     assert all(np.isfinite(array).all() for array in found.values())
 
 
+def test_scales_below_the_smallest_have_no_derivative_and_leave_others_theirs(backend):
+    """Splats with a tiny first scale, a tiny second one, both and none."""
+    cloud, capture = random_picture(5, count=40, scale=(0.05, 0.3), depth=(1.5, 4.0))
+    tiny = np.arange(40)[:, None] // [1, 2] % 2 == 1
+    scales = np.where(tiny, np.float32(1e-25), cloud.scales)
+    thin = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, sh=cloud.sh, origin=cloud.origin)
+    found = assert_same(backend, thin, capture)["scales"]
+    assert not found[tiny].any()
+    assert all(found[~tiny[:, axis], axis].any() for axis in (0, 1))
+
+
 def long_lists():
     """Hundreds of faint splats in each tile, in windows and beyond them: light is left at the end."""
     cloud, capture = random_picture(

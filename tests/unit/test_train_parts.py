@@ -235,6 +235,21 @@ def test_neighbours_are_those_of_all_pairs(pairs, monkeypatch):
     assert mean_square_distances(points[:1]).tolist() == [0]
 
 
+def test_neighbours_are_sought_in_the_boxes_nearby(monkeypatch):
+    """A grid of 20,000 points: the pairs compared grow with the points, not with their square."""
+    compared, nearest = 0, neighbours._nearest
+
+    def counted(mine, among):
+        nonlocal compared
+        compared += len(mine) * len(among)
+        return nearest(mine, among)
+
+    monkeypatch.setattr(neighbours, "_nearest", counted)
+    points = np.stack(np.meshgrid(np.arange(40), np.arange(25), np.arange(20)), -1).reshape(-1, 3)
+    assert (mean_square_distances(points) == 1).all()
+    assert compared < len(points) ** 2 / 4
+
+
 def ready(count=8):
     """Splats with ids as their colours, of opacity 0.5 and 1 cm."""
     splats = splats_of(count)
