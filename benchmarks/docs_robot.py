@@ -35,7 +35,7 @@ def main(out: str) -> None:
     part = slice(*np.searchsorted(whole.times, (START, END)).tolist())
     run = Run(whole.times[part], whole.poses[part], whole.wheels[part], whole.gyro[part])
     pictures, sightings = [], []
-    for picture in arguments.pictures(VARIANTS["exact"], run, renderer):
+    for picture in arguments.images(VARIANTS["exact"], run, renderer):
         codes = detect(picture, (FAMILY,), qr=False)
         marks = [(code.corners, str(code.id)) for code in codes]
         pictures.append(resize_to_width(draw_outlines(picture, marks, thickness=2, size=0.6), WIDTH))
@@ -43,7 +43,7 @@ def main(out: str) -> None:
         print(f"{len(pictures)} of {len(arguments.image_indices(run))}", end="\r", file=sys.stderr)
     ways = [
         run.poses,
-        *(arguments.localised(run, seen, arguments.camera)[0].poses for seen in (None, sightings)),
+        *(arguments.localise(run, seen, arguments.camera)[0].poses for seen in (None, sightings)),
     ]
     with tempfile.TemporaryDirectory() as folder:
         for number, (picture, k) in enumerate(

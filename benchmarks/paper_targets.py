@@ -2,13 +2,14 @@
 
     python benchmarks/paper_targets.py devlog/results [--missed devlog/paper-targets-missed.csv]
 
-Prints how many targets of each kind are reached, and writes those that are missed.
+Prints how many targets of each kind are reached, and writes those that are missed. Gaps to the ideal texture
+are computed from raw results, or read from columns of their table in devlog/results.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,11 +18,16 @@ import pandas as pd
 from fidsplat.experiments import angles, counts, trained, views
 from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.paper import ANGLES, VIEWS
-from fidsplat.experiments.results import ALLOWED_GAP, NEVER, load
-from fidsplat.experiments.summary import Frame, Summary
+from fidsplat.experiments.results import load
+from fidsplat.experiments.summary import Frame
+from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.experiments.views import LINEAR
 from fidsplat.util.files import atomic_write
 
+ALLOWED_GAP = {"exact": 0.2, "fitted": 1.0}
+"""allowed gap below the limit of the ideal texture in degrees, by mixture"""
+NEVER = 90.0
+"""gap in degrees of a code that is never read"""
 EXACT_PSNR, EXACT_SSIM = 38.7, 0.99
 FITTED_GAIN = 3.0
 """dB above the paper's own method"""
@@ -43,12 +49,13 @@ class Target(NamedTuple):
     reached: bool
 
 
-def targets(summaries: dict[str, Summary]) -> Frame:
+def targets(folders: Sequence[Path]) -> Frame:
     """Table with a row for each target that has measurements."""
     found: list[Target] = []
-    rows = {name: summary.rows for name, summary in summaries.items()}
+    rows = {name: summary.rows for name, summary in load(folders).items()}
     if angles.NAME in rows:
-        found += [*_gaps(rows[angles.NAME]), *_misses(rows[angles.NAME]), *_paper_angles(rows[angles.NAME])]
+        scans = with_gaps(rows[angles.NAME], [r for f in folders for r in folder_records(f, angles.NAME)])
+        found += [*_gaps(scans), *_misses(scans), *_paper_angles(scans)]
     if views.NAME in rows:
         found += _views(rows[views.NAME])
     if counts.NAME in rows:
@@ -56,6 +63,53 @@ def targets(summaries: dict[str, Summary]) -> Frame:
     if trained.NAME in rows:
         found += _trained(rows[trained.NAME])
     return pd.DataFrame(found, columns=Target._fields).astype({"reached": bool})
+
+
+Hits = dict[float, str]
+"""tilt -> "1" if the code was read, else "0\""""
+_SCAN = ["protocol", "category", "marker", "method", "reader"]
+
+
+def with_gaps(rows: Frame, records: Iterable[Record]) -> Frame:
+    """Rows of scans with columns of their gap to the ideal texture (see `_gap_columns`), from raw results."""
+    longest: dict[tuple, Hits] = {}
+    for record in records:
+        key, tilts = record.key, angles.parse_tilts(record.key["tilts"])
+        for reader, hits in record.result["readers"].items():
+            scan = (key["protocol"], key["category"], key["index"], key["method"], reader)
+            read = dict(zip(tilts, hits["read"], strict=True))
+            longest[scan] = max(longest.get(scan, read), read, key=len)
+    columns = {}
+    for scan, read in longest.items():
+        ideal = longest.get((*scan[:3], IDEAL, scan[4]))
+        if ideal is not None:
+            columns[scan] = _gap_columns(read, ideal, scan[3])
+    if not columns:
+        return rows
+    gaps = pd.DataFrame.from_dict(columns, orient="index").rename_axis(_SCAN)
+    return gaps.combine_first(rows.set_index(_SCAN)).reset_index()
+
+
+def _gap_columns(read: Hits, ideal: Hits, method: str) -> dict[str, float | None]:
+    """Gap between a scan and that of the ideal texture, on common tilts.
+
+    Returns `behind`, `behind_all`: degrees by which the largest readable tilt, and the largest without a
+    miss, are below the ideal's; `NEVER` without any, None where the ideal has none. `missed` of `below`:
+    unread tilts, up to the allowed gap below the largest one without a miss of the ideal.
+    """
+    tilts = sorted(set(read) & set(ideal))
+    ours, theirs = ("".join(hits[tilt] for tilt in tilts) for hits in (read, ideal))
+    row: dict[str, float | None] = {}
+    ceiling = None
+    for name, own, ceiling in zip(
+        ("behind", "behind_all"), angles.largest(tilts, ours), angles.largest(tilts, theirs), strict=True
+    ):
+        row[name] = None if ceiling is None else NEVER if own is None else ceiling - own
+    if ceiling is not None:
+        limit = ceiling - ALLOWED_GAP.get(method.partition("/")[0], 0.0) + 1e-6
+        below = [hit for tilt, hit in zip(tilts, ours, strict=True) if tilt <= limit]
+        row |= {"missed": below.count("0"), "below": len(below)}
+    return row
 
 
 def _best(rows: Frame) -> Iterator[tuple[str, str, Frame]]:
@@ -209,7 +263,7 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", type=Path, help="folders with results or their tables")
     parser.add_argument("--missed", type=Path, metavar="FILE.csv", help="write the missed targets")
     options = parser.parse_args()
-    found = targets(load(options.folders))
+    found = targets(options.folders)
     if options.missed is not None:
         missed = found[~found["reached"]].drop(columns="reached")
         with atomic_write(options.missed) as stream:

@@ -6,7 +6,7 @@ from conftest import CLOCK
 
 def drawn(run):
     """One frame, finished."""
-    return run.draw().wait()
+    return run.render().wait()
 
 
 def facts(benchmark, run) -> None:

@@ -57,7 +57,7 @@ def compared(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], repea
     peer.first_frame_ms = Timer(lambda: drawn.append(np.asarray(draw())[..., :3])).run()
     picture = drawn.pop()
     peer.mean_rgb = float(picture.mean(dtype=np.float64))
-    error = np.mean((np.clip(picture, 0, 1).astype(np.float64) - np.clip(ours.picture, 0, 1)) ** 2)
+    error = np.mean((np.clip(picture, 0, 1).astype(np.float64) - np.clip(ours.image, 0, 1)) ** 2)
     with Progress(console=PROGRESS) as progress:
         task = progress.add_task(peer.scene, total=2 * repeats)
         time_interleaved([ours.result.timer, peer.timer], repeats, tick=lambda: progress.advance(task))

@@ -74,9 +74,9 @@ class Warm:
         steps = warm(renderer, sets)
         try:
             for recipe, seconds in show_progress(
-                "sets of kernels", steps, len(sets), label=lambda step: step[0].words
+                "sets of kernels", steps, len(sets), label=lambda step: step[0].text
             ):
-                compiled.append((recipe.words, seconds))
+                compiled.append((recipe.text, seconds))
         finally:  # an interrupted run reports what it has compiled
             device, took = renderer.device, time.perf_counter() - begun
             facts: dict = {"device": device.name, "title": device.title, "version": device.version}

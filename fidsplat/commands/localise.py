@@ -46,7 +46,7 @@ class Localise:
         str | None, option("FILE.mp4", "also write the images of `exact` as a video (extra: video)")
     ] = None
     device: Device = None
-    overwrite: Annotated[bool, switch("measure again what the folder holds")] = False
+    overwrite: Annotated[bool, switch("replace existing results")] = False
     json: Json = False
 
     def run(self) -> int:
@@ -100,7 +100,7 @@ class Localise:
 
         if (self.log is None or source is None) and self.video is None:
             return
-        images = drive.pictures(VARIANTS["exact"], drive.run(), renderer)
+        images = drive.images(VARIANTS["exact"], drive.run(), renderer)
         if self.log is not None and source is not None:
             images = write_log(drive, "exact", renderer, self.log, self.overwrite, source)
         steps = images if self.video is None else write_video(self.video, images, RATE)

@@ -14,16 +14,9 @@ from pathlib import Path
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments.methods import plain_marker
-from fidsplat.experiments.setup import (
-    BACKGROUND,
-    COLLECTIONS,
-    PROTOCOLS,
-    Category,
-    novel_cameras,
-    training_cameras,
-)
+from fidsplat.experiments.setup import BACKGROUND, PROTOCOLS, Category, novel_cameras, training_cameras
 from fidsplat.util import interrupts
-from fidsplat.util.errors import DeviceError, InputError
+from fidsplat.util.errors import DeviceError, InputError, unknown
 from fidsplat.util.files import atomic_write, from_json, read_text, user_cache, writable_folder
 
 BPY = "bpy==5.0.1"
@@ -32,16 +25,13 @@ VIEW_NAMES = ("standard", "raw")
 values, so edges are means of displayed values"""
 FULL_SAMPLES = 64
 WORKER = Path(__file__).with_name("blender_worker.py")
+TEST, TRAINING = "test", "view"
+"""kinds of images in file names"""
 
 
-def novel_image(folder: Path, view: str, category: str, index: int, number: int) -> Path:
-    """File of a test view."""
-    return folder / view / f"{category}-{index}" / f"test-{number:02d}.png"
-
-
-def training_image(folder: Path, view: str, category: str, index: int, number: int) -> Path:
-    """File of a training view of the densest collection."""
-    return folder / view / f"{category}-{index}" / f"view-{number:02d}.png"
+def image_file(folder: Path, view: str, category: str, index: int, kind: str, number: int) -> Path:
+    """File of a test image, or of a training image of the densest collection."""
+    return folder / view / f"{category}-{index}" / f"{kind}-{number:02d}.png"
 
 
 def check_images(folder: Path, view: str, seed: int, samples: int | None = None) -> dict:
@@ -49,29 +39,31 @@ def check_images(folder: Path, view: str, seed: int, samples: int | None = None)
 
     Raises InputError for another seed or number of samples (None: any).
     """
-    if not _note(folder, view).exists():
+    file = _settings_file(folder, view)
+    if not file.exists():
         return {}
     try:
-        about = from_json(read_text(_note(folder, view)))
+        settings = from_json(read_text(file))
     except ValueError as error:
-        raise InputError(f"cannot read {_note(folder, view)}: {error}") from error
-    for name, wanted in (("seed", seed), ("samples", samples)):
-        if wanted is not None and about.get(name) != wanted:
+        raise InputError(f"cannot read {file}: {error}") from error
+    for name, expected in (("seed", seed), ("samples", samples)):
+        if expected is not None and settings.get(name) != expected:
             raise InputError(
-                f"{folder / view} holds images of {name} {about.get(name)}, not {wanted}; give another folder"
+                f"{folder / view} holds images of {name} {settings.get(name)}, not {expected}; give another "
+                "folder"
             )
-    return about
+    return settings
 
 
 def record_images(folder: Path, view: str, seed: int, samples: int) -> None:
     """Record the settings of the images of a view. Raises InputError for other settings."""
     check_images(folder, view, seed, samples)
     writable_folder(folder / view)
-    with atomic_write(_note(folder, view)) as stream:
+    with atomic_write(_settings_file(folder, view)) as stream:
         stream.write(json.dumps({"seed": seed, "samples": samples}).encode())
 
 
-def _note(folder: Path, view: str) -> Path:
+def _settings_file(folder: Path, view: str) -> Path:
     return folder / view / "drawn-with.json"
 
 
@@ -89,13 +81,14 @@ def install(environment: Path, progress: Callable[[str], None] = lambda text: No
     if python is None:
         raise InputError(f"{BPY} needs Python 3.11, and python3.11 is not on the path; install it first")
     writable_folder(environment.parent)
-    progress(f"making the environment {environment}")
-    _call([python, "-m", "venv", "--clear", str(environment)])
     own = environment_python(environment)
-    progress(f"installing {BPY}, about 400 MB to fetch")
-    _call([str(own), "-m", "pip", "install", "--quiet", BPY, "numpy<2"])
-    progress("starting it once")
-    _call([str(own), "-c", "import bpy"])
+    for text, command in (
+        (f"making the environment {environment}", [python, "-m", "venv", "--clear", str(environment)]),
+        (f"installing {BPY}, about 400 MB", [str(own), "-m", "pip", "install", "--quiet", BPY, "numpy<2"]),
+        ("first start", [str(own), "-c", "import bpy"]),
+    ):
+        progress(text)
+        _call(command)
     return own
 
 
@@ -112,43 +105,39 @@ def _call(command: list[str]) -> None:
 
 
 def marker_job(category: Category, index: int, seed: int, folder: Path, view: str, training: bool) -> dict:
-    """Worker job for the test views of a marker, and optionally its training views."""
+    """Worker job for the test images of a marker, and optionally its training images."""
     grid = plain_marker(category.spec(index, seed)).grid
-    shots = [
-        (novel_image(folder, view, category.name, index, i), camera)
-        for i, camera in enumerate(novel_cameras(category, index, seed))
-    ]
-    if training:
-        shots += [
-            (training_image(folder, view, category.name, index, i), camera)
-            for i, camera in enumerate(training_cameras(COLLECTIONS[-1]))
-        ]
+    cameras = {TEST: novel_cameras(category, index, seed), TRAINING: training_cameras() if training else []}
     return {
         "name": f"{category.name}-{index}",
         "grid": grid.tolist(),
         "module": PROTOCOLS["fixed-plane"].module(grid.shape[0]),
-        "shots": [{"file": str(file.absolute()), **camera_facts(camera)} for file, camera in shots],
+        "images": [
+            image_job(image_file(folder, view, category.name, index, kind, i), camera)
+            for kind, own in cameras.items()
+            for i, camera in enumerate(own)
+        ],
     }
+
+
+def image_job(file: Path, camera: Camera) -> dict:
+    """File and camera of an image. Raises InputError unless the pixels of the camera are square."""
+    if camera.fx != camera.fy:
+        raise InputError("fx and fy of a Blender camera must be equal")
+    facts = {name: getattr(camera, name) for name in ("width", "height", "fx", "cx", "cy")}
+    return {"file": str(file.absolute()), **facts, "matrix": camera.world_to_camera.tolist()}
 
 
 def ready(view: str, environment: Path) -> Path:
     """Python interpreter with Blender. Raises InputError for an unknown view or without Blender."""
     if view not in VIEW_NAMES:
-        raise InputError(f"unknown view {view!r}; known: {', '.join(VIEW_NAMES)}")
+        raise InputError(unknown("view", view, VIEW_NAMES))
     python = environment_python(environment)
     if not python.is_file():
         raise InputError(
             f"Blender is not installed in {environment}; run fidsplat experiment blender --install"
         )
     return python
-
-
-def camera_facts(camera: Camera) -> dict:
-    """Camera of a worker job. Raises InputError unless its pixels are square."""
-    if camera.fx != camera.fy:
-        raise InputError("fx and fy of a Blender camera must be equal")
-    names = ("width", "height", "fx", "cx", "cy")
-    return {name: getattr(camera, name) for name in names} | {"matrix": camera.world_to_camera.tolist()}
 
 
 def render(
@@ -159,56 +148,52 @@ def render(
     pixel_filter: str = "BOX",
     threads: int | None = None,
 ) -> Iterator[Path]:
-    """Render missing images; yields each file when it is done, existing ones first.
+    """Render missing images; yields each file when it is complete, existing ones first.
 
     Args:
         markers: jobs of `marker_job`.
         view: one of `VIEW_NAMES`.
         environment: folder of `install`.
-        samples: per pixel.
+        samples: samples per pixel.
         pixel_filter: "BOX" (1 px, a mean over the pixel) or "BLACKMAN_HARRIS" (Blender's default, 1.5 px).
-        threads: of Cycles; all by default.
+        threads: threads of Cycles; by default one per core.
 
-    Raises InputError when Blender is not installed, DeviceError if it fails; finished images stay.
+    Raises InputError when Blender is not installed, DeviceError if it fails; complete images stay.
     """
-    python = ready(view, environment)
-    job = {
-        "view": view,
-        "samples": samples,
-        "filter": pixel_filter,
-        "threads": threads or os.cpu_count() or 1,
-        "background": BACKGROUND,
-    }
-    yield from drawn(python, WORKER, markers, job)
+    job = {"view": view, "samples": samples, "filter": pixel_filter, "background": BACKGROUND}
+    yield from run_worker(ready(view, environment), WORKER, markers, job, threads)
 
 
-def drawn(python: Path, worker: Path, things: Iterable[dict], job: dict) -> Iterator[Path]:
-    """Render the missing images of some objects with a worker; yields each file when it is done, existing
-    ones first. Raises DeviceError if Blender fails; finished images stay."""
+def run_worker(
+    python: Path, worker: Path, objects: Iterable[dict], job: dict, threads: int | None = None
+) -> Iterator[Path]:
+    """Render the missing images of objects with a worker; yields each file when it is complete, existing ones
+    first. Raises DeviceError if Blender fails; complete images stay."""
     missing = []
-    for thing in things:
-        there = [Path(shot["file"]) for shot in thing["shots"] if Path(shot["file"]).is_file()]
-        yield from there
-        left = [shot for shot in thing["shots"] if Path(shot["file"]) not in there]
+    for one in objects:
+        existing = [image["file"] for image in one["images"] if Path(image["file"]).is_file()]
+        yield from map(Path, existing)
+        left = [image for image in one["images"] if image["file"] not in existing]
         if left:
-            missing.append({**thing, "shots": left})
+            missing.append({**one, "images": left})
     if not missing:
         return
-    for folder in {Path(shot["file"]).parent for thing in missing for shot in thing["shots"]}:
+    for folder in {Path(image["file"]).parent for one in missing for image in one["images"]}:
         writable_folder(folder)
     with tempfile.TemporaryDirectory() as work:
-        file = Path(work) / "job.json"
-        file.write_text(json.dumps({**job, "things": missing}), "utf-8")
-        log = Path(work) / "stderr.txt"
+        file, log = Path(work) / "job.json", Path(work) / "stderr.txt"
+        job = {**job, "threads": threads or os.cpu_count() or 1, "objects": missing}
+        file.write_text(json.dumps(job), "utf-8")
+        environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
         with open(log, "wb") as errors:
             process = subprocess.Popen(
                 [str(python), str(worker), str(file)],
-                stdout=subprocess.PIPE, stderr=errors, env=_clean_environment(),
+                stdout=subprocess.PIPE, stderr=errors, env=environment,
             )  # fmt: skip
             try:
                 assert process.stdout is not None
                 for line in interrupts.lines_of(process.stdout):
-                    if line.startswith("done "):  # other output of Blender
+                    if line.startswith("done "):  # Blender prints other lines
                         yield Path(line.removeprefix("done "))
                 status = process.wait()
             finally:
@@ -218,8 +203,3 @@ def drawn(python: Path, worker: Path, things: Iterable[dict], job: dict) -> Iter
         if status:
             lines = log.read_text("utf-8", "replace").strip().splitlines() or ["no message"]
             raise DeviceError(f"Blender stopped with status {status}: {lines[-1]}")
-
-
-def _clean_environment() -> dict[str, str]:
-    """Environment variables without Python paths."""
-    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}

@@ -11,22 +11,18 @@ import sys
 
 import bpy  # type: ignore[import-not-found]
 import numpy as np
-from blender_worker import prepare, shoot  # type: ignore[import-not-found]
+from blender_worker import prepare, render  # type: ignore[import-not-found]
 
 
 def main(job: dict) -> None:
     """Render all images of all plants on a transparent background."""
     scene = prepare(job)
     light(scene)
-    for plant in job["things"]:
-        made = build(plant)
-        for shot in plant["shots"]:
-            shoot(scene, shot)
-        bpy.data.objects.remove(made, do_unlink=True)
+    render(scene, job["objects"], build)
 
 
 def light(scene) -> None:
-    """Soft light from above that leaves transmit; a transparent background."""
+    """Soft light from above, and a transparent background."""
     scene.cycles.max_bounces = 4
     scene.cycles.use_denoising = True
     scene.render.film_transparent = True
@@ -37,24 +33,24 @@ def light(scene) -> None:
     scene.collection.objects.link(bpy.data.objects.new("sun", sun))  # shines down
 
 
-def build(plant: dict):
+def build(one: dict):
     """Smooth mesh with vertex colours."""
-    vertices, colors = np.array(plant["vertices"]), np.array(plant["colors"])
-    mesh = bpy.data.meshes.new(plant["name"])
-    mesh.from_pydata(vertices.tolist(), [], plant["quads"])
+    vertices, colors = np.array(one["vertices"]), np.array(one["colors"])
+    mesh = bpy.data.meshes.new(one["name"])
+    mesh.from_pydata(vertices.tolist(), [], one["quads"])
     mesh.shade_smooth()
     linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
     painted = mesh.color_attributes.new("surface", "FLOAT_COLOR", "POINT")
     painted.data.foreach_set("color", np.column_stack([linear, np.ones(len(linear))]).ravel())
     mesh.materials.append(material())
-    made = bpy.data.objects.new(plant["name"], mesh)
+    made = bpy.data.objects.new(one["name"], mesh)
     bpy.context.scene.collection.objects.link(made)
     return made
 
 
 def material():
     """Translucent material with the vertex colours."""
-    made = bpy.data.materials.new("plant")
+    made = bpy.data.materials.new("leaf")
     made.use_nodes = True
     tree = made.node_tree
     tree.nodes.clear()

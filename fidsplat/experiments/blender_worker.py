@@ -17,22 +17,22 @@ from mathutils import Matrix  # type: ignore[import-not-found]
 def main(job: dict) -> None:
     """Render all images of all markers."""
     scene = prepare(job)
-    for marker in job["things"]:
-        plane = build(marker, job["view"])
-        for shot in marker["shots"]:
-            shoot(scene, shot)
-        bpy.data.objects.remove(plane, do_unlink=True)
+    render(scene, job["objects"], lambda marker: build(marker, job["view"]))
 
 
-def shoot(scene, shot: dict) -> None:
-    """Render one image into its file and report it."""
-    aim(scene, shot)
-    # a worker of a killed run may still render the same image
-    part = f"{shot['file']}.{os.getpid()}.part.png"
-    scene.render.filepath = part
-    bpy.ops.render.render(write_still=True)
-    os.replace(part, shot["file"])
-    print("done", shot["file"], flush=True)
+def render(scene, objects: list[dict], build) -> None:
+    """Build each object and render its images into their files."""
+    for one in objects:
+        built = build(one)
+        for image in one["images"]:
+            aim(scene, image)
+            # a worker of a killed run may still render the same image
+            part = f"{image['file']}.{os.getpid()}.part.png"
+            scene.render.filepath = part
+            bpy.ops.render.render(write_still=True)
+            os.replace(part, image["file"])
+            print("done", image["file"], flush=True)
+        bpy.data.objects.remove(built, do_unlink=True)
 
 
 def prepare(job: dict):
@@ -83,20 +83,20 @@ def build(marker: dict, view: str):
     mesh = bpy.data.meshes.new(marker["name"])
     mesh.from_pydata([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], [], [(0, 1, 2, 3)])
     corners = mesh.uv_layers.new().data
-    for corner, place in zip(corners, [(0, 1), (1, 1), (1, 0), (0, 0)], strict=True):
-        corner.uv = place
-    image = bpy.data.images.new(marker["name"], columns, rows)
-    image.colorspace_settings.name = "sRGB" if view == "standard" else "Non-Color"
+    for corner, uv in zip(corners, [(0, 1), (1, 1), (1, 0), (0, 0)], strict=True):
+        corner.uv = uv
+    bitmap = bpy.data.images.new(marker["name"], columns, rows)
+    bitmap.colorspace_settings.name = "sRGB" if view == "standard" else "Non-Color"
     pixels = np.ones((rows, columns, 4), np.float32)
     pixels[:, :, :3] = 1 - grid[::-1, :, None]  # Blender's first row is the lowest
-    image.pixels.foreach_set(pixels.ravel())
-    image.update()
+    bitmap.pixels.foreach_set(pixels.ravel())
+    bitmap.update()
     material = bpy.data.materials.new(marker["name"])
     material.use_nodes = True
     tree = material.node_tree
     tree.nodes.clear()
     texture = tree.nodes.new("ShaderNodeTexImage")
-    texture.image, texture.interpolation, texture.extension = image, "Closest", "EXTEND"
+    texture.image, texture.interpolation, texture.extension = bitmap, "Closest", "EXTEND"
     emission = tree.nodes.new("ShaderNodeEmission")
     output = tree.nodes.new("ShaderNodeOutputMaterial")
     tree.links.new(texture.outputs["Color"], emission.inputs["Color"])
@@ -107,16 +107,16 @@ def build(marker: dict, view: str):
     return plane
 
 
-def aim(scene, shot: dict) -> None:
-    """Set the camera. Blender's faces -z with y up, ours z with y down."""
-    width, height = shot["width"], shot["height"]
+def aim(scene, image: dict) -> None:
+    """Set the camera. Blender's camera looks along -z with y up, ours along z with y down."""
+    width, height = image["width"], image["height"]
     scene.render.resolution_x, scene.render.resolution_y = width, height
     data = scene.camera.data
-    data.lens = shot["fx"] / width * data.sensor_width
-    data.shift_x = (width / 2 - shot["cx"]) / width
-    data.shift_y = (shot["cy"] - height / 2) / width
-    turned = np.linalg.inv(np.array(shot["matrix"])) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    scene.camera.matrix_world = Matrix(turned.tolist())
+    data.lens = image["fx"] / width * data.sensor_width
+    data.shift_x = (width / 2 - image["cx"]) / width
+    data.shift_y = (image["cy"] - height / 2) / width
+    pose = np.linalg.inv(np.array(image["matrix"])) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    scene.camera.matrix_world = Matrix(pose.tolist())
 
 
 if __name__ == "__main__":

@@ -21,9 +21,8 @@ from fidsplat.util.files import atomic_write, printable
 
 Values = Sequence[float]
 _STYLE: dict[Any, Any] = {
-    # the same file for the same numbers
-    "svg.hashsalt": "fidsplat",
-    "figure.dpi": 72,  # as SVG counts, so that labels are where they were placed
+    "svg.hashsalt": "fidsplat",  # files are reproducible
+    "figure.dpi": 72,  # of SVG, so that labels are where they were placed
     "font.size": 10,
     "axes.grid": True,
     "axes.axisbelow": True,
@@ -41,13 +40,13 @@ COLOURS = (
 
 @contextmanager
 def chart(file: Path, panels: int = 1, size: tuple[float, float] = (9.0, 4.2), one_scale: bool = True):
-    """Axes to draw on, side by side; the figure is written when all went well.
+    """Figure and its axes side by side; the file is written at the end unless an error is raised.
 
-    size: inches. one_scale: whether they have one vertical scale.
+    size: inches. one_scale: whether all axes share the vertical scale.
     """
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(figure)  # measures texts
+        FigureCanvasAgg(figure)  # to measure texts
         axes = figure.subplots(1, panels, squeeze=False, sharey=one_scale)[0]
         yield figure, axes
         with atomic_write(file) as stream:
@@ -77,7 +76,7 @@ def legend_above(figure: Figure, axes: Axes) -> None:
 
 
 def literal(text: str) -> str:
-    """Escape a name for matplotlib, which reads text between two $ as mathematics."""
+    """Escape a name for matplotlib, which renders text between two $ as mathematics."""
     return printable(text).replace("$", r"\$")
 
 
@@ -89,8 +88,8 @@ def plain_ticks(axis) -> None:
 
 
 def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
-    """Names beside points, each at the nearest place where it covers no other name, no named point, no text
-    that is there and no line right across the panel."""
+    """Label points, each at the nearest position that overlaps no other label, labelled point, text, or line
+    across the panel."""
     figure.canvas.draw()
     inside = axes.get_window_extent()
     dots = [axes.transData.transform((x, y)) for x, y, _ in points]
@@ -112,7 +111,7 @@ def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float
             )
             label.set_in_layout(False)
             label.update_positions(figure.canvas.get_renderer())  # type: ignore[attr-defined]
-            box = Text.get_window_extent(label).padded(2)  # of the words, without the line to the point
+            box = Text.get_window_extent(label).padded(2)  # of the text, without the line to the point
             if _contains(inside, box) and not any(box.overlaps(other) for other in taken):
                 taken.append(box)
                 break

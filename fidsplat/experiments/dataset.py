@@ -1,6 +1,6 @@
 """The data set of the paper's section 4.1: 25 markers x 4 viewpoint collections, 100 scenes for COLMAP.
 
-SCENE/images/view-00.png ...      training views
+SCENE/images/view-00.png ...      training images
 SCENE/sparse/0/cameras.bin ...    their model, .bin and .txt
 SCENE/test/images/test-00.png ... 20 random views, the same for the four collections of a marker
 SCENE/test/sparse/0/...
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.experiments.blender import novel_image, training_image
+from fidsplat.experiments.blender import TEST, TRAINING, image_file
 from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import (
     BACKGROUND,
@@ -48,66 +48,67 @@ def dataset_scenes(categories: Iterable[Category], markers: int = 5) -> list[dic
     ]
 
 
-def scene_name(wanted: dict) -> str:
+def scene_name(scene: dict) -> str:
     """Name of a scene, e.g. "small-0-views-17"."""
-    return f"{wanted['category']}-{wanted['index']}-views-{wanted['views']}"
+    return f"{scene['category']}-{scene['index']}-views-{scene['views']}"
 
 
-def write_scene(wanted: dict, folder: Path, seed: int, truth: str, blender: Path) -> Path:
-    """Write a scene unless it is complete; marker.json is written last.
+def write_scene(scene: dict, out: Path, seed: int, truth: str, blender: Path) -> Path:
+    """Write a scene unless it is complete; marker.json is written last. Returns its folder.
 
     Args:
-        wanted: scene of `dataset_scenes`.
-        truth: source of its images, one of `fidsplat.experiments.views.TRUTHS`.
+        scene: scene of `dataset_scenes`.
+        out: folder of the data set.
+        truth: renderer of its images, one of `fidsplat.experiments.views.TRUTHS`.
         blender: folder of Blender's images, for ground truth from Blender.
 
     Raises InputError if an image of Blender is missing or the folder cannot be written.
     """
-    scene = folder / scene_name(wanted)
-    category = CATEGORIES[wanted["category"]]
-    spec = category.spec(wanted["index"], seed)
-    about = _about(spec, wanted, seed, truth)
-    note = scene / "marker.json"
-    if _whole(note, about):
-        return scene
+    folder, index = out / scene_name(scene), scene["index"]
+    category = CATEGORIES[scene["category"]]
+    spec = category.spec(index, seed)
+    facts = _facts(spec, scene["views"], seed, truth)
+    file = folder / "marker.json"
+    if _is_complete(file, facts):
+        return folder
     # an interrupted run must not mix two kinds of images
-    note.unlink(missing_ok=True)
-    points, colors = _points(spec, f"{seed} points {category.name} {wanted['index']}")
-    sets = (
-        (scene, "view", training_cameras(wanted["views"]), training_image),
-        (scene / "test", "test", novel_cameras(category, wanted["index"], seed), novel_image),
-    )
-    for place, stem, cameras, drawn in sets:
+    file.unlink(missing_ok=True)
+    points, colors = _points(spec, f"{seed} points {category.name} {index}")
+    for place, kind, cameras in (
+        (folder, TRAINING, training_cameras(scene["views"])),
+        (folder / "test", TEST, novel_cameras(category, index, seed)),
+    ):
         writable_folder(place / "images")
-        names = [f"{stem}-{i:02d}.png" for i in range(len(cameras))]
+        names = [f"{kind}-{i:02d}.png" for i in range(len(cameras))]
         for i, (name, camera) in enumerate(zip(names, cameras, strict=True)):
             if truth.startswith("blender-"):
-                file = drawn(blender, truth.removeprefix("blender-"), category.name, wanted["index"], i)
-                if not file.is_file():
-                    raise InputError(f"{file} is missing; run fidsplat experiment blender --training first")
-                picture = read_image(file)
+                view = truth.removeprefix("blender-")
+                source = image_file(blender, view, category.name, index, kind, i)
+                if not source.is_file():
+                    raise InputError(f"{source} is missing; run fidsplat experiment blender --training first")
+                image = read_image(source)
             else:
-                picture = _rgb(exact_view(spec, camera, truth == "exact-linear"))
-            write_png(place / "images" / name, picture)
+                image = np.repeat(exact_view(spec, camera, truth == "exact-linear")[:, :, None], 3, axis=2)
+            write_png(place / "images" / name, image)
         save_colmap(place / "sparse" / "0", names, cameras, points, colors)
-    with atomic_write(note) as stream:
-        stream.write(json.dumps(about, indent=1).encode())
-    return scene
+    with atomic_write(file) as stream:
+        stream.write(json.dumps(facts, indent=1).encode())
+    return folder
 
 
-def _whole(note: Path, about: dict) -> bool:
+def _is_complete(file: Path, facts: dict) -> bool:
     try:
-        return from_json(read_text(note)) == about
-    except ValueError:  # InputError too: it is not there
+        return from_json(read_text(file)) == facts
+    except ValueError:  # or InputError if it is missing
         return False
 
 
-def _about(spec: str, wanted: dict, seed: int, truth: str) -> dict:
+def _facts(spec: str, views: int, seed: int, truth: str) -> dict:
     plain = plain_marker(spec)
     module = PROTOCOLS["fixed-plane"].module(plain.grid.shape[0])
     return {
         "spec": spec,
-        "views": wanted["views"],
+        "views": views,
         "seed": seed,
         "truth": truth,
         "plane_m": PLANE,
@@ -121,11 +122,7 @@ def _about(spec: str, wanted: dict, seed: int, truth: str) -> dict:
 def _points(spec: str, seed: str) -> tuple[np.ndarray, np.ndarray]:
     grid = plain_marker(spec).grid
     generator = np.random.default_rng(zlib.crc32(seed.encode()))
-    places = generator.uniform(0, 1, (POINTS, 2))
-    column, row = (places * grid.shape[::-1]).astype(int).T
-    points = np.column_stack([(places - 0.5) * PLANE, np.zeros(POINTS)])
+    uv = generator.uniform(0, 1, (POINTS, 2))
+    column, row = (uv * grid.shape[::-1]).astype(int).T
+    points = np.column_stack([(uv - 0.5) * PLANE, np.zeros(POINTS)])
     return points, np.repeat(255 * (1 - grid[row, column])[:, None], 3, axis=1).astype(np.uint8)
-
-
-def _rgb(grey: np.ndarray) -> np.ndarray:
-    return np.repeat(grey[:, :, None], 3, axis=2)

@@ -27,10 +27,12 @@ from fidsplat.scenes import Scene
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.vision.readback import Reading, read_back
 
-# visible share of a completely visible marker; the rest is the soft edge of its quiet zone
-WHOLE = 0.98
-MAX_POSITION_ERROR = 0.01  # of the distance
-_FRAMES = 3  # timed after the one that compiles; the median counts
+COMPLETE = 0.98
+"""visible share of a completely visible marker; the rest is the soft edge of its quiet zone"""
+MAX_POSITION_ERROR = 0.01
+"""relative to the distance"""
+_FRAMES = 3
+"""timed frames after the one that compiles kernels"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,7 @@ class Sighting:
     @property
     def passed(self) -> bool | None:
         """Whether it was found at its position; None for a marker that is not completely visible."""
-        if self.reading.visible < WHOLE:
+        if self.reading.visible < COMPLETE:
             return None
         error = self.reading.position_error
         return error is not None and error < MAX_POSITION_ERROR * self.reading.distance
@@ -69,15 +71,17 @@ class DemoResult:
 
     @property
     def passed(self) -> bool:
-        """Whether all completely visible markers, at least one, were found within the limit, and nothing
-        else."""
+        """Whether all completely visible markers, at least one, were located within the limit, and no other
+        code was detected."""
         decided = [s.passed for s in self.sightings if s.passed is not None]
         return bool(decided) and all(decided) and not self.unexpected
 
     def as_dict(self) -> dict:
         """Plain data for JSON."""
-        seen = [{"view": s.view, "passed": s.passed, **s.reading.as_dict()} for s in self.sightings]
-        return {"passed": self.passed} | vars(self) | {"sightings": seen, "files": [*map(str, self.files)]}
+        sightings = [{"view": s.view, "passed": s.passed, **s.reading.as_dict()} for s in self.sightings]
+        return (
+            {"passed": self.passed} | vars(self) | {"sightings": sightings, "files": [*map(str, self.files)]}
+        )
 
 
 def run_demo(
@@ -89,13 +93,14 @@ def run_demo(
     """Run the demo and write its images, scene and results into the folder ``out``.
 
     Args:
-        out: folder, made if missing; existing files are overwritten.
-        device: as for `Renderer`.
+        out: folder, created if missing; existing files are overwritten.
+        device: name of a `Renderer`.
         progress: called with the name of each step.
-        mixture: of the markers; scene.ply has `fitted` instead of `exact`, since PLY files have no boxes.
+        mixture: mixture of the markers; scene.ply has `fitted` instead of `exact`, since PLY files have no
+            boxes.
 
-    Raises InputError when the folder cannot be written or there is no such mixture, DeviceError when the
-    device cannot be used.
+    Raises InputError when the folder cannot be written or for an unknown mixture, DeviceError when the device
+    cannot be used.
     """
     begun = time.perf_counter()
     folder = writable_folder(out)
@@ -111,18 +116,21 @@ def run_demo(
     scene = Scene.load(files[0])
     resident = renderer.upload(scene)
 
-    sightings, unexpected, frame_ms, visible, seen = [], [], {}, {}, {}
+    sightings, unexpected, frame_ms, visible, columns = [], [], {}, {}, {}
     for view, camera in demo_views().items():
-        progress(f"drawing and reading: {view}")
-        images, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
-        image = to_uint8(images["rgb"])
+        progress(f"rendering and detecting: {view}")
+        images, frame_ms[view], visible[view] = _render(renderer, resident, scene, camera)
         readings, others = read_back(images, scene, camera)
         sightings += [Sighting(view, reading) for reading in readings]
         unexpected += [code.name for code in others]
-        marked = _marked(image, readings)
-        files += _save(folder, view.replace(" ", "-"), images, marked)
-        seen[view] = (marked, images["depth"], images["normal"])
-    files.append(write_png(folder / "contact-sheet.png", _sheet(seen)))
+        detected = [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
+        outlined = draw_outlines(to_uint8(images["rgb"]), detected)
+        stem = folder / view.replace(" ", "-")
+        for name, image in images.items():
+            files += save_output(name, image, lambda kind, suffix, stem=stem: Path(f"{stem}-{kind}{suffix}"))
+        files.append(write_png(f"{stem}-detection.png", outlined))
+        columns[view] = (outlined, images["depth"], images["normal"])
+    files.append(write_png(folder / "contact-sheet.png", _sheet(columns)))
 
     result = DemoResult(
         device=renderer.device.title,
@@ -140,7 +148,7 @@ def run_demo(
     return result
 
 
-def _draw(
+def _render(
     renderer: Renderer, resident, scene: Scene, camera: Camera
 ) -> tuple[dict[str, np.ndarray], float, int]:
     """Output images, milliseconds of a warm frame, number of splats after culling."""
@@ -151,27 +159,13 @@ def _draw(
     return {name: frame[name] for name in OUTPUTS}, float(np.median(times[1:])), int(frame.stats["visible"])
 
 
-def _marked(image: np.ndarray, readings: list[Reading]) -> np.ndarray:
-    found = [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
-    return draw_outlines(image, found)
-
-
-def _save(folder: Path, stem: str, images: dict[str, np.ndarray], marked: np.ndarray) -> list[Path]:
-    files = [
-        file
-        for name, image in images.items()
-        for file in save_output(name, image, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
-    ]
-    return [*files, write_png(folder / f"{stem}-detection.png", marked)]
-
-
-def _sheet(seen: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+def _sheet(columns: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
     """Contact sheet with a column per view: detections, depth and normals, with keys."""
-    span = depth_span(depth for _, depth, _ in seen.values())
+    span = depth_span(depth for _, depth, _ in columns.values())
     rows = [
-        [(f"{view}: what was read", marked) for view, (marked, _, _) in seen.items()],
-        [(f"{view}: depth", colour_depth(depth, span)) for view, (_, depth, _) in seen.items()],
-        [(f"{view}: normals", colour_normals(normal)) for view, (_, _, normal) in seen.items()],
+        [(f"{view}: what was read", outlined) for view, (outlined, _, _) in columns.items()],
+        [(f"{view}: depth", colour_depth(depth, span)) for view, (_, depth, _) in columns.items()],
+        [(f"{view}: normals", colour_normals(normal)) for view, (_, _, normal) in columns.items()],
     ]
     keys = (lambda height: None, lambda height: depth_key(span, height), normal_key)
     return contact_sheet(rows, width=560, key=lambda row, height: keys[row](height))

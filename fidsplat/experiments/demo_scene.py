@@ -1,8 +1,8 @@
 """Scene of the demo: three signs in a small yard and three views, generated from one seed.
 
 x right, y down, z away; the signs are at z = 0 and face -z. Stones and bricks differ by millimetres in depth,
-since the order of coplanar splats would depend on rounding. Flat things are disks, blooms and bushy shrubs 3D
-Gaussians.
+since the order of coplanar splats would depend on rounding. Splats are disks, those of blooms and bushy
+shrubs 3D Gaussians.
 """
 
 import math
@@ -17,10 +17,9 @@ from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
 
 SKY = (0.70, 0.82, 0.93)
 WIDTH, HEIGHT, FOV_X = 1280, 720, math.radians(60.0)
-GROUND = 0.85  # y of the ground, metres below the middle of the signs
-WALL = 1.6  # z of the wall
+GROUND, WALL = 0.85, 1.6  # y of the ground and z of the wall, metres from the middle of the signs
 
-# spec, edge in metres, where its middle is
+# spec, edge in metres, position
 SIGNS = (
     ("apriltag:36h11:5", 0.40, (-0.72, 0.0, 0.0)),
     ("aruco:4x4_50:7", 0.38, (0.0, 0.0, 0.0)),
@@ -55,9 +54,9 @@ def demo_views() -> dict[str, Camera]:
     """Cameras by name: from the front, from 60 degrees to the side, and past a plant that occludes part of a
     sign."""
 
-    def around(degrees: float, away: float, up: float, target) -> Camera:
-        turn = math.radians(degrees)
-        position = np.add(target, [away * math.sin(turn), -up, -away * math.cos(turn)])
+    def around(degrees: float, distance: float, up: float, target) -> Camera:
+        azimuth = math.radians(degrees)
+        position = np.add(target, [distance * math.sin(azimuth), -up, -distance * math.cos(azimuth)])
         return Camera.look_at(WIDTH, HEIGHT, FOV_X, position, target)
 
     return {
@@ -122,8 +121,8 @@ def _tiles(
     flat = np.concatenate([place, joints])
     before = np.append(random.normal(0, 0.002, len(place)), random.normal(0.01, 0.001, len(joints)))
     means = np.asarray(corner) + flat @ axes[:, :2].T - before[:, None] * axes[:, 2]
-    turns = np.repeat(axes[None], len(flat), 0)
-    return _cloud(means, turns, np.concatenate([spread, widths]), 0.97, colors)
+    rotations = np.repeat(axes[None], len(flat), 0)
+    return _cloud(means, rotations, np.concatenate([spread, widths]), 0.97, colors)
 
 
 def _plants(random: np.random.Generator) -> list[SplatCloud]:
@@ -147,8 +146,8 @@ def _shrub(random: np.random.Generator, middle, axes, leaves: int, bushy, colour
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     means = np.asarray(middle) + direction * np.asarray(axes) * np.cbrt(random.uniform(0.15, 1, (leaves, 1)))
     means[:, 1] = np.minimum(means[:, 1], GROUND - 0.01)
-    turns = np.linalg.qr(random.normal(size=(leaves, 3, 3)))[0]
-    turns *= np.sign(np.linalg.det(turns))[:, None, None]
+    rotations = np.linalg.qr(random.normal(size=(leaves, 3, 3)))[0]
+    rotations *= np.sign(np.linalg.det(rotations))[:, None, None]
     light = 0.75 + 0.35 * (-direction[:, 1:2]) + random.normal(0, 0.08, (leaves, 1))  # brighter on top
     colors = np.asarray(colour) * light
     blooms = np.zeros(leaves, bool)
@@ -158,7 +157,7 @@ def _shrub(random: np.random.Generator, middle, axes, leaves: int, bushy, colour
     scales = min(axes) * random.uniform((0.08, 0.04), (0.14, 0.065), (leaves, 2))
     scales = np.column_stack([scales, 0.5 * scales[:, 1] if bushy else np.zeros(leaves)])
     scales[blooms] = 1.2 * scales[blooms, 1:2]
-    return _cloud(means, turns, scales, 0.92, colors)
+    return _cloud(means, rotations, scales, 0.92, colors)
 
 
 def _post(random: np.random.Generator, sign: PlacedMarker) -> SplatCloud:
@@ -173,6 +172,6 @@ def _post(random: np.random.Generator, sign: PlacedMarker) -> SplatCloud:
     return _cloud(means, facing, np.full((count, 2), 0.014), 0.95, colors)
 
 
-def _cloud(means, turns, scales, opacity: float, colors) -> SplatCloud:
-    quats = np.array([matrix_to_quaternion(turn) for turn in turns])
+def _cloud(means, rotations, scales, opacity: float, colors) -> SplatCloud:
+    quats = np.array([matrix_to_quaternion(rotation) for rotation in rotations])
     return SplatCloud(means, quats, scales, np.full(len(means), opacity), colors=np.clip(colors, 0, 1))

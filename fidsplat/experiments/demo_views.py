@@ -39,41 +39,42 @@ def write_demo_views(
 
     Args:
         views: number of training images; test: number of test images, in the folder test.
-        width: of an image in pixels; the aspect ratio is 16 : 9.
+        width: width of an image in pixels; the aspect ratio is 16 : 9.
 
     Raises:
         InputError: the folder cannot be written; DeviceError: the device cannot be used.
     """
-    place = writable_folder(folder)
+    folder = writable_folder(folder)
     scene, renderer = demo_scene(seed), Renderer(device)
     resident, done = renderer.upload(scene), 0
-    for where, stem, cameras in (
-        (place, "view", _cameras(views, width, 0.0)),
-        (place / "test", "test", _cameras(test, width, 0.5)),
+    for out, stem, cameras in (
+        (folder, "view", _cameras(views, width, 0.0)),
+        (folder / "test", "test", _cameras(test, width, 0.5)),
     ):
-        writable_folder(where / "images")
+        writable_folder(out / "images")
         names = [f"{stem}-{i:02d}.png" for i in range(len(cameras))]
         frames = renderer.render_views(resident, cameras, outputs="rgb", quality="standard,samples=3")
         for name, frame in zip(names, frames, strict=True):
-            write_png(where / "images" / name, frame["rgb"])
+            write_png(out / "images" / name, frame["rgb"])
             done += 1
             if progress is not None:
-                progress("pictures", done / (views + test))
-        save_colmap(where / "sparse" / "0", names, cameras, *_points(scene, seed))
-    # last: it marks a complete data set
-    with atomic_write(place / "dataset.json") as stream:
+                progress("images", done / (views + test))
+        save_colmap(out / "sparse" / "0", names, cameras, *_points(scene, seed))
+    # written last, since it marks a complete data set
+    with atomic_write(folder / "dataset.json") as stream:
         stream.write(json.dumps({"background": scene.background, "seed": seed}).encode())
-    return place
+    return folder
 
 
 def _cameras(count: int, width: int, shift: float) -> list[Camera]:
-    """Cameras on an arc with alternating distances and heights; shift moves them between those of shift 0."""
+    """Cameras on an arc with alternating distances and heights; a shift of 0.5 places them between those
+    without."""
     height = round(width * 9 / 16)
     cameras = []
     for i in range(count):
         angle = _ARC * (2 * (i + shift + 0.25) / count - 1)
-        away, up = 2.2 + 0.3 * math.cos(2.4 * (i + shift)), 0.25 + 0.3 * math.sin(1.7 * (i + shift))
-        offset = (away * math.sin(angle), -up, -away * math.cos(angle))
+        distance, up = 2.2 + 0.3 * math.cos(2.4 * (i + shift)), 0.25 + 0.3 * math.sin(1.7 * (i + shift))
+        offset = (distance * math.sin(angle), -up, -distance * math.cos(angle))
         cameras.append(Camera.look_at(width, height, FOV_X, np.add(_TARGET, offset), _TARGET))
     return cameras
 

@@ -11,7 +11,6 @@ from urllib.parse import quote
 
 from fidsplat import __version__
 from fidsplat.images.files import write_png
-from fidsplat.render.frame import Frame
 from fidsplat.render.output_files import picture_of
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
@@ -66,15 +65,17 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
     renderers: dict[str | None, Renderer] = {}
     parts = []
     for piece in pieces:
-        wanted = device or piece.scene.device
-        if wanted not in renderers:
-            renderers[wanted] = Renderer(wanted)
-        renderer = renderers[wanted]
+        name = device or piece.scene.device
+        if name not in renderers:
+            renderers[name] = Renderer(name)
+        renderer = renderers[name]
         names = piece.scene.capture.outputs
         key = digest_of((piece.scene.content, piece.scene.capture, renderer.device.title, __version__))
         files = [folder / f"{piece.name[:60]}-{name}-{key}.png" for name in names]
         if not all(file.exists() for file in files):
-            _draw(renderer.render(piece.scene), files)
+            frame = renderer.render(piece.scene)
+            for name, file in zip(frame.outputs, files, strict=True):
+                write_png(file, picture_of(name, frame[name]))
         parts.append(_figure(piece, files, renderer.device.title))
         yield files[0]
     with atomic_write(folder / PAGE) as stream:
@@ -82,21 +83,16 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
     yield folder / PAGE
 
 
-def _draw(frame: Frame, files: Sequence[Path]) -> None:
-    for name, file in zip(frame.outputs, files, strict=True):
-        write_png(file, picture_of(name, frame[name]))
-
-
 def _figure(piece: Piece, files: Sequence[Path], device: str) -> str:
-    said = html.escape
+    escape = html.escape
     first, *more = [quote(os.fsencode(file.name)) for file in files]
     markers = ", ".join(placed.marker.spec for placed in piece.scene.markers)
     facts = f"{len(piece.scene.splats):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
     images = "".join(f'<a href="{name}"><img src="{name}" loading="lazy" alt=""></a> ' for name in more)
-    text = f"<details><summary>scene file</summary><pre>{said(piece.text)}</pre></details>"
+    text = f"<details><summary>scene file</summary><pre>{escape(piece.text)}</pre></details>"
     return (
-        f'<figure style="margin:0"><a href="{first}"><img src="{first}" alt="{said(piece.title)}"></a>'
-        f"<figcaption>{said(piece.title)}<p>{said(facts)}</p></figcaption>"
+        f'<figure style="margin:0"><a href="{first}"><img src="{first}" alt="{escape(piece.title)}"></a>'
+        f"<figcaption>{escape(piece.title)}<p>{escape(facts)}</p></figcaption>"
         f'<div class="more">{images}</div>{text if piece.text else ""}</figure>'
     )
 

@@ -12,7 +12,7 @@ from fidsplat.capture.environment import ExternalDepth
 from fidsplat.experiments.plane import plane_image
 from fidsplat.scenes import PlacedMarker
 
-_LEAST = 1 / 512
+_MIN_COVERAGE = 1 / 512
 """minimum share of a pixel that a tag covers"""
 
 
@@ -41,14 +41,14 @@ def tag_depth_image(tags: Iterable[PlacedMarker], camera: Camera, behind: np.nda
         grid, module = tag.marker.grid, tag.marker.module
         light = plane_image(grid, module, part, 0.0, 1.0, 0.0)
         covered = plane_image(np.zeros_like(grid), module, part, 0.0, 1.0, 0.0)
-        far = _depth(pose, part)
-        there = (covered > _LEAST) & (far > 0)
+        tag_depth = _depth(pose, part)
+        inside = (covered > _MIN_COVERAGE) & (tag_depth > 0)
         white, black = tag.marker.palette
-        shown = light[..., None] * white + (covered - light)[..., None] * black
+        color = light[..., None] * white + (covered - light)[..., None] * black
         rows = slice(top, bottom), slice(left, right)
-        mixed = shown + (1 - covered)[..., None] * rgb[rows]
-        rgb[rows] = np.where(there[..., None], mixed, rgb[rows])
-        depth[rows] = np.where(there, far, depth[rows])
+        mixed = color + (1 - covered)[..., None] * rgb[rows]
+        rgb[rows] = np.where(inside[..., None], mixed, rgb[rows])
+        depth[rows] = np.where(inside, tag_depth, depth[rows])
     return ExternalDepth(rgb, depth)
 
 
@@ -56,10 +56,10 @@ def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, i
     """Bounding box (left, top, right, bottom) of a tag at `pose`, camera from marker; None if not visible."""
     height, width = np.array(tag.marker.grid.shape) * tag.marker.module / 2
     corners = np.array([(x, y, 0.0) for x in (-width, width) for y in (-height, height)])
-    seen = corners @ pose[:3, :3].T + pose[:3, 3]
-    if seen[:, 2].min() <= camera.near or pose[:3, 2] @ pose[:3, 3] <= 0:
+    points = corners @ pose[:3, :3].T + pose[:3, 3]
+    if points[:, 2].min() <= camera.near or pose[:3, 2] @ pose[:3, 3] <= 0:
         return None
-    pixels = camera.with_pose(np.eye(4)).project(seen)
+    pixels = camera.with_pose(np.eye(4)).project(points)
     low = np.maximum(np.floor(pixels.min(0)).astype(int), 0)
     high = np.minimum(np.ceil(pixels.max(0)).astype(int), (camera.width, camera.height))
     return (*low.tolist(), *high.tolist()) if (low < high).all() else None

@@ -25,8 +25,9 @@ from fidsplat.util.errors import InputError
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.pose import marker_pose
 from fidsplat.vision.readback import corner_error
+from fidsplat.worlds import robot
 from fidsplat.worlds.greenhouse import AISLE, Greenhouse
-from fidsplat.worlds.robot import BODY, Errors, Run, camera_at, drive
+from fidsplat.worlds.robot import BODY, Errors, Run, camera_at
 
 RATE = 4.0
 """images per second"""
@@ -52,15 +53,15 @@ class Variant:
     ideal: bool = False
     """use the detected tags with ideal corners"""
     texture: bool = False
-    """replace tag splats by the exact mean of the texture per pixel; pinhole camera without exposure time"""
+    """replace tag splats by the exact mean of the texture per pixel (pinhole camera, no exposure time)"""
     reach: float = math.inf
     """maximum distance of tags in metres"""
     speed: float | None = None
     """metres per second; None: that of the experiment"""
 
     @property
-    def taken(self) -> Variant | None:
-        """Key of the rendered images; None without images."""
+    def rendering(self) -> Variant | None:
+        """The variant with equal images and without other changes; None without images."""
         return None if self.mixture is None else replace(self, ideal=False, reach=math.inf)
 
 
@@ -94,7 +95,7 @@ class Drive:
     plants: int = 12
     """Number of plants in each row."""
     seed: int = 0
-    """Seed of the plants and of the sensors' errors."""
+    """Seed of the greenhouse and of the sensors' errors."""
     speed: float = 0.5
     """Speed in metres per second."""
 
@@ -119,54 +120,54 @@ class Drive:
         for aisle in range(self.rows + 1):
             y = (aisle - 0.5) * AISLE
             path += [(x, y) for x in (ends if aisle % 2 == 0 else ends[::-1])]
-        return drive(self.house.mjcf(BODY), np.array(path), speed or self.speed, Errors(seed=self.seed))
+        return robot.drive(self.house.mjcf(BODY), np.array(path), speed or self.speed, Errors(seed=self.seed))
 
     def image_indices(self, run: Run) -> np.ndarray:
         """Indices of the poses with images."""
         return np.unique(np.searchsorted(run.times, np.arange(1 / RATE, run.times[-1], 1 / RATE)))
 
-    def pictures(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
+    def images(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
         """Images (480, 640, 3) uint8 of the drive."""
         scene = replace(self.house, mixture=variant.mixture).scene
         if variant.texture:
             scene = replace(scene, markers=tuple(each for each in scene.markers if each.marker.id is None))
-        plain = Capture(
-            replace(self.camera, lens=variant.lens),
-            background=scene.background,
-            motion=Motion(run.camera.inverse()),
-        )
-        captures = []
-        for k in self.image_indices(run):
-            shutter = Shutter(
-                float(run.times[k]), variant.exposure_time, 5, variant.readout, rows_per_band=30
+        camera, motion = replace(self.camera, lens=variant.lens), Motion(run.camera.inverse())
+        base = Capture(camera, background=scene.background, motion=motion)
+        indices = self.image_indices(run).tolist()
+        captures = [
+            base.with_(
+                shutter=Shutter(
+                    float(run.times[k]), variant.exposure_time, 5, variant.readout, rows_per_band=30
+                ),
+                sensor=None if variant.sensor is None else replace(variant.sensor, seed=k),
             )
-            sensor = None if variant.sensor is None else replace(variant.sensor, seed=int(k))
-            captures.append(plain.with_(shutter=shutter, sensor=sensor))
-        splats, tags = renderer.upload(scene), self.tags
-        for capture, k, frame in zip(
-            captures, self.image_indices(run), renderer.render_views(splats, captures), strict=True
-        ):
+            for k in indices
+        ]
+        resident = renderer.upload(scene)
+        frames = renderer.render_views(resident, captures)
+        for capture, k, frame in zip(captures, indices, frames, strict=True):
             if variant.texture:
-                ideal = tag_depth_image(tags.values(), camera_at(self.camera, run.poses[k]), frame["rgb"])
-                frame = renderer.render(splats, capture.with_(external_depth=ideal))
+                camera = camera_at(self.camera, run.poses[k])
+                ideal = tag_depth_image(self.tags.values(), camera, frame["rgb"])
+                frame = renderer.render(resident, capture.with_(external_depth=ideal))
             yield frame.to_uint8()
 
-    def sightings(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
+    def detections(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
         """Detected tags of each image; detection overlaps with rendering."""
         workers = os.cpu_count() or 1
-        waiting = deque()
+        pending = deque()
         with ThreadPoolExecutor(workers) as pool:
-            for picture in self.pictures(variant, run, renderer):
-                waiting.append(pool.submit(detect, picture, (FAMILY,), qr=False))
-                if len(waiting) > 2 * workers:
-                    yield interrupts.result_of(waiting.popleft())
-            while waiting:
-                yield interrupts.result_of(waiting.popleft())
+            for image in self.images(variant, run, renderer):
+                pending.append(pool.submit(detect, image, (FAMILY,), qr=False))
+                if len(pending) > 2 * workers:
+                    yield interrupts.result_of(pending.popleft())
+            while pending:
+                yield interrupts.result_of(pending.popleft())
 
-    def localised(
+    def localise(
         self,
         run: Run,
-        sightings: list[list[Detection]] | None,
+        detections: list[list[Detection]] | None,
         camera: Camera,
         noise: float = 0.5,
         reach: float = math.inf,
@@ -174,80 +175,76 @@ class Drive:
         """Estimated poses and their errors.
 
         Args:
-            sightings: detected tags of each image; None: no camera.
+            detections: detected tags of each image; None: no camera.
             noise: standard deviation of corners in pixels.
             reach: maximum distance of tags in metres.
         """
         first = run.poses[0]
-        filtered = Localiser(np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]), noise)
-        tags = self.tags
-        at = {} if sightings is None else dict(zip(self.image_indices(run).tolist(), sightings, strict=True))
-        standing = partial(camera_at, camera)
-        poses, seen = [first], 0
+        localiser = Localiser(np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]), noise)
+        by_pose = {} if detections is None else {k: codes for k, codes, _ in self._known(run, detections)}
+        poses, used = [first], 0
         for k in range(1, len(run.times)):
-            filtered.move(run.wheels[k], float(run.gyro[k]), float(run.times[k] - run.times[k - 1]))
-            for tag in at.get(k, []):
-                if tag.id in tags and _away(tag, tags[tag.id], camera) <= reach:
-                    seen += filtered.correct(tag.corners, tags[tag.id].corners, standing)
-            poses.append(filtered.pose)
+            localiser.move(run.wheels[k], float(run.gyro[k]), float(run.times[k] - run.times[k - 1]))
+            for code, tag in by_pose.get(k, []):
+                pose = marker_pose(code.corners, tag.marker.size, camera)
+                if np.linalg.norm(pose[:3, 3]) <= reach:
+                    used += localiser.correct(code.corners, tag.corners, partial(camera_at, camera))
+            poses.append(localiser.pose)
         facts = errors_of(run, np.array(poses))
-        facts |= {"tags": seen, "refused": filtered.rejected}
+        facts |= {"tags": used, "refused": localiser.rejected}
         return Trajectory(run.times, np.array(poses)), facts
 
-    def ideal(self, run: Run, sightings: list[list[Detection]]) -> list[list[Detection]]:
+    def _known(
+        self, run: Run, detections: list[list[Detection]]
+    ) -> Iterator[tuple[int, list[tuple[Detection, PlacedMarker]], np.ndarray]]:
+        """Index of the pose, detections with their tags, and pose of the robot, for each image."""
+        for k, codes in zip(self.image_indices(run).tolist(), detections, strict=True):
+            yield k, [(code, self.tags[code.id]) for code in codes if code.id in self.tags], run.poses[k]
+
+    def ideal_corners(self, run: Run, detections: list[list[Detection]]) -> list[list[Detection]]:
         """The detected tags with ideal corners."""
-        tags, found = self.tags, []
-        for k, codes in zip(self.image_indices(run).tolist(), sightings, strict=True):
-            camera = camera_at(self.camera, run.poses[k])
-            known = [(code, tags[code.id]) for code in codes if code.id is not None and code.id in tags]
-            found.append([replace(code, corners=camera.project(tag.corners)) for code, tag in known])
-        return found
+        return [
+            [replace(code, corners=camera_at(self.camera, pose).project(tag.corners)) for code, tag in pairs]
+            for _, pairs, pose in self._known(run, detections)
+        ]
 
     def corner_errors(
-        self, run: Run, sightings: list[list[Detection]], camera: Camera
+        self, run: Run, detections: list[list[Detection]], camera: Camera
     ) -> list[dict[str, Any]]:
         """Number of detected tags and median corner error (root mean square per tag, pixels) by bin of
         `DISTANCES`."""
-        tags, found = self.tags, []
-        for k, codes in zip(self.image_indices(run).tolist(), sightings, strict=True):
-            standing = camera_at(camera, run.poses[k])
-            for code in codes:
-                if code.id in tags:
-                    away = np.linalg.norm(tags[code.id].pose[:3, 3] - standing.position)
-                    off = corner_error(code, standing.project(tags[code.id].corners))
-                    found.append((int(np.searchsorted(DISTANCES, away)), off))
-        return [
-            {"tags": len(own), "median_px": float(np.median(own)) if own else None}
-            for own in ([off for place, off in found if place == k] for k in range(len(DISTANCES) + 1))
-        ]
-
-
-def _away(tag: Detection, placed: PlacedMarker, camera: Camera) -> float:
-    """Distance of a tag in metres, from its corners."""
-    return float(np.linalg.norm(marker_pose(tag.corners, placed.marker.size, camera)[:3, 3]))
+        errors: list[list[float]] = [[] for _ in range(len(DISTANCES) + 1)]
+        for _, pairs, pose in self._known(run, detections):
+            at = camera_at(camera, pose)
+            for code, tag in pairs:
+                distance = np.linalg.norm(tag.pose[:3, 3] - at.position)
+                error = corner_error(code, at.project(tag.corners))
+                errors[np.searchsorted(DISTANCES, distance)].append(error)
+        return [{"tags": len(own), "median_px": float(np.median(own)) if own else None} for own in errors]
 
 
 def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
     """Errors of estimated poses (n, 4, 4): ATE without alignment (root mean square and worst) and RPE over a
     metre (root mean square), in metres on the floor; heading in degrees."""
-    off = np.linalg.norm(poses[:, :2, 3] - run.poses[:, :2, 3], axis=1)
-    turn = np.einsum("nji,njk->nik", run.poses[:, :3, :3], poses[:, :3, :3])
-    heading = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
-    gone = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(run.poses[:, :2, 3], axis=0), axis=1))])
-    after = np.searchsorted(gone, gone + 1.0)
-    pairs = np.flatnonzero(after < len(gone))
-    steps = [np.linalg.inv(each[pairs]) @ each[after[pairs]] for each in (run.poses, poses)]
-    relative = (np.linalg.inv(steps[0]) @ steps[1])[:, :2, 3]
+    distance = np.linalg.norm(poses[:, :2, 3] - run.poses[:, :2, 3], axis=1)
+    rotation = np.einsum("nji,njk->nik", run.poses[:, :3, :3], poses[:, :3, :3])
+    heading = np.degrees(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
+    steps = np.linalg.norm(np.diff(run.poses[:, :2, 3], axis=0), axis=1)
+    travelled = np.concatenate([[0], np.cumsum(steps)])
+    after = np.searchsorted(travelled, travelled + 1.0)
+    pairs = np.flatnonzero(after < len(travelled))
+    true, estimated = (np.linalg.inv(each[pairs]) @ each[after[pairs]] for each in (run.poses, poses))
+    relative = (np.linalg.inv(true) @ estimated)[:, :2, 3]
     return {
-        "ate_m": float(np.sqrt((off**2).mean())),
-        "worst_m": float(off.max()),
+        "ate_m": float(np.sqrt((distance**2).mean())),
+        "worst_m": float(distance.max()),
         "rpe_m": float(np.sqrt((relative**2).sum(1).mean())) if len(pairs) else 0.0,
         "heading_deg": float(np.sqrt((heading**2).mean())),
     }
 
 
 def write_log(
-    asked: Drive, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
+    drive: Drive, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
 ) -> Iterator[np.ndarray]:
     """Write the drive of a variant as a log: JPEG images, intrinsics, detections, gyroscope, camera poses
     (/tf) and estimated poses (/odom). Yields the logged images.
@@ -259,19 +256,19 @@ def write_log(
     variant = VARIANTS[name]
     if variant.mixture is None:
         raise InputError(f"a logged variant must have images, e.g. exact, got {name!r}")
-    run = asked.run()
-    indices, camera = asked.image_indices(run), replace(asked.camera, lens=variant.lens)
-    sightings = []
+    run = drive.run()
+    indices, camera = drive.image_indices(run), replace(drive.camera, lens=variant.lens)
+    detections = []
     with RobotLog(path, overwrite=overwrite, source=source) as log:
-        for k, picture in zip(indices.tolist(), asked.pictures(variant, run, renderer), strict=True):
-            time, codes = float(run.times[k]), detect(picture, (FAMILY,), qr=False)
-            sightings.append(codes)
-            log.image(time, CAMERA, picture, compress="jpeg")
+        for k, image in zip(indices.tolist(), drive.images(variant, run, renderer), strict=True):
+            time, codes = float(run.times[k]), detect(image, (FAMILY,), qr=False)
+            detections.append(codes)
+            log.image(time, CAMERA, image, compress="jpeg")
             log.camera_info(time, CAMERA, camera)
             log.transform(time, CAMERA, run.camera.poses[k])
             log.detections(time, CAMERA, codes)
-            yield picture
-        path_taken, _ = asked.localised(run, sightings, camera)
+            yield image
+        estimate, _ = drive.localise(run, detections, camera)
         for k, time in enumerate(run.times.tolist()):
             log.imu(time, (0, 0, run.gyro[k]), frame="base_link")
-            log.odometry(time, path_taken.poses[k])
+            log.odometry(time, estimate.poses[k])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,10 @@ from fidsplat.experiments.charts import COLOURS, chart, legend_above
 from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Drive, Variant
 from fidsplat.experiments.pages import fixed, write_page
 from fidsplat.experiments.summary import Frame
-from fidsplat.experiments.sweep import Key, Results, Sweep
+from fidsplat.experiments.sweep import Key, Results, Sweep, Work
 from fidsplat.formats import load_trajectory, save_trajectory
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.errors import InputError, unknown
-from fidsplat.util.files import writable_folder
 from fidsplat.util.provenance import run_facts
 from fidsplat.vision.detect import Detection
 from fidsplat.worlds.robot import Run
@@ -28,7 +28,9 @@ from fidsplat.worlds.robot import Run
 RESULTS, REPORT, CHART = "localise.jsonl", "localise.md", "localise.svg"
 Found = Mapping[str, Mapping[str, Any]]
 """results by variant"""
-_SHOWN = ("odometry", "paper", "exact")
+Progress = Callable[[str, float], object]
+"""called with the name of a variant and the completed share of its images"""
+_PLOTTED = ("odometry", "paper", "exact")
 """variants with a plotted trajectory"""
 _SPANS = (
     f"to {DISTANCES[0]:g} m",
@@ -39,15 +41,13 @@ _SPANS = (
 
 def drive_sweep(
     out: Path,
-    asked: Drive,
+    drive: Drive,
     names: Sequence[str],
     renderer: Renderer,
-    tell: Callable[[str, float], object],
+    progress: Progress,
     overwrite: bool = False,
 ) -> Sweep:
-    """Sweep over the variants of these names.
-
-    tell: called with a variant's name and the share of its pictures that is done.
+    """Sweep over variants by name.
 
     Raises:
         InputError: an unknown name; the folder holds results of another greenhouse, device or code, or cannot
@@ -56,59 +56,52 @@ def drive_sweep(
     for name in names:
         if name not in VARIANTS:
             raise InputError(unknown("variant", name, VARIANTS))
-    facts = run_facts(renderer.device.title, asked.seed)
-    facts |= {"scene": {"rows": asked.rows, "plants": asked.plants, "speed": asked.speed}}
-    results = Results(writable_folder(out) / RESULTS, facts, overwrite)
-    drive = _Drive(out, asked, renderer, tell)
-    return Sweep("drive", results, [{"variant": name} for name in names], drive.begin)
+    facts = run_facts(renderer.device.title, drive.seed)
+    facts |= {"scene": {"rows": drive.rows, "plants": drive.plants, "speed": drive.speed}}
+    results = Results(out / RESULTS, facts, overwrite)
 
+    @cache
+    def run_at(speed: float | None) -> Run:
+        """A drive; its ground truth is saved with the results."""
+        run = drive.run(speed)
+        save_trajectory(Trajectory(run.times, run.poses), out / _tum(_truth(speed)))
+        return run
 
-class _Drive:
-    """Measurement of variants; shared drives and detections are cached."""
+    detected: dict[Variant, list[list[Detection]]] = {}
 
-    def __init__(
-        self, folder: Path, asked: Drive, renderer: Renderer, tell: Callable[[str, float], object]
-    ) -> None:
-        self._folder, self._asked, self._renderer, self._tell = folder, asked, renderer, tell
-        self._runs: dict[float | None, Run] = {}
-        self._seen: dict[Variant, list[list[Detection]]] = {}
+    def detections(name: str, rendering: Variant, run: Run) -> list[list[Detection]]:
+        if rendering not in detected:
+            found, count = [], len(drive.image_indices(run))
+            for codes in drive.detections(rendering, run, renderer):
+                found.append(codes)
+                progress(name, len(found) / count)
+            detected[rendering] = found
+        return detected[rendering]
 
-    def begin(self, key: Key) -> Callable[[], dict[str, Any]]:
-        """Render and detect for a variant; returns the estimation as work."""
+    def begin(key: Key) -> Work:
+        """Render and detect for a variant; returns the estimation."""
         name = key["variant"]
         variant = VARIANTS[name]
-        run = self._driven(variant.speed)
-        sightings = None if variant.taken is None else self._sightings(name, variant.taken, run)
-        return lambda: self._localised(name, variant, run, sightings)
+        run = run_at(variant.speed)
+        rendering = variant.rendering
+        codes = None if rendering is None else detections(name, rendering, run)
+        return partial(_estimate, out / _tum(name), drive, variant, run, codes)
 
-    def _driven(self, speed: float | None) -> Run:
-        """A drive; its ground truth is saved with the results."""
-        if speed not in self._runs:
-            run = self._runs[speed] = self._asked.run(speed)
-            save_trajectory(Trajectory(run.times, run.poses), self._folder / _tum(_truth(speed)))
-        return self._runs[speed]
+    return Sweep("drive", results, [{"variant": name} for name in names], begin)
 
-    def _sightings(self, name: str, taken: Variant, run: Run) -> list[list[Detection]]:
-        if taken not in self._seen:
-            found, count = [], len(self._asked.image_indices(run))
-            for codes in self._asked.sightings(taken, run, self._renderer):
-                found.append(codes)
-                self._tell(name, len(found) / count)
-            self._seen[taken] = found
-        return self._seen[taken]
 
-    def _localised(
-        self, name: str, variant: Variant, run: Run, sightings: list[list[Detection]] | None
-    ) -> dict[str, Any]:
-        asked, camera = self._asked, replace(self._asked.camera, lens=variant.lens)
-        if variant.ideal and sightings is not None:
-            sightings = asked.ideal(run, sightings)
-        noise = 0.05 if variant.ideal else 0.5
-        path, facts = asked.localised(run, sightings, camera, noise, variant.reach)
-        if sightings is not None:
-            facts["corners"] = asked.corner_errors(run, sightings, camera)
-        save_trajectory(path, self._folder / _tum(name))
-        return facts | {"length_m": run.length}
+def _estimate(
+    file: Path, drive: Drive, variant: Variant, run: Run, detections: list[list[Detection]] | None
+) -> dict[str, Any]:
+    """Write the estimated trajectory of a variant; returns its errors."""
+    camera = replace(drive.camera, lens=variant.lens)
+    if variant.ideal and detections is not None:
+        detections = drive.ideal_corners(run, detections)
+    path, facts = drive.localise(run, detections, camera, 0.05 if variant.ideal else 0.5, variant.reach)
+    if detections is not None:
+        facts["corners"] = drive.corner_errors(run, detections, camera)
+    save_trajectory(path, file)
+    return facts | {"length_m": run.length}
 
 
 def found_of(results: Results) -> dict[str, dict[str, Any]]:
@@ -118,7 +111,7 @@ def found_of(results: Results) -> dict[str, dict[str, Any]]:
 
 def table_of(found: Found) -> Frame:
     """Table row of each variant: errors in centimetres, degrees and pixels, and tags."""
-    unseen = [{"median_px": None}] * len(_SPANS)
+    no_corners = [{"median_px": None}] * len(_SPANS)
     return pd.DataFrame(
         {
             "": name,
@@ -131,18 +124,18 @@ def table_of(found: Found) -> Frame:
         }
         | {
             f"[px] {span}": fixed(corners["median_px"], 3)
-            for span, corners in zip(_SPANS, facts.get("corners", unseen), strict=True)
+            for span, corners in zip(_SPANS, facts.get("corners", no_corners), strict=True)
         }
         for name, facts in found.items()
     )
 
 
-def write_report(folder: Path, asked: Drive, device: str, found: Found) -> Path:
+def write_report(folder: Path, drive: Drive, device: str, found: Found) -> Path:
     """Write the report and its chart."""
-    _draw(folder, found)
+    _write_chart(folder, found)
     context = {
         "length": next(iter(found.values()))["length_m"],
-        "rows": asked.rows,
+        "rows": drive.rows,
         "rate": RATE,
         "device": device,
         "table": table_of(found),
@@ -152,10 +145,10 @@ def write_report(folder: Path, asked: Drive, device: str, found: Found) -> Path:
     return folder / REPORT
 
 
-def _draw(folder: Path, found: Found) -> None:
+def _write_chart(folder: Path, found: Found) -> None:
     """Chart of true and estimated trajectories, and of the errors of all variants."""
     errors = {name: 100 * facts["ate_m"] for name, facts in found.items()}
-    shown = [name for name in _SHOWN if name in errors]
+    shown = [name for name in _PLOTTED if name in errors]
     with chart(folder / CHART, panels=2, size=(11.0, 4.6), one_scale=False) as (figure, axes):
         # the drive at the default speed, or that of the first measured variant
         speeds = [VARIANTS[name].speed for name in found]

@@ -1,10 +1,10 @@
 """Ideal image of a printed plane: each pixel is the exact mean of the texture over its square.
 
-A texture of square modules is constant but for jumps across module edges. In a pinhole image an edge is
-a straight segment, so by Green's theorem a pixel's mean is a sum over the segments that cross it or pass on
-its left: each segment is cut where it crosses the lines between pixels, and each piece adds its jump times
-its height times the share of its pixel that lies to its right (as exact rasterisers of fonts do). Nothing is
-sampled: the result is right to the rounding of float64.
+Analytic antialiasing, as in rasterisers of fonts. A texture of square modules is constant except for jumps
+across module edges, which are straight segments in a pinhole image. By Green's theorem the mean of a pixel is
+a sum over the segments that cross it or pass on its left: segments are cut at pixel borders, and each piece
+adds its jump times its height times the share of the pixel to its right. Nothing is sampled; the result is
+exact up to rounding in float64.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def plane_image(
         grid: (h, w) uint8, 1 = dark, quiet zone included.
         module: edge of a module in metres.
         camera: the complete plane must be beyond its near distance.
-        dark, light, background: values of dark modules, light modules and the background, which are averaged:
-            display values or linear light.
+        dark, light, background: values of dark modules, light modules and the background, as display values
+            or linear light.
 
     Returns (height, width) float64.
 
@@ -40,17 +40,15 @@ def plane_image(
     offset = np.array([grid.shape[1], grid.shape[0]]) / 2
     begin, end = (_project((points - offset) * module, camera) for points in (start, stop))
     # from behind, right and left are swapped
-    turn = np.linalg.det(camera.world_to_camera[:3, [0, 1, 3]])
-    picture = _accumulate(begin, end, jump * np.sign(turn), (camera.height, camera.width))
-    return background + picture
+    side = np.sign(np.linalg.det(camera.world_to_camera[:3, [0, 1, 3]]))
+    return background + _accumulate(begin, end, jump * side, (camera.height, camera.width))
 
 
 def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Segments (n, 2) and (n, 2) in modules between modules of different value, and by how much the value on
-    the right of their direction (y down) exceeds that on the left.
+    """Segments (n, 2) and (n, 2) in modules between modules of different value, and the value on the right of
+    their direction (y down) minus that on the left.
 
-    Segments run down along vertical lines and to the left along horizontal ones; runs of equal jumps are one
-    segment.
+    Segments point down on vertical lines and left on horizontal ones; runs of equal jumps are one segment.
     """
     value = np.pad(paper - contrast * np.asarray(grid, np.float64), 1)  # background: 0
     across = np.diff(value, axis=1)[1:-1]  # at vertical lines, from left to right
@@ -61,7 +59,7 @@ def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray,
         found = runs(jumps.T)
         line, first, last, size = (each[found[3] != 0] for each in found)
         a, b = np.stack([line, first], 1), np.stack([line, last], 1)
-        # an edge that has the larger value to the right of "downwards" has it on the left of "rightwards"
+        # the right of a segment that points down is the left of one that points right
         parts.append((a[:, ::-1], b[:, ::-1], -size) if swapped else (a, b, size))
     start, stop, jump = (np.concatenate(column) for column in zip(*parts, strict=True))
     return start.astype(np.float64), stop.astype(np.float64), jump

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.blender import camera_facts, drawn, ready
+from fidsplat.experiments.blender import image_job, ready, run_worker
 from fidsplat.formats import save_ply
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.render.renderer import Renderer
@@ -26,16 +25,17 @@ from fidsplat.util.provenance import code_hash
 from fidsplat.worlds.plants import GOLDEN, KINDS, Mesh
 
 BACKGROUND = (0.9, 0.2, 0.9)
-"""background of training, a colour that no plant has, so that holes are visible"""
+"""background of training, unlike any plant, so that holes are visible"""
 WORKER = Path(__file__).with_name("blender_plants.py")
-NOTE = "plants.json"
+SETTINGS = "plants.json"
 HEIGHT, FOCAL = 320, 480.0
 """height and focal length of the images in pixels"""
 _LOW, _HIGH = math.radians(-15), math.radians(60)
 """range of camera elevations"""
-_FAINT = 0.05
+_MIN_OPACITY = 0.05
 """minimum opacity of trained splats"""
-Tell = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
+"""called with the name of a step and the completed share"""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class PlantSettings:
                 raise InputError(unknown("kind of plant", kind, KINDS))
         ranges = {"each": (1, 1000), "views": (2, 1000), "test": (1, 1000), "samples": (1, 10_000)}
         ranges |= {"splats": (100, 1_000_000), "iterations": (0, 1_000_000), "seed": (0, 2**32 - 1)}
-        for name, (least, most) in ranges.items():
-            whole_number(f"plants: {name}", getattr(self, name), least, most)
+        for name, (low, high) in ranges.items():
+            whole_number(f"plants: {name}", getattr(self, name), low, high)
 
     @property
     def names(self) -> list[tuple[str, int]]:
@@ -79,68 +79,66 @@ class PlantSettings:
 
 
 def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:
-    """Cameras on a spiral around a plant, from below to far above; shift moves them between those of shift
-    0."""
+    """Cameras on a spiral around a mesh, from below to far above; a shift of 0.5 places them between those
+    without."""
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    off = mesh.vertices - middle
-    reach, aside = (float(np.linalg.norm(part, axis=1).max()) for part in (off, off[:, :2]))
-    away = 1.01 * reach * math.hypot(1, 2 * FOCAL / HEIGHT)  # its bounding sphere fills the height
-    width = min(HEIGHT, 2 * math.ceil(FOCAL * aside / (away - reach)))
+    offsets = mesh.vertices - middle
+    radius, side = (float(np.linalg.norm(part, axis=1).max()) for part in (offsets, offsets[:, :2]))
+    distance = 1.01 * radius * math.hypot(1, 2 * FOCAL / HEIGHT)  # the bounding sphere fills the height
+    width = min(HEIGHT, 2 * math.ceil(FOCAL * side / (distance - radius)))
+    fov = 2 * math.atan(width / 2 / FOCAL)
     found = []
     for i in range(count):
-        rise = _LOW + (_HIGH - _LOW) * (i + 0.5) / count
-        turn = GOLDEN * (i + shift)
-        ray = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
-        fov = 2 * math.atan(width / 2 / FOCAL)
-        found.append(Camera.look_at(width, HEIGHT, fov, middle + away * ray, middle, (0, 0, 1)))
+        elevation, azimuth = _LOW + (_HIGH - _LOW) * (i + 0.5) / count, GOLDEN * (i + shift)
+        flat = math.cos(elevation)
+        ray = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
+        found.append(Camera.look_at(width, HEIGHT, fov, middle + distance * ray, middle, (0, 0, 1)))
     return found
 
 
 def write_plants(
-    wanted: PlantSettings,
+    settings: PlantSettings,
     folder: Path,
     environment: Path,
     device: str | None = None,
-    tell: Tell = lambda words, share: None,
+    progress: Progress = lambda step, share: None,
 ) -> Iterator[tuple[Path, float | None]]:
     """Make missing plants: yields each PLY file, and the mean PSNR of held-out views if it was trained now.
 
     Args:
-        folder: for KIND-NUMBER.ply, and folders KIND-NUMBER of images.
-        environment: of `fidsplat.experiments.blender.install`.
-        tell: called with the step and the completed share.
+        folder: folder for KIND-NUMBER.ply, and for KIND-NUMBER with the images.
+        environment: folder of `fidsplat.experiments.blender.install`.
 
     Raises:
-        InputError: Blender is not installed, or the folder holds plants of other numbers or sources.
-        DeviceError: Blender fails; finished images stay.
+        InputError: Blender is not installed, or the folder holds plants of other settings or sources.
+        DeviceError: Blender fails; complete images stay.
     """
-    python = ready("standard", environment) if wanted.iterations else None
-    _note(wanted, writable_folder(folder))
-    renderer = Renderer(device) if wanted.iterations else None
-    for done, (kind, number) in enumerate(wanted.names):
+    python = ready("standard", environment) if settings.iterations else None
+    _record(settings, writable_folder(folder))
+    renderer = Renderer(device) if settings.iterations else None
+    for done, (kind, number) in enumerate(settings.names):
         file = folder / f"{kind}-{number}.ply"
 
-        def part(words: str, share: float, name: str = file.stem, done: int = done) -> None:
-            tell(f"{name}: {words}", (done + share) / len(wanted.names))
+        def report(step: str, share: float, name: str = file.stem, done: int = done) -> None:
+            progress(f"{name}: {step}", (done + share) / len(settings.names))
 
-        part("mesh", 0.0)
+        report("mesh", 0.0)
         score = None
         if not file.exists():
-            mesh = wanted.mesh(kind, number)
+            mesh = settings.mesh(kind, number)
             if python is None or renderer is None:
-                save_ply(mesh.splats(wanted.splats, wanted.seed), file)
+                save_ply(mesh.splats(settings.splats, settings.seed), file)
             else:
-                place = folder / file.stem
-                _draw(wanted, mesh, place, python, part)
-                score = _train(wanted, mesh, place, file, renderer, part)
+                _render(settings, mesh, folder / file.stem, python, report)
+                score = _train(settings, mesh, folder / file.stem, file, renderer, report)
         yield file, score
 
 
-def _note(wanted: PlantSettings, folder: Path) -> None:
-    """Check and record the settings of the plants of a folder."""
-    file = folder / NOTE
+def _record(settings: PlantSettings, folder: Path) -> None:
+    """Check and record the settings of a folder."""
+    file = folder / SETTINGS
     # plants may be added later
-    own = {name: value for name, value in asdict(wanted).items() if name not in ("kind", "each")}
+    own = {name: value for name, value in asdict(settings).items() if name not in ("kind", "each")}
     own["sources"] = code_hash()
     try:
         before = from_json(read_text(file)) if file.exists() else own
@@ -152,66 +150,53 @@ def _note(wanted: PlantSettings, folder: Path) -> None:
         stream.write(json.dumps(own).encode())
 
 
-def _draw(wanted: PlantSettings, mesh: Mesh, place: Path, python: Path, tell: Tell) -> None:
-    """Write the data set of a plant; existing images stay."""
-    views, shots = [], []
+def _render(settings: PlantSettings, mesh: Mesh, out: Path, python: Path, progress: Progress) -> None:
+    """Write the data set of a mesh; existing images stay."""
+    sets, images = [], []
     for folder, stem, cameras in (
-        (place, "view", cameras_around(mesh, wanted.views)),
-        (place / "test", "test", cameras_around(mesh, wanted.test, 0.5)),
+        (out, "view", cameras_around(mesh, settings.views)),
+        (out / "test", "test", cameras_around(mesh, settings.test, 0.5)),
     ):
         names = [f"{stem}-{i:03d}.png" for i in range(len(cameras))]
-        views.append((folder, names, cameras))
-        files = [str((folder / "images" / name).absolute()) for name in names]
-        shots += [{"file": f, **camera_facts(c)} for f, c in zip(files, cameras, strict=True)]
-    plant = {
-        "name": place.name,
-        "vertices": mesh.vertices.tolist(),
-        "quads": mesh.quads.tolist(),
-        "colors": mesh.colors.tolist(),
-        "shots": shots,
-    }
-    job = {
-        "view": "standard",
-        "samples": wanted.samples,
-        "filter": "BOX",
-        "threads": os.cpu_count() or 1,
-        "background": 0.9,
-    }
-    for done, _ in enumerate(drawn(python, WORKER, [plant], job)):
-        tell("Blender", 0.5 * (done + 1) / len(shots))
-    disks = mesh.splats(wanted.splats, wanted.seed)
+        sets.append((folder, names, cameras))
+        images += [image_job(folder / "images" / name, c) for name, c in zip(names, cameras, strict=True)]
+    arrays = {name: getattr(mesh, name).tolist() for name in ("vertices", "quads", "colors")}
+    job = {"view": "standard", "samples": settings.samples, "filter": "BOX", "background": 0.9}
+    worker = run_worker(python, WORKER, [{"name": out.name, "images": images, **arrays}], job)
+    for done, _ in enumerate(worker, 1):
+        progress("Blender", 0.5 * done / len(images))
+    disks = mesh.splats(settings.splats, settings.seed)
     assert disks.colors is not None  # meshes have plain colours
     points, colors = disks.world_means(), np.rint(255 * disks.colors).astype(np.uint8)
-    for folder, names, cameras in views:
+    for folder, names, cameras in sets:
         save_colmap(folder / "sparse" / "0", names, cameras, points, colors)
-    with atomic_write(place / "dataset.json") as stream:
-        stream.write(json.dumps({"background": BACKGROUND, "seed": wanted.seed}).encode())
+    with atomic_write(out / "dataset.json") as stream:
+        stream.write(json.dumps({"background": BACKGROUND, "seed": settings.seed}).encode())
 
 
 def _train(
-    wanted: PlantSettings, mesh: Mesh, place: Path, file: Path, renderer: Renderer, tell: Tell
+    settings: PlantSettings, mesh: Mesh, folder: Path, file: Path, renderer: Renderer, progress: Progress
 ) -> float:
     """Train on the images from disks on the mesh, and write the visible splats; returns the mean test
     PSNR."""
-    settings = TrainSettings(
-        iterations=wanted.iterations,
-        seed=wanted.seed,
+    training = TrainSettings(
+        iterations=settings.iterations,
+        seed=settings.seed,
         sh_degree=0,  # plants are rotated, with light from above
         densify_until=0,
-        position_steps=wanted.iterations,
+        position_steps=settings.iterations,
     )
-    dataset = load_dataset(place)
-    start = mesh.splats(wanted.splats, wanted.seed)
-    trainer = Trainer(dataset, renderer, settings, place / "training.npz", start)
+    start = mesh.splats(settings.splats, settings.seed)
+    trainer = Trainer(load_dataset(folder), renderer, training, folder / "training.npz", start)
 
-    def step(made: Step) -> None:
-        tell(f"training, {made.psnr:.1f} dB", 0.5 + 0.5 * made.iteration / wanted.iterations)
+    def report(step: Step) -> None:
+        progress(f"training, {step.psnr:.1f} dB", 0.5 + 0.5 * step.iteration / settings.iterations)
 
-    trainer.run(step)
+    trainer.run(report)
     score = float(np.mean([view.psnr for view in trainer.evaluate()]))
     cloud = trainer.cloud()
     assert cloud.sh is not None  # trainers make SH
-    seen = cloud.opacities > _FAINT
-    parts = (getattr(cloud, name)[seen] for name in ("means", "quats", "scales", "opacities"))
-    save_ply(SplatCloud(*parts, sh=cloud.sh[seen], origin=cloud.origin), file)
+    rows = cloud.opacities > _MIN_OPACITY
+    arrays = (getattr(cloud, name)[rows] for name in ("means", "quats", "scales", "opacities"))
+    save_ply(SplatCloud(*arrays, sh=cloud.sh[rows], origin=cloud.origin), file)
     return score

@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 
 from fidsplat.experiments import angles, counts, localisation, trained, views
-from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.summary import Summary, join, read_summary, summarise
-from fidsplat.experiments.sweep import Key, Record, folder_records
+from fidsplat.experiments.sweep import Record, folder_records
 from fidsplat.util.errors import InputError
 
-ALLOWED_GAP = {"exact": 0.2, "fitted": 1.0}
-"""allowed gap below the limit of the ideal texture in degrees, by mixture"""
-NEVER = 90.0
-"""gap in degrees of a code that is never read"""
 Rows = Iterator[dict[str, Any]]
-Hits = dict[float, str]
-"""tilt -> "1" if the code was found or read, else "0\""""
-Ideals = dict[tuple, dict[str, Hits]]
-"""protocol and marker -> readings of the ideal texture by detector"""
 
 
 class Kind(NamedTuple):
@@ -49,8 +39,7 @@ def load(folders: Sequence[Path]) -> dict[str, Summary]:
         summaries = [read_summary(file) for folder in folders if (file := folder / f"{name}.csv").is_file()]
         try:
             if records:
-                rows_of = partial(_angles_rows, _ideals(records)) if name == angles.NAME else kind.rows
-                summaries.insert(0, summarise(records, rows_of, (*kind.keys, "amount", *kind.columns)))
+                summaries.insert(0, summarise(records, kind.rows, (*kind.keys, "amount", *kind.columns)))
             if summaries:
                 found[name] = join(summaries, kind.keys)
                 rows = found[name].rows
@@ -80,61 +69,14 @@ def _counts_rows(record: Record) -> Rows:
         yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
 
 
-def _hits(record: Record, name: str) -> dict[str, Hits]:
-    """`found` or `read` by detector."""
-    tilts = angles.parse_tilts(record.key["tilts"])
-    readers = record.result["readers"].items()
-    return {reader: dict(zip(tilts, found[name], strict=True)) for reader, found in readers}
-
-
-def _ideals(records: Iterable[Record]) -> Ideals:
-    """Readings of the ideal texture by protocol and marker, from the longest scan."""
-    found: Ideals = {}
-    for record in records:
-        if record.key["method"] == IDEAL:
-            known = found.setdefault(_marker_of(record.key), {})
-            for reader, hits in _hits(record, "read").items():
-                known[reader] = max(hits, known.get(reader, hits), key=len)
-    return found
-
-
-def _marker_of(key: Key) -> tuple:
-    return key["protocol"], key["category"], key["index"]
-
-
-def _angles_rows(ideals: Ideals, record: Record) -> Rows:
-    key, found = record.key, _hits(record, "found")
-    for reader, read in _hits(record, "read").items():
+def _angles_rows(record: Record) -> Rows:
+    key, tilts = record.key, angles.parse_tilts(record.key["tilts"])
+    for reader, hits in record.result["readers"].items():
         row = {"protocol": key["protocol"], "category": key["category"], "marker": key["index"]}
-        row |= {"method": key["method"], "reader": reader, "amount": len(read), "tilts": key["tilts"]}
-        row["found"], row["found_all"] = _largest(found[reader])
-        row["read"], row["read_all"] = _largest(read)
-        ideal = ideals.get(_marker_of(key), {}).get(reader)
-        yield row if ideal is None else row | _gap(read, ideal, key["method"])
-
-
-def _largest(hits: Hits) -> tuple[float | None, float | None]:
-    return angles.largest(list(hits), "".join(hits.values()))
-
-
-def _gap(read: Hits, ideal: Hits, method: str) -> dict[str, float | None]:
-    """Gap between a scan and that of the ideal texture, on common tilts.
-
-    Returns `behind`, `behind_all`: degrees by which the largest readable tilt, and the largest without a
-    miss, are below the ideal's; `NEVER` without any, None where the ideal has none. `missed` of `below`:
-    unread tilts, up to the allowed gap below the largest one without a miss of the ideal.
-    """
-    tilts = sorted(set(read) & set(ideal))
-    ours, theirs = ({tilt: hits[tilt] for tilt in tilts} for hits in (read, ideal))
-    row: dict[str, float | None] = {}
-    for name, own, ceiling in zip(("behind", "behind_all"), _largest(ours), _largest(theirs), strict=True):
-        row[name] = None if ceiling is None else NEVER if own is None else ceiling - own
-    ceiling = _largest(theirs)[1]
-    if ceiling is not None:
-        limit = ceiling - ALLOWED_GAP.get(method.partition("/")[0], 0.0) + 1e-6
-        below = [hit for tilt, hit in ours.items() if tilt <= limit]
-        row |= {"missed": below.count("0"), "below": len(below)}
-    return row
+        row |= {"method": key["method"], "reader": reader, "amount": len(tilts), "tilts": key["tilts"]}
+        for name in ("found", "read"):
+            row[name], row[f"{name}_all"] = angles.largest(tilts, hits[name])
+        yield row
 
 
 def _views_rows(record: Record) -> Rows:
@@ -182,8 +124,8 @@ KINDS = {
     ),
     angles.NAME: Kind(
         ("protocol", "category", "marker", "method", "reader"),
-        ("found", "found_all", "read", "read_all", "behind", "behind_all", "missed", "below"),
-        partial(_angles_rows, {}),
+        ("found", "found_all", "read", "read_all"),
+        _angles_rows,
     ),
     views.NAME: Kind(
         ("truth", "category", "method", "marker"), ("psnr", "ssim", "flip", "lpips"), _views_rows

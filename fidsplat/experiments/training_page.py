@@ -16,8 +16,8 @@ from fidsplat.images.files import write_png
 from fidsplat.train import Trainer, TrainingView, ViewScore
 from fidsplat.util.provenance import run_facts
 
-PICTURES = 4
-"""maximum number of views"""
+MAX_VIEWS = 4
+"""maximum number of images"""
 _POINTS = 200
 """number of points of a curve, means of equal parts of the run"""
 
@@ -25,9 +25,9 @@ _POINTS = 200
 def write_training_page(
     trainer: Trainer, scores: Sequence[ViewScore], facts: Mapping[str, Any], out: Path
 ) -> list[Path]:
-    """Write the page, its chart and pictures; returns the files, the page first.
+    """Write the report, its chart and images; returns the files, the report first.
 
-    facts: what `fidsplat train --json` prints.
+    facts: output of `fidsplat train --json`.
 
     Raises InputError when they cannot be written.
     """
@@ -35,10 +35,10 @@ def write_training_page(
     files = [page, folder / "training.svg"]
     draw_curves(trainer.history, files[1])
     shown = []
-    rows = np.unique(np.linspace(0, len(scores) - 1, min(PICTURES, len(scores))).astype(int))
+    rows = np.unique(np.linspace(0, len(scores) - 1, min(MAX_VIEWS, len(scores))).astype(int))
     for row in rows if len(scores) else ():
         name = f"held-out-{len(shown)}.png"
-        files.append(write_png(folder / name, beside(trainer.dataset.held_out[row], scores[row])))
+        files.append(write_png(folder / name, side_by_side(trainer.dataset.held_out[row], scores[row])))
         shown.append({"name": scores[row].name, "file": name})
     table = [{"view": one.name, "PSNR, dB": fixed(one.psnr, 2), "SSIM": fixed(one.ssim, 4)} for one in scores]
     if scores:
@@ -47,7 +47,7 @@ def write_training_page(
     context = {
         "facts": facts,
         "scores": pd.DataFrame(table),
-        "pictures": shown,
+        "images": shown,
         "settings": pd.DataFrame([{"setting": name, "value": value} for name, value in settings]),
         "run": run_facts(trainer.renderer.device.title, trainer.settings.seed),
     }
@@ -59,13 +59,12 @@ def draw_curves(history: Mapping[str, np.ndarray], file: Path) -> None:
     """Charts of loss, training PSNR and number of splats over the iterations."""
     panels = (("losses", "loss"), ("psnrs", "PSNR of the view, dB"), ("counts", "splats"))
     with chart(file, panels=len(panels), size=(9.0, 3.0), one_scale=False) as (_, axes):
-        for (name, words), axis, colour in zip(panels, axes, COLOURS[1:], strict=False):
-            places_, means = _means(history[name])
-            axis.plot(places_, means, color=colour)
-            axis.set(title=words, xlabel="iteration")
+        for (name, title), axis, colour in zip(panels, axes, COLOURS[1:], strict=False):
+            axis.plot(*_means(history[name]), color=colour)
+            axis.set(title=title, xlabel="iteration")
 
 
-def beside(view: TrainingView, score: ViewScore) -> np.ndarray:
+def side_by_side(view: TrainingView, score: ViewScore) -> np.ndarray:
     """Ground truth, rendering, and their difference times four around grey, side by side."""
     difference = 4 * (score.image.astype(float) - view.image) + 128
     return np.hstack([view.image, score.image, np.clip(difference, 0, 255).astype(np.uint8)])
@@ -74,6 +73,6 @@ def beside(view: TrainingView, score: ViewScore) -> np.ndarray:
 def _means(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres and means of equal parts of a curve, without infinite values."""
     parts = [part for part in np.array_split(np.arange(len(values)), _POINTS) if len(part)]
-    kept = [values[part][np.isfinite(values[part])] for part in parts]
-    means = [float(np.mean(one)) if len(one) else np.nan for one in kept]
+    finite = [values[part][np.isfinite(values[part])] for part in parts]
+    means = [float(np.mean(part)) if len(part) else np.nan for part in finite]
     return np.array([part.mean() + 1 for part in parts]), np.array(means)

@@ -11,7 +11,7 @@ from threading import Lock
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.blender import VIEW_NAMES, novel_image
+from fidsplat.experiments.blender import TEST, VIEW_NAMES, image_file
 from fidsplat.experiments.methods import (
     IDEAL,
     MarkerRenderer,
@@ -60,7 +60,9 @@ def views_points(
             truths += [
                 f"blender-{view}"
                 for view in VIEW_NAMES
-                if all(novel_image(blender, view, category.name, index, i).is_file() for i in range(views))
+                if all(
+                    image_file(blender, view, category.name, index, TEST, i).is_file() for i in range(views)
+                )
             ]
             for method in with_linear_light(methods):
                 for truth in truths:
@@ -131,7 +133,7 @@ def measure_views(
             reference = cache.get(truth, marker, number, render)
         else:
             view = truth.removeprefix("blender-")
-            file = novel_image(blender, view, category.name, point["index"], number)
+            file = image_file(blender, view, category.name, point["index"], TEST, number)
             reference = to_uint8(read_image(file)[:, :, 0])
         if reference.shape != image.shape:
             raise InputError(f"the Blender images in {blender} have another size; render them again")

@@ -110,8 +110,8 @@ def draw(environment: Path) -> None:
     """Draw what is missing."""
     for name, (_, camera, view, pixel_filter) in SHOTS.items():
         grid = grid_of(name)
-        shot = {"file": str(DATA / f"{name}.png"), **blender.camera_facts(CAMERAS[camera])}
-        job = {"name": name, "grid": grid.tolist(), "module": EDGE / grid.shape[0], "shots": [shot]}
+        shot = blender.image_job(DATA / f"{name}.png", CAMERAS[camera])
+        job = {"name": name, "grid": grid.tolist(), "module": EDGE / grid.shape[0], "images": [shot]}
         for file in blender.render([job], view, environment, SAMPLES, pixel_filter):
             print(file)
 

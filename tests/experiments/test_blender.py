@@ -56,11 +56,11 @@ FAKE = """
 import json, pathlib, sys
 job = json.load(open(sys.argv[1]))
 print("Blender says much else")
-for marker in job["things"]:
-    for shot in marker["shots"]:
+for marker in job["objects"]:
+    for shot in marker["images"]:
         if "broken" in shot["file"]:
             sys.exit("Error: no device")
-        pathlib.Path(shot["file"]).write_text(json.dumps({**job, "things": marker["name"]}))
+        pathlib.Path(shot["file"]).write_text(json.dumps({**job, "objects": marker["name"]}))
         print("done", shot["file"], flush=True)
 """
 
@@ -77,12 +77,12 @@ def fake(tmp_path, monkeypatch) -> Path:
 
 def test_pictures_that_are_there_stay_and_the_others_are_drawn(fake):
     job = blender.marker_job(CATEGORIES["apriltag"], 1, 0, fake / "out", "raw", training=True)
-    assert len(job["shots"]) == 37
-    first = Path(job["shots"][0]["file"])
+    assert len(job["images"]) == 37
+    first = Path(job["images"][0]["file"])
     first.parent.mkdir(parents=True)
     first.write_text("old")
     done = list(blender.render([job], "raw", fake, samples=7, threads=3))
-    assert [str(file) for file in done] == [shot["file"] for shot in job["shots"]]
+    assert [str(file) for file in done] == [shot["file"] for shot in job["images"]]
     assert first.read_text() == "old"
     orders = json.loads(done[1].read_text())
     assert (orders["view"], orders["samples"], orders["filter"], orders["threads"]) == ("raw", 7, "BOX", 3)
@@ -103,7 +103,7 @@ def test_without_blender_the_error_says_how_to_get_it(tmp_path):
         list(blender.render([job], "agx", tmp_path))
     camera = fs.Camera.pinhole(10, 10, 9.0, 8.0, 5.0, 5.0)
     with pytest.raises(fs.InputError, match="fx and fy of a Blender camera must be equal"):
-        blender.camera_facts(camera)
+        blender.image_job(tmp_path / "a.png", camera)
 
 
 def test_installing_where_it_cannot_be(tmp_path, monkeypatch):

@@ -200,7 +200,7 @@ def test_blenders_pictures_take_part_where_a_marker_has_all_of_them(pool, tmp_pa
     category = CATEGORIES["small"]
     camera = novel_cameras(category, 0)[0]
     for index, number in ((0, 0), (0, 1), (1, 0)):
-        file = views.novel_image(tmp_path, "raw", "small", index, number)
+        file = views.image_file(tmp_path, "raw", "small", index, "test", number)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_png(file, to_uint8(views.exact_view(category.spec(0), camera, False)))
     points = views.views_points([category], [IDEAL], tmp_path, markers=2, views=2)
@@ -213,7 +213,7 @@ def test_blenders_pictures_take_part_where_a_marker_has_all_of_them(pool, tmp_pa
     found = views.measure_views(point, CEILING, 0, tmp_path, pool)
     assert found["psnr"][0] is None  # the first view is in its place, the second is another view's picture
     assert found["psnr"][1] < 20
-    write_png(views.novel_image(tmp_path, "raw", "small", 0, 1), np.zeros((10, 10), np.uint8))
+    write_png(views.image_file(tmp_path, "raw", "small", 0, "test", 1), np.zeros((10, 10), np.uint8))
     with pytest.raises(fs.InputError, match="have another size"):
         views.measure_views(point, CEILING, 0, tmp_path, pool)
 

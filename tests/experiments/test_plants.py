@@ -104,11 +104,11 @@ def test_a_stock_of_sampled_plants_fills_a_greenhouse(tmp_path, capsys):
 
 
 def test_plants_of_other_sources_are_not_mixed(tmp_path, monkeypatch):
-    plants._note(PlantSettings(), tmp_path)
-    plants._note(PlantSettings(), tmp_path)
+    plants._record(PlantSettings(), tmp_path)
+    plants._record(PlantSettings(), tmp_path)
     monkeypatch.setattr(plants, "code_hash", lambda: "another")
     with pytest.raises(fs.InputError, match=r"'sources': 'another'.*; give another folder"):
-        plants._note(PlantSettings(), tmp_path)
+        plants._record(PlantSettings(), tmp_path)
 
 
 def test_without_blender_the_error_says_how_to_get_it(tmp_path):
@@ -119,9 +119,9 @@ def test_without_blender_the_error_says_how_to_get_it(tmp_path):
 FAKE = """
 import json, sys
 import numpy as np, cv2
-for plant in json.load(open(sys.argv[1]))["things"]:
+for plant in json.load(open(sys.argv[1]))["objects"]:
     assert len(plant["vertices"]) == len(plant["colors"]) > max(map(max, plant["quads"]))
-    for shot in plant["shots"]:
+    for shot in plant["images"]:
         picture = np.zeros((shot["height"], shot["width"], 4), np.uint8)
         picture[100:200, 50:100] = (0, 200, 0, 255)
         cv2.imwrite(shot["file"], picture)
@@ -178,7 +178,9 @@ def test_blender_draws_a_plant(tmp_path):
     if not python.is_file():
         pytest.skip("Blender is not here; fidsplat experiment blender --install")
     wanted = PlantSettings(("lettuce",), 1, views=2, test=1, samples=4)
-    plants._draw(wanted, wanted.mesh("lettuce", 0), tmp_path / "lettuce-0", python, lambda words, share: None)
+    plants._render(
+        wanted, wanted.mesh("lettuce", 0), tmp_path / "lettuce-0", python, lambda words, share: None
+    )
     picture = read_rgba(tmp_path / "lettuce-0/images/view-000.png").astype(int)
     assert picture[0, 0, 3] == 0
     seen = picture[picture[..., 3] == 255]

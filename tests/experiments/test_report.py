@@ -17,7 +17,7 @@ from fidsplat.experiments import charts, pages
 from fidsplat.experiments.report import make_report
 from fidsplat.experiments.results import load
 from fidsplat.experiments.summary import Summary, join, read_summary
-from fidsplat.experiments.sweep import Results
+from fidsplat.experiments.sweep import Results, folder_records
 from fidsplat.images.files import write_png
 from fidsplat.util.provenance import run_facts
 
@@ -159,7 +159,7 @@ def test_the_page_can_be_made_again_from_its_tables(reported, tmp_path):
 
 
 def test_targets_are_compared_with_what_was_found(results):
-    found = paper_targets.targets(load([results])).set_index("what")
+    found = paper_targets.targets([results]).set_index("what")
 
     def verdict(what: str) -> list:
         return found.loc[what, ["found", "reached"]].tolist()
@@ -206,6 +206,7 @@ def test_a_part_of_the_results_is_enough_and_none_is_an_error(tmp_path):
 def angles_of(tmp_path, scans):
     write(tmp_path, "angles", scans)
     rows = load([tmp_path])["angles"].rows
+    rows = paper_targets.with_gaps(rows, folder_records(tmp_path, "angles"))
     return rows.set_index(["category", "marker", "method"])
 
 
@@ -372,7 +373,7 @@ def test_names_in_a_page_are_no_markup(tmp_path):
     context = {
         "facts": facts,
         "scores": pd.DataFrame([{"view": name, "PSNR, dB": "1.0"}]),
-        "pictures": [{"name": name, "file": "held-out-0.png"}],
+        "images": [{"name": name, "file": "held-out-0.png"}],
         "settings": pd.DataFrame([{"setting": "quality", "value": name}]),
         "run": run_facts("a device", 0),
     }

@@ -150,13 +150,13 @@ def test_memory_is_that_of_cloud_buffers_and_picture(renderer):
 @pytest.mark.usefixtures("rates_once")
 def test_devices_take_turns(monkeypatch):
     turns = []
-    draw = measure.SceneRun.draw
+    draw = measure.SceneRun.render
 
     def noted(self):
         turns.append(self.renderer.device.name)
         return draw(self)
 
-    monkeypatch.setattr(measure.SceneRun, "draw", noted)
+    monkeypatch.setattr(measure.SceneRun, "render", noted)
     running = measure.Bench(["reference", "opencl"], lambda words: None, lambda: None)
     running.run("small", 2)
     first, second = (result.device.name for result in running.results)
@@ -336,7 +336,7 @@ def test_the_plot_has_a_bar_for_each_scene_and_device(tmp_path):
     words = ("--device", "reference", "--device", "opencl:pocl")
     assert bench("--scenes", "small", "other", *words, "--plot", file) == 0
     drawn = xml.dom.minidom.parse(str(file)).toxml()
-    for words in ("small", "other", "opencl:pocl", "reference", "ms a frame"):
+    for words in ("small", "other", "opencl:pocl", "reference", "ms per frame"):
         assert f"<!-- {words}" in drawn, words
 
 

@@ -28,7 +28,7 @@ def pictures():
 @pytest.fixture(autouse=True)
 def drawn_once(pictures, monkeypatch):
     """One frame of each view is timed, and none is drawn again for a second demo."""
-    draw = demo._draw
+    draw = demo._render
 
     def kept(renderer, resident, scene, camera):
         place = tuple(camera.position)
@@ -37,7 +37,7 @@ def drawn_once(pictures, monkeypatch):
         return pictures[place]
 
     monkeypatch.setattr(demo, "_FRAMES", 1)
-    monkeypatch.setattr(demo, "_draw", kept)
+    monkeypatch.setattr(demo, "_render", kept)
 
 
 def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):

@@ -213,7 +213,7 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
     monkeypatch.setattr("fidsplat.experiments.localise.RATE", 0.5)
     grey = np.full((480, 640, 3), 128, np.uint8)
     monkeypatch.setattr(
-        Drive, "pictures", lambda self, variant, run, renderer: (grey for _ in self.image_indices(run))
+        Drive, "images", lambda self, variant, run, renderer: (grey for _ in self.image_indices(run))
     )
     asked = Drive(1, 1)
     pictures = list(write_log(asked, "exact", None, str(tmp_path / "run.mcap"), False))
@@ -253,12 +253,12 @@ def test_with_ideal_corners_it_knows_its_way():
         sightings.append(
             [Detection("apriltag", "36h11", p.marker.id, None, camera.project(p.corners)) for p in near]
         )
-    _, blind = asked.localised(moved, None, asked.camera)
-    _, seeing = asked.localised(moved, sightings, asked.camera, 0.05)
+    _, blind = asked.localise(moved, None, asked.camera)
+    _, seeing = asked.localise(moved, sightings, asked.camera, 0.05)
     assert seeing["tags"] > 5
     assert seeing["refused"] == 0
     assert seeing["ate_m"] < 0.01 < blind["ate_m"]
-    _, near = asked.localised(moved, sightings, asked.camera, 0.05, reach=1.0)
+    _, near = asked.localise(moved, sightings, asked.camera, 0.05, reach=1.0)
     assert 0 < near["tags"] < seeing["tags"]
     aside = np.array([0.6, 0.8])
     off = [[replace(tag, corners=tag.corners + aside) for tag in tags] for tags in sightings]
@@ -266,7 +266,7 @@ def test_with_ideal_corners_it_knows_its_way():
     assert [each["tags"] > 0 for each in bins] == [True, True, False, False]
     assert [each["median_px"] for each in bins] == pytest.approx([1.0, 1.0, None, None])
     assert sum(each["tags"] for each in bins) == sum(map(len, sightings))
-    back = asked.corner_errors(moved, asked.ideal(moved, off), asked.camera)
+    back = asked.corner_errors(moved, asked.ideal_corners(moved, off), asked.camera)
     assert [each["median_px"] for each in back] == pytest.approx([0.0, 0.0, None, None])
 
 

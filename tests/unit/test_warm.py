@@ -17,7 +17,7 @@ from fidsplat.experiments.demo_scene import demo_scene
 def test_recipes_are_what_scenes_call_for():
     wanted = warming.recipes()
     assert len(set(wanted)) == len(wanted)
-    assert len({recipe.words for recipe in wanted}) == len(wanted)
+    assert len({recipe.text for recipe in wanted}) == len(wanted)
     called_for = {
         select(warming._cloud(recipe, 5), fs.Capture(outputs=recipe.outputs, quality=recipe.quality))
         for recipe in wanted
@@ -32,7 +32,7 @@ def test_recipes_are_what_scenes_call_for():
 
 
 @in_turn()
-@pytest.mark.parametrize("recipe", sampled(warming.recipes(), 3, 2), ids=lambda recipe: recipe.words)
+@pytest.mark.parametrize("recipe", sampled(warming.recipes(), 3, 2), ids=lambda recipe: recipe.text)
 def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
     ((done, seconds),) = warming.warm(renderer, [recipe])
     assert done is recipe
@@ -52,7 +52,7 @@ def test_the_command(capsys, monkeypatch):
     monkeypatch.setattr(warming, "recipes", lambda: few)
     assert main(["warm", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
-    assert [entry["set"] for entry in content["sets"]] == [recipe.words for recipe in few]
+    assert [entry["set"] for entry in content["sets"]] == [recipe.text for recipe in few]
     assert content["of"] == 2
     assert content["seconds"] >= sum(entry["seconds"] for entry in content["sets"])
     assert main(["warm"]) == 0

@@ -20,8 +20,7 @@ from fidsplat.util.errors import InputError, unknown
 
 TIMED = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, arithmetic="precise")
 """quality of the benchmark: cut-off and stop of all peers, for equal work"""
-WALL_COLUMNS, WALL_ROWS = 20, 10
-_WALL_CODES = 10  # number of different codes
+WALL_COLUMNS, WALL_ROWS, _WALL_CODES = 20, 10, 10
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ def _random(name: str) -> BenchScene:
 
 
 BENCH_SCENES: dict[str, BenchScene] = {
-    "tag": BenchScene("an AprilTag alone, 640 x 480", tag),
+    "tag": BenchScene("an AprilTag, 640 x 480", tag),
     **{name: _random(name) for name in SCENES},
     "qr_wall": BenchScene("200 QR codes of version 22 on a wall, 1920 x 1080", qr_wall),
     "tag_in_million": BenchScene("an AprilTag before 1,000,000 random splats, 1920 x 1080", tag_in_million),
@@ -87,9 +86,7 @@ def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, Be
     """
     camera = scene.camera
     if camera is None:
-        raise InputError(
-            f"{name} has no [camera] table; add one, whose size and lens are those of the pictures"
-        )
+        raise InputError(f"{name} has no [camera] table; add one with the size and lens of the images")
     about = f"{len(scene.cloud()):,} splats, {camera.width} x {camera.height}"
     if path is None:
         return {name: BenchScene(about, lambda: (scene.cloud(), camera))}

@@ -54,9 +54,9 @@ class Result:
     @property
     def times_roofline(self) -> dict[str, float]:
         """Ratio to the roofline by stage, and of `frame`; without unknown ones."""
-        taken = self.timer.part_medians | {"frame": self.timer.median}
-        least = self.rooflines | ({"frame": sum(self.rooflines.values())} if self.rooflines else {})
-        return {name: taken[name] / least[name] for name in taken if least.get(name, 0.0) > 0}
+        measured = self.timer.part_medians | {"frame": self.timer.median}
+        rooflines = self.rooflines | {"frame": sum(self.rooflines.values())}
+        return {name: ms / rooflines[name] for name, ms in measured.items() if rooflines.get(name, 0.0) > 0}
 
     @property
     def host(self) -> float:
@@ -109,7 +109,7 @@ class Bench:
     def __init__(
         self,
         devices: Sequence[str],
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
         tick: Callable[[], None],
         scenes: Mapping[str, BenchScene] = BENCH_SCENES,
     ) -> None:
@@ -117,7 +117,7 @@ class Bench:
 
         Args:
             devices: names of `Renderer`.
-            tell: called with what is being done.
+            report: called with the name of each step.
             tick: called after each timed frame.
             scenes: catalogue of `run`.
 
@@ -126,22 +126,22 @@ class Bench:
         """
         self.results: list[Result] = []
         self.devices: dict[str, Rates | None] = {}
-        self._tell, self._tick, self._scenes = tell, tick, scenes
+        self._report, self._tick, self._scenes = report, tick, scenes
         for name in dict.fromkeys(devices):
-            tell(f"rates of {name}")
+            report(f"rates of {name}")
             backend = Renderer(name).backend
             self.devices[name] = backend.rates() if backend.traits.measures_rates else None
 
     def run(self, scene: str, repeats: int) -> None:
         """Render a scene `repeats` times on each device. Errors of a device are stored in its result."""
-        self._tell(f"making {scene}")
+        self._report(f"making {scene}")
         cloud, camera = self._scenes[scene].make()
         runs = []
         for name, rates in self.devices.items():
-            self._tell(f"{scene}: first frame on {name}")
+            self._report(f"{scene}: first frame on {name}")
             runs.append(SceneRun(scene, name, rates, cloud, camera))
             self.results.append(runs[-1].result)
-        self._tell(scene)
+        self._report(scene)
         time_interleaved([run.result.timer for run in runs], repeats, tick=self._tick)
 
 
@@ -153,9 +153,9 @@ class SceneRun:
     ) -> None:
         self.renderer = Renderer(device)
         self.camera, self.capture = camera, Capture(camera, quality=TIMED)
-        self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
+        self.image = np.zeros((camera.height, camera.width, 3), np.float32)
         """rendered image (h, w, 3)"""
-        timer = Timer(self._whole, catch_errors=True, parts=lambda frame: frame.timings)
+        timer = Timer(self._complete, catch_errors=True, parts=lambda frame: frame.timings)
         self.result = Result(scene, self.renderer.device, camera.width, camera.height, timer, rates)
         try:
             self.resident = self.renderer.upload(cloud)
@@ -164,32 +164,32 @@ class SceneRun:
         except FidsplatError as error:
             timer.error = str(error)
 
-    def draw(self) -> Frame:
+    def render(self) -> Frame:
         """Render a frame."""
         return self.renderer.render(self.resident, self.capture)
 
-    def _whole(self) -> Frame:
+    def _complete(self) -> Frame:
         """Render a frame and wait for the device."""
         begun = time.perf_counter()
-        frame = self.draw()
+        frame = self.render()
         self.result.host_ms.append(1e3 * (time.perf_counter() - begun))
         return frame.wait()
 
     def _first(self) -> None:
-        frame = self.draw()
-        self.picture, self.result.counts = frame["rgb"], dict(frame.stats)
+        frame = self.render()
+        self.image, self.result.counts = frame["rgb"], dict(frame.stats)
 
     def _count(self, cloud: SplatCloud) -> None:
         result, backend = self.result, self.renderer.backend
-        result.mean_rgb = float(self.picture.mean(dtype=np.float64))
+        result.mean_rgb = float(self.image.mean(dtype=np.float64))
         if not backend.traits.measures_rates or result.rates is None:
             return
         pixels = result.width * result.height
         result.memory_bytes = backend.memory_bytes + self.resident.memory_bytes + 12 * pixels
-        drawn = overdraw(self.renderer, self.resident, self.camera, TIMED)
-        result.counts["fragments"] = int(drawn.sum(dtype=np.int64))
-        further = max(cloud.sh_degree + 1, 1) ** 2 - 1
-        counts = Counts(pixels=pixels, sh_coefficients=further, **result.counts)
+        fragments = overdraw(self.renderer, self.resident, self.camera, TIMED)
+        result.counts["fragments"] = int(fragments.sum(dtype=np.int64))
+        coefficients = max(cloud.sh_degree + 1, 1) ** 2 - 1
+        counts = Counts(pixels=pixels, sh_coefficients=coefficients, **result.counts)
         result.rooflines = roofline_ms(counts, result.rates)
 
 

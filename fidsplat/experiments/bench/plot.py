@@ -11,37 +11,37 @@ from fidsplat.experiments.charts import bars, chart, legend_above, plain_ticks
 
 
 def write_plot(results: Sequence[Result], file: Path) -> None:
-    """A group of bars for each scene, one for each device: median milliseconds of a frame, on a logarithmic
-    axis, with the quartiles; below each the device's roofline, where it is known.
+    """Write a chart: for each scene a bar per device with the median milliseconds of a frame on a logarithmic
+    axis, its quartiles, and the roofline of the device if it is known.
 
     Raises InputError when the file cannot be written.
     """
-    drawn = {(result.scene, result.device.name): result for result in results if result.timer.ms}
-    scenes = list(dict.fromkeys(scene for scene, _ in drawn))
-    devices = list(dict.fromkeys(device for _, device in drawn))
-    of = [[drawn.get((scene, device)) for scene in scenes] for device in devices]
+    measured = {(result.scene, result.device.name): result for result in results if result.timer.ms}
+    scenes = list(dict.fromkeys(scene for scene, _ in measured))
+    devices = list(dict.fromkeys(device for _, device in measured))
     series = {
-        device: [math.nan if result is None else result.timer.median for result in row]
-        for device, row in zip(devices, of, strict=True)
+        device: [
+            measured[scene, device].timer.median if (scene, device) in measured else math.nan
+            for scene in scenes
+        ]
+        for device in devices
     }
-    with chart(file, size=(max(5.0, 1.6 + 0.9 * len(scenes) * max(1, len(devices))), 4.2)) as (
-        figure,
-        (axes,),
-    ):
+    width = max(5.0, 1.6 + 0.9 * len(scenes) * len(devices))
+    with chart(file, size=(width, 4.2)) as (figure, (axes,)):
         bars(axes, scenes, series, logarithmic=True)
-        places = [(bar.get_x() + bar.get_width() / 2) for held in axes.containers for bar in held]
-        each = [result for row in of for result in row]
-        for place, result in zip(places, each, strict=True):
-            if result is None:
-                continue
-            low, middle, high = result.timer.quartiles
-            axes.errorbar(place, middle, [[middle - low], [high - middle]], color="black", capsize=3)
-            if least := sum(result.rooflines.values()):
-                axes.plot(place, least, marker="_", markersize=18, color="black")
-        axes.set_ylabel("ms a frame (_: roofline)")
+        for device, container in zip(devices, list(axes.containers), strict=True):
+            for scene, bar in zip(scenes, container, strict=True):
+                if (scene, device) not in measured:
+                    continue
+                x, result = bar.get_x() + bar.get_width() / 2, measured[scene, device]
+                low, middle, high = result.timer.quartiles
+                axes.errorbar(x, middle, [[middle - low], [high - middle]], color="black", capsize=3)
+                if roofline := sum(result.rooflines.values()):
+                    axes.plot(x, roofline, marker="_", markersize=18, color="black")
+        axes.set_ylabel("ms per frame (_: roofline)")
         plain_ticks(axes.yaxis)
         axes.tick_params(axis="x", labelrotation=15 if len(scenes) > 3 else 0)
         if len(devices) > 1:
             legend_above(figure, axes)
         else:
-            axes.set_title(next(iter(drawn.values())).device.title, fontsize=10)
+            axes.set_title(next(iter(measured.values())).device.title, fontsize=10)

@@ -17,7 +17,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.timing import Timer
 
 COUNTS = (2, 70_000)
-"""Splats of the pictures that are drawn: launches of few and of many work-items."""
+"""numbers of splats of the frames: launches of few and of many work-items"""
 
 _OUTPUTS = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
 _STANDARD = Quality()
@@ -38,7 +38,7 @@ class Recipe:
     quality: Quality = _STANDARD
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """Readable description."""
         colors = "plain colours" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
         quality = "" if self.quality == _STANDARD else "; no low-pass, 3 x 3 samples"
@@ -59,7 +59,7 @@ def recipes() -> list[Recipe]:
     return [*some, demo, *sharp, *degrees, *flat]
 
 
-def warm(renderer: Renderer, wanted: list[Recipe]) -> Iterator[tuple[Recipe, float]]:
+def warm(renderer: Renderer, recipes: list[Recipe]) -> Iterator[tuple[Recipe, float]]:
     """Compile each recipe and yield it with the seconds that it took.
 
     Raises:
@@ -67,14 +67,14 @@ def warm(renderer: Renderer, wanted: list[Recipe]) -> Iterator[tuple[Recipe, flo
     """
     camera = Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
 
-    def draw(recipe: Recipe) -> None:
+    def render(recipe: Recipe) -> None:
         for count in COUNTS:
             frame = renderer.render(_cloud(recipe, count), camera, recipe.outputs, recipe.quality)
             for name in recipe.outputs:
                 frame[name]
 
-    for recipe in wanted:
-        yield recipe, Timer(partial(draw, recipe)).run() / 1e3
+    for recipe in recipes:
+        yield recipe, Timer(partial(render, recipe)).run() / 1e3
 
 
 def _cloud(recipe: Recipe, count: int) -> SplatCloud:
@@ -85,7 +85,5 @@ def _cloud(recipe: Recipe, count: int) -> SplatCloud:
     kind = np.array(recipe.kinds)[np.arange(count) % len(recipe.kinds)]
     scales = np.column_stack([flat.scales, np.where(kind == CAPTURE, 0.002, 0.0)])
     cloud = SplatCloud(flat.means, flat.quats, scales, flat.opacities, colors=flat.colors, sh=flat.sh)
-    printed = kind == MARKER
-    return (
-        cloud.with_coplanar_groups(np.where(printed, 0, -1)).with_boxes(printed) if printed.any() else cloud
-    )
+    boxes = kind == MARKER
+    return cloud.with_coplanar_groups(np.where(boxes, 0, -1)).with_boxes(boxes) if boxes.any() else cloud

@@ -1,1 +1,1 @@
-"""What accuracy costs in time: every knob of `Quality` alone and in combinations, on named scenes."""
+"""Trade-off of accuracy and time: every quality setting, alone and in combinations, on standard scenes."""

@@ -24,13 +24,13 @@ CELLS = ("haze", "veils", "opaque", "edge-on", "tiny", "pages", "needles", "near
 
 
 def hard_scene(seed: int = 0) -> tuple[SplatCloud, Camera]:
-    """Some 5000 splats before black, in 640 x 480; the same on every machine.
+    """About 5000 splats on black in 640 x 480 pixels, 4.5 million metres from the origin; deterministic.
 
-    haze: 300 layers of opacity 0.0039, below 1/255. veils: 300 of 0.05, whose rims a cut-off takes. opaque:
-    40 stacks of layers of 0.98 to 1 before a lamp, which a ceiling of 0.99 and a dropped last layer let shine
-    through. edge-on: tilts of 89 to 89.9999 degrees. tiny: 0.01 to 0.5 px. pages: layers 0.1 mm apart
-    at 5 m, in no order of the file. needles: 1000 to 30,000 times as long as wide. near: strips of ground
-    that begin behind the camera. All of it lies 4.5 million metres from the origin.
+    haze: 300 layers of opacity 0.0039, below 1/255. veils: 300 of 0.05, whose rims a cut-off removes. opaque:
+    40 stacks of layers of 0.98 to 1 in front of a lamp, which is visible through them with a ceiling of 0.99
+    or without the last layer. edge-on: tilts of 89 to 89.9999 degrees. tiny: 0.01 to 0.5 px. pages: layers
+    0.1 mm apart at 5 m, in random order. needles: 1000 to 30,000 times as long as wide. near: strips of
+    ground that begin behind the camera.
     """
     generator = np.random.default_rng(seed)
     parts = [
@@ -76,7 +76,7 @@ def _layers(
     wander: float = 0.0,
     shuffled: bool = False,
 ) -> SplatCloud:
-    """Layers across the view from 5 m on, a step apart, of random colours."""
+    """Layers of random colours at right angles to the view, a step apart, from 5 m on."""
     number = np.arange(count)
     if shuffled:
         generator.shuffle(number)
@@ -104,7 +104,7 @@ def _edge_on(generator: np.random.Generator, cell: int) -> SplatCloud:
     count = 200
     depth = generator.uniform(3, 8, count)
     means = _at(cell, generator.uniform(-60, 60, (count, 2)) * (1.0, 1.6), depth)
-    # about the direction from which each is seen, not about the camera's axis
+    # tilts relative to the ray of each splat, not to the axis of the camera
     quats = []
     for mean in means:
         ray = mean / np.linalg.norm(mean)
