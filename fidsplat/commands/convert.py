@@ -12,7 +12,6 @@ import tyro
 from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Device, Json, Overwrite, new_file
 from fidsplat.commands.output import console, delayed_progress, report
-from fidsplat.commands.scenes import framing_camera
 from fidsplat.util.errors import InputError
 
 
@@ -72,10 +71,14 @@ def image_error(before, after, device: str | None) -> dict[str, float]:
     import numpy as np
 
     import fidsplat as fs
+    from fidsplat.scenes.sources import framing_camera
+    from fidsplat.vision.metrics import psnr
 
     renderer, camera = fs.Renderer(device), framing_camera(before)
     one, other = (renderer.render(cloud, camera)["rgb"].astype(np.float64) for cloud in (before, after))
-    apart = np.abs(one - other)
-    square = float((apart * apart).mean())
-    psnr = math.inf if square == 0 else -10 * math.log10(square)
-    return {"largest": float(apart.max()), "mean": float(apart.mean()), "psnr": psnr}
+    difference = np.abs(one - other)
+    return {
+        "largest": float(difference.max()),
+        "mean": float(difference.mean()),
+        "psnr": psnr(one, other),
+    }

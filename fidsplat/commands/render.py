@@ -15,7 +15,7 @@ import tyro
 from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, check_request
 from fidsplat.commands.output import console, delayed_progress, report
-from fidsplat.commands.scenes import RenderInput, load_source
+from fidsplat.commands.scenes import RenderInput
 from fidsplat.effects.catalogue import outputs_help
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import path_of, writable_folder
@@ -197,6 +197,7 @@ class Gallery:
 
     def run(self) -> int:
         from fidsplat.experiments.gallery import piece_of, write_gallery
+        from fidsplat.scenes.sources import load_source
 
         if not self.sources:
             raise InputError(
@@ -206,7 +207,7 @@ class Gallery:
             total, pieces = len(self.sources), []
             for k, source in enumerate(self.sources):
                 progress(f"reading {source}", 0.5 * k / total)
-                pieces.append(piece_of(path_of(source), load_source(source, None, lambda words, share: None)))
+                pieces.append(piece_of(path_of(source), load_source(source)))
             files: list[Path] = []
             for file in write_gallery(path_of(self.out), pieces, self.device):
                 files.append(file)

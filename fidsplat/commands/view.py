@@ -11,7 +11,7 @@ import tyro
 from fidsplat.commands.declarations import option
 from fidsplat.commands.options import MemoryBudget
 from fidsplat.commands.output import console, delayed_progress, print_lines
-from fidsplat.commands.scenes import SceneDevice, SceneQuality, framing_camera, load_source
+from fidsplat.commands.scenes import SceneDevice, SceneQuality
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
@@ -127,13 +127,14 @@ class Target:
 
     def scene(self, quality: str | None, progress: Progress) -> Scene:
         """The scene, at a quality that replaces its own if one is given."""
+        from fidsplat.experiments.demo_scene import demo_scene
+        from fidsplat.scenes.sources import load_source
+
         changes = {} if quality is None else {"quality": quality}
         if self.training is not None:
             return self.training.scene
         if self.source:
             return replace(load_source(self.source, quality, progress), **changes)
-        from fidsplat.experiments.demo_scene import demo_scene
-
         return replace(demo_scene(), **changes)
 
 
@@ -196,6 +197,7 @@ class Training:
 
     def _load(self) -> Scene:
         from fidsplat.scenes import Scene
+        from fidsplat.scenes.sources import framing_camera
         from fidsplat.train import splats_of
 
         cloud, background = splats_of(self.file)

@@ -23,6 +23,7 @@ from fidsplat.commands import COMMANDS, declarations
 from fidsplat.commands.output import delayed_progress
 from fidsplat.images.files import read_image, write_png
 from fidsplat.images.tag_dictionaries import dictionary_bits
+from fidsplat.splats.statistics import describe
 
 CAMERA = fs.Camera.pinhole(320, 240, 400, 400, 160, 120)
 
@@ -358,9 +359,13 @@ def test_detect_where_nothing_is(capsys, tmp_path):
     assert "no code found" in capsys.readouterr().out
 
 
+def test_a_marker_position_shows_no_rounding_errors():
+    tag = fs.marker("apriltag:36h11:5", size=0.16).gaussians  # its mean position is 1e-17 m from 0
+    assert describe(tag)["marker_position"][:2].tolist() == [0, 0]
+
+
 def test_figures_of_a_cloud_move_with_its_origin():
     """Lengths stay, places move."""
-    from fidsplat.commands.info import describe
     from fidsplat.scenes.random_clouds import random_splats
 
     cloud, away = random_splats(500, 4), np.array([4e5, -3e5, 100.0])

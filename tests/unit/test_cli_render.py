@@ -8,8 +8,8 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.commands.scenes import framing_camera
 from fidsplat.images.files import read_image, to_uint8
+from fidsplat.scenes.sources import framing_camera
 
 SCENE = """
 [camera]

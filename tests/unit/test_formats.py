@@ -364,8 +364,8 @@ def test_what_a_format_cannot_hold_is_said():
 
 def test_convert_says_what_it_costs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("fidsplat.commands.scenes.WIDTH", 64)
-    monkeypatch.setattr("fidsplat.commands.scenes.HEIGHT", 36)
+    monkeypatch.setattr("fidsplat.scenes.sources.WIDTH", 64)
+    monkeypatch.setattr("fidsplat.scenes.sources.HEIGHT", 36)
     fs.save_splats(some(labels=2), "a.ply")
     assert main(["convert", "a.ply", "a.glb", "--device", "reference", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
