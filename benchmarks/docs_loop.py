@@ -13,8 +13,8 @@ import imageio_ffmpeg
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.experiments.demo_scene import demo_scene
 from fidsplat.render.flight import Flight, FlightFolder
+from fidsplat.worlds.yard import demo_scene
 
 WIDTH, HEIGHT, RATE = 480, 270, 16.0
 AIM = (0.0, 0.05, 0.0)

@@ -31,7 +31,7 @@ CHILD = """
 import time; marks = [time.time()]
 import sys, fidsplat as fs, numpy; marks.append(time.time())
 if sys.argv[1] == "demo":
-    from fidsplat.experiments.demo_scene import demo_scene
+    from fidsplat.worlds.yard import demo_scene
     scene, camera = demo_scene(), None
 else:
     from fidsplat.experiments.bench.catalogue import BENCH_SCENES

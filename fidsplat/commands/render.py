@@ -196,7 +196,7 @@ class Gallery:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.gallery import piece_of, write_gallery
+        from fidsplat.render.gallery import piece_of, write_gallery
         from fidsplat.scenes.sources import load_source
 
         if not self.sources:

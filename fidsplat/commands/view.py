@@ -127,8 +127,8 @@ class Target:
 
     def scene(self, quality: str | None, progress: Progress) -> Scene:
         """The scene, at a quality that replaces its own if one is given."""
-        from fidsplat.experiments.demo_scene import demo_scene
         from fidsplat.scenes.sources import load_source
+        from fidsplat.worlds.yard import demo_scene
 
         changes = {} if quality is None else {"quality": quality}
         if self.training is not None:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.demo_scene import OUTPUTS, demo_scene, demo_views
 from fidsplat.formats import save_ply
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.visualize import (
@@ -26,6 +25,7 @@ from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.vision.readback import Reading, read_back
+from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views
 
 COMPLETE = 0.98
 """visible share of a completely visible marker; the rest is the soft edge of its quiet zone"""

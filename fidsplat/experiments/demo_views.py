@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.experiments.demo_scene import FOV_X, demo_scene
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import write_png
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.files import atomic_write, writable_folder
+from fidsplat.worlds.yard import FOV_X, demo_scene
 
 POINTS = 6000
 _SPREAD = 0.005

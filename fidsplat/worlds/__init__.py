@@ -1,1 +1,1 @@
-"""Demo worlds made of splats: a greenhouse, a city, a robot that drives."""
+"""Demo worlds made of splats: a yard, a greenhouse, a city, a robot that drives."""

@@ -12,7 +12,6 @@ from fidsplat.backends.opencl.resident import Resident
 from fidsplat.capture.quality import ELLIPSOID, PRESETS, MarkerQuality
 from fidsplat.experiments.tradeoff import compare, run
 from fidsplat.experiments.tradeoff import session as session_module
-from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
 from fidsplat.experiments.tradeoff.points import (
     ABLATION,
     BASE,
@@ -27,6 +26,7 @@ from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make_view
 from fidsplat.experiments.tradeoff.session import QUICK, Effort, Session, memory_of, time_point
 from fidsplat.scenes.random_clouds import SCENES
 from fidsplat.selftest.clouds import camera, splats
+from fidsplat.selftest.hard_scene import CELLS, cell_window, hard_scene
 
 pytestmark = pytest.mark.usefixtures("optimised")
 FACING = (1.0, 0.0, 0.0, 0.0)

@@ -8,8 +8,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments import demo
-from fidsplat.experiments.demo_scene import demo_scene
 from fidsplat.images.files import read_image
+from fidsplat.worlds.yard import demo_scene
 
 pytestmark = pytest.mark.usefixtures("optimised")
 

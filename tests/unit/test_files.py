@@ -11,12 +11,12 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments.charts import bars, chart
-from fidsplat.experiments.gallery import Piece, write_gallery
 from fidsplat.experiments.summary import read_summary
 from fidsplat.experiments.sweep import read_records
 from fidsplat.formats import load_splats, save_splats
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import read_image, read_images, write_png
+from fidsplat.render.gallery import Piece, write_gallery
 from fidsplat.sim import read_description
 from fidsplat.store.build import build_store
 from fidsplat.store.store import Store

@@ -10,7 +10,6 @@ from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.experiments.demo_scene import demo_scene, demo_views
 from fidsplat.images.files import write_png
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import rigid_matrix
@@ -18,6 +17,7 @@ from fidsplat.vision import read_back
 from fidsplat.vision.detect import Detection
 from fidsplat.vision.readback import corner_error, families_of, match, means
 from fidsplat.vision.visible import visible, visible_part
+from fidsplat.worlds.yard import demo_scene, demo_views
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.effects import select
 from fidsplat.experiments.bench import warm as warming
-from fidsplat.experiments.demo_scene import demo_scene
+from fidsplat.worlds.yard import demo_scene
 
 
 def test_recipes_are_what_scenes_call_for():

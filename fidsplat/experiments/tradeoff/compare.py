@@ -14,11 +14,11 @@ from fidsplat.capture.quality import MarkerQuality, Quality
 from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.plane import plane_image
 from fidsplat.experiments.setup import BACKGROUND
-from fidsplat.experiments.tradeoff.hard import CELLS, cell_window
 from fidsplat.experiments.tradeoff.scenes import GREY, HARD, PROTOCOL, SEED, TradeScene, placed_marker
 from fidsplat.experiments.tradeoff.session import Session
 from fidsplat.images.files import to_uint8
 from fidsplat.selftest.agreement import FrameSpec, reference_images
+from fidsplat.selftest.hard_scene import CELLS, cell_window
 from fidsplat.util.errors import FidsplatError
 from fidsplat.vision.metrics import flip, has_flip, psnr
 from fidsplat.vision.readback import corner_error, own_code

@@ -12,9 +12,9 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import MarkerQuality
 from fidsplat.experiments.bench.catalogue import BenchScene
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
-from fidsplat.experiments.tradeoff.hard import hard_scene
 from fidsplat.markers import Marker, marker
 from fidsplat.scenes.random_clouds import load_scene
+from fidsplat.selftest.hard_scene import hard_scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.provenance import digest_of

@@ -1,4 +1,4 @@
-"""Scene of the demo: three signs in a small yard and three views, generated from one seed.
+"""Yard: the scene of `fidsplat demo` with three signs, paving, bricks and shrubs, and its three views.
 
 x right, y down, z away; the signs are at z = 0 and face -z. Stones and bricks differ by millimetres in depth,
 since the order of coplanar splats would depend on rounding. Splats are disks, those of blooms and bushy
