@@ -18,12 +18,6 @@ if TYPE_CHECKING:
     from fidsplat.experiments.bench.measure import Bench as Measuring
     from fidsplat.experiments.bench.measure import Result
 
-_LEGEND = (
-    "ms: median (quartiles) of complete frames; medians of the stages by the device's clock. Splats are "
-    "resident and the image stays on the device. host: time until the call returns. x roofline: multiple of "
-    "the minimum time at the device's measured peak rates (devlog/roofline.md)."
-)
-
 
 @dataclass
 class Bench:
@@ -146,6 +140,8 @@ def _record(results: "list[Result]", scenes: tuple[str, ...], interrupted: bool)
 
 def _print(results: "list[Result]", where: "Console", about: dict[str, str]) -> None:
     """Print a table for each scene with one column per device. about: descriptions of scenes by name."""
+    from fidsplat.experiments.bench.table import LEGEND, scene_table
+
     for scene in dict.fromkeys(result.scene for result in results):
         measured = [result for result in results if result.scene == scene]
         for result in measured:
@@ -153,48 +149,10 @@ def _print(results: "list[Result]", where: "Console", about: dict[str, str]) -> 
                 print_lines(where, f"{scene} on {result.device.name}: {result.timer.error}")
         measured = [result for result in measured if result.timer.ms]
         if measured:
-            _print_scene(f"{scene}: {about[scene]}", measured, where)
+            print_table(where, f"{scene}: {about[scene]}", *scene_table(measured))
+            for result in measured:
+                device, frames = result.device, len(result.timer.ms)
+                print_lines(where, f"{device.name}: {device.title}, {device.version}; {frames} frames")
+            where.print()
     if any(result.timer.ms for result in results):
-        where.print(_LEGEND, markup=False)
-
-
-def _print_scene(title: str, results: "list[Result]", where: "Console") -> None:
-    heads, rows = ["ms"], [["frame"]]
-    stages = list(dict.fromkeys(stage for result in results for stage in result.timer.parts))
-    rows += [[stage] for stage in stages]
-    for result in results:
-        heads += [result.device.name, "x roofline"]
-        low, middle, high = result.timer.quartiles
-        rows[0] += [f"{middle:.2f} ({low:.2f} to {high:.2f})", _times(result, "frame")]
-        for row, stage in zip(rows[1:], stages, strict=True):
-            ms = result.timer.part_medians.get(stage)
-            row += ["-" if ms is None else f"{ms:.2f}", _times(result, stage)]
-    facts = ("host", "first frame", *results[0].counts, "splats/s", "memory")
-    for fact in facts:
-        rows.append([fact])
-        for result in results:
-            rows[-1] += [_fact(result, fact), ""]
-    print_table(where, title, heads, rows)
-    for result in results:
-        device, frames = result.device, len(result.timer.ms)
-        print_lines(where, f"{device.name}: {device.title}, {device.version}; {frames} frames")
-    where.print()
-
-
-def _times(result: "Result", name: str) -> str:
-    times = result.times_roofline.get(name)
-    return "-" if times is None else f"{times:.1f}"
-
-
-def _fact(result: "Result", fact: str) -> str:
-    if fact == "host":
-        return f"{result.host:.3f}"
-    if fact == "first frame":
-        return f"{result.first_frame_ms:.1f}"
-    if fact == "splats/s":
-        return f"{1e-3 * result.counts['splats'] / result.timer.quartiles[1]:.2f} M"
-    if fact == "memory":
-        size = result.memory_bytes
-        return "-" if size is None else f"{size / 2**30:.3f} GiB"
-    count = result.counts.get(fact)
-    return "-" if count is None else f"{count:,}"
+        where.print(LEGEND, markup=False)

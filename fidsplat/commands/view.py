@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +15,7 @@ from fidsplat.commands.scenes import SceneDevice, SceneQuality
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
+from fidsplat.viewer.settings import PageSettings
 
 if TYPE_CHECKING:
     from fidsplat.formats import Progress
@@ -58,22 +59,16 @@ class View:
             "poses to show as keyframes (docs/formats.md#trajectories), e.g. a flight's trajectory.tum",
         ),
     ] = None
-    port: Annotated[int, option("N", "port of the page")] = 8080
-    host: Annotated[str, option("ADDRESS", "address to listen on; 0.0.0.0 opens it to the network")] = (
-        "127.0.0.1"
-    )
+    page: PageSettings = field(default_factory=PageSettings)
     device: SceneDevice = None
     quality: SceneQuality = None
-    rate: Annotated[float, option("HZ", "target frame rate while moving")] = 30.0
     memory_budget: MemoryBudget = None
 
     def run(self) -> int:
         from fidsplat.formats import load_trajectory
         from fidsplat.viewer.server import Viewer, check_port
 
-        if not 0 < self.rate <= 1000:
-            raise InputError(f"--rate must be above 0 and at most 1000 frames per second, got {self.rate:g}")
-        check_port(self.host, self.port)
+        check_port(self.page.host, self.page.port)
         target = self._target()
         path = None if target.trajectory is None else load_trajectory(target.trajectory)
         where = console(True)
@@ -87,9 +82,7 @@ class View:
                 file,
                 self.device,
                 self.memory_budget,
-                self.host,
-                self.port,
-                self.rate,
+                self.page,
                 keyframes=path,
                 reload=reload,
                 quality=self.quality,

@@ -22,6 +22,7 @@ from fidsplat.formats import save_trajectory
 from fidsplat.images.files import png_bytes
 from fidsplat.scenes import Scene
 from fidsplat.store.chunked_splats import ChunkedSplats
+from fidsplat.util.arguments import settings_with
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.markup import escaped
 from fidsplat.viewer.controls import NO_TARGET, Controls
@@ -30,7 +31,7 @@ from fidsplat.viewer.guard import guarded
 from fidsplat.viewer.nodes import Nodes
 from fidsplat.viewer.scene_file import SceneFile, SplatFile
 from fidsplat.viewer.session import Session, StillImage
-from fidsplat.viewer.settings import Viewpoint
+from fidsplat.viewer.settings import PageSettings, Viewpoint
 from fidsplat.viewer.stream import Stream
 from fidsplat.vision.readback import read_back
 
@@ -65,9 +66,7 @@ class Viewer:
         scene: scene to show.
         file: its scene file; loaded again when it changes, and written when a marker is moved.
         device, memory_budget: see `Session`.
-        host: address to listen on; other machines cannot reach 127.0.0.1.
-        port: 0 selects a free port.
-        rate: target frames per second while moving.
+        page: address and frame rate; None: the defaults. `changes` are its fields: port, host, rate.
         keyframes: camera-to-world poses shown as keyframes.
         reload: called once a second; returns a newer scene of a running training, or None.
         quality: quality that replaces the scene file's when it is loaded again.
@@ -83,16 +82,16 @@ class Viewer:
         file: Path | None = None,
         device: str | None = None,
         memory_budget: int | None = None,
-        host: str = "127.0.0.1",
-        port: int = 8080,
-        rate: float = 30.0,
+        page: PageSettings | None = None,
         keyframes: Trajectory | None = None,
         reload: Callable[[], Scene | None] | None = None,
         quality: str | None = None,
+        **changes: Any,
     ) -> None:
-        viser = _viser()
+        viser, page = _viser(), settings_with(PageSettings, page, changes)
+        host, port = page.host, page.port
         check_port(host, port)
-        self._rate, self._lock = rate, threading.Lock()
+        self._rate, self._lock = page.rate, threading.Lock()
         self._streams: dict[int, Stream] = {}
         self._views: dict[int, StillImage] = {}
         self._messages: dict[int, Any] = {}

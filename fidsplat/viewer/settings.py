@@ -26,6 +26,22 @@ _LEAST, _MOST = 16, 16384  # pixels a side
 
 
 @dataclass(frozen=True)
+class PageSettings:
+    """Address and frame rate of the viewer's page. Raises InputError for an unusable rate."""
+
+    port: int = 8080
+    """port of the page; 0 selects a free one"""
+    host: str = "127.0.0.1"
+    """address to listen on; 0.0.0.0 opens it to the network"""
+    rate: float = 30.0
+    """target frame rate while moving, in Hz"""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate <= 1000:
+            raise InputError(f"--rate must be above 0 and at most 1000 frames per second, got {self.rate:g}")
+
+
+@dataclass(frozen=True)
 class Viewpoint:
     """Camera of a browser, with OpenCV's axes."""
 
