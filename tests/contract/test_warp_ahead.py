@@ -112,7 +112,7 @@ def test_images_that_nobody_reads_leave_at_once(ahead):
     pipeline = ahead.pipeline(features)
     pipeline.render_view(resident, view)
     images = pipeline.render_view(resident, view)
-    assert images.settle
+    assert images.rendered[0].complete
     array = weakref.ref(images.arrays["rgb"])
     gc.disable()
     try:
@@ -120,7 +120,7 @@ def test_images_that_nobody_reads_leave_at_once(ahead):
         assert array() is None
     finally:
         gc.enable()
-    assert images.settle
+    assert images.rendered[0].complete
 
 
 @pytest.fixture

@@ -78,12 +78,12 @@ class Launcher:
     def launch(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
         """Launch `count` threads of a kernel whose first parameter is the number of thread 0."""
         args = _arguments(kernel, given, 1)
-        if self._workers is None:
+        pieces = 1 if self._workers is None else min(self.pieces, -(-count // _MIN_PIECE))
+        if pieces == 1:
             self._cache.launch(kernel, count, [0, *args], block)
             return
-        pieces = min(self.pieces, -(-count // _MIN_PIECE))
         cuts = [count * k // pieces for k in range(pieces + 1)]
-        self._run(kernel, [(first, end - first, [first, *args]) for first, end in pairwise(cuts)])
+        self._run(kernel, [(end - first, [first, *args]) for first, end in pairwise(cuts)])
 
     def launch_whole(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
         """Launch `count` threads in one piece on every device, with all arguments given."""
@@ -97,16 +97,17 @@ class Launcher:
         cuts = [first + (end - first) * k // pieces for k in range(pieces + 1)]
         args = _arguments(kernel, {**given, "state_first": 0}, 1)[:-1]
         spans = enumerate(pairwise(cuts))
-        self._run(kernel, [(k, b - a, [a, *args, k * area]) for k, (a, b) in spans])
+        self._run(kernel, [(b - a, [a, *args, k * area]) for k, (a, b) in spans])
 
-    def _run(self, kernel: Any, pieces: list[tuple[int, int, list[Any]]]) -> None:
+    def _run(self, kernel: Any, pieces: list[tuple[int, list[Any]]]) -> None:
+        """Launch pieces of a kernel, each with its number of threads and arguments."""
         wp, device = self._wp, self._device
 
-        def run(piece: tuple[int, int, list[Any]]) -> None:
-            wp.launch(kernel, piece[1], piece[2], device=device, record_tape=False)
+        def run(piece: tuple[int, list[Any]]) -> None:
+            wp.launch(kernel, *piece, device=device, record_tape=False)
 
         if len(pieces) == 1:
-            self._cache.launch(kernel, *pieces[0][1:])
+            self._cache.launch(kernel, *pieces[0])
         elif self._workers is not None:
             list(self._workers.map(run, pieces))  # raises the exception of a piece
 

@@ -32,7 +32,7 @@ from fidsplat.backends.warp.uniforms import (
     surroundings_of,
     uniforms,
 )
-from fidsplat.backends.warp.workspace import ArrayPool, Workspace
+from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.util.errors import DeviceError
 
 
@@ -62,7 +62,7 @@ class DeviceFrame:
     def __init__(
         self,
         program: Program,
-        workspace: Workspace,
+        planner: MemoryPlanner,
         resident: Resident,
         stack: ViewBatch,
         launcher: Launcher,
@@ -76,10 +76,11 @@ class DeviceFrame:
             capacity: of its lists; by default the host waits for their sizes.
             inputs: arrays that the host fills for the views; the workspace's by default.
         """
-        self.program, self.workspace, self.pool = program, workspace, workspace.pool
+        self.program, self.planner, self.workspace = program, planner, planner.workspace
+        self.pool = self.workspace.pool
         self.resident, self.launcher = resident, launcher
         self.reserved, self.capacity = reserved, capacity
-        self.inputs = inputs or workspace.pool
+        self.inputs = inputs or self.pool
         self.wp = load()
         view, shape = stack.view, program.shape
         columns, rows = -(-view.width // shape.tile_width), -(-view.height // shape.tile_height)
@@ -87,7 +88,6 @@ class DeviceFrame:
         self.tiles = self.views * rows * columns
         self.grid = rows * shape.tile_height, columns * shape.tile_width
         """of samples of a view"""
-        self.planner = MemoryPlanner(program, workspace)
         self.named: dict[str, Any] = {}
         """arrays and structs by the names of the kernels' parameters"""
         self.bands = 0
@@ -125,7 +125,7 @@ class DeviceFrame:
         reserved = self.reserved + self.planner.sample_bytes(self.view)
         for sub_frame in self.view.sub_frames:
             stack = ViewBatch.single(sub_frame.view)
-            part = DeviceFrame(self.program, self.workspace, self.resident, stack, self.launcher, reserved)
+            part = DeviceFrame(self.program, self.planner, self.resident, stack, self.launcher, reserved)
             samples = part._render_pose()
             self.launcher.stage("expose")
             self._accumulate(sub_frame, samples, exposed)
@@ -186,7 +186,7 @@ class DeviceFrame:
         visible, offsets = self._exact("visible", n, wp.int32), self._exact("offsets", n, wp.int32)
         # not read if all splats are of one kind
         cloud = {"boxes": visible, "thickness": self.resident.arrays["opacities"]} | self.resident.arrays
-        cloud |= {name: self.named[name] for name in ("coplanar_groups", "group_keys")}
+        cloud |= {"coplanar_groups": self.named["coplanar_groups"], "group_keys": self.named["group_keys"]}
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
         wp.utils.array_scan(visible, offsets, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)
@@ -246,7 +246,7 @@ class DeviceFrame:
         listed = self._take("lists", 2 * pairs, wp.int32)
         band = {"band_first": first, "band_end": end}
         if pairs:
-            lengths, ends = (self._exact(name, visible, wp.int64) for name in ("lengths", "ends"))
+            lengths, ends = self._exact("lengths", visible, wp.int64), self._exact("ends", visible, wp.int64)
             count = sort.gather if complete else lists.count
             self._launch(count, visible, **band, capacity=visible, pairs=pairs)
             wp.utils.array_scan(lengths, ends, inclusive=True)
@@ -280,6 +280,7 @@ class DeviceFrame:
 
     def resolve(self, into: ImageArrays, launcher: Launcher) -> None:
         """Run the last stage, which makes images from samples."""
+        launcher.stage("resolve")
         view, wp, program = self.view, self.wp, self.program
         width, pixels = view.width // view.samples, view.width * view.height // view.samples**2
         out = program.images_type()
@@ -303,6 +304,7 @@ class DeviceFrame:
             given = {"settings": settings, "batch_indices": into.indices, "rgb": into.arrays["rgb"]}
             sizes = {"width": width, "pixels": pixels}
             launcher.launch(program.sensor.kernel, self.views * pixels, given | sizes)
+        launcher.stage(None)
 
     # helpers
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Images, summed
 from fidsplat.backends.warp.command_list import Launcher
-from fidsplat.backends.warp.frame import ImageArrays
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import Output
@@ -21,61 +20,94 @@ from fidsplat.util.errors import DeviceError, bytes_words
 _CONVERTING = threading.Lock()
 
 
+@dataclass(eq=False)
+class Rendered:
+    """Views that were rendered together: their launches and counts."""
+
+    launcher: Launcher
+    counts: dict[str, int]
+    """splats, visible, pairs; see `complete`"""
+    complete: Callable[[], Rendered | None] | None = None
+    """of a frame whose counts are not known: waits for it, and returns its second rendering into the same
+    arrays if it exceeded its capacity"""
+    profile: Callable[[], Mapping[str, float]] | None = None
+    """of a replayed frame: measures its stages"""
+
+    def settle(self) -> Rendered:
+        """Wait for the counts; render the frame again if it exceeded its capacity."""
+        if self.complete:
+            again = self.complete()
+            self.complete = None
+            if again:
+                self.launcher, self.counts, self.profile = again.launcher, again.counts, None
+        return self
+
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, in their order."""
+        return self.profile() if self.profile else self.launcher.timings()
+
+
 class WarpImages(Images):
-    """Output images of one view, or of views that were rendered together."""
+    """Output images of one view, or of all views of a batch."""
 
     shares_arrays = True
 
     def __init__(
         self,
-        outputs: tuple[Output, ...],
-        into: ImageArrays,
+        workspace: Workspace,
+        outputs: Mapping[str, Output],
         size: tuple[int, int],
-        launcher: Launcher,
-        stats: dict[str, int],
+        views: int = 1,
+        splats: int = 0,
     ) -> None:
-        """into: arrays of a view, or of a batch. size: rows and columns of pixels."""
-        self._outputs = {output.name: output for output in outputs}
-        self.into, self._size, self._launcher, self._stats = into, size, launcher, stats
-        self.settle: Callable[[], WarpImages | None] | None = None
-        """of a frame whose counts are not known: waits for it, and returns its second rendering into the same
-        arrays if it exceeded its capacity"""
-        self.profile: Callable[[], dict[str, float]] | None = None
-        """of a replayed frame: measures its stages"""
+        """New arrays. size: rows and columns of pixels. splats: in the cloud.
 
-    def _settled(self) -> None:
-        if self.settle:
-            again = self.settle()
-            self.settle = None
-            if again:
-                self._launcher, self._stats, self.profile = again._launcher, again._stats, None
+        Raises:
+            DeviceError: they exceed the memory budget, or the memory of the device.
+        """
+        self._outputs, self._size, self.views, self._splats = outputs, size, views, splats
+        self.nbytes, pixels = 0, views * size[0] * size[1]
+        self.arrays: dict[str, Any] = {}
+        """by the names of the outputs; complete or not"""
+        for name, output in outputs.items():
+            self.nbytes += 4 * pixels * output.channels
+            if self.nbytes > workspace.memory_budget:
+                raise DeviceError(
+                    f"the images of {views} views must be at most {bytes_words(workspace.memory_budget)}, "
+                    f"the memory budget, got {bytes_words(self.nbytes)}; render fewer views or outputs at "
+                    "once"
+                )
+            dtype = getattr(load(), output.dtype)
+            self.arrays[name] = workspace.pool.fresh(name, pixels * output.channels, dtype)
+        self.rendered: list[Rendered] = []
+        """in parts of the batch"""
 
-    @property
-    def stats(self) -> Mapping[str, int]:
-        """splats, visible, pairs."""
-        self._settled()
-        return self._stats
-
-    @property
-    def arrays(self) -> Mapping[str, Any]:
-        """Arrays of the images, complete or not."""
-        return self.into.arrays
+    def blank(self) -> None:
+        """Fill the images of all views, of which some are masked out."""
+        for name, output in self._outputs.items():
+            self.arrays[name].fill_(output.blank)
 
     def device_array(self, name: str, index: int | None = None) -> Any:
-        """The image as a wp.array (1, h, w) or (1, h, w, 3), with an index without the first dimension, on
-        the device; no copy."""
-        self._settled()
-        output, array = self._outputs[name], self.into.arrays[name]
+        """The images as a wp.array (views, h, w) or (views, h, w, 3), with an index that of one view, on the
+        device; no copy."""
+        for part in self.rendered:
+            part.settle()
+        output, array = self._outputs[name], self.arrays[name]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        return array.reshape((1, *shape) if index is None else shape)
+        if index is None:
+            return array.reshape((self.views, *shape))
+        if self.views > 1:
+            size = math.prod(shape)
+            array = array[index * size : (index + 1) * size]
+        return array.reshape(shape)
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy the image to the host."""
+        """Copy the images of all views, or of one, to the host."""
         # a CPU array's numpy() is its own memory, which device_array shares
         return np.array(self.device_array(name, index).numpy())
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
-        """Copy the image to the host in 8 bits, converted on the device."""
+        """Copy an image to the host in 8 bits, converted on the device."""
         image = self.device_array(name, index)
         made = load().empty(image.size, dtype=load().uint8, device=image.device)
         given = [image.flatten(), made]
@@ -87,87 +119,17 @@ class WarpImages(Images):
         return made.numpy().reshape(image.shape)
 
     def wait(self) -> None:
-        """Wait until the device has rendered them."""
-        self._settled()
-        self._launcher.finish()
-
-    @property
-    def timings(self) -> dict[str, float]:
-        """Milliseconds on the device by stage, in their order."""
-        self._settled()
-        return self.profile() if self.profile else self._launcher.timings()
-
-
-class WarpBatch(Images):
-    """Output images of all views of a batch."""
-
-    shares_arrays = True
-
-    def __init__(
-        self, workspace: Workspace, outputs: tuple[Output, ...], batch: ViewBatch, splats: int
-    ) -> None:
-        """
-        Raises:
-            DeviceError: they exceed the memory budget, or the memory of the device.
-        """
-        self._workspace, self._size, self.views, self._splats = workspace, batch.size, batch.total, splats
-        height, width = batch.size
-        self.nbytes = 4 * batch.total * height * width * sum(output.channels for output in outputs)
-        if self.nbytes > workspace.memory_budget:
-            raise DeviceError(
-                f"the images of {batch.total} views take {bytes_words(self.nbytes)}, more than the memory "
-                f"budget of {bytes_words(workspace.memory_budget)}; draw fewer views or outputs at once"
-            )
-        self._images: dict[str, tuple[Output, Any]] = {}
-        for output in outputs:
-            size, dtype = batch.total * height * width * output.channels, getattr(load(), output.dtype)
-            array = workspace.pool.fresh(f"{output.name} of {batch.total} views", size, dtype)
-            if len(batch) < batch.total:
-                array.fill_(output.blank)
-            self._images[output.name] = output, array
-        self._parts: list[WarpImages] = []
-
-    def arrays_of(self, indices: np.ndarray) -> ImageArrays:
-        """Output arrays of the views of these indices."""
-        wp = load()
-        numbers = wp.array(indices.astype(np.int32), dtype=wp.int32, device=self._workspace.device)
-        return ImageArrays({name: array for name, (_, array) in self._images.items()}, numbers)
-
-    def add(self, images: WarpImages) -> None:
-        """Add views that were rendered together."""
-        self._parts.append(images)
-
-    def _settle(self) -> None:
-        for images in self._parts:
-            images.wait()
-
-    def device_array(self, name: str, index: int | None = None) -> Any:
-        """The images as a wp.array (views, h, w) or (views, h, w, 3), with an index that of one view, on the
-        device; no copy."""
-        self._settle()
-        output, array = self._images[name]
-        shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        if index is None:
-            return array.reshape((self.views, *shape))
-        size = math.prod(shape)
-        return array[index * size : (index + 1) * size].reshape(shape)
-
-    def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy the images of all views, or of one, to the host."""
-        return np.array(self.device_array(name, index).numpy())
-
-    def wait(self) -> None:
         """Wait until the device has rendered all views."""
-        self._settle()
-        load().synchronize_device(self._workspace.device)
+        for part in self.rendered:
+            part.settle().launcher.finish()
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds by stage, of all views together."""
-        return summed(images.timings for images in self._parts)
+        """Milliseconds on the device by stage, of all views together."""
+        return summed(part.settle().timings() for part in self.rendered)
 
     @property
     def stats(self) -> Mapping[str, int]:
         """visible and pairs, sums over all views; splats in the cloud."""
         none = {"splats": 0, "visible": 0, "pairs": 0}
-        return summed([none, *(images.stats for images in self._parts)]) | {"splats": self._splats}
+        return summed([none, *(part.settle().counts for part in self.rendered)]) | {"splats": self._splats}

@@ -28,7 +28,7 @@ class MemoryPlanner:
     """Plans frames of one program."""
 
     def __init__(self, program: Program, workspace: Workspace) -> None:
-        self._workspace, shape = workspace, program.shape
+        self.workspace, shape = workspace, program.shape
         self._tile_width, self._tile_height = shape.tile_width, shape.tile_height
         sizes = map(load().types.type_size_in_bytes, program.sample_fields.values())
         self._sample_bytes = sum(sizes)
@@ -51,7 +51,7 @@ class MemoryPlanner:
         Raises:
             DeviceError: the rest of the frame exceeds the memory budget.
         """
-        workspace = self._workspace
+        workspace = self.workspace
         fixed = resident.memory_bytes + self._splat_bytes * len(stack) * resident.count + _VISIBLE * visible
         fixed += len(stack) * self.sample_bytes(stack.view) + reserved + memory_bytes(stack.view, workspace)
         pairs = (workspace.memory_budget - fixed) // _PAIR
@@ -65,7 +65,7 @@ class MemoryPlanner:
 
     def parts(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[tuple[int, int]]:
         """Ranges [first, end) of views that are rendered together. reserved: bytes of all their images."""
-        count, workspace = len(batch), self._workspace
+        count, workspace = len(batch), self.workspace
         if not count or not batch.stacked or (self._same_settings and batch.numbers):
             return iter([(k, k + 1) for k in range(count)])
         each = resident.count * (self._splat_bytes + _VISIBLE) + self.sample_bytes(batch.view)

@@ -8,12 +8,12 @@ from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.command_list import LaunchCache
-from fidsplat.backends.warp.frame import DeviceFrame
-from fidsplat.backends.warp.images import WarpBatch, WarpImages
-from fidsplat.backends.warp.memory_plan import MemoryPlanner
+from fidsplat.backends.warp.frame import DeviceFrame, ImageArrays
+from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.recorded_frame import FrameRenderer
 from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import Workspace
 
 
@@ -22,8 +22,8 @@ class WarpPipeline(Pipeline):
 
     def __init__(self, program: Program, workspace: Workspace, launches: LaunchCache) -> None:
         self.program, self.workspace = program, workspace
+        self.outputs = {output.name: output for output in program.images}
         self._renderer = FrameRenderer(program, workspace, launches)
-        self._planner = MemoryPlanner(program, workspace)
 
     def render_view(self, resident: Resident, view: View) -> WarpImages:
         """Render one view.
@@ -32,27 +32,42 @@ class WarpPipeline(Pipeline):
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.working("while rendering"):
-            return self._renderer.render(resident, ViewBatch.single(view))
+            images, into = self._new_images(resident, view)
+            views = ViewBatch.single(view)
+            images.rendered.append(self._renderer.render(resident, views, into, images.nbytes))
+            return images
 
-    def render(self, resident: Resident, views: ViewBatch) -> WarpImages | WarpBatch:
+    def render(self, resident: Resident, views: ViewBatch) -> WarpImages:
         """Render views, as many at once as memory holds. Raises DeviceError as `render_view`."""
-        if views.is_single:
-            return self.render_view(resident, views.one(0))
+        wp, device = load(), self.workspace.device
         with self.workspace.working("while rendering"):
-            images = WarpBatch(self.workspace, self.program.images, views, resident.count)
-            for first, end in self._planner.parts(resident, views, images.nbytes):
-                into = images.arrays_of(views.batch_indices[first:end])
-                images.add(self._renderer.render(resident, views.part(first, end), into, images.nbytes))
+            images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)
+            if len(views) < views.total:
+                images.blank()
+            for first, end in self._renderer.planner.parts(resident, views, images.nbytes):
+                indices = views.batch_indices[first:end].astype(np.int32)
+                into = ImageArrays(images.arrays, wp.array(indices, dtype=wp.int32, device=device))
+                part = views.part(first, end)
+                images.rendered.append(self._renderer.render(resident, part, into, images.nbytes))
             return images
 
     def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
         """Render one view; its frame, whose arrays are valid until another is rendered, and its images.
 
         Raises:
-            DeviceError: as `render`.
+            DeviceError: as `render_view`.
         """
         with self.workspace.working("while rendering"):
-            return self._renderer.render_counted(resident, ViewBatch.single(view))
+            images, into = self._new_images(resident, view)
+            views = ViewBatch.single(view)
+            frame, rendered = self._renderer.render_counted(resident, views, into, images.nbytes)
+            images.rendered.append(rendered)
+            return frame, images
+
+    def _new_images(self, resident: Resident, view: View) -> tuple[WarpImages, ImageArrays]:
+        size = view.height // view.samples, view.width // view.samples
+        images = WarpImages(self.workspace, self.outputs, size, splats=resident.count)
+        return images, ImageArrays(images.arrays, self.workspace.first_index)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view and return the data between the stages.

@@ -9,7 +9,7 @@ views is in arrays that are filled before the replay.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -18,7 +18,8 @@ from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.command_list import CommandList, LaunchCache, Launcher
 from fidsplat.backends.warp.frame import Capacity, DeviceFrame, ImageArrays
-from fidsplat.backends.warp.images import WarpImages
+from fidsplat.backends.warp.images import Rendered
+from fidsplat.backends.warp.memory_plan import MemoryPlanner
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import load
@@ -75,105 +76,101 @@ class FrameRenderer:
 
     def __init__(self, program: Program, workspace: Workspace, launches: LaunchCache) -> None:
         self.program, self._workspace, self._launches = program, workspace, launches
+        self.planner = MemoryPlanner(program, workspace)
         workspace.pool.holders.add(launches)
         self._cached: WeakKeyDictionary[Resident, dict[tuple[int, int, int], _CachedFrame]] = (
             WeakKeyDictionary()
         )
 
     def render_counted(
-        self, resident: Resident, stack: ViewBatch, into: ImageArrays | None = None, reserved: int = 0
-    ) -> tuple[DeviceFrame, WarpImages]:
+        self, resident: Resident, views: ViewBatch, into: ImageArrays, reserved: int
+    ) -> tuple[DeviceFrame, Rendered]:
         """Render views, waiting for their counts.
 
         Args:
-            into: arrays of the images; by default new ones for one view.
-            reserved: bytes on the device of the batch of which they are a part.
+            into: arrays of the images.
+            reserved: bytes on the device of the images of all views.
         """
-        launcher, reserved = Launcher(self._launches), reserved or self._image_bytes(stack.view)
-        frame = DeviceFrame(self.program, self._workspace, resident, stack, launcher, reserved)
+        launcher = Launcher(self._launches)
+        frame = DeviceFrame(self.program, self.planner, resident, views, launcher, reserved)
         self._workspace.frames += 1
         frame.render()
-        if not stack.view.sub_frames:
-            self._update_capacity(resident, stack, frame.stats["visible"], frame.stats["pairs"])
-        return frame, self._resolved(frame, launcher, frame.stats, into)
+        if not views.view.sub_frames:
+            self._update_capacity(resident, views, frame.stats["visible"], frame.stats["pairs"])
+        frame.resolve(into, launcher)
+        return frame, Rendered(launcher, frame.stats)
 
-    def render(
-        self, resident: Resident, stack: ViewBatch, into: ImageArrays | None = None, reserved: int = 0
-    ) -> WarpImages:
+    def render(self, resident: Resident, views: ViewBatch, into: ImageArrays, reserved: int) -> Rendered:
         """Render views without waiting where a frame of their kind was rendered before."""
-        workspace, view = self._workspace, stack.view
-        cached = self._cached.get(resident, {}).get(_kind(stack))
+        workspace, view = self._workspace, views.view
         # adopted arrays may have changed by the time that a frame must be rendered again
-        adopted = resident.adopted or not resident.count
-        if cached is None or not workspace.asynchronous or view.sub_frames or adopted:
-            return self.render_counted(resident, stack, into, reserved)[1]
-        reserved, capacity = reserved or self._image_bytes(view), cached.capacity
+        if not workspace.asynchronous or view.sub_frames or resident.adopted or not resident.count:
+            return self.render_counted(resident, views, into, reserved)[1]
+        cached = self._cached.get(resident, {}).get((view.width, view.height, len(views)))
+        if cached is None:
+            return self.render_counted(resident, views, into, reserved)[1]
         # other frames overwrite the inputs, and a failure leaves them undefined
-        recorded, cached.recorded = cached.recorded, None
+        capacity, recorded, cached.recorded = cached.capacity, cached.recorded, None
         if recorded is not None and recorded.token == self._token(cached, view, reserved):
-            recorded.replay(stack)
+            recorded.replay(views)
             cached.recorded = recorded
             workspace.frames += 1
             launcher = Launcher(self._launches, timed=False)
-            return self._pending(resident, stack, capacity, recorded.frame, launcher, into)
+            return self._pending(resident, views, capacity, recorded.frame, launcher, into, reserved)
         launcher = Launcher(self._launches)
-        given = {"reserved": reserved, "capacity": capacity, "inputs": cached.inputs}
-        frame = DeviceFrame(self.program, workspace, resident, stack, launcher, **given)
+        given = {"capacity": capacity, "inputs": cached.inputs}
+        frame = DeviceFrame(self.program, self.planner, resident, views, launcher, reserved, **given)
         if not frame.fits(capacity):
-            return self.render_counted(resident, stack, into, reserved)[1]
+            return self.render_counted(resident, views, into, reserved)[1]
         workspace.frames += 1
         frame.render()
-        images = self._pending(resident, stack, capacity, frame, launcher, into)
+        rendered = self._pending(resident, views, capacity, frame, launcher, into, reserved)
         self._record(cached, frame, reserved)
-        return images
+        return rendered
 
     def _pending(
         self,
         resident: Resident,
-        stack: ViewBatch,
+        views: ViewBatch,
         capacity: Capacity,
         frame: DeviceFrame,
         launcher: Launcher,
-        into: ImageArrays | None,
-    ) -> WarpImages:
-        """Images of a frame whose counts are not known yet."""
+        into: ImageArrays,
+        reserved: int,
+    ) -> Rendered:
+        """A frame whose counts are not known yet."""
         workspace, pool = self._workspace, frame.pool
         counts = pool.lend("totals", 2, load().int64)
         load().copy(counts, frame.named["totals"])
-        stats = {"splats": resident.count, "visible": 0, "pairs": 0}
-        images = self._resolved(frame, launcher, stats, into)
+        frame.resolve(into, launcher)
+        rendered = Rendered(launcher, {"splats": resident.count, "visible": 0, "pairs": 0})
         # a later frame may write there, even if this one is still running
-        weakref.finalize(images, pool.give_back, "totals", counts)
-        arrays = images.into  # not the images, which are freed at once if nothing reads them
+        weakref.finalize(rendered, pool.give_back, "totals", counts)
+        stats = rendered.counts  # not the object, which is freed at once if nothing reads the images
 
-        def settle() -> WarpImages | None:
+        def complete() -> Rendered | None:
             with workspace.failing("while rendering"):
                 launcher.finish()
             with workspace.working("while rendering"):
                 visible, pairs = counts.numpy().tolist()
                 stats.update(visible=visible, pairs=pairs)
-                self._update_capacity(resident, stack, visible, pairs)
+                self._update_capacity(resident, views, visible, pairs)
                 if visible > capacity.visible or pairs > capacity.pairs:
-                    return self.render_counted(resident, stack, arrays)[1]
+                    return self.render_counted(resident, views, into, reserved)[1]
             return None
 
-        images.settle = settle
+        def profile() -> Mapping[str, float]:
+            """Measure the stages by rendering into other arrays, or into those of a batch."""
+            with workspace.working("while rendering"):
+                own = into
+                if len(views) == 1:
+                    own = ImageArrays({n: load().empty_like(a) for n, a in into.arrays.items()}, into.indices)
+                return self.render_counted(resident, views, own, reserved)[1].timings()
+
+        rendered.complete = complete
         if not launcher.timed:
-            images.profile = self._profiler(resident, stack, arrays)
-        return images
-
-    def _profiler(
-        self, resident: Resident, stack: ViewBatch, arrays: ImageArrays
-    ) -> Callable[[], dict[str, float]]:
-        """A function that measures the stages of a replayed frame by rendering it again, a batch into the
-        same images."""
-        into = arrays if len(stack) > 1 else None
-
-        def timings() -> dict[str, float]:
-            with self._workspace.working("while rendering"):
-                return self.render_counted(resident, stack, into)[1].timings
-
-        return timings
+            rendered.profile = profile
+        return rendered
 
     def _record(self, cached: _CachedFrame, frame: DeviceFrame, reserved: int) -> None:
         """Record a frame whose launches equal those of the last of its kind."""
@@ -192,44 +189,16 @@ class FrameRenderer:
         states = workspace.pool.state, cached.inputs.state
         return cached.capacity, budgets, states, view.raster, view.surroundings, labels
 
-    def _resolved(
-        self, frame: DeviceFrame, launcher: Launcher, stats: dict[str, int], into: ImageArrays | None
-    ) -> WarpImages:
-        view = frame.view
-        size = view.height // view.samples, view.width // view.samples
-        into = into or self._new_arrays(size)
-        launcher.stage("resolve")
-        frame.resolve(into, launcher)
-        launcher.stage(None)
-        return WarpImages(self.program.images, into, size, launcher, stats)
-
-    def _new_arrays(self, size: tuple[int, int]) -> ImageArrays:
-        """New arrays for the images of one view."""
-        wp, pool = load(), self._workspace.pool
-        arrays = {
-            one.name: pool.fresh(one.name, size[0] * size[1] * one.channels, getattr(wp, one.dtype))
-            for one in self.program.images
-        }
-        return ImageArrays(arrays, self._workspace.first_index)
-
-    def _image_bytes(self, view: View) -> int:
-        """Bytes of the images of one view."""
-        pixels = view.width * view.height // view.samples**2
-        return 4 * pixels * sum(output.channels for output in self.program.images)
-
-    def _update_capacity(self, resident: Resident, stack: ViewBatch, visible: int, pairs: int) -> None:
-        kinds, kind = self._cached.setdefault(resident, {}), _kind(stack)
-        if kind not in kinds and len(kinds) >= _MAX_KINDS:
-            kinds.clear()
-        new = kind not in kinds
-        cached = kinds.setdefault(kind, _CachedFrame(ArrayPool(self._workspace.device), Capacity(0, 0)))
+    def _update_capacity(self, resident: Resident, views: ViewBatch, visible: int, pairs: int) -> None:
+        kinds, kind = self._cached.setdefault(resident, {}), (views.view.width, views.view.height, len(views))
+        cached = kinds.get(kind)
+        if cached is None:
+            if len(kinds) >= _MAX_KINDS:
+                kinds.clear()
+            cached = kinds[kind] = _CachedFrame(ArrayPool(self._workspace.device), Capacity(-1, -1))
         before = cached.capacity
-        if new or visible > before.visible or pairs > before.pairs:
+        if visible > before.visible or pairs > before.pairs:
             cached.capacity = Capacity(
-                min(max(visible + visible // 8 + _SPARE, before.visible), len(stack) * resident.count),
+                min(max(visible + visible // 8 + _SPARE, before.visible), len(views) * resident.count),
                 max(pairs + pairs // 8 + _SPARE, before.pairs),
             )
-
-
-def _kind(stack: ViewBatch) -> tuple[int, int, int]:
-    return stack.view.width, stack.view.height, len(stack)

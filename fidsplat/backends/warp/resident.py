@@ -30,6 +30,8 @@ class Resident(ResidentData):
         ellipsoids: str = "none",
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
+        self.memory_bytes = sum(map(nbytes, arrays.values()))
+        """including adopted arrays"""
         self.sh_degree, self.group_table, self.has_coplanar_groups = (
             sh_degree,
             group_table,
@@ -45,11 +47,6 @@ class Resident(ResidentData):
         if self.sh_degree > 0:
             return color_range(None, colors.reshape(self.count, -1, 3))
         return color_range(colors, None)
-
-    @property
-    def memory_bytes(self) -> int:
-        """Bytes of the splats, including adopted arrays."""
-        return sum(map(nbytes, self.arrays.values()))
 
     @classmethod
     def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:

@@ -5,7 +5,6 @@ Arrays of lenses and panoramas are cached as long as the host refers to them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -21,17 +20,6 @@ from fidsplat.cameras.raster import RayRaster
 from fidsplat.capture.environment import Gradient, Panorama
 from fidsplat.util.errors import DeviceError, bytes_words
 
-_DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
-    "tile_w": lambda view, shape: shape.tile_width,
-    "tile_h": lambda view, shape: shape.tile_height,
-    "tiles_x": lambda view, shape: -(-view.width // shape.tile_width),
-    "tiles_y": lambda view, shape: -(-view.height // shape.tile_height),
-    "per_pixel": lambda view, shape: 1.0 / view.samples**2,
-}
-"""fields that are derived from a view"""
-_LATER = frozenset({"per_focal_x", "per_focal_y", "per_near", "ray", "ray_step", "splats"})
-"""fields that are filled separately"""
-
 
 @cache
 def _record() -> Any:
@@ -42,21 +30,22 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
     """Fill the struct `View` (views,) for tiles of this shape. splats: of the cloud. sloped: whether kernels
     read derivatives of rays."""
     view = stack.view
+    derived = {
+        **{"tile_w": shape.tile_width, "tile_h": shape.tile_height, "splats": splats},
+        **{"tiles_x": -(-view.width // shape.tile_width), "tiles_y": -(-view.height // shape.tile_height)},
+        **{"per_pixel": 1.0 / view.samples**2, "rotation": stack.rotation[0]},
+        **{"translation": stack.translation[0], "eye": stack.eye[0], **stack.numbers},
+        # below
+        **{"per_focal_x": 0.0, "per_focal_y": 0.0, "per_near": 0.0, "ray": 0.0, "ray_step": 0.0},
+    }
     filled: Any = np.zeros(len(stack), _record())
     for name in filled.dtype.names:
-        if name not in _LATER:
-            derive = _DERIVED.get(name)
-            filled[name] = derive(view, shape) if derive else getattr(view, name)
-    for name in ("rotation", "translation", "eye"):
-        filled[name] = getattr(stack, name)[0]
-    for name, numbers in stack.numbers.items():
-        filled[name] = numbers
+        filled[name] = derived[name] if name in derived else getattr(view, name)
     for name in ("focal_x", "focal_y", "near"):
         filled[f"per_{name}"] = 1.0 / filled[name]
     if not (view.along_ray or view.parallel):  # else depths are distances, and the ray is 0
         own = (filled["per_focal_x"], filled["per_focal_y"], filled["center_x"], filled["center_y"])
         filled["ray"] = np.stack(own, axis=1)
-    filled["splats"] = splats
     if sloped and view.raster:
         filled["ray_step"] = view.raster.step
     return filled
@@ -168,11 +157,14 @@ def surroundings_of(view: View, workspace: Workspace) -> Any:
 
 def memory_bytes(view: View, workspace: Workspace) -> int:
     """Bytes of the arrays of a view's lens, panorama and external depth image."""
-    around, raster, external = view.surroundings, view.raster, view.external_depth
-    cached = {} if raster is None else workspace.lenses.get(raster.whole or raster, {})
-    taken = [around.image] if isinstance(around, Panorama) else []
-    taken += [] if external is None else [external.rgb, external.depth, external.label]
-    return sum(map(nbytes, cached.values())) + sum(array.nbytes for array in taken)
+    around, raster, external, size = view.surroundings, view.raster, view.external_depth, 0
+    if raster is not None:
+        size += sum(map(nbytes, workspace.lenses.get(raster.whole or raster, {}).values()))
+    if isinstance(around, Panorama):
+        size += around.image.nbytes
+    if external is not None:
+        size += external.rgb.nbytes + external.depth.nbytes + external.label.nbytes
+    return size
 
 
 def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:
