@@ -65,7 +65,7 @@ class ViewBatch:
         if view.groups:
             return _stacked((view,), {}, _FIRST, 1)
         poses = view.rotation[None, None], view.translation[None, None], view.eye[None, None]
-        return ViewBatch(view, *poses, views=(view,))
+        return ViewBatch(view, *poses, batch_indices=_FIRST, views=(view,))
 
     @staticmethod
     def of(views: Sequence[View], batch_indices: np.ndarray, total: int) -> ViewBatch:

@@ -85,6 +85,8 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
         InputError: as View.of; a pose that is not rigid.
     """
     camera, motion, shutter = capture.camera, capture.motion, capture.shutter
+    if motion.is_still:
+        return View.of(capture, origin)
 
     def at(time: float) -> View:
         moved = None if camera is None else motion.moved(camera, time)

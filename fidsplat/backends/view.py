@@ -178,23 +178,22 @@ class View:
         lens, grid = camera.lens, (camera.width * n, camera.height * n)
         intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n
         parallel = isinstance(lens, Orthographic)
+        fx, fy, cx, cy = intrinsics
         # 3DGS and gsplat: 0.3 half images outside the image
-        beyond = [0.15 * size / f for size, f in zip(grid, intrinsics[:2], strict=True)]
+        beyond_x, beyond_y = 0.15 * grid[0] / fx, 0.15 * grid[1] / fy
         slopes = (
-            intrinsics[2] / intrinsics[0] + beyond[0],
-            (grid[0] - intrinsics[2]) / intrinsics[0] + beyond[0],
-            intrinsics[3] / intrinsics[1] + beyond[1],
-            (grid[1] - intrinsics[3]) / intrinsics[1] + beyond[1],
+            *(cx / fx + beyond_x, (grid[0] - cx) / fx + beyond_x),
+            *(cy / fy + beyond_y, (grid[1] - cy) / fy + beyond_y),
         )
         raster = None if lens is None or parallel else raster_of(lens, *grid, *intrinsics)
         return cls(
             width=camera.width * n,
             height=camera.height * n,
             samples=n,
-            focal_x=intrinsics[0],
-            focal_y=intrinsics[1],
-            center_x=intrinsics[2],
-            center_y=intrinsics[3],
+            focal_x=fx,
+            focal_y=fy,
+            center_x=cx,
+            center_y=cy,
             rotation=rotation,
             translation=-rotation @ eye,
             # view-dependent colours of parallel rays are those of a distant eye

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -100,7 +101,7 @@ class Motion:
     def __reduce__(self):
         return Motion, (self.camera, dict(self.groups))  # a mapping proxy is not pickled
 
-    @property
+    @cached_property
     def is_still(self) -> bool:
         """Whether nothing moves."""
         return self.camera is None and not self.groups

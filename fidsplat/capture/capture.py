@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypedDict
 
@@ -13,6 +13,11 @@ from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
 from fidsplat.util.arguments import PickledByFields
 from fidsplat.util.errors import InputError, unknown
+
+_KINDS = {
+    **{"motion": Motion, "shutter": Shutter, "sensor": Sensor, "fog": Fog},
+    **{"external_depth": ExternalDepth},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +54,12 @@ class Capture(PickledByFields):
         put(self, "outputs", output_names(self.outputs))
         put(self, "quality", Quality.of(self.quality))
         put(self, "background", background_of(self.background))
-        for name, kind in (("motion", Motion), ("shutter", Shutter), ("sensor", Sensor)):
-            put(self, name, _of_kind(name, getattr(self, name), kind) or kind())
-        _of_kind("fog", self.fog, Fog)
-        _of_kind("external_depth", self.external_depth, ExternalDepth)
+        for name, kind in _KINDS.items():
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"{name} must be a {kind.__name__}, got {value!r}")
+            if value is None and name in ("motion", "shutter", "sensor"):
+                put(self, name, kind())
 
     @cached_property
     def foggy(self) -> bool:
@@ -87,10 +94,12 @@ class Capture(PickledByFields):
         Raises:
             InputError: an unknown part, or a value of the wrong kind.
         """
-        for name in changes:
+        given = {}
+        for name, value in changes.items():
             if name not in self.__dataclass_fields__:
-                raise InputError(unknown("part of a capture", name, [part.name for part in fields(self)]))
-        given = {name: value for name, value in changes.items() if value is not None}
+                raise InputError(unknown("part of a capture", name, self.__dataclass_fields__))
+            if value is not None:
+                given[name] = value
         return replace(self, **given) if given else self
 
 
@@ -115,12 +124,7 @@ def output_names(outputs: Any) -> tuple[str, ...]:
         names = (outputs,)
     if not names:
         raise InputError("outputs must have at least one name, e.g. 'rgb', got none")
-    if not all(isinstance(name, str) for name in names):
-        raise InputError(f"outputs must be one or more names, got {outputs!r}")
+    for name in names:
+        if not isinstance(name, str):
+            raise InputError(f"outputs must be one or more names, got {outputs!r}")
     return tuple(dict.fromkeys(names))
-
-
-def _of_kind(name: str, value: Any, kind: type) -> Any:
-    if value is not None and not isinstance(value, kind):
-        raise InputError(f"{name} must be a {kind.__name__}, got {value!r}")
-    return value

@@ -175,9 +175,9 @@ def background_of(value: Any) -> Background:
 def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
     """Validated tuple of three finite floats; errors name it."""
     try:
-        numbers = tuple(float(number) for number in value)
+        x, y, z = map(float, value)
     except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != 3 or not all(abs(number) <= LARGEST for number in numbers):
+        x = y = z = math.nan
+    if not (abs(x) <= LARGEST and abs(y) <= LARGEST and abs(z) <= LARGEST):
         raise InputError(f"{name} must be three finite numbers, at most {LARGEST:g}, got {value!r}")
-    return numbers  # type: ignore[return-value]
+    return x, y, z

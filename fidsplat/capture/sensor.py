@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -82,7 +83,7 @@ class Sensor:
         else:
             object.__setattr__(self, "response", _numbers("response", self.response, 2, 65536))
 
-    @property
+    @cached_property
     def steps(self) -> tuple[str, ...]:
         """Names of the active steps, in order of application."""
         found = [

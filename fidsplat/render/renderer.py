@@ -355,7 +355,7 @@ class Renderer:
 
     def _render_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
         interrupts.check()
-        features, batch = prepare_batch(resident.whole, views)
+        features, batch = prepare_batch(resident.complete, views)
         with self._lock:
             rendered = (batch.one(number) for number in range(len(batch)))
             data, ids = resident.gather(rendered, features, (capture.quality for capture in views.captures))
@@ -379,17 +379,17 @@ class Renderer:
         band: tuple[int, int] | None = None,
     ) -> Frame:
         interrupts.check()
-        features, view = prepare(resident.whole, capture)
-        view = _banded(view, band)
+        features, view = prepare(resident.complete, capture)
+        if band is not None:
+            view = _banded(view, band)
         plan = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None
         with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
             pipeline, data = self.backend.pipeline(features), resident.data
             if not isinstance(data, Residency):
-                error = None
-                images = render(pipeline, data, view)
+                error, images = None, render(pipeline, data, view)
                 if plan is not None:
-                    ideal = render(self.backend.pipeline(plan.features), data, _banded(plan.view, band))
-                    error = ErrorImage(images, ideal, plan)
+                    own = plan.view if band is None else _banded(plan.view, band)
+                    error = ErrorImage(images, render(self.backend.pipeline(plan.features), data, own), plan)
                 return Frame(images, capture, error=error)
 
             def part(one: BandData) -> Frame:
@@ -399,9 +399,9 @@ class Renderer:
             return stacked(data.bands(view, features, capture.quality, pipeline), part)
 
 
-def _banded(view: View, band: tuple[int, int] | None) -> View:
+def _banded(view: View, band: tuple[int, int]) -> View:
     """The view restricted to these rows of pixels."""
-    return view if band is None else replace(view, band=(band[0] * view.samples, band[1] * view.samples))
+    return replace(view, band=(band[0] * view.samples, band[1] * view.samples))
 
 
 def _requested(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:

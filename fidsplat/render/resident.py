@@ -30,6 +30,8 @@ class ResidentCloud:
         labels: np.ndarray | None = None,
     ) -> None:
         self.backend, self.data, self._labels = backend, data, labels
+        self.complete: Any = data.scene if isinstance(data, Residency) else data
+        """all splats, in memory or in stores, for which captures are prepared"""
         self.capture = capture
         """capture of the uploaded scene, which `render` uses by default"""
 
@@ -51,11 +53,6 @@ class ResidentCloud:
     def labels(self) -> frozenset[int] | None:
         """Labels of its splats; None if they are only on the device or on disk."""
         return None if self._labels is None else frozenset(np.unique(self._labels).tolist())
-
-    @property
-    def whole(self) -> Any:
-        """All splats, in memory or in stores, for which captures are prepared."""
-        return self.data.scene if isinstance(self.data, Residency) else self.data
 
     def gather(
         self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]

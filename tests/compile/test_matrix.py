@@ -38,8 +38,8 @@ def assert_well_formed(names, shapes=SHAPES):
         # resolve may be fused into blend
         taken = {one.name for one in source.arguments.get("resolve", source.arguments["blend"])}
         assert {f"{output.name}_out" for output in features.images} <= taken
-        assert {one.name for one, _ in source.samples} <= taken
-        assert {one.name for one, _ in source.samples} <= {one.name for one in source.arguments["blend"]}
+        assert {one.name for one in source.samples} <= taken
+        assert {one.name for one in source.samples} <= {one.name for one in source.arguments["blend"]}
 
 
 def test_texts_of_each_effect():

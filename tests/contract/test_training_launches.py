@@ -71,7 +71,7 @@ def test_replayed_steps_are_bit_identical(on_groups, dataset, monkeypatch):
 
 def never_replay(monkeypatch):
     """Record every frame and every step."""
-    monkeypatch.setattr(RecordedFrame, "valid", False)
+    monkeypatch.setattr(RecordedFrame, "set_view", lambda *_: False)
     monkeypatch.setattr(CommandList, "key", property(lambda _: object(), lambda *_: None), raising=False)
 
 

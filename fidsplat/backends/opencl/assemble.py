@@ -16,7 +16,7 @@ import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import chain
 from pathlib import Path
 
@@ -99,8 +99,8 @@ class Source:
     """structs of the texts, as NumPy types"""
     arguments: dict[str, tuple[Argument, ...]]
     """of each kernel of the texts"""
-    samples: tuple[tuple[Samples, bool], ...]
-    """what passes from blending to resolving, and whether several sub-frames are averaged there"""
+    samples: tuple[Samples, ...]
+    """sample buffers of the effects"""
     scalars: Scalars
 
     @property
@@ -117,6 +117,21 @@ class Source:
     def digest(self) -> str:
         """SHA-256 of the text: the cache key."""
         return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @cached_property
+    def uniform_groups(self) -> dict[str, dict[int, str]]:
+        """Kernel arguments by index, for each group of uniforms (`View.uniform`)."""
+        groups: dict[str, dict[int, str]] = {}
+        for one in chain.from_iterable(self.arguments.values()):
+            if one.source == "uniform":
+                groups.setdefault(one.uniform[0], {})[one.uniform[1]] = one.name
+        return groups
+
+    @cached_property
+    def view_arrays(self) -> set[str]:
+        """Names of the arrays of the view (`View.array`) that kernels read."""
+        arguments = chain.from_iterable(self.arguments.values())
+        return {one.name for one in arguments if one.source == "array"}
 
 
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
@@ -345,7 +360,7 @@ class Declarations:
         """fused: blending resolves, with the arguments of both."""
         every = list((layouts or {}).values())
         self.scalars = scalars
-        self.samples = tuple((one, layout.averaged) for layout in every for one in layout.samples)
+        self.samples = tuple(chain.from_iterable(layout.samples for layout in every))
         self._layouts, self._outputs, self._fused, self._kernels = every, outputs, fused, kernels
         self.constants = dict(one for layout in every for one in layout.constant)
         """fields of `Splat` that all splats share, and their values"""
@@ -369,7 +384,7 @@ class Declarations:
             added += (one for layout in self._layouts for one in getattr(layout, field))
         if kernel in ("blend", "resolve"):
             access = "out" if kernel == "blend" else "in"
-            added += (Argument(one.ctype, one.name, access, note=one.note) for one, _ in self.samples)
+            added += (Argument(one.ctype, one.name, access, note=one.note) for one in self.samples)
         if kernel == "resolve":
             added += map(output_argument, self._outputs)
         if kernel == "blend" and self._fused:

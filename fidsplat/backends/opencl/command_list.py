@@ -44,10 +44,6 @@ class Command:
             self.kernel._set_arg_buf(index, scalar(value))  # pyright: ignore[reportAttributeAccessIssue]
         self._marks[index] = mark
 
-    def submit(self, queue: cl.CommandQueue) -> cl.Event:
-        """Enqueue the kernel with the arguments that are bound."""
-        return cl.enqueue_nd_range_kernel(queue, self.kernel, self.size, self.group)
-
 
 class _NamedArgument:
     """The places of one argument in all commands, and the value that was set there last."""
@@ -126,7 +122,8 @@ class CommandList:
         stage: str = "",
     ) -> cl.Event:
         """Append a launch as `record`, and submit it."""
-        return self.record(kernel, size, group, values, stage).submit(queue)
+        command = self.record(kernel, size, group, values, stage)
+        return cl.enqueue_nd_range_kernel(queue, command.kernel, size, group)
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Change arguments by name, in all commands that have one of that name."""
@@ -142,9 +139,12 @@ class CommandList:
                 command.bind(index, value)
             argument.mark = mark
 
-    def submit(self, queue: cl.CommandQueue) -> list[cl.Event]:
-        """Enqueue all commands in their order."""
-        return [command.submit(queue) for command in self._commands]
+    def submit(self, queue: cl.CommandQueue, first: int = 0, end: int | None = None) -> list[cl.Event]:
+        """Enqueue the commands [first, end) in their order, by default all."""
+        return [
+            cl.enqueue_nd_range_kernel(queue, command.kernel, command.size, command.group)
+            for command in self._commands[first:end]
+        ]
 
     def _places(self, name: str) -> list[tuple[Command, int]]:
         """Commands and argument indices of a name."""

@@ -8,8 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 
-# words of the buffer `counts`, as in tile_lists.cl: big splats, pairs (two words), visible splats
 COUNTS = 4
+"""words of the buffer `counts`, as in tile_lists.cl: big splats, pairs (two words), visible splats"""
+TALLIES = 8
+"""counters of the buffer `tallies`, as in prelude.cl"""
+VISIBLE, PAIRS, BIG = 0, 2, 6
+"""of which: visible splats, pairs (two words), big splats"""
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,12 @@ class Counts:
         words = np.empty(COUNTS, np.uint32)
         cl.enqueue_copy(queue, words, counts, wait_for=after)
         return Counts(int(words[0]), int(words[1]) | int(words[2]) << 32, int(words[3]))
+
+    @staticmethod
+    def of_tallies(words: np.ndarray) -> Counts:
+        """From the counters (views, TALLIES) of `tallies`; `big` is the first view's."""
+        pairs = int(words[0, PAIRS]) | int(words[0, PAIRS + 1]) << 32
+        return Counts(int(words[0, BIG]), pairs, int(words[:, VISIBLE].sum(dtype=np.int64)))
 
     def stats(self, splats: int) -> dict[str, int]:
         """`Frame.stats` of a cloud with this many splats."""

@@ -177,6 +177,8 @@ class Samples:
     name: str
     channels: int = 1
     note: str = ""
+    averaged: bool = False
+    """whether sub-frames are averaged (light); otherwise the middle sub-frame's values are taken"""
 
 
 @dataclass(frozen=True)
@@ -197,8 +199,6 @@ class Layout:
     backdrop: tuple[Argument, ...] = ()
     resolve: tuple[Argument, ...] = ()
     samples: tuple[Samples, ...] = ()
-    averaged: bool = False
-    """whether the samples of sub-frames are averaged (light), instead of one sub-frame's"""
     backward_file: str = ""
     """file of its derivatives below kernels/opencl/; empty: none"""
     moments: tuple[Member, ...] = ()

@@ -10,20 +10,17 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import Capacity, Counts
 from fidsplat.backends.opencl.declare import Argument
+from fidsplat.backends.opencl.layout import RAW
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
-from fidsplat.backends.opencl.uniforms import frozen, scalars_of, view_records
+from fidsplat.backends.opencl.uniforms import numbers_of, projection_arrays
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
-
-_GRID = (16, 4)
-"""the work-group of kernels over pixels or samples"""
 
 
 @dataclass(init=False)
@@ -71,14 +68,38 @@ class FrameBuffers:
     """termination depth of each tile (t) uint32"""
 
 
-@dataclass(frozen=True)
-class SampleBuffer:
-    """A buffer of values per sample that the blend stage writes."""
+@dataclass
+class Rendered:
+    """What a submitted frame leaves: its own buffers and events, without the cloud and scratch buffers that
+    `DeviceFrame` holds."""
 
-    name: str
-    channels: int
-    averaged: bool
-    """whether sub-frames are averaged (light); otherwise the middle sub-frame's values are taken"""
+    queue: cl.CommandQueue
+    leased: list[tuple[str, cl.Buffer]]
+    """output images and counts by name"""
+    stats: Callable[[], dict[str, int]]
+    events: list[cl.Event]
+    """of the launches"""
+    stages: list[str] | None = None
+    """of the launches; None on a queue without profiling"""
+    uploads: list[cl.Event] | None = None
+    """kept until the device has read the arrays"""
+
+    def buffer(self, name: str) -> cl.Buffer:
+        """A leased buffer."""
+        return dict(self.leased)[name]
+
+    def done(self) -> list[cl.Event]:
+        """Events that another queue waits for before it reads the images."""
+        self.queue.flush()
+        return [self.events[-1]]
+
+    def timings(self) -> dict[str, float]:
+        """Milliseconds by stage; empty without profiling."""
+        self.queue.finish()
+        timings: dict[str, float] = {}
+        for stage, event in zip(self.stages or (), self.events, strict=False):
+            timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
+        return timings
 
 
 class DeviceFrame:
@@ -99,8 +120,8 @@ class DeviceFrame:
         """
         Args:
             commands: records the launches.
-            replay_queue: the queue of a frame that is recorded for replay: the host does not wait for its
-                counts.
+            replay_queue: the queue of a frame that is recorded for replay: on a GPU the host does not wait
+                for its counts.
             pair_limit: largest capacity of the lists of a recorded frame; 0 for no limit.
         """
         self.workspace, self.commands, self.shape = workspace, commands, shape
@@ -108,9 +129,12 @@ class DeviceFrame:
         self.batch, self.views = views, len(views)
         self.view = view = views.view
         """the view, or what the views have in common"""
-        self.recorded, self.pair_limit = replay_queue is not None, pair_limit
+        self.waits = replay_queue is None or shape.lists == "ordered"
+        """whether the host waits for the counts"""
+        self.pair_limit, self.pool = pair_limit, workspace.pool
         self.queue = workspace.switch_to(workspace.queue) if replay_queue is None else replay_queue
-        self.pool = workspace.pool
+        self.source = commands.program.source
+        """of the program whose kernels are launched"""
         workspace.frames += 1
         self.tiles_x = -(-view.width // shape.tile_width)
         self.tiles_y = -(-view.height // shape.tile_height)
@@ -126,25 +150,23 @@ class DeviceFrame:
         self.buffers = FrameBuffers()
         self.named: dict[str, cl.Buffer] = {}
         """buffers that depend on effects and outputs, by the names of the kernel arguments"""
-        self.numbers: dict[str, Any] = scalars_of(view) | {
-            "width": view.width,
-            "height": view.height,
-            "stride": self.stride,
-            "channel_stride": self.views * self.rows * self.stride,
-        }
+        self.numbers: dict[str, Any] = numbers_of(view, self.source)
         """numbers by the names of the kernel arguments"""
-        self.samples = [
-            SampleBuffer("raw", 4, True),
-            *(SampleBuffer(one.name, one.channels, averaged) for one, averaged in self.source.samples),
-        ]
+        self.numbers |= {"width": view.width, "height": view.height, "stride": self.stride}
+        self.numbers["channel_stride"] = self.views * self.rows * self.stride
+        self.samples = RAW, *self.source.samples
+        """buffers of values per sample, which the blend stage writes"""
         self.is_sub_frame = False
         """whether it is one pose of a frame with a shutter, which resolves the samples of all"""
-        self.events: list[tuple[str, cl.Event]] = []
-        """stage and event of each launch"""
+        self.events: list[cl.Event] = []
+        self.stages: list[str] = []
+        """of the launches"""
         self.arrays: dict[str, np.ndarray] = {}
         """arrays that were copied to the device for this view"""
         self.uploads: list[cl.Event] = []
         self.leased: list[tuple[str, cl.Buffer]] = []
+        self.counted_launches = 0
+        """launches after which the counts are complete"""
         self.counted: cl.Event | None = None
         """completes when the device has counted the pairs, where the host did not wait"""
         self.in_bands = False
@@ -152,7 +174,6 @@ class DeviceFrame:
         self.pairs = 0
         """pairs that were listed; the capacity of the lists where the host did not wait"""
         self.stats: Callable[[], dict[str, int]] = dict
-        self._uniforms: dict[str, tuple[Any, ...]] = {}
 
     def sub_frame(self, view: View) -> DeviceFrame:
         """The frame of one pose of a shutter."""
@@ -160,11 +181,6 @@ class DeviceFrame:
         frame = DeviceFrame(self.workspace, self.commands, self.shape, self.resident, views, self.plan)
         frame.is_sub_frame = True
         return frame
-
-    @property
-    def source(self) -> Source:
-        """The source of the program whose kernels are launched."""
-        return self.commands.program.source
 
     @property
     def bound(self) -> dict[str, cl.Buffer]:
@@ -194,49 +210,43 @@ class DeviceFrame:
         return Counts.read(self.workspace.side_queue, self.buffers.counts, [counted])
 
     def launch(
-        self, stage: str, kernel: str, items: int, group: int, views: int = 1, **given: Any
+        self,
+        stage: str,
+        kernel: str,
+        items: tuple[int, ...],
+        group: tuple[int, ...],
+        views: int = 1,
+        **given: Any,
     ) -> cl.Event:
         """Submit a kernel with at least `items` work-items for each view; kernels check their index.
 
         Arguments are `given`, or buffers and numbers of the frame, or numbers and arrays of its view.
         """
-        size = -(-items // group) * group
-        if views == 1:
-            return self._launch(stage, kernel, (size,), (group,), given)
-        return self._launch(stage, kernel, (size, views), (group, 1), given)
-
-    def launch_grid(self, stage: str, kernel: str, width: int, height: int, **given: Any) -> cl.Event:
-        """Submit a kernel with a work-item for each pixel or sample of each view; its arguments `width` and
-        `height` are their numbers."""
-        size = (-(-width // _GRID[0]) * _GRID[0], -(-height // _GRID[1]) * _GRID[1])
-        given |= {"width": width, "height": height}
-        if self.views == 1:
-            return self._launch(stage, kernel, size, _GRID, given)
-        return self._launch(stage, kernel, (*size, self.views), (*_GRID, 1), given)
-
-    def _launch(
-        self, stage: str, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: dict[str, Any]
-    ) -> cl.Event:
+        size = tuple([-(-count // side) * side for count, side in zip(items, group, strict=True)])
+        if views > 1:
+            size, group = (*size, views), (*group, 1)
         arguments = self.source.arguments[kernel]
         values = [given[one.name] if one.name in given else self.value(one) for one in arguments]
         event = self.commands.launch(self.queue, kernel, size, group, values, stage)
-        self.events.append((stage, event))
+        self.events.append(event)
+        self.stages.append(stage)
         return event
+
+    def discard_launches(self) -> None:
+        """Start the frame again."""
+        self.commands.clear()
+        self.events, self.stages = [], []
 
     def value(self, argument: Argument) -> Any:
         """The value of a kernel argument that is not given with the launch."""
         name = argument.name
-        if argument.source == "uniform":
-            group, index = argument.uniform
-            if group not in self._uniforms:
-                self._uniforms[group] = self.view.uniform(group)
-            return self._uniforms[group][index]
         for values in (vars(self.buffers), self.named, self.numbers):
             if name in values:
                 return values[name]
-        if argument.source == "array":
-            return self.put(name, self.view.array(name))
-        raise KeyError(name)
+        if argument.source == "uniform":  # of derivatives
+            group, index = argument.uniform
+            return self.view.uniform(group)[index]
+        return self.put(name, self.view.array(name))
 
     def take(self, name: str, size: int) -> cl.Buffer:
         """Bind a scratch buffer, which the next frame overwrites."""
@@ -290,38 +300,19 @@ class DeviceFrame:
 
     def put_view(self, row: int, end: int) -> None:
         """Copy the uniforms of the projection for the requested ones of rows of samples [row, end)."""
-        view = self.view
-        if view.band is not None:
-            row, end = max(row, view.band[0]), min(end, view.band[1])
-        self.put_rays()
-        self.put("view", frozen(self.record(row, end)))
-        if view.groups:
-            moving = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
-            self.put("moving", frozen(moving))
-        if self.resident.group_table is not None:
-            table = self.resident.group_table
-            # a copy, since it must own its memory to be recognised
-            keys = table.keys(view) if self.views == 1 else table.keys_of(self.batch).T.copy()
-            self.put("plane_keys", frozen(keys))
+        if self.view.raster is not None:
+            self.put_rays()
+        arrays = projection_arrays(self.batch, self.resident, self.source, row, end)
+        for name, array in arrays.items():
+            self.put(name, array)
 
-    def put_arrays(self) -> None:
-        """Copy the view's arrays that kernels read."""
-        for arguments in self.source.arguments.values():
-            for one in arguments:
-                if one.source == "array":
-                    self.value(one)
+    def rendered(self) -> Rendered:
+        """What the frame leaves."""
+        stages = None if self.queue is self.workspace.replay_queue else self.stages
+        return Rendered(self.queue, self.leased, self.stats, self.events, stages, self.uploads)
 
     def put_rays(self) -> None:
         """Bind the rays of a lens, and its map from directions to samples."""
-        if self.view.raster is not None:
-            slopes = self.takes("blend", "ray_slopes")
-            rays = self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)
-            self.named |= rays
-
-    def record(self, row: int, end: int) -> np.ndarray:
-        """The records `View` for rows of samples [row, end)."""
-        return view_records(self.batch, row, end, self.source.records["View"])
-
-    def is_of_view(self, argument: Argument) -> bool:
-        """Whether an argument is a number that changes with the view."""
-        return argument.source == "uniform" or argument.name in scalars_of(self.view)
+        assert self.view.raster is not None
+        slopes = self.takes("blend", "ray_slopes")
+        self.named |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)

@@ -290,8 +290,7 @@ LAYOUTS: dict[str, Layout] = {
         "output/fog.cl",
         parts=("ray_depth", "ray_length"),
         blend=takes(uniforms("fog_density", "float fog_density"), RAY_UNIFORMS),
-        samples=(Samples("float", "fog_raw"),),
-        averaged=True,
+        samples=(Samples("float", "fog_raw", averaged=True),),
     ),
     "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
     "vignetting": Layout(

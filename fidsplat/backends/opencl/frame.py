@@ -8,16 +8,19 @@ once. The images are bit-identical in every case.
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.opencl import tiling
-from fidsplat.backends.opencl.counts import COUNTS, read_stats
+from fidsplat.backends.opencl.counts import COUNTS, TALLIES, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.tiling import TileBand
 from fidsplat.backends.view import SubFrame
 
+_GRID = (16, 4)
+"""work-group of kernels over pixels or samples"""
 _UNLIMITED = 2**32 - 1
 _NEVER = np.full(1, 0xFFFFFFFF, np.uint32)
 """termination depth of a tile that is not rendered"""
@@ -33,7 +36,7 @@ def render(frame: DeviceFrame) -> None:
 
 def render_pose(frame: DeviceFrame) -> None:
     """Submit all stages for one pose of the camera."""
-    frame.commands.clear()
+    frame.discard_launches()
     allocate_samples(frame)
     if frame.plan.chunk:
         render_in_chunks(frame)
@@ -58,12 +61,14 @@ def render_sorted(frame: DeviceFrame) -> None:
     count, big = frame.resident.count, 0
     frame.put_view(0, frame.rows)
     while True:
-        tiling.project_all(frame, big)
+        tiling.allocate_tallies(frame, TALLIES * frame.views, big)
+        tiling.project(frame, 0, count)
         tiling.sort_by_depth(frame, count)
         counts = tiling.count_pairs(frame, count)
         if counts.big <= frame.numbers["big_capacity"]:
             break
         big = counts.big
+        frame.discard_launches()
     for band in tiling.sorted_bands(frame, frame.first_tile, frame.end_tile, counts.pairs):
         tiling.list_sorted(frame, band, count)
         blend(frame, band)
@@ -81,17 +86,18 @@ def render_tiled(frame: DeviceFrame) -> None:
         capacity = min(capacity, frame.pair_limit)
     tiling.project_and_count(frame)
     counted = tiling.start_lists(frame, capacity)
+    frame.counted_launches = len(frame.events)
     if capacity:
         every = TileBand(0, frame.tiles, capacity)
         tiling.list_and_sort(frame, every, capacity, first_band=True)
         blend(frame, every)
         resolve(frame)
-    if frame.recorded:
-        frame.counted, frame.pairs = counted, capacity
-    else:
+    if frame.waits:
         complete_tiled(frame, counted, capacity)
+    else:
+        frame.counted, frame.pairs = counted, capacity
     frame.queue.flush()
-    reader, last, count = frame.workspace.read_queue, frame.events[-1][1], frame.resident.count
+    reader, last, count = frame.workspace.read_queue, frame.events[-1], frame.resident.count
     frame.stats = partial(read_stats, reader, frame.buffers.counts, last, count)
 
 
@@ -142,16 +148,21 @@ def render_in_chunks(frame: DeviceFrame) -> None:
 def blend(frame: DeviceFrame, band: TileBand) -> None:
     """Composite the splats of a band of tiles to samples."""
     group = frame.shape.blend_items
-    frame.launch("blend", "blend", (band.end - band.first) * group, group, band_first=band.first)
+    frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), band_first=band.first)
 
 
 def resolve(frame: DeviceFrame) -> None:
     """Composite the background behind the splats and average samples to pixels, unless fused into `blend`."""
     arguments, view = frame.source.arguments, frame.view
     if "backdrop" in arguments and not view.sub_frames:
-        frame.launch_grid("resolve", "backdrop", view.width, view.height)
+        _launch_grid(frame, "resolve", "backdrop", view.width, view.height)
     if "resolve" in arguments and not frame.is_sub_frame:
-        frame.launch_grid("resolve", "resolve", view.width // view.samples, view.height // view.samples)
+        _launch_grid(frame, "resolve", "resolve", view.width // view.samples, view.height // view.samples)
+
+
+def _launch_grid(frame: DeviceFrame, stage: str, kernel: str, width: int, height: int, **given: Any) -> None:
+    """Submit a kernel with a work-item for each pixel or sample of each view."""
+    frame.launch(stage, kernel, (width, height), _GRID, frame.views, width=width, height=height, **given)
 
 
 def render_exposure(frame: DeviceFrame) -> None:
@@ -170,6 +181,7 @@ def render_exposure(frame: DeviceFrame) -> None:
         part.named |= surroundings
         render_pose(part)
         frame.events += part.events
+        frame.stages += part.stages
         accumulate(frame, part, sub_frame)
         for name, value in part.stats().items():
             stats[name] = max(stats[name], value)
@@ -194,4 +206,4 @@ def accumulate(frame: DeviceFrame, part: DeviceFrame, sub_frame: SubFrame) -> No
         buffers = {"raw": part.buffer(one.name), "exposed": frame.buffer(one.name), "channels": one.channels}
         weights = {"weight": sub_frame.weight, "first": sub_frame.first} if one.averaged else {}
         kernel = "expose" if one.averaged else "expose_middle"
-        frame.launch_grid("expose", kernel, *size, **given, **buffers, **weights)
+        _launch_grid(frame, "expose", kernel, *size, **given, **buffers, **weights)

@@ -149,7 +149,7 @@ class OpenCLGradients(GradientPipeline):
     def _backward_frame(self, forward: DeviceFrame) -> DeviceFrame:
         """The frame with the buffers of gradients, and with launches of the program `gradients`."""
         frame = copy(forward)
-        frame.commands = self._tile_commands
+        frame.commands, frame.source = self._tile_commands, self.source
         frame.take("splat_slots", 4 * frame.resident.count)
         frame.take("moments", self.source.records["Moments"].itemsize * frame.pairs)
         frame.take("tile_sums", 3 * self.source.scalars.dtype("real").itemsize * frame.tiles)
@@ -166,7 +166,8 @@ class OpenCLGradients(GradientPipeline):
             leased = {name: buffer for name, buffer in frame.leased}
             given = {f"by_{name}": frame.buffer(f"by_{name}") for name in self._by_outputs}
             commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **leased, **given})
-            frame.events += zip(commands.stages, commands.submit(frame.queue), strict=True)
+            frame.events += commands.submit(frame.queue)
+            frame.stages += commands.stages
             self._check_capacity(frame)
             return
         commands.clear()
@@ -190,19 +191,19 @@ class OpenCLGradients(GradientPipeline):
             rows = -(-frame.view.height // shape.tile_height)
             frame.take("big_rows", 4 * frame.numbers["big_capacity"] * rows)
         if count := frame.resident.count:
-            frame.launch("reserve", "reserve_slots", count, _GROUP, count=count)
+            frame.launch("reserve", "reserve_slots", (count,), (_GROUP,), count=count)
         groups = chunks if in_groups else min(frame.tiles, frame.workspace.info.compute_units)
         if in_groups:
             frame.take("reached", 4 * frame.tiles)
             frame.take("chunk_tiles", 4 * chunks)
             size = frame.tiles * shape.blend_items
             frame.launch(
-                "blend backward", "blend_checkpoints", size, shape.blend_items, log_ceiling=log_ceiling
+                "blend backward", "blend_checkpoints", (size,), (shape.blend_items,), log_ceiling=log_ceiling
             )
         else:
             frame.take("tapes", self._tape_bytes() * groups)
         items = backward_items(features, shape)
-        frame.launch("blend backward", "blend_backward", groups * items, items, log_ceiling=log_ceiling)
+        frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
         """Size of the record `Tape` (schedule/lanes_backward.cl): light and opacity of each pixel for a
@@ -225,10 +226,10 @@ class OpenCLGradients(GradientPipeline):
             arrays: dict[str, Any] = {
                 name: frame.resident.part(name, 0, count) for name in self._cloud_arrays
             }
-            frame.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
+            frame.launch("project backward", "project_backward", (count,), (_GROUP,), count=count, **arrays)
         given: dict[str, Any] = {name: found[name].data for name in ("background", "pose")}
         given |= {"tiles": frame.tiles, "groups": groups}
-        frame.launch("project backward", "add_up", (3 + 6) * _GROUP, _GROUP, **given)
+        frame.launch("project backward", "add_up", ((3 + 6) * _GROUP,), (_GROUP,), **given)
         return found
 
     def compile_step(self) -> None:
@@ -251,7 +252,8 @@ class OpenCLGradients(GradientPipeline):
             commands.key = count
         commands.set(values)
         (event,) = commands.submit(frame.queue)
-        frame.events.append(("project backward", event))
+        frame.events.append(event)
+        frame.stages.append("project backward")
 
     def _check_capacity(self, frame: DeviceFrame) -> None:
         """Raise CapacityExceeded if the lists were too small: they are empty then, and gradient buffer

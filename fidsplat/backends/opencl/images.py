@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Images, summed
-from fidsplat.backends.opencl.counts import Counts
-from fidsplat.backends.opencl.device_frame import DeviceFrame
-from fidsplat.backends.opencl.recorded_frame import RecordedFrame
-from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.device_frame import Rendered
+from fidsplat.backends.opencl.recorded_frame import Replay
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.uint8 import read_uint8
 from fidsplat.backends.opencl.workspace import Workspace
@@ -23,96 +22,6 @@ from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
 from fidsplat.util.errors import DeviceError, bytes_words
-
-
-@dataclass
-class Rendered:
-    """What a submitted frame leaves: its own buffers and events, without the cloud and scratch buffers that
-    `DeviceFrame` holds."""
-
-    queue: cl.CommandQueue
-    leased: list[tuple[str, cl.Buffer]]
-    """output images and counts by name"""
-    stats: Callable[[], dict[str, int]]
-    last: cl.Event
-    """of the last launch"""
-    events: list[tuple[str, cl.Event]] | None = None
-    """stage and event of each launch; None on a queue without profiling"""
-    uploads: list[cl.Event] | None = None
-    """kept until the device has read the arrays"""
-
-    @staticmethod
-    def of(frame: DeviceFrame, timed: bool = True) -> Rendered:
-        """What a frame leaves."""
-        events, last = frame.events if timed else None, frame.events[-1][1]
-        return Rendered(frame.queue, frame.leased, frame.stats, last, events, frame.uploads)
-
-    def buffer(self, name: str) -> cl.Buffer:
-        """A leased buffer."""
-        return dict(self.leased)[name]
-
-    def done(self) -> list[cl.Event]:
-        """Events that another queue waits for before it reads the images."""
-        self.queue.flush()
-        return [self.last]
-
-    def timings(self) -> dict[str, float]:
-        """Milliseconds by stage."""
-        self.queue.finish()
-        return milliseconds(self.events or ())
-
-
-def milliseconds(events: Iterable[tuple[str, cl.Event]]) -> dict[str, float]:
-    """The time of completed launches by stage."""
-    timings: dict[str, float] = {}
-    for stage, event in events:
-        timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
-    return timings
-
-
-class ReplayingPipeline(Protocol):
-    """The part of `OpenCLPipeline` that completes a replayed frame."""
-
-    workspace: Workspace
-
-    def render_again(self, resident: Resident, view: View) -> Rendered:
-        """Render with the buffers that the frame requires."""
-        ...
-
-    def profile(self, resident: Resident, view: View, recorded: RecordedFrame) -> dict[str, float]:
-        """Milliseconds by stage."""
-        ...
-
-
-class Replay:
-    """A replayed frame, whose capacity is checked when it is first read."""
-
-    def __init__(
-        self, pipeline: ReplayingPipeline, resident: Resident, view: View, recorded: RecordedFrame
-    ) -> None:
-        self._pipeline, self._view, self._recorded = pipeline, view, recorded
-        self._number = pipeline.workspace.frames
-        self._resident: Resident | None = resident
-        self._timed = weakref.ref(resident)
-
-    def overflow(self, rendered: Rendered) -> Rendered | None:
-        """The frame rendered again, if its counts exceed the capacity; None if it is complete."""
-        resident, workspace = self._resident, self._pipeline.workspace
-        if resident is None:
-            return None
-        queue, after = rendered.queue, None  # faster than a queue that waits for another
-        if workspace.frames != self._number:  # without waiting for frames that were submitted since
-            queue, after = workspace.read_queue, rendered.done()
-        counts = Counts.read(queue, rendered.buffer("counts"), after)
-        complete = self._recorded.capacity.holds(counts)
-        again = None if complete else self._pipeline.render_again(resident, self._view)
-        self._resident = None  # the cloud is held until the check only
-        return again
-
-    def timings(self) -> dict[str, float]:
-        """Milliseconds by stage, of another replay with profiling; empty if the cloud was released."""
-        resident = self._timed()
-        return {} if resident is None else self._pipeline.profile(resident, self._view, self._recorded)
 
 
 def lease_images(
@@ -154,8 +63,8 @@ class OpenCLImages(Images):
     def __init__(
         self,
         workspace: Workspace,
-        outputs: tuple[Output, ...],
-        views: ViewBatch,
+        outputs: Mapping[str, Output],
+        views: ViewBatch | View,
         shape: DeviceShape,
         rendered: list[Rendered],
         splats: int,
@@ -163,16 +72,20 @@ class OpenCLImages(Images):
         replay: Replay | None = None,
     ) -> None:
         """leased: the images of a batch; None if they belong to the one frame in `rendered`."""
-        self._workspace, self.views, self._size, self._splats = workspace, views.total, views.size, splats
+        self._workspace, self._splats, self._outputs = workspace, splats, outputs
+        self._view = view = views if isinstance(views, View) else views.view
+        if isinstance(views, ViewBatch):
+            self.views = views.total
+        self._size = view.height // view.samples, view.width // view.samples
         self._rendered, self._replay = rendered, replay
-        self._outputs = {output.name: output for output in outputs}
-        self._batch = None if leased is None else dict(zip(self._outputs, leased, strict=True))
+        self._tile = shape.tile_height, shape.tile_width
+        self._batch = None if leased is None else dict(zip(outputs, leased, strict=True))
         self._timings: dict[str, float] = {}
-        self._samples, self._tile = views.view.samples, (shape.tile_height, shape.tile_width)
-        self._grid = -(-views.view.height // self._tile[0]), -(-views.view.width // self._tile[1])
-        self._copied: list[tuple[dict[str, int], list[tuple[str, cl.Event]]]] = []
-        """counts and launches of the frames from which tiles were copied"""
-        self._leased = [*(leased or ()), *(buffer for one in rendered for buffer in one.leased)]
+        self._copied: list[Rendered] = []
+        """frames from which tiles were copied, without buffers"""
+        self._leased = [*(leased or ())]
+        for one in rendered:
+            self._leased += one.leased
         weakref.finalize(self, workspace.pool.give_back, self._leased)
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
@@ -252,12 +165,11 @@ class OpenCLImages(Images):
         read."""
         with self._workspace.failing("rendering"):
             rendered = self.complete()
-            if self._replay is not None and rendered[0].events is None:
+            if self._replay is not None and rendered[0].stages is None:
                 with self._workspace.lock:
                     self._timings = self._timings or self._replay.timings()
                 return self._timings
-            copied = [event for _, events in self._copied for event in events]
-            return summed([*(one.timings() for one in rendered), milliseconds(copied)])
+            return summed(one.timings() for one in (*rendered, *self._copied))
 
     @property
     def stats(self) -> Mapping[str, int]:
@@ -265,7 +177,7 @@ class OpenCLImages(Images):
         with self._workspace.failing("rendering"):
             stats = summed(one.stats() for one in self.complete())
             stats = {"splats": 0, "visible": 0, "pairs": 0} | stats | {"splats": self._splats}
-            return summed([stats, *(copied for copied, _ in self._copied)])
+            return summed([stats, *(copied.stats() for copied in self._copied)])
 
     def complete(self) -> list[Rendered]:
         """The rendered parts; a replayed frame that exceeded its capacity is rendered again."""
@@ -280,7 +192,8 @@ class OpenCLImages(Images):
     def termination_depths(self) -> TerminationDepths:
         """Termination depths of a frame with that effect. Raises DeviceError as `read`."""
         with self._workspace.failing("rendering"):
-            keys = np.empty(self._grid, np.uint32)
+            (height, width), view = self._tile, self._view
+            keys = np.empty((-(-view.height // height), -(-view.width // width)), np.uint32)
             (rendered,) = self.complete()
             queue, buffer = self._workspace.read_queue, rendered.buffer("termination_depths")
             cl.enqueue_copy(queue, keys, buffer, wait_for=rendered.done())
@@ -305,12 +218,12 @@ class OpenCLImages(Images):
             if copied is not None:
                 copied.wait()  # the next frame may be rendered into the buffers of the other
             (rendered,) = other.complete()
-            self._copied.append((dict(rendered.stats()), rendered.events or []))
+            self._copied.append(replace(rendered, leased=[], stats=partial(dict, rendered.stats())))
 
     def _rectangles(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
         """Rectangles [top, bottom) x [left, right) of pixels that cover tiles (rows, columns) bool, row by
         row."""
-        (rows, columns), (height, width) = self._size, (side // self._samples for side in self._tile)
+        (rows, columns), (height, width) = self._size, (side // self._view.samples for side in self._tile)
         for row, chosen in enumerate(tiles):
             sides = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
             for first, end in sides.reshape(-1, 2).tolist():

@@ -7,7 +7,10 @@ arguments by their names. effect_layouts.py declares the additions of effects an
 
 from __future__ import annotations
 
-from fidsplat.backends.opencl.declare import Argument, Record, member, takes, uniforms
+from fidsplat.backends.opencl.declare import Argument, Record, Samples, member, takes, uniforms
+
+RAW = Samples("float", "raw", 4, "r, g, b, transmittance", averaged=True)
+"""the sample buffer of every frame"""
 
 VIEW = Record(
     "View",

@@ -28,7 +28,7 @@ _LARGE = 1 << 23
 _MINIMUM = 1 << 10
 KEYS, WINDOWS, SORTED = 4, 8, 16
 """bytes per splat of sort keys, of tile windows, and of keys and indices while they are sorted"""
-BIG = 1 << 12
+MIN_BIG = 1 << 12
 """initial capacity for big splats"""
 SMALL = 1 << 14
 """bytes for uniforms, counts and moving groups"""
@@ -50,7 +50,7 @@ class MemoryPlan:
     capacity: int
     """visible splats of one band that are stored, if in chunks"""
     held: int
-    """bytes in total, with the cloud; more only if there are more than `BIG` big splats"""
+    """bytes in total, with the cloud; more only if there are more than `MIN_BIG` big splats"""
 
 
 class Part(NamedTuple):
@@ -87,7 +87,7 @@ class MemoryPlanner:
         self._view_arrays = {one.name for one in arguments if one.source == "array"}
         self._slopes = any(one.name == "ray_slopes" for one in source.arguments["blend"])
         self._of_cameras = any(one.uniform[0] in _OF_CAMERAS for one in arguments)
-        self._channels = 4 + sum(one.channels for one, _ in source.samples)
+        self._channels = 4 + sum(one.channels for one in source.samples)
         resolved = any(one.name == "rays" for one in source.arguments.get("resolve", ()))
         self._separate = bool(self._view_arrays) or resolved or "backdrop" in source.arguments
         """whether views differ in more than the record `View`"""
@@ -106,7 +106,7 @@ class MemoryPlanner:
         stays, upload = resident.bytes_for(self._cloud_arrays)
         samples, tables = self._samples_and_tables(view)
         fixed = reserved + stays + SMALL + tables
-        fixed += BIG * (4 + self._source.records["Bounds"].itemsize)
+        fixed += MIN_BIG * (4 + self._source.records["Bounds"].itemsize)
         # sub-frames have samples of their own
         fixed += 4 * samples * self._channels * (2 if view.sub_frames else 1)
         fixed += self._image_bytes(view)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,12 @@ from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.command_list import CommandList
-from fidsplat.backends.opencl.counts import read_stats
-from fidsplat.backends.opencl.device_frame import DeviceFrame
+from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.frame import render
-from fidsplat.backends.opencl.images import OpenCLImages, Rendered, Replay, lease_images
+from fidsplat.backends.opencl.images import OpenCLImages, lease_images
 from fidsplat.backends.opencl.memory_plan import MemoryPlan, MemoryPlanner
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.recorded_frame import RecordedFrame
+from fidsplat.backends.opencl.recorded_frame import RecordedFrame, Replay
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import Workspace
@@ -62,61 +60,54 @@ class OpenCLPipeline(Pipeline):
         """other: returns the pipeline of another shape."""
         self.workspace, self.source, self.features, self.shape = workspace, source, features, shape
         self.program = Program(workspace, source)
+        self.outputs = {output.name: output for output in features.images}
         self._commands = CommandList(self.program)
         """of frames that are not replayed"""
         self._planner = MemoryPlanner(workspace, source, features, shape)
         self._other = other
 
     def render_view(self, resident: Resident, view: View) -> OpenCLImages:
-        """Render one view. A frame of a kind that was rendered before is replayed, without waiting for the
-        device.
+        """Render one view. A frame of a kind that was rendered before is replayed; a GPU is not waited for.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.rendering():
-            return self._render_single(resident, ViewBatch.single(view))
+            key = self._key(view)
+            cached = resident.cached_frames.get(key) if view.band is None else None
+            if cached is not None and (images := self._replay(resident, view, cached)) is not None:
+                return images
+            if resident.coherent and self.shape.lists == "tiled":
+                return self._listing("local").render_view(resident, view)
+            plan = self._planner.frame(resident, view)
+            if plan.chunk and self.shape.lists != "ordered":
+                # chunks are rendered by one strategy only: where memory is short, sorting is fastest
+                return self._listing("ordered").render_view(resident, view)
+            frame = self._render_planned(resident, view, plan)
+            complete = not (plan.chunk or frame.in_bands or view.sub_frames or view.band)
+            if complete and resident.count and not resident.streamed:
+                self._cache(resident, key, frame)
+            return self._images(view, [frame.rendered()], resident)
 
     def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
         """Render views, as many at once as memory holds. Raises DeviceError as `render_view`."""
         if views.is_single:
             return self.render_view(resident, views.one(0))
-        with self.workspace.rendering():
-            return self._render_parts(resident, views)
-
-    def _render_single(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
-        view = views.view
-        key = self._key(view) if view.band is None else None
-        cached = resident.cached_frames.get(key)
-        if cached is not None and (images := self._replay(resident, views, cached)) is not None:
-            return images
-        if resident.coherent and self.shape.lists == "tiled":
-            return self._listing("local").render(resident, views)
-        plan = self._planner.frame(resident, view)
-        if plan.chunk and self.shape.lists != "ordered":
-            # chunks are rendered by one strategy only: where memory is short, sorting is fastest
-            return self._listing("ordered").render(resident, views)
-        frame = self._render_planned(resident, view, plan)
-        if key is not None and self._is_replayable(frame):
-            self._cache(resident, key, frame)
-        return self.images_of(frame)
-
-    def _render_parts(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
         workspace, rendered = self.workspace, []
-        workspace.switch_to(workspace.queue)
-        leased = lease_images(workspace, self.features.images, views)
-        names = [f"{output.name}_out" for output in self.features.images]
-        images = dict(zip(names, (buffer for _, buffer in leased), strict=True))
-        for first, end, plan in self._planner.parts(resident, views):
-            part = views.part(first, end)
-            pipeline = self._for_part(resident, plan, part)
-            kind = pipeline, "views", resident.capacity, plan
-            workspace.pool.make_way(kind, workspace.memory_budget - plan.held)
-            frame = DeviceFrame(workspace, pipeline._commands, pipeline.shape, resident, part, plan)
-            frame.bind_images(images)
-            render(frame)
-            rendered.append(Rendered.of(frame))
-        return self._images(views, rendered, resident, leased)
+        with workspace.rendering():
+            workspace.switch_to(workspace.queue)
+            leased = lease_images(workspace, self.features.images, views)
+            images = {f"{name}_out": buffer for name, (_, buffer) in zip(self.outputs, leased, strict=True)}
+            for first, end, plan in self._planner.parts(resident, views):
+                part = views.part(first, end)
+                pipeline = self._for_part(resident, plan, part)
+                kind = pipeline, "views", resident.capacity, plan
+                workspace.pool.make_way(kind, workspace.memory_budget - plan.held)
+                frame = DeviceFrame(workspace, pipeline._commands, pipeline.shape, resident, part, plan)
+                frame.bind_images(images)
+                render(frame)
+                rendered.append(frame.rendered())
+            return self._images(views, rendered, resident, leased)
 
     def fits(self, resident: Resident, view: View) -> bool:
         """Whether the frame is rendered at once; otherwise the cloud is projected for each of its parts."""
@@ -154,7 +145,7 @@ class OpenCLPipeline(Pipeline):
         with workspace.rendering():
             cached, queue = resident.cached_frames.get(key), workspace.switch_to(workspace.queue)
             recorded = None if cached is None else cached.recorded
-            if cached is not None and recorded is not None and self._ready(recorded, resident, view, queue):
+            if cached is not None and recorded is not None and recorded.set_view(resident, view, queue):
                 frame = self._frame(resident, view, cached.plan, recorded.commands, queue, pair_limit)
                 recorded.render(frame)
                 return frame
@@ -173,64 +164,43 @@ class OpenCLPipeline(Pipeline):
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:
         """The output images of a frame."""
-        return self._images(frame.batch, [Rendered.of(frame)], frame.resident)
+        return self._images(frame.view, [frame.rendered()], frame.resident)
 
     def render_again(self, resident: Resident, view: View) -> Rendered:
         """A frame whose replay exceeded its capacity, with the buffers that it requires."""
         with self.workspace.rendering():
-            return Rendered.of(self._render_planned(resident, view, self._planner.frame(resident, view)))
+            return self._render_planned(resident, view, self._planner.frame(resident, view)).rendered()
 
-    def profile(self, resident: Resident, view: View, recorded: RecordedFrame) -> dict[str, float]:
-        """Milliseconds by stage, of a frame that is rendered once more on a queue with profiling."""
-        workspace = self.workspace
-        with workspace.rendering():
-            queue = workspace.switch_to(workspace.queue)
-            workspace.frames += 1
-            if self._ready(recorded, resident, view, queue):
-                leased, events = recorded.submit(queue)
-                named = list(zip(recorded.commands.stages, events, strict=True))
-                rendered = Rendered(queue, leased, dict, events[-1], named)
-            else:
-                rendered = self.render_again(resident, view)
-            workspace.finish()
-            workspace.pool.give_back(rendered.leased)
-        return rendered.timings()
-
-    def _replay(self, resident: Resident, views: ViewBatch, cached: CachedFrame) -> OpenCLImages | None:
-        """The next frame of a kind; None if the buffers of the last were released."""
-        workspace, view, recorded = self.workspace, views.view, cached.recorded
+    def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
+        """The next frame of a kind; None if it exceeds the capacity, or the buffers of the last frame were
+        released."""
+        workspace, recorded, waits = self.workspace, cached.recorded, self.shape.lists == "ordered"
         workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.held, resident.capacity)
-        if not tiling.pair_capacity(workspace):
+        if not waits and not tiling.pair_capacity(workspace):
             return None
-        queue = workspace.switch_to(workspace.replay_queue)
+        queue = workspace.switch_to(workspace.queue if waits else workspace.replay_queue)
         workspace.frames += 1
-        if recorded is not None and self._ready(recorded, resident, view, queue):
-            leased, events = recorded.submit(queue)
-            stats = partial(
-                read_stats, workspace.read_queue, dict(leased)["counts"], events[-1], resident.count
-            )
-            rendered = Rendered(queue, leased, stats, events[-1])
+        if recorded is not None and recorded.set_view(resident, view, queue):
+            rendered = recorded.submit(queue, resident.count)
+            if rendered is None:
+                return None
         else:
             commands = CommandList(self.program) if recorded is None else recorded.commands
             cached.recorded = None  # an interrupt leaves a part of a recording
             frame = self._frame(resident, view, cached.plan, commands, queue)
             frame.lease_images(self.features.images)
             render(frame)
-            rendered = Rendered.of(frame, timed=False)
-            cached.recorded = recorded = RecordedFrame(frame)
-        images = self._images(views, [rendered], resident, replay=Replay(self, resident, view, recorded))
+            rendered = frame.rendered()
+            if not frame.in_bands:
+                cached.recorded = recorded = RecordedFrame(frame)
+        if waits:
+            return self._images(view, [rendered], resident)
+        assert recorded is not None  # the lists of a recorded frame are not divided on a GPU
+        replay = Replay(recorded, resident, view, self.render_again)
+        images = self._images(view, [rendered], resident, replay=replay)
         if not resident.immutable:
             images.complete()
         return images
-
-    def _ready(self, recorded: RecordedFrame, resident: Resident, view: View, queue: cl.CommandQueue) -> bool:
-        """Bind a view to a recorded frame; whether it can be submitted."""
-        if not recorded.valid:
-            return False
-        if not recorded.knows(view):
-            plan = MemoryPlan(0, 0, 0)
-            recorded.learn(self._frame(resident, view, plan, recorded.commands, queue))
-        return recorded.set_view(view, queue)
 
     def _frame(
         self,
@@ -266,11 +236,6 @@ class OpenCLPipeline(Pipeline):
         alike = resident.buffer_key if not plan.chunk else None
         return self, view.width, view.height, alike or (resident.capacity, plan)
 
-    def _is_replayable(self, frame: DeviceFrame) -> bool:
-        """Whether the next frame of its kind can be recorded."""
-        resident, complete = frame.resident, not (frame.plan.chunk or frame.in_bands or frame.view.sub_frames)
-        return complete and self.shape.lists != "ordered" and resident.count > 0 and not resident.streamed
-
     def _cache(self, resident: Resident, key: tuple[Any, ...], frame: DeviceFrame) -> None:
         """Replay the next frame of this kind."""
         cached, raster = resident.cached_frames, frame.view.raster
@@ -282,21 +247,20 @@ class OpenCLPipeline(Pipeline):
 
     def _key(self, view: View) -> tuple[Any, ...]:
         """What frames have in common that differ in numbers only."""
-        labels = tuple(label for label, _ in view.groups)
+        labels = [label for label, _ in view.groups]
         budgets = self.workspace.memory_budget, self.workspace.pair_budget
-        return self, view.width, view.height, view.raster, labels, budgets
+        return self, view.width, view.height, view.raster, *labels, budgets
 
     def _images(
         self,
-        views: ViewBatch,
+        views: ViewBatch | View,
         rendered: list[Rendered],
         resident: Resident,
         leased: list[tuple[str, cl.Buffer]] | None = None,
         replay: Replay | None = None,
     ) -> OpenCLImages:
-        outputs = self.features.images
         return OpenCLImages(
-            self.workspace, outputs, views, self.shape, rendered, resident.count, leased, replay
+            self.workspace, self.outputs, views, self.shape, rendered, resident.count, leased, replay
         )
 
     def _listing(self, lists: str) -> OpenCLPipeline:

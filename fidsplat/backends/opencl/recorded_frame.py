@@ -1,21 +1,26 @@
 """Frames that are replayed: the command list of one frame, submitted again for the next of its kind.
 
-Frames of a kind run the same kernels with the same arguments, but for their output images and the numbers
-of their views. To set these takes the host a fraction of the time of planning a frame, and nothing waits for
-the device.
+Frames of a kind run the same kernels with the same arguments, except for their output images and the numbers
+of their views. Setting these takes the host a fraction of the time of planning a frame. On a GPU nothing
+waits for the device. On a CPU the host reads the counts before the lists are written, as in `render_sorted`.
 """
 
 from __future__ import annotations
 
+import weakref
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.counts import read_stats
-from fidsplat.backends.opencl.device_frame import DeviceFrame
+from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.opencl.counts import TALLIES, Capacity, Counts, read_stats
+from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.uniforms import numbers_of, projection_arrays
 from fidsplat.backends.view import View
 
 _VIEWS = 256
@@ -24,6 +29,7 @@ _VIEWS_BYTES = 1 << 26
 """bytes of their arrays, such as external depth images"""
 _UPLOADS = 64
 """copies to the device that may be under way before the host waits for the first"""
+_ZERO = np.zeros(1, np.uint32)
 
 
 class RecordedFrame:
@@ -31,85 +37,146 @@ class RecordedFrame:
     it (`Resident.cached_frames`)."""
 
     def __init__(self, frame: DeviceFrame) -> None:
-        self.commands, self.capacity = frame.commands, frame.capacity
-        self._pool, self._state = frame.pool, frame.pool.state
+        self.workspace, self.commands, self.capacity = frame.workspace, frame.commands, frame.capacity
+        self.state = frame.pool.state
+        """of the scratch buffers to which the kernels are bound"""
+        self._waits = frame.waits
+        """whether the host waits for the counts of each frame"""
+        self._rows, self._tallies = frame.rows, frame.pool.size("tallies")
+        if frame.waits:
+            pairs = min(frame.pool.size("lists") // 4, frame.workspace.pair_budget)
+            self.capacity, self._tallies = Capacity(self.capacity.big, pairs), 4 * TALLIES
+        self._counted = frame.counted_launches
+        self._stages = self.commands.stages
+        self._source = frame.source
         self._view, self._arrays = frame.view, frame.arrays
-        arguments = {one.name: one for name in self.commands.kernels for one in frame.source.arguments[name]}
-        self._of_view = [one for one in arguments.values() if frame.is_of_view(one)]
-        """kernel arguments that are numbers of the view"""
         self._views: dict[int, tuple[View, dict[str, np.ndarray], dict[str, Any]]] = {
-            id(frame.view): (frame.view, frame.arrays, self._numbers_of(frame))
+            id(frame.view): (frame.view, frame.arrays, numbers_of(frame.view, frame.source))
         }
         """views that were rendered, with their arrays and numbers"""
         self._bytes = 0
         """of those arrays"""
-        self._tallies = frame.pool.size("tallies")
         self._uploads: deque[cl.Event] = deque(frame.uploads, maxlen=_UPLOADS)
         self._leases = [(name, buffer.size) for name, buffer in frame.leased]
         self._scratch = [name for name in frame.bound if name not in dict(frame.leased)]
 
-    @property
-    def valid(self) -> bool:
-        """Whether no scratch buffer was replaced since."""
-        return self._pool.state is self._state
-
-    def knows(self, view: View) -> bool:
-        """Whether the uniforms of a view are cached."""
-        return view is self._view or id(view) in self._views
-
-    def learn(self, frame: DeviceFrame) -> None:
-        """Cache the uniforms of another view. frame: of that view, not rendered."""
-        frame.put_view(0, frame.rows)
-        frame.put_arrays()
-        self._uploads.extend(frame.uploads)
-        # an array that views share, a panorama say, is counted once
-        own = sum(a.nbytes for name, a in frame.arrays.items() if a is not self._arrays.get(name))
-        if len(self._views) >= _VIEWS or self._bytes + own > _VIEWS_BYTES:
-            self._views.clear()
-            self._bytes = 0
-        self._bytes += own
-        # the view is kept alive, so that no other has its id
-        arrays = self._arrays | frame.arrays
-        self._views[id(frame.view)] = frame.view, arrays, self._numbers_of(frame)
-
-    def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
-        """Bind the uniforms of a view. Returns whether the command list can be submitted: not after a buffer
-        was replaced."""
-        pool = self._pool
+    def set_view(self, resident: Resident, view: View, queue: cl.CommandQueue) -> bool:
+        """Bind the uniforms of a view. Returns whether the command list can be submitted: not after a scratch
+        buffer was replaced."""
+        pool = self.workspace.pool
+        if pool.state is not self.state:
+            return False
         if view is not self._view:
-            _, arrays, numbers = self._views[id(view)]
+            _, arrays, numbers = self._views.get(id(view)) or self._learn(resident, view)
             self.commands.set(numbers)
             self._view, self._arrays = view, arrays
         for name, array in self._arrays.items():
             _, event = pool.put(queue, name, array)
             if event is not None:  # frames of other kinds use the same buffers
                 self._uploads.append(event)
-        pool.zeroed("tallies", self._tallies, queue)  # frames of other kinds leave theirs
-        return self.valid
+        if not self._waits:
+            pool.zeroed("tallies", self._tallies, queue)  # frames of other kinds leave theirs
+        return pool.state is self.state
 
-    def submit(self, queue: cl.CommandQueue) -> tuple[list[tuple[str, cl.Buffer]], list[cl.Event]]:
-        """Render into leased buffers. Returns these by name, and the event of each launch."""
-        leased = [(name, self._pool.lease(name, size)) for name, size in self._leases]
-        self.commands.set(dict(leased))
-        events = self.commands.submit(queue)
+    def submit(self, queue: cl.CommandQueue, splats: int) -> Rendered | None:
+        """Render the view that is bound, of a cloud of so many splats. None if it exceeds the capacity, where
+        the host waits for its counts."""
+        commands, pool = self.commands, self.workspace.pool
+        leased = [(name, pool.lease(name, size)) for name, size in self._leases]
+        commands.set(dict(leased))
+        if not self._waits:
+            events = commands.submit(queue)
+            queue.flush()
+            counts, reader = dict(leased)["counts"], self.workspace.read_queue
+            stats = partial(read_stats, reader, counts, events[-1], splats)
+            stages = None if queue is self.workspace.replay_queue else self._stages
+            return Rendered(queue, leased, stats, events, stages)
+        tallies = pool.scratch("tallies", self._tallies)
+        cl.enqueue_fill_buffer(queue, tallies, _ZERO, 0, self._tallies)
+        events = commands.submit(queue, 0, self._counted)
+        words = np.empty((1, TALLIES), np.uint32)
+        cl.enqueue_copy(queue, words, tallies)
+        counts = Counts.of_tallies(words)
+        if not self.capacity.holds(counts):
+            pool.give_back(leased)
+            return None
+        events += commands.submit(queue, self._counted)
         queue.flush()
-        return leased, events
+        return Rendered(queue, leased, partial(counts.stats, splats), events, self._stages)
 
     def render(self, frame: DeviceFrame) -> None:
         """Replay as a frame of the view that is bound, with the buffers that its stages leave for
         derivatives."""
-        frame.leased, events = self.submit(frame.queue)
+        rendered = self.submit(frame.queue, frame.resident.count)
+        assert rendered is not None  # on CPUs frames with derivatives are not replayed
+        frame.leased, events = rendered.leased, rendered.events
         for name in self._scratch:
-            if (buffer := self._pool.known(name)) is not None:
+            if (buffer := frame.pool.known(name)) is not None:
                 frame.bind(name, buffer)
         for name, buffer in frame.leased:
             frame.bind(name, buffer)
         frame.numbers["big_capacity"], frame.pairs = self.capacity.big, self.capacity.pairs
-        frame.events = list(zip(self.commands.stages, events, strict=True))
-        frame.counted = events[self.commands.kernels.index("tile_starts")]
-        reader, count = frame.workspace.read_queue, frame.resident.count
-        frame.stats = partial(read_stats, reader, frame.buffers.counts, events[-1], count)
+        frame.events, frame.stages = events, self._stages.copy()
+        frame.counted, frame.stats = events[self._counted - 1], rendered.stats
 
-    def _numbers_of(self, frame: DeviceFrame) -> dict[str, Any]:
-        """The numbers of a frame's view, by the names of the kernel arguments."""
-        return {argument.name: frame.value(argument) for argument in self._of_view}
+    def _learn(self, resident: Resident, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
+        """Cache the uniforms of another view."""
+        own = projection_arrays(ViewBatch.single(view), resident, self._source, 0, self._rows)
+        for name in self._source.view_arrays:
+            own[name] = view.array(name)
+        # an array that views share, a panorama say, is counted once
+        size = sum(array.nbytes for name, array in own.items() if array is not self._arrays.get(name))
+        if len(self._views) >= _VIEWS or self._bytes + size > _VIEWS_BYTES:
+            self._views.clear()
+            self._bytes = 0
+        self._bytes += size
+        # the view is kept alive, so that no other has its id
+        learned = view, self._arrays | own, numbers_of(view, self._source)
+        self._views[id(view)] = learned
+        return learned
+
+
+class Replay:
+    """A frame that was replayed on a GPU: its capacity is checked when it is first read."""
+
+    def __init__(
+        self,
+        recorded: RecordedFrame,
+        resident: Resident,
+        view: View,
+        render_again: Callable[[Resident, View], Rendered],
+    ) -> None:
+        """render_again: renders the view with the buffers that it requires."""
+        self._recorded, self._view, self._render_again = recorded, view, render_again
+        self._number = recorded.workspace.frames
+        self._resident: Resident | None = resident
+        self._timed = weakref.ref(resident)
+
+    def overflow(self, rendered: Rendered) -> Rendered | None:
+        """The frame rendered again, if its counts exceed the capacity; None if it is complete."""
+        resident, workspace = self._resident, self._recorded.workspace
+        if resident is None:
+            return None
+        queue, after = rendered.queue, None  # faster than a queue that waits for another
+        if workspace.frames != self._number:  # without waiting for frames that were submitted since
+            queue, after = workspace.read_queue, rendered.done()
+        counts = Counts.read(queue, rendered.buffer("counts"), after)
+        again = None if self._recorded.capacity.holds(counts) else self._render_again(resident, self._view)
+        self._resident = None  # the cloud is held until the check only
+        return again
+
+    def timings(self) -> dict[str, float]:
+        """Milliseconds by stage, of another replay with profiling; empty if the cloud was released."""
+        resident, recorded, workspace = self._timed(), self._recorded, self._recorded.workspace
+        if resident is None:
+            return {}
+        with workspace.rendering():
+            queue = workspace.switch_to(workspace.queue)
+            workspace.frames += 1
+            rendered = None
+            if recorded.set_view(resident, self._view, queue):
+                rendered = recorded.submit(queue, resident.count)
+            rendered = rendered or self._render_again(resident, self._view)
+            workspace.finish()
+            workspace.pool.give_back(rendered.leased)
+        return rendered.timings()

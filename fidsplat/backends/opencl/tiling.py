@@ -18,9 +18,9 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.bands import split_by_cost
-from fidsplat.backends.opencl.counts import Counts
+from fidsplat.backends.opencl.counts import BIG, PAIRS, TALLIES, VISIBLE, Counts
 from fidsplat.backends.opencl.device_frame import DeviceFrame
-from fidsplat.backends.opencl.memory_plan import BIG, KEYS, WINDOWS
+from fidsplat.backends.opencl.memory_plan import KEYS, MIN_BIG, WINDOWS
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
@@ -30,8 +30,6 @@ _GROUP_SPLATS = 4096
 """splats per work-group of the strategy `local`"""
 _ITEMS = 256
 """BIN_ITEMS and SORT_ITEMS"""
-# words of the buffer `tallies`, as in prelude.cl
-_VISIBLE, _PAIRS, _BIG, _TALLIES = 0, 2, 6, 8
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -45,11 +43,11 @@ class TileBand(NamedTuple):
 
 def allocate_tallies(frame: DeviceFrame, words: int, big: int = 0) -> None:
     """Zeroed counters, and buffers for at least `big` big splats."""
-    capacity = max(big * 5 // 4, frame.pool.size("big") // 4, BIG)
+    capacity = max(big * 5 // 4, frame.pool.size("big") // 4, MIN_BIG)
     frame.numbers["big_capacity"] = capacity
     frame.take("big", 4 * capacity)
     frame.take("big_bounds", frame.source.records["Bounds"].itemsize * capacity)
-    if frame.recorded:  # the kernel tile_starts clears them for the next replay
+    if not frame.waits:  # the kernel tile_starts clears them for the next replay
         frame.bind("tallies", frame.pool.zeroed("tallies", 4 * words, frame.queue))
         return
     tallies = frame.take("tallies", 4 * words)
@@ -68,7 +66,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
     if count:
         names = [one.name for one in frame.source.arguments["project"] if one.source == "cloud"]
         arrays = {name: frame.resident.part(name, first, end) for name in names}
-        frame.launch("project", "project", count, 64, frame.views, count=count, **arrays)
+        frame.launch("project", "project", (count,), (64,), frame.views, count=count, **arrays)
 
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:
@@ -78,12 +76,6 @@ def _splat_capacity(frame: DeviceFrame, count: int) -> int:
 
 
 # on CPUs: sort by depth, then list
-
-
-def project_all(frame: DeviceFrame, big: int) -> None:
-    """Project the cloud, with buffers for at least `big` big splats."""
-    allocate_tallies(frame, _TALLIES * frame.views, big)
-    project(frame, 0, frame.resident.count)
 
 
 def sort_by_depth(frame: DeviceFrame, count: int) -> None:
@@ -96,24 +88,23 @@ def sort_by_depth(frame: DeviceFrame, count: int) -> None:
         keys_out = frame.take(f"sorted keys {number % 2}", size)
         order_out = frame.take(f"order {(number + 1) % 2}", size)
         digit = {"keys": keys, "count": count, "first": number == 0, "shift": shift, "table": table}
-        frame.launch("sort", "sort_count", chunks, 1, views, **digit)
-        starts = _prefix_sums(frame, "sort", table, bins, _VISIBLE, views)
+        frame.launch("sort", "sort_count", (chunks,), (1,), views, **digit)
+        starts = _prefix_sums(frame, "sort", table, bins, VISIBLE, views)
         out = {"starts": starts, "indices": order, "keys_out": keys_out, "indices_out": order_out}
-        frame.launch("sort", "sort_scatter", chunks, 1, views, **digit, **out)
+        frame.launch("sort", "sort_scatter", (chunks,), (1,), views, **digit, **out)
         keys, order = keys_out, order_out
     frame.buffers.order = order
 
 
 def count_pairs(frame: DeviceFrame, count: int) -> Counts:
-    """Length of each tile's list; waits for the totals. `big` is the first view's."""
+    """Length of each tile's list; waits for the totals."""
     views = frame.views
     table = frame.take("bin table", 4 * frame.tiles * frame.shape.chunks)
-    frame.launch("bin", "bin_count", frame.shape.chunks, 1, views, table=table, count=count)
+    frame.launch("bin", "bin_count", (frame.shape.chunks,), (1,), views, table=table, count=count)
     # one list of all views' tiles: those of the second view follow those of the first
-    frame.buffers.starts = _prefix_sums(frame, "bin", table, frame.tiles // views, _PAIRS, 1)
-    words = frame.read("tallies", np.uint32, (views, _TALLIES))
-    pairs = int(words[0][_PAIRS]) | int(words[0][_PAIRS + 1]) << 32
-    return Counts(int(words[0][_BIG]), pairs, int(words[:, _VISIBLE].sum(dtype=np.int64)))
+    frame.buffers.starts = _prefix_sums(frame, "bin", table, frame.tiles // views, PAIRS, 1)
+    frame.counted_launches = len(frame.events)
+    return Counts.of_tallies(frame.read("tallies", np.uint32, (views, TALLIES)))
 
 
 def sorted_bands(frame: DeviceFrame, first: int, end: int, pairs: int) -> Iterable[TileBand]:
@@ -138,7 +129,7 @@ def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
     frame.take("lists", 4 * size)
     given = {"band_first": band.first, "band_end": band.end, "count": count}
     table = frame.named["bin table"]
-    frame.launch("bin", "bin_emit", frame.shape.chunks, 1, frame.views, table=table, **given)
+    frame.launch("bin", "bin_emit", (frame.shape.chunks,), (1,), frame.views, table=table, **given)
 
 
 def _prefix_sums(
@@ -150,9 +141,9 @@ def _prefix_sums(
     totals = frame.take(f"{stage} totals", 4 * bins * views)
     each = bins * views // lists
     starts = frame.take(f"{stage} starts", 4 * (each + 1) * lists)
-    frame.launch(stage, "scan_chunks", bins, 64, views, table=table, bins=bins, totals=totals)
+    frame.launch(stage, "scan_chunks", (bins,), (64,), views, table=table, bins=bins, totals=totals)
     scan = {"bins": each, "totals": totals, "starts": starts, "slot": slot}
-    frame.launch(stage, "scan_bins", items, items, lists, **scan)
+    frame.launch(stage, "scan_bins", (items,), (items,), lists, **scan)
     return starts
 
 
@@ -174,7 +165,7 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
     frame.put_view(top * height, end * height)
     big = 0
     while True:
-        allocate_tallies(frame, _TALLIES, big)
+        allocate_tallies(frame, TALLIES, big)
         sizes = {"splats": frame.source.records["Splat"].itemsize, "keys": KEYS, "windows": WINDOWS}
         packed = {name: frame.take(f"packed {name}", size * plan.capacity) for name, size in sizes.items()}
         found, big = _pack_chunks(frame, packed)
@@ -196,18 +187,18 @@ def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Pack
         stop = min(start + chunk, count)
         project(frame, start, stop)
         frame.take("piece_counts", 8 * chunks)
-        frame.launch("project", "pack_count", chunks, 1, count=stop - start)
+        frame.launch("project", "pack_count", (chunks,), (1,), count=stop - start)
         counts = frame.read("piece_counts", np.uint32, (2, chunks)).astype(np.int64)
         visible += int(counts[1].sum())
         places = np.concatenate([[0], np.cumsum(counts[0])]) + total
         total = int(places[-1])
         if total > frame.plan.capacity:
             return Packed(-(-total * count // stop), visible), 0
-        big = int(frame.read("tallies", np.uint32, (_TALLIES,))[_BIG])
+        big = int(frame.read("tallies", np.uint32, (TALLIES,))[BIG])
         if big > frame.numbers["big_capacity"]:
             return Packed(total, visible), big
         frame.put("piece_offsets", places[:-1].astype(np.uint32))
-        frame.launch("project", "pack_move", chunks, 1, count=stop - start, **out)
+        frame.launch("project", "pack_move", (chunks,), (1,), count=stop - start, **out)
     return Packed(total, visible), 0
 
 
@@ -237,9 +228,9 @@ def pair_capacity(workspace: Workspace) -> int:
 def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
     """Project the cloud and count the pairs of each tile, with buffers for at least `big` big splats."""
     count = frame.resident.count
-    allocate_tallies(frame, _TALLIES + frame.tiles, big)
+    allocate_tallies(frame, TALLIES + frame.tiles, big)
     project(frame, 0, count)
-    frame.launch("bin", "tally_big", _big_groups(frame) * _ITEMS, _ITEMS, count=count)
+    frame.launch("bin", "tally_big", (_big_groups(frame) * _ITEMS,), (_ITEMS,), count=count)
     if frame.shape.lists == "local":
         launch_local(frame, "tally_local")
 
@@ -249,8 +240,8 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     items = frame.shape.scan_items
     frame.take("starts", 4 * (frame.tiles + 1))
     frame.take("cursors", 4 * frame.tiles)
-    given = {"tiles": frame.tiles, "capacity": capacity, "clear": frame.recorded}
-    return frame.launch("bin", "tile_starts", items, items, **given)
+    given = {"tiles": frame.tiles, "capacity": capacity, "clear": not frame.waits}
+    return frame.launch("bin", "tile_starts", (items,), (items,), **given)
 
 
 def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
@@ -260,13 +251,17 @@ def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band:
     count, views, groups = frame.resident.count, frame.views, _big_groups(frame)
     given = {"band_first": band.first, "band_end": band.end, "capacity": capacity, "first_band": first_band}
     if frame.shape.lists == "local":  # big splats, then all others
-        frame.launch("bin", "emit", groups * _ITEMS, _ITEMS, views, count=count, splat_groups=0, **given)
+        frame.launch(
+            "bin", "emit", (groups * _ITEMS,), (_ITEMS,), views, count=count, splat_groups=0, **given
+        )
         launch_local(frame, "emit_local", **given)
     else:
         splat_groups = -(-count // _ITEMS)
         items = (splat_groups + -(-groups // views)) * _ITEMS
-        frame.launch("bin", "emit", items, _ITEMS, views, count=count, splat_groups=splat_groups, **given)
-    frame.launch("sort", "sort_tiles", (band.end - band.first) * _ITEMS, _ITEMS, band_first=band.first)
+        frame.launch(
+            "bin", "emit", (items,), (_ITEMS,), views, count=count, splat_groups=splat_groups, **given
+        )
+    frame.launch("sort", "sort_tiles", ((band.end - band.first) * _ITEMS,), (_ITEMS,), band_first=band.first)
 
 
 def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
@@ -275,8 +270,8 @@ def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
     if pairs <= budget:
         return [TileBand(0, frame.tiles, pairs)]
     frame.in_bands = True
-    tallies = frame.read("tallies", np.uint32, (_TALLIES + frame.tiles,))
-    return [TileBand(*band) for band in split_by_cost(tallies[_TALLIES:], budget)]
+    tallies = frame.read("tallies", np.uint32, (TALLIES + frame.tiles,))
+    return [TileBand(*band) for band in split_by_cost(tallies[TALLIES:], budget)]
 
 
 def launch_local(frame: DeviceFrame, kernel: str, **given: Any) -> None:
@@ -284,7 +279,7 @@ def launch_local(frame: DeviceFrame, kernel: str, **given: Any) -> None:
     count, items = frame.resident.count, frame.shape.scan_items
     if count:
         groups = -(-count // _GROUP_SPLATS)
-        frame.launch("bin", kernel, groups * items, items, frame.views, count=count, **given)
+        frame.launch("bin", kernel, (groups * items,), (items,), frame.views, count=count, **given)
 
 
 def _big_groups(frame: DeviceFrame) -> int:

@@ -1,4 +1,5 @@
-"""Uniforms of views: the records `View` and the numbers that are kernel arguments of their own."""
+"""Uniforms of views: the records `View` and other arrays, and the numbers that are kernel arguments of their
+own."""
 
 from __future__ import annotations
 
@@ -7,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.opencl.assemble import Source
+from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.view import View
 
 
 def scalars_of(view: View) -> dict[str, float]:
-    """Numbers of a view that are kernel arguments of their own, by the names of the arguments."""
+    """Numbers of a view that are kernel arguments of their own in every program, by the names of the
+    arguments."""
     red, green, blue = view.background
     return {
         **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
@@ -20,10 +24,33 @@ def scalars_of(view: View) -> dict[str, float]:
     }
 
 
-def frozen(array: np.ndarray) -> np.ndarray:
-    """The array, made read-only: `BufferPool.put` copies a read-only array once."""
-    array.flags.writeable = False
-    return array
+def numbers_of(view: View, source: Source) -> dict[str, Any]:
+    """All numbers of a view that are arguments of the kernels, by the names of the arguments."""
+    numbers: dict[str, Any] = scalars_of(view)
+    for group, names in source.uniform_groups.items():
+        values = view.uniform(group)
+        for index, name in names.items():
+            numbers[name] = values[index]
+    return numbers
+
+
+def projection_arrays(
+    views: ViewBatch, resident: Resident, source: Source, row: int, end: int
+) -> dict[str, np.ndarray]:
+    """Arrays of views that kernels of the projection read, for rows of samples [row, end), by the names of
+    the arguments. They are read-only: `BufferPool.put` copies such an array once."""
+    view = views.view
+    if view.band is not None:
+        row, end = max(row, view.band[0]), min(end, view.band[1])
+    arrays = {"view": view_records(views, row, end, source.records["View"])}
+    if view.groups:
+        arrays["moving"] = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
+    if resident.group_table is not None:
+        # a copy, since it must own its memory to be recognised
+        arrays["plane_keys"] = resident.group_table.keys_of(views).T.copy()
+    for array in arrays.values():
+        array.flags.writeable = False
+    return arrays
 
 
 def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.ndarray:
@@ -31,8 +58,10 @@ def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.n
     of a single view are in one row."""
     real = record[0].base  # all members have one type
     if len(views) == 1:
-        every = [views.view, *(moved for _, moved in views.view.groups)]
-        return np.array([number for each in every for number in _numbers(each, row, end, record)], real)
+        numbers = _numbers(views.view, row, end, record)
+        for _, moved in views.view.groups:
+            numbers += _numbers(moved, row, end, record)
+        return np.array(numbers, real)
     made = np.empty(views.translation.shape[:2], record)
     made[:] = np.array(_numbers(views.view, row, end, record), real).view(record)
     made["rotation"] = views.rotation.reshape(*made.shape, 9)
