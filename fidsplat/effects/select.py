@@ -44,10 +44,15 @@ class FeatureSet:
     @cached_property
     def images(self) -> tuple[Output, ...]:
         """Output images: rgb, those that other outputs need, the others."""
-        needed = sorted({name for output in self.outputs for name in CATALOGUE[output].needs})
-        names = (*needed, *(name for name in self.outputs if name not in needed))
-        effects = (CATALOGUE[name] for name in names)
-        return (RGB, *(effect.output for effect in effects if effect.output))
+        needed: set[str] = set()
+        for name in self.outputs:
+            needed.update(CATALOGUE[name].needs)
+        images = [RGB]
+        for name in (*sorted(needed), *self.outputs):
+            output = CATALOGUE[name].output
+            if output is not None and output not in images:
+                images.append(output)
+        return tuple(images)
 
 
 class CloudTraits(Protocol):

@@ -16,7 +16,7 @@ import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -25,10 +25,10 @@ import numpy as np
 from fidsplat.backends.opencl.declare import (
     Argument,
     Layout,
+    Member,
     Record,
     Samples,
     Scalars,
-    member,
     output_argument,
 )
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS
@@ -68,6 +68,8 @@ _STEP = (
 )
 _TRAINING = ("surface", "activation_functions", "activate", "gather_rows", "position_noise")
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
+_HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
+_COMMENT = re.compile(r"[ \t]*//.*")
 _SECTION = re.compile(r"//@ (\w+)[ \t]*")
 # both begin with a word itself, which re finds 20 times as fast as a boundary
 _WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
@@ -89,7 +91,7 @@ class Text:
     """the same without them, line for line"""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Source:
     """Flat kernel sources with what the host must know of them."""
 
@@ -118,20 +120,25 @@ class Source:
         """SHA-256 of the text: the cache key."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
-    @cached_property
-    def uniform_groups(self) -> dict[str, dict[int, str]]:
-        """Kernel arguments by index, for each group of uniforms (`View.uniform`)."""
-        groups: dict[str, dict[int, str]] = {}
-        for one in chain.from_iterable(self.arguments.values()):
-            if one.source == "uniform":
-                groups.setdefault(one.uniform[0], {})[one.uniform[1]] = one.name
-        return groups
+    def __post_init__(self) -> None:
+        self.uniform_groups: dict[str, dict[int, str]] = {}
+        """kernel arguments by index, for each group of uniforms (`View.uniform`)"""
+        self.view_arrays: set[str] = set()
+        """names of the arrays of the view (`View.array`) that kernels read"""
+        self.cloud_arrays: list[str] = []
+        """names of the arrays of the cloud that the projection reads"""
+        for kernel, arguments in self.arguments.items():
+            for one in arguments:
+                if one.source == "uniform":
+                    self.uniform_groups.setdefault(one.uniform[0], {})[one.uniform[1]] = one.name
+                elif one.source == "array":
+                    self.view_arrays.add(one.name)
+                elif one.source == "cloud" and kernel == "project":
+                    self.cloud_arrays.append(one.name)
 
-    @cached_property
-    def view_arrays(self) -> set[str]:
-        """Names of the arrays of the view (`View.array`) that kernels read."""
-        arguments = chain.from_iterable(self.arguments.values())
-        return {one.name for one in arguments if one.source == "array"}
+    def takes(self, kernel: str, argument: str) -> bool:
+        """Whether a kernel has an argument of this name."""
+        return any(one.name == argument for one in self.arguments.get(kernel, ()))
 
 
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
@@ -317,13 +324,16 @@ class Assembler:
         return Source(texts, records, arguments, declared.samples, declared.scalars)
 
     def _program(self, name: str, stages: Iterable[str]) -> Text:
-        files = [f"{stage}.cl" for stage in stages]
-        body = "".join(f"#line 1 {_shown(file)}\n{self._expand(file, 1, lines_of(file))}" for file in files)
+        body = ""
+        for stage in stages:
+            file = f"{stage}.cl"
+            body += f"#line 1 {_shown(file)}\n{self._expand(file, 1, lines_of(file))}"
         body = with_scalars(with_constants(body, self._declared.constants), self._declared.scalars.wide)
-        bare = "\n".join(_without_comment(line) if "//" in line else line for line in body.split("\n"))
-        # an unused number must not change the text
-        numbers = sorted(self._defines.items())
-        head = "".join(f"#define {name} {value}\n" for name, value in numbers if name in bare)
+        bare = _COMMENT.sub("", body)
+        head = ""
+        for number, value in sorted(self._defines.items()):
+            if number in bare:  # an unused number must not change the text
+                head += f"#define {number} {value}\n"
         return Text(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
 
     def _fill(self, hook: str, subject: str) -> Iterator[str]:
@@ -358,39 +368,44 @@ class Declarations:
         kernels: Mapping[str, tuple[Argument, ...]] = KERNELS,
     ) -> None:
         """fused: blending resolves, with the arguments of both."""
-        every = list((layouts or {}).values())
         self.scalars = scalars
-        self.samples = tuple(chain.from_iterable(layout.samples for layout in every))
-        self._layouts, self._outputs, self._fused, self._kernels = every, outputs, fused, kernels
-        self.constants = dict(one for layout in every for one in layout.constant)
+        self.samples: tuple[Samples, ...] = ()
+        self.constants: dict[str, str] = {}
         """fields of `Splat` that all splats share, and their values"""
-        moments = MOMENTS.with_members(one for layout in every for one in layout.moments)
-        names = " ".join(name for one in moments.members for name, _ in one.names)
+        self._layouts = list((layouts or {}).values())
+        self._outputs, self._fused, self._kernels = outputs, fused, kernels
+        view, splat, bounds, moments = VIEW, SPLAT, BOUNDS, MOMENTS
+        for layout in self._layouts:
+            self.samples += layout.samples
+            self.constants |= dict(layout.constant)
+            view, splat = view.with_members(layout.view), splat.with_members(layout.splat)
+            bounds, moments = bounds.with_members(layout.bounds), moments.with_members(layout.moments)
         # as many fields of padding as in `Moments`
         alignment = moments.alignment // 4 * scalars.dtype("real").itemsize
-        structs = (
-            VIEW.with_members(one for layout in every for one in layout.view),
-            SPLAT.with_members(one for layout in every for one in layout.splat).without(self.constants),
-            BOUNDS.with_members(one for layout in every for one in layout.bounds),
-            moments,
-            Record("Totals", (member(f"real {names}", "of all tiles"),), alignment),
-        )
-        self.structs = {record.name: record for record in structs}
+        fields = tuple(chain.from_iterable(one.names for one in moments.members))
+        totals = Record("Totals", (Member("real", fields, "of all tiles"),), alignment)
+        records = view, splat.without(self.constants), bounds, moments, totals
+        self.structs = {record.name: record for record in records}
 
     def arguments(self, kernel: str) -> tuple[Argument, ...]:
         """A kernel's own arguments, then those of the effects in their order, each name once."""
-        added: list[Argument] = []
+        found = {one.name: one for one in self._kernels[kernel]}
         if field := _EFFECT_ARGUMENTS.get(kernel):
-            added += (one for layout in self._layouts for one in getattr(layout, field))
+            for layout in self._layouts:
+                for one in getattr(layout, field):
+                    found[one.name] = one
         if kernel in ("blend", "resolve"):
             access = "out" if kernel == "blend" else "in"
-            added += (Argument(one.ctype, one.name, access, note=one.note) for one in self.samples)
+            for one in self.samples:
+                found[one.name] = Argument(one.ctype, one.name, access, note=one.note)
         if kernel == "resolve":
-            added += map(output_argument, self._outputs)
+            for output in self._outputs:
+                found[f"{output.name}_out"] = output_argument(output)
         if kernel == "blend" and self._fused:
-            own = {"stride", *(one.name for one in (*self._kernels[kernel], *added))}
-            added += [one for one in self.arguments("resolve") if one.name not in own]
-        return tuple({one.name: one for one in (*self._kernels[kernel], *added)}.values())
+            for one in self.arguments("resolve"):
+                if one.name != "stride":
+                    found.setdefault(one.name, one)
+        return tuple(found.values())
 
     def text(self, hook: str, subject: str) -> str:
         """C for `//@@ struct NAME` or `//@@ arguments KERNEL`."""
@@ -406,10 +421,6 @@ class Declarations:
 def _shown(file: str) -> str:
     """The file name for `#line`: the path below kernels/, or the name of a file from elsewhere."""
     return f'"{Path(file).name}"' if Path(file).is_absolute() else f'"opencl/{file}"'
-
-
-def _without_comment(line: str) -> str:
-    return line[: line.index("//")].rstrip(" \t")
 
 
 def with_scalars(text: str, wide: str = "float") -> str:
@@ -428,10 +439,11 @@ def with_constants(text: str, constants: Mapping[str, str]) -> str:
 
 
 def _refuse_unknown_hooks(files: list[str]) -> None:
-    stages = (stage.format(schedule) for stage in _DRAWN for schedule in ("lanes", "group"))
-    everywhere = {f"{stage}.cl" for stage in (*stages, *chain(*_LISTS.values()))}
+    """Raise DeviceError if a file fills a hook that neither a stage nor an effect has."""
+    stages = [stage.format(schedule) for stage in _DRAWN for schedule in ("lanes", "group")]
+    everywhere = {f"{stage}.cl" for stage in chain(stages, *_LISTS.values())}
     everywhere |= {layout.file for layout in LAYOUTS.values() if layout.file}
-    known = {hook for file in everywhere for hook in _hooks(file)}
+    known = set(chain.from_iterable(map(_hooks, everywhere)))
     for file in files:
         if unknown := set(sections_of(file)) - known:
             raise DeviceError(f"kernel file {file} fills hooks that no file has: {sorted(unknown)}")
@@ -449,9 +461,9 @@ def lines_of(path: str) -> tuple[str, ...]:
 
 
 @cache
-def _hooks(path: str) -> tuple[str, ...]:
-    found = (_HOOK.fullmatch(line) for line in lines_of(path))
-    return tuple(hook[1] for hook in found if hook)
+def _hooks(path: str) -> list[str]:
+    """The names of a file's hooks."""
+    return _HOOKS.findall(kernel_text(path))
 
 
 @cache

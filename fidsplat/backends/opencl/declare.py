@@ -79,30 +79,25 @@ class Record:
 
     def without(self, names: Collection[str]) -> Record:
         """The record without these fields, in the same order."""
-        kept = (
-            Member(one.ctype, tuple(field for field in one.names if field[0] not in names), one.note)
-            for one in self.members
-        )
-        return Record(self.name, tuple(one for one in kept if one.names), self.alignment)
+        members = []
+        for one in self.members:
+            if fields := tuple([field for field in one.names if field[0] not in names]):
+                members.append(Member(one.ctype, fields, one.note))
+        return Record(self.name, tuple(members), self.alignment)
 
     def dtype(self, scalars: Scalars) -> np.dtype:
         """The C layout, by natural alignment."""
-        fields = [
-            (name, scalars.dtype(one.ctype), *(((length,),) if length > 1 else ()))
-            for one in self.members
-            for name, length in one.names
-        ]
+        fields = []
+        for one in self.members:
+            dtype = scalars.dtype(one.ctype)
+            fields += [
+                (name, dtype, (length,)) if length > 1 else (name, dtype) for name, length in one.names
+            ]
         plain = np.dtype(fields, align=True)
         size = plain.itemsize + -plain.itemsize % self.alignment
-        known = plain.fields or {}
-        return np.dtype(
-            {
-                "names": list(known),
-                "formats": [known[name][0] for name in known],
-                "offsets": [known[name][1] for name in known],
-                "itemsize": size,
-            }
-        )
+        names = list(plain.fields or ())
+        formats, offsets = zip(*(plain.fields or {}).values(), strict=True) if names else ((), ())
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
 
     def text(self, scalars: Scalars) -> str:
         """The C struct, with a compile-time check of its size."""

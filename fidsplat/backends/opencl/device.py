@@ -19,6 +19,7 @@ from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, kernel_cache, linker, target_patch
 from fidsplat.backends.opencl.probe import OpenCLProbe
+from fidsplat.backends.opencl.program import build_options
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
@@ -99,6 +100,7 @@ class OpenCLBackend(Workspace, Backend):
         else:  # pyopencl caches programs for drivers without a cache of their own
             check_once(user_cache() / "pyopencl", _PYOPENCL_FILES.__contains__, lambda _: True)
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
+        self.compiler_options = build_options(device)
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
         self._ahead = Ahead()

@@ -192,10 +192,6 @@ class DeviceFrame:
         """What the buffers hold."""
         return Capacity(self.numbers["big_capacity"], self.pairs)
 
-    def takes(self, kernel: str, argument: str) -> bool:
-        """Whether a kernel of the program has an argument of this name."""
-        return any(one.name == argument for one in self.source.arguments.get(kernel, ()))
-
     def count_pairs(self) -> int | None:
         """The number of pairs; None if they exceeded the capacity, so that the frame is empty. Waits until
         the device has counted, not until it has rendered."""
@@ -314,5 +310,5 @@ class DeviceFrame:
     def put_rays(self) -> None:
         """Bind the rays of a lens, and its map from directions to samples."""
         assert self.view.raster is not None
-        slopes = self.takes("blend", "ray_slopes")
+        slopes = self.source.takes("blend", "ray_slopes")
         self.named |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)

@@ -50,7 +50,7 @@ def allocate_samples(frame: DeviceFrame) -> None:
     """Bind buffers for what the blend stage writes."""
     for one in frame.samples:
         frame.take(one.name, 4 * frame.numbers["channel_stride"] * one.channels)
-    if frame.takes("blend", "termination_depths"):
+    if frame.source.takes("blend", "termination_depths"):
         ends = frame.lease("termination_depths", 4 * frame.tiles)
         if frame.view.band is not None:
             cl.enqueue_fill_buffer(frame.queue, ends, _NEVER, 0, 4 * frame.tiles)
@@ -187,7 +187,7 @@ def render_exposure(frame: DeviceFrame) -> None:
             stats[name] = max(stats[name], value)
         frame.uploads += part.uploads
         frame.pool.give_back(part.leased)
-    if frame.takes("resolve", "rays"):
+    if frame.source.takes("resolve", "rays"):
         frame.put_rays()
     resolve(frame)
     frame.stats = partial(dict, stats)

@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.buffers import RayBuffers
+from fidsplat.backends.opencl.layout import RAW
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.view import View
@@ -37,7 +38,7 @@ PART_BYTES = {"cpu": 1 << 28}
 OTHER_PART_BYTES = 1 << 31
 _PART_SAMPLES = 1 << 30
 """samples of the views of a part; kernels number them in 32 bits, several channels of them"""
-_OF_CAMERAS = ("ray", "vignette_center")
+_OF_CAMERAS = {"ray", "vignette_center"}
 """groups of uniforms that differ between cameras"""
 
 
@@ -81,16 +82,18 @@ class MemoryPlanner:
     """Plans frames of one pipeline."""
 
     def __init__(self, device: Device, source: Source, features: FeatureSet, shape: DeviceShape) -> None:
-        self._device, self._source, self._features, self._shape = device, source, features, shape
-        arguments = [one for each in source.arguments.values() for one in each]
-        self._cloud_arrays = [one.name for one in source.arguments["project"] if one.source == "cloud"]
-        self._view_arrays = {one.name for one in arguments if one.source == "array"}
-        self._slopes = any(one.name == "ray_slopes" for one in source.arguments["blend"])
-        self._of_cameras = any(one.uniform[0] in _OF_CAMERAS for one in arguments)
-        self._channels = 4 + sum(one.channels for one in source.samples)
-        resolved = any(one.name == "rays" for one in source.arguments.get("resolve", ()))
-        self._separate = bool(self._view_arrays) or resolved or "backdrop" in source.arguments
+        self._device, self._source, self._shape = device, source, shape
+        self._slopes = source.takes("blend", "ray_slopes")
+        self._of_cameras = not _OF_CAMERAS.isdisjoint(source.uniform_groups)
+        self._channels = RAW.channels
+        for samples in source.samples:
+            self._channels += samples.channels
+        resolved = source.takes("resolve", "rays")
+        self._separate = bool(source.view_arrays) or resolved or "backdrop" in source.arguments
         """whether views differ in more than the record `View`"""
+        self._image_channels = 0
+        for output in features.images:
+            self._image_channels += output.channels
 
     def tiles(self, view: View) -> int:
         """Number of tiles of a view."""
@@ -103,14 +106,15 @@ class MemoryPlanner:
             DeviceError: the budget does not hold the frame in any way.
         """
         shape = self._shape
-        stays, upload = resident.bytes_for(self._cloud_arrays)
+        stays, upload = resident.bytes_for(self._source.cloud_arrays)
         samples, tables = self._samples_and_tables(view)
         fixed = reserved + stays + SMALL + tables
         fixed += MIN_BIG * (4 + self._source.records["Bounds"].itemsize)
         # sub-frames have samples of their own
         fixed += 4 * samples * self._channels * (2 if view.sub_frames else 1)
         fixed += self._image_bytes(view)
-        fixed += sum(view.array(name).nbytes for name in self._view_arrays)
+        for name in self._source.view_arrays:
+            fixed += view.array(name).nbytes
         if view.raster is not None:
             rasters = {view.raster, *(one.view.raster for one in view.sub_frames if one.view.raster)}
             columns = -(-view.width // shape.tile_width) * shape.tile_width
@@ -144,8 +148,7 @@ class MemoryPlanner:
 
     def _image_bytes(self, view: View) -> int:
         """Bytes of the output images of a view."""
-        pixels = view.width * view.height // view.samples**2
-        return 4 * pixels * sum(output.channels for output in self._features.images)
+        return 4 * self._image_channels * (view.width * view.height // view.samples**2)
 
     def _samples_and_tables(self, view: View) -> tuple[int, int]:
         """Samples of whole tiles, and bytes of the tables of tile binning."""

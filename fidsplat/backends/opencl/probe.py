@@ -14,7 +14,7 @@ import pyopencl as cl
 from fidsplat.backends.opencl.buffers import BufferPool
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
-from fidsplat.backends.opencl.program import build_options, check_kernels
+from fidsplat.backends.opencl.program import check_kernels
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.probing import Probe
 from fidsplat.util.errors import DeviceError
@@ -152,7 +152,7 @@ class OpenCLProbe(Probe):
 
     def options(self) -> list[str]:
         """What every program is compiled with."""
-        return build_options(self._workspace.device)
+        return self._workspace.compiler_options
 
     def scan(self, pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
         """What the device makes of lengths of lists (n,) uint32: where each list starts (n + 1,) uint32,

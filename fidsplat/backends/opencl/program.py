@@ -6,6 +6,7 @@ import importlib
 import threading
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -65,23 +66,16 @@ def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
     Raises:
         DeviceError: compilation fails; the message has the log.
     """
-    all_options = (*build_options(workspace.device), *options)
-
-    def compiled() -> cl.Program:
-        return cl.Program(workspace.context, text).build(options=list(all_options))
-
-    def built() -> cl.Program:
-        if is_pocl(workspace.device):
-            return shared_program(workspace.context, text, all_options, compiled)
-        return compiled()
-
+    context, options = workspace.context, (*workspace.compiler_options, *options)
     try:
-        if getattr(in_background, "on", False):
-            return built()
-        interrupts.check()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", cl.CompilerWarning)
-            return built()
+        with ExitStack() as stack:
+            if not getattr(in_background, "on", False):
+                interrupts.check()
+                stack.enter_context(warnings.catch_warnings())
+                warnings.simplefilter("ignore", cl.CompilerWarning)
+            if is_pocl(workspace.device):
+                return shared_program(context, text, options)
+            return cl.Program(context, text).build(options=list(options))
     except cl.Error as error:
         raise DeviceError(f"{workspace.info.title} cannot compile the kernels: {error}") from error
 

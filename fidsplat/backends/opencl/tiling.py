@@ -64,8 +64,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         # the kernel writes no window for splats outside the band: an empty window, of no big splat
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOWS * size)
     if count:
-        names = [one.name for one in frame.source.arguments["project"] if one.source == "cloud"]
-        arrays = {name: frame.resident.part(name, first, end) for name in names}
+        arrays = {name: frame.resident.part(name, first, end) for name in frame.source.cloud_arrays}
         frame.launch("project", "project", (count,), (64,), frame.views, count=count, **arrays)
 
 

@@ -20,6 +20,9 @@ from fidsplat.util.errors import DeviceError
 class Workspace:
     """An open device: its queues and buffers."""
 
+    compiler_options: list[str]
+    """of all programs"""
+
     def __init__(self, device: cl.Device, info: DeviceInfo, shape: DeviceShape) -> None:
         self.device, self.info, self.shape = device, info, shape
         self.context = shared_context(device) if is_pocl(device) else cl.Context([device])

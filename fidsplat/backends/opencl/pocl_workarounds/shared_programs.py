@@ -7,12 +7,9 @@ are not.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 
 import pyopencl as cl
-
-_programs: dict[tuple[cl.Context, str, tuple[str, ...]], cl.Program] = {}
 
 
 @cache
@@ -21,11 +18,7 @@ def shared_context(device: cl.Device) -> cl.Context:
     return cl.Context([device])
 
 
-def shared_program(
-    context: cl.Context, text: str, options: tuple[str, ...], build: Callable[[], cl.Program]
-) -> cl.Program:
-    """The program that `build` has made of a text with these options, in this call or an earlier one."""
-    key = context, text, options
-    if key not in _programs:
-        _programs[key] = build()
-    return _programs[key]
+@cache
+def shared_program(context: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
+    """The program of a text compiled with these options, in this call or an earlier one."""
+    return cl.Program(context, text).build(options=list(options))
