@@ -142,27 +142,20 @@ class Source:
 
 
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
-    """The layouts of all effects, in the order in which their text is put together: those of which there is
-    one of each kind, parts, outputs, what changes rgb."""
-    chosen = (*features.slots, *features.outputs, *features.posts)
-    parts = _parts_of(chosen)
-    outputs = [name for name in features.outputs if name not in parts]
-    return {name: LAYOUTS[name] for name in (*features.slots, *sorted(parts), *outputs, *features.posts)}
-
-
-def _parts_of(names: Iterable[str]) -> set[str]:
-    """The parts that layouts require, directly or through other parts."""
+    """The layouts of all effects and of the parts that they require, in the order in which their text is put
+    together: effects of which there is one of each kind, parts, outputs, steps on rgb."""
+    chosen = [*features.slots, *features.outputs, *features.posts]
     parts: set[str] = set()
-    chosen = list(names)
     todo = chosen.copy()
     while todo:
-        needed = LAYOUTS[todo.pop()].parts
+        needed = list(LAYOUTS[todo.pop()].parts)
         for slot in chosen:
-            needed = [dict(LAYOUTS[part].behind).get(slot, part) for part in needed]
-        fresh = set(needed) - parts
-        parts |= fresh
-        todo += fresh
-    return parts
+            for k, part in enumerate(needed):
+                needed[k] = dict(LAYOUTS[part].behind).get(slot, part)
+        todo += set(needed) - parts
+        parts.update(needed)
+    names = (*features.slots, *sorted(parts), *features.outputs, *features.posts)
+    return {name: LAYOUTS[name] for name in names}
 
 
 def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
@@ -172,7 +165,9 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         DeviceError: an effect's file fills a hook that no file has.
     """
     layouts = layouts_of(features)
-    fused = _resolves_fused(features, layouts)
+    # without a pass of its own, if a pixel is one sample of one pose, and nothing but blending adds to it
+    separate = {"rays", "shutter_exposure", "shutter_rows"}
+    fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     files = [layout.file for layout in layouts.values() if layout.file]
     files.append(LAYOUTS["resolve_pixel"].file)
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
@@ -278,13 +273,6 @@ def _scalars(features: FeatureSet) -> Scalars:
     return Scalars(real, "double" if "blend_double" in features.slots else "float")
 
 
-def _resolves_fused(features: FeatureSet, layouts: Mapping[str, Layout]) -> bool:
-    """Whether blend and resolve are fused, which saves a launch: if a pixel is one
-    sample of one pose, and nothing but blending adds to it."""
-    alone = features.samples == 1 and "background_constant" in layouts and "rays" not in layouts
-    return alone and not any(name.startswith("shutter_") for name in layouts)
-
-
 def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
     """The build constants, by their names in the kernels."""
     numbers = {
@@ -310,7 +298,7 @@ class Assembler:
 
     def __init__(self, files: Iterable[str], declared: Declarations, defines: Mapping[str, int]) -> None:
         """files: of the effects, below kernels/opencl/, in the order in which they fill a hook."""
-        self._sections = [(file, sections_of(file)) for file in files if file]
+        self._sections = {file: sections_of(file) for file in files if file}
         self._declared, self._defines = declared, defines
         self._used: dict[str, list[str]] = {"struct": [], "arguments": []}
         """names of the structs and kernels of the texts"""
@@ -340,7 +328,7 @@ class Assembler:
         if hook in self._used:
             self._used[hook].append(subject)
             yield f'#line 1 "layout.py: {subject}"\n{self._declared.text(hook, subject)}'
-        for file, by_hook in self._sections:
+        for file, by_hook in self._sections.items():
             for first, lines in by_hook.get(hook, ()):
                 yield f"#line {first} {_shown(file)}\n{self._expand(file, first, lines)}"
 
@@ -411,10 +399,11 @@ class Declarations:
         """C for `//@@ struct NAME` or `//@@ arguments KERNEL`."""
         if hook == "struct":
             return self.structs[subject].text(self.scalars)
-        arguments = self.arguments(subject)
-        lines = [f"    {one.text}{',' if one is not arguments[-1] else ''}" for one in arguments]
-        notes = [f"  // {one.note}" if one.note else "" for one in arguments]
-        return "".join(f"{line}{note}\n" for line, note in zip(lines, notes, strict=True))
+        text, arguments = "", self.arguments(subject)
+        for one in arguments:
+            comma = "," if one is not arguments[-1] else ""
+            text += f"    {one.text}{comma}{f'  // {one.note}' if one.note else ''}\n"
+        return text
 
 
 @cache
@@ -463,16 +452,16 @@ def lines_of(path: str) -> tuple[str, ...]:
 @cache
 def _hooks(path: str) -> list[str]:
     """The names of a file's hooks."""
-    return _HOOKS.findall(kernel_text(path))
+    return _HOOKS.findall("\n".join(lines_of(path)))
 
 
 @cache
 def sections_of(path: str) -> dict[str, list[tuple[int, tuple[str, ...]]]]:
     """The sections of an effect's file, by the hook that each fills: number of the first line, and lines."""
-    lines = lines_of(path)
-    starts = [(k, match[1]) for k, line in enumerate(lines) if (match := _SECTION.fullmatch(line))]
-    ends = [k for k, _ in starts[1:]] + [len(lines)]
     sections: dict[str, list[tuple[int, tuple[str, ...]]]] = {}
-    for (start, hook), end in zip(starts, ends, strict=True):
-        sections.setdefault(hook, []).append((start + 2, lines[start + 1 : end]))
+    lines, end = lines_of(path), len(lines_of(path))
+    for number in range(end - 1, -1, -1):
+        if match := _SECTION.fullmatch(lines[number]):
+            sections.setdefault(match[1], []).insert(0, (number + 2, lines[number + 1 : end]))
+            end = number
     return sections

@@ -79,9 +79,12 @@ class BufferPool:
     @property
     def memory_bytes(self) -> int:
         """Bytes of the scratch buffers, and of leased ones that were given back."""
+        size = 0
         # copied first: images that die meanwhile give back theirs
-        spare = [buffer for buffers in list(self._spare.values()) for buffer in list(buffers)]
-        return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
+        for buffers in [list(self._buffers.values()), *self._spare.values()]:
+            for buffer in buffers.copy():
+                size += buffer.size
+        return size
 
     def make_way(self, kind: Hashable, size: int, splats: int = 0) -> None:
         """Before a frame: release the buffers of other kinds of frames, if they take more than `size` bytes.

@@ -101,7 +101,8 @@ class CommandList:
         number = self._used.get(kernel, 0)
         same = self._reusable.setdefault(kernel, [])
         if number == len(same):
-            same.append(Command(self.program.own_kernel(kernel), kernel, self.program.types(kernel)))
+            own = cl.Kernel(self.program.compiled[kernel], kernel)
+            same.append(Command(own, kernel, self.program.types[kernel]))
         command = same[number]
         command.stage, command.size, command.group = stage, size, group
         for index, value in enumerate(values):

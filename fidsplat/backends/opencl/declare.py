@@ -35,7 +35,7 @@ class Member:
     @property
     def text(self) -> str:
         """The C declaration."""
-        names = ", ".join(name if length == 1 else f"{name}[{length}]" for name, length in self.names)
+        names = ", ".join([name if length == 1 else f"{name}[{length}]" for name, length in self.names])
         return f"    {self.ctype} {names};" + (f"  // {self.note}" if self.note else "") + "\n"
 
 
@@ -61,7 +61,7 @@ class Scalars:
 
     def dtype(self, ctype: str) -> np.dtype:
         """The NumPy type of a C type."""
-        return np.dtype(_TYPES[self.of(ctype)])
+        return np.dtype(_TYPES[{"real": self.real, "wide": self.wide}.get(ctype, ctype)])
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Record:
         size = self.dtype(scalars).itemsize
         check = f"typedef char {self.name}_has_the_size_that_the_host_knows"
         check += f"[(sizeof({self.name}) == {size}) ? 1 : -1];"
-        body = "".join(one.text for one in self.members)
+        body = "".join([one.text for one in self.members])
         return f"typedef struct{aligned} {{\n{body}}} {self.name};\n{check}\n"
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import Source
@@ -18,6 +18,7 @@ from fidsplat.backends.opencl.buffers import RayBuffers
 from fidsplat.backends.opencl.layout import RAW
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError, bytes_words
@@ -62,26 +63,10 @@ class Part(NamedTuple):
     plan: MemoryPlan
 
 
-class Device(Protocol):
-    """The part of `Workspace` that limits memory."""
-
-    memory_budget: int
-
-    @property
-    def largest_buffer(self) -> int:
-        """Bytes of the largest buffer that the device allocates."""
-        ...
-
-    @property
-    def kind(self) -> str:
-        """cpu, gpu or other."""
-        ...
-
-
 class MemoryPlanner:
     """Plans frames of one pipeline."""
 
-    def __init__(self, device: Device, source: Source, features: FeatureSet, shape: DeviceShape) -> None:
+    def __init__(self, device: Workspace, source: Source, features: FeatureSet, shape: DeviceShape) -> None:
         self._device, self._source, self._shape = device, source, shape
         self._slopes = source.takes("blend", "ray_slopes")
         self._of_cameras = not _OF_CAMERAS.isdisjoint(source.uniform_groups)

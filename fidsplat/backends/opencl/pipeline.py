@@ -239,17 +239,19 @@ class OpenCLPipeline(Pipeline):
     def _cache(self, resident: Resident, key: tuple[Any, ...], frame: DeviceFrame) -> None:
         """Replay the next frame of this kind."""
         cached, raster = resident.cached_frames, frame.view.raster
-        rasters = {each.raster for each in cached.values()} - {None, raster}
-        if len(cached) >= _KINDS or (raster is not None and len(rasters) >= _RASTERS):
+        if raster is not None:
+            rasters = {each.raster for each in cached.values()} - {None, raster}
+            if len(rasters) >= _RASTERS:
+                cached.clear()
+        if len(cached) >= _KINDS:
             cached.clear()
         kind = self._buffer_kind(resident, frame.view, frame.plan)
         cached[key] = CachedFrame(frame.plan, kind, raster)
 
     def _key(self, view: View) -> tuple[Any, ...]:
         """What frames have in common that differ in numbers only."""
-        labels = [label for label, _ in view.groups]
-        budgets = self.workspace.memory_budget, self.workspace.pair_budget
-        return self, view.width, view.height, view.raster, *labels, budgets
+        labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
+        return self, view.width, view.height, view.raster, labels, budgets
 
     def _images(
         self,

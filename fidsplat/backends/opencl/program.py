@@ -84,24 +84,18 @@ class Program:
     """The kernels of one source on one device."""
 
     def __init__(self, workspace: Workspace, source: Source) -> None:
-        self.source = source
-        self._kernels = _kernels_of(workspace, source)
-        self._types = {
-            kernel: [None if one.access else source.scalars.dtype(one.ctype).type for one in arguments]
-            for kernel, arguments in source.arguments.items()
-        }
-
-    def own_kernel(self, name: str) -> cl.Kernel:
-        """A new kernel object, not shared with other callers."""
-        return cl.Kernel(self._kernels[name].program, name)
-
-    def types(self, name: str) -> Sequence[Callable[[Any], Any] | None]:
-        """The NumPy type of each argument of a kernel; None for a buffer."""
-        return self._types[name]
+        self.source, self.compiled = source, _compiled(workspace, source)
+        """the program of each kernel"""
+        self.types: dict[str, list[Callable[[Any], Any] | None]] = {}
+        """NumPy type of each argument of a kernel; None for a buffer"""
+        for kernel, arguments in source.arguments.items():
+            self.types[kernel] = types = []
+            for one in arguments:
+                types.append(None if one.access else source.scalars.dtype(one.ctype).type)
 
 
-def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
-    """The kernels of a source.
+def _compiled(workspace: Workspace, source: Source) -> dict[str, cl.Program]:
+    """The program of each kernel of a source.
 
     PoCL's cache may return a program without kernels if another process is writing the entry, or was killed
     while writing it. A retry with another option uses another cache entry.
@@ -111,11 +105,13 @@ def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
     """
     load_invoker()
     for attempt in range(3):
-        again = [f"-DATTEMPT_{attempt}"] if attempt else []
-        built = [build(workspace, program.compiled, *again) for program in source.programs.values()]
-        kernels = {kernel.function_name: kernel for each in built for kernel in each.all_kernels()}
-        if source.arguments.keys() <= kernels.keys():
-            return kernels
+        again, compiled = [f"-DATTEMPT_{attempt}"] if attempt else [], {}
+        for text in source.programs.values():
+            program = build(workspace, text.compiled, *again)
+            for kernel in program.all_kernels():
+                compiled[kernel.function_name] = program
+        if source.arguments.keys() <= compiled.keys():
+            return compiled
     raise DeviceError(
         f"{workspace.info.title} returned a program without its kernels; the cache of compiled kernels may "
         f"be damaged; remove {pocl_folder()}"

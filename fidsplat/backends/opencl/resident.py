@@ -68,7 +68,9 @@ class Resident(ResidentData):
         self.coherent = False
         """whether consecutive splats are close to each other, as in stores"""
         total = self.count * self._bytes_of(self._arrays)
-        widest = max(array.nbytes for array in self._arrays.values())
+        widest = 0
+        for array in self._arrays.values():
+            widest = max(widest, array.nbytes)
         device = workspace.device
         self._shared = workspace.info.kind == "cpu" and bool(device.host_unified_memory)
         if self._shared:
@@ -88,7 +90,10 @@ class Resident(ResidentData):
 
     def _bytes_of(self, names: Iterable[str]) -> int:
         """Bytes per splat of these arrays."""
-        return sum(self._array(name).nbytes // max(self.count, 1) for name in names)
+        size = 0
+        for name in names:
+            size += self._array(name).nbytes // max(self.count, 1)
+        return size
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
         """Memory of the cloud in a frame that reads these arrays: bytes that stay on the device, and bytes

@@ -89,15 +89,11 @@ class Workspace:
 
     def limit_memory(self, budget: int) -> None:
         """Limit a frame and its cloud to `budget` bytes of the device (memory_plan.py)."""
-        self.memory_budget = budget
+        self.memory_budget, self.largest_buffer = budget, self.device.max_mem_alloc_size
+        """bytes of a frame and its cloud, and of one buffer"""
         largest = self.largest_buffer // 8
         self.pair_budget = max(1, min(largest, budget // 8 // self.shape.pair_bytes, 2**32 - 1))
         """most pairs of splats and tiles that are listed at once"""
-
-    @property
-    def largest_buffer(self) -> int:
-        """Bytes of the largest buffer that the device allocates."""
-        return self.device.max_mem_alloc_size
 
     @property
     def kind(self) -> str:
