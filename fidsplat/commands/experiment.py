@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
-from fidsplat.commands.declarations import option
 from fidsplat.commands.experiment_data import (
     Baseline,
     Blender,
@@ -36,14 +34,6 @@ from fidsplat.util.errors import InputError
 class Command(MarkerSettings):
     """Options of every experiment."""
 
-    out: Annotated[
-        Path | None,
-        option(
-            "DIR",
-            "folder for results (default: fidsplat-experiments, with --quick fidsplat-experiments-quick)",
-            "-o",
-        ),
-    ] = None
     json: Json = False
 
 

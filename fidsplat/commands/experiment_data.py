@@ -21,14 +21,14 @@ from fidsplat.commands.options import (
 from fidsplat.commands.output import console, delayed_progress, report, show_progress
 from fidsplat.commands.sweeps import run_interleaved
 from fidsplat.experiments.plants import PlantSettings
-from fidsplat.experiments.settings import CountedSettings
+from fidsplat.experiments.settings import BlenderSettings, DatasetSettings
 from fidsplat.experiments.trained import BaselineSettings
-from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.errors import InputError
 
 
 @repeatable
 @dataclass(frozen=True)
-class Dataset(CountedSettings):
+class Dataset(DatasetSettings):
     """Write the paper's data set: 100 scenes in COLMAP's layout, 25 markers x 4 numbers of views.
 
     Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Existing
@@ -39,29 +39,18 @@ class Dataset(CountedSettings):
       fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender
     """
 
-    out: Annotated[Path, option("DIR", "folder for the scenes", "-o")] = Path("fidsplat-dataset")
-    truth: Annotated[
-        str, option("NAME", "renderer: exact, exact-linear, blender-standard or blender-raw")
-    ] = "exact"
-    blender: Annotated[Path, option("DIR", "Blender's images")] = Path("fidsplat-experiments/blender")
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.blender import check_images
         from fidsplat.experiments.dataset import dataset_scenes, write_scene
         from fidsplat.experiments.setup import chosen_categories
-        from fidsplat.experiments.views import TRUTHS
         from fidsplat.util.files import writable_folder
 
-        if self.truth not in TRUTHS:
-            raise InputError(unknown("truth", self.truth, TRUTHS))
         self.check()
-        if self.truth.startswith("blender-"):
-            check_images(self.blender, self.truth.removeprefix("blender-"), self.seed)
         folder = writable_folder(self.out)
-        wanted = dataset_scenes(chosen_categories(self.category), self.marker_count)
-        scenes = (write_scene(part, folder, self.seed, self.truth, self.blender) for part in wanted)
-        names = [scene.name for scene in show_progress("scenes", scenes, len(wanted))]
+        parts = dataset_scenes(chosen_categories(self.category), self.marker_count)
+        scenes = (write_scene(part, folder, self.seed, self.truth, self.blender) for part in parts)
+        names = [scene.name for scene in show_progress("scenes", scenes, len(parts))]
         return report(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
 
 
@@ -81,9 +70,6 @@ class Baseline(BaselineSettings):
       fidsplat experiment report fidsplat-experiments fidsplat-baseline
     """
 
-    out: Annotated[
-        Path | None, option("DIR", "folder for splats and results (default: fidsplat-baseline)", "-o")
-    ] = None
     device: Device = None
     json: Json = False
 
@@ -100,7 +86,7 @@ class Baseline(BaselineSettings):
 
 @repeatable
 @dataclass(frozen=True)
-class Blender(CountedSettings):
+class Blender(BlenderSettings):
     """Render every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
 
     --install makes a virtual environment with bpy (about 1 GB, needs Python 3.11). Without it, missing images
@@ -112,20 +98,12 @@ class Blender(CountedSettings):
       fidsplat experiment blender --view raw --category small --markers 1 --samples 16
     """
 
-    out: Annotated[Path, option("DIR", "folder for the images", "-o")] = Path("fidsplat-experiments/blender")
     install: Annotated[bool, switch("install Blender instead of rendering")] = False
     environment: BlenderEnvironment = None
-    view: tuple[str, ...] = ()
-    """View transform: standard or raw. By default both."""
-    training: Annotated[bool, switch("render the training views as well")] = False
-    samples: int = 64
-    """Samples per pixel."""
-    threads: Annotated[int | None, option("N", "threads of Cycles (default: one per core)")] = None
     json: Json = False
 
     def run(self) -> int:
         from fidsplat.experiments import blender
-        from fidsplat.experiments.setup import chosen_categories
 
         environment = self.environment or blender.default_environment()
         if self.install:
@@ -133,25 +111,17 @@ class Blender(CountedSettings):
                 python = blender.install(environment, status.update)
             return report(self.json, {"python": str(python)}, f"Blender is in {environment}")
         self.check()
-        for name in ("samples", "threads"):
-            if (number := getattr(self, name)) is not None and number < 1:
-                raise InputError(f"--{name} must be at least 1, got {number}")
-        views = self.view or blender.VIEW_NAMES
-        categories = chosen_categories(self.category)
+        views, done = self.view or blender.VIEW_NAMES, 0
         for view in views:
             blender.ready(view, environment)
-        folder, done = self.out, 0
         for view in views:
-            blender.record_images(folder, view, self.seed, self.samples)
+            blender.record_images(self.out, view, self.seed, self.samples)
         for view in views:
-            jobs = [
-                blender.marker_job(category, index, self.seed, folder, view, self.training)
-                for category in categories
-                for index in range(self.marker_count)
-            ]
+            jobs = self.jobs(view)
             images = blender.render(jobs, view, environment, self.samples, threads=self.threads)
-            done += len(list(show_progress(f"view {view}", images, sum(len(job["shots"]) for job in jobs))))
-        return report(self.json, {"folder": str(folder), "pictures": done}, f"{done} images in {folder}")
+            done += len(list(show_progress(f"view {view}", images, sum(len(job["images"]) for job in jobs))))
+        facts = {"folder": str(self.out), "pictures": done}
+        return report(self.json, facts, f"{done} images in {self.out}")
 
 
 @repeatable
@@ -207,29 +177,25 @@ class Merge:
     def run(self) -> int:
         from fidsplat.experiments import trained
         from fidsplat.experiments.run import NAMES
-        from fidsplat.experiments.sweep import merge, missing_shards
+        from fidsplat.experiments.sweep import merge, missing_shards, result_files
 
-        result = {}
+        result, lines = {}, []
         for name in (*NAMES, trained.NAME):
-            files = [f for folder in self.folders for f in sorted(Path(folder).glob(f"{name}-*-of-*.jsonl"))]
-            files += [f for folder in self.folders for f in [Path(folder) / f"{name}.jsonl"] if f.is_file()]
-            if files:
-                target = Path(self.out) / f"{name}.jsonl"
-                joined = merge(files, target)
-                facts = {"file": str(target), "files": len(files), "points": joined.points}
-                result[name] = facts | {"repeated": joined.repeated, "missing": missing_shards(files)}
-                if result[name]["missing"]:
-                    text = f"{name}: missing shard {', '.join(result[name]['missing'])}"
-                    warnings.warn(text, stacklevel=2)
-                if joined.differ:
-                    text = f"{name}: joined results differ in {' and '.join(joined.differ)}"
-                    warnings.warn(f"{text}; the report lists them", stacklevel=2)
+            if not (files := result_files([Path(folder) for folder in self.folders], name)):
+                continue
+            target = Path(self.out) / f"{name}.jsonl"
+            joined, missing = merge(files, target), missing_shards(files)
+            if missing:
+                warnings.warn(f"{name}: missing shard {', '.join(missing)}", stacklevel=2)
+            if joined.differ:
+                text = f"{name}: joined results differ in {' and '.join(joined.differ)}"
+                warnings.warn(f"{text}; the report lists them", stacklevel=2)
+            facts = {"file": str(target), "files": len(files), "points": joined.points}
+            result[name] = facts | {"repeated": joined.repeated, "missing": missing}
+            twice = f", {joined.repeated} of them repeated" if joined.repeated else ""
+            lines.append(f"{target}: {joined.points} results of {len(files)} files{twice}")
         if not result:
             raise InputError(f"no results of shards in {', '.join(self.folders) or 'no folder'}")
-        lines = []
-        for facts in result.values():
-            twice = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
-            lines.append(f"{facts['file']}: {facts['points']} results of {facts['files']} files{twice}")
         return report(self.json, result, *lines)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fidsplat.experiments.angles import parse_tilts
-from fidsplat.experiments.blender import VIEW_NAMES, check_images
+from fidsplat.experiments.blender import FULL_SAMPLES, VIEW_NAMES, check_images, marker_job
 from fidsplat.experiments.methods import IDEAL, method_names
 from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, chosen_categories
 from fidsplat.util.errors import InputError, unknown
@@ -56,6 +56,59 @@ class CountedSettings(MarkerSettings):
         super().check()
         if not 1 <= self.marker_count <= MARKERS:
             raise InputError(f"--markers must be 1 to {MARKERS}, got {self.markers}")
+
+
+@dataclass(frozen=True)
+class DatasetSettings(CountedSettings):
+    """Markers and images of the data set."""
+
+    out: Path = Path("fidsplat-dataset")
+    """Folder for the scenes."""
+    truth: str = "exact"
+    """Renderer: exact, exact-linear, blender-standard or blender-raw."""
+    blender: Path = Path("fidsplat-experiments/blender")
+    """Folder with Blender's images."""
+
+    def check(self) -> None:
+        """Raise InputError for settings that cannot be used."""
+        from fidsplat.experiments.views import TRUTHS
+
+        super().check()
+        if self.truth not in TRUTHS:
+            raise InputError(unknown("truth", self.truth, TRUTHS))
+        if self.truth.startswith("blender-"):
+            check_images(self.blender, self.truth.removeprefix("blender-"), self.seed)
+
+
+@dataclass(frozen=True)
+class BlenderSettings(CountedSettings):
+    """Markers and images that Blender renders."""
+
+    out: Path = Path("fidsplat-experiments/blender")
+    """Folder for the images."""
+    view: tuple[str, ...] = ()
+    """View transform: standard or raw. By default both."""
+    training: bool = False
+    """Render the training views as well."""
+    samples: int = FULL_SAMPLES
+    """Samples per pixel."""
+    threads: int | None = None
+    """Threads of Cycles (default: one per core)."""
+
+    def check(self) -> None:
+        """Raise InputError for settings that cannot be used."""
+        super().check()
+        for name in ("samples", "threads"):
+            if (number := getattr(self, name)) is not None and number < 1:
+                raise InputError(f"--{name} must be at least 1, got {number}")
+
+    def jobs(self, view: str) -> list[dict]:
+        """Jobs of `fidsplat.experiments.blender.render` for a view."""
+        return [
+            marker_job(category, index, self.seed, self.out, view, self.training)
+            for category in chosen_categories(self.category)
+            for index in range(self.marker_count)
+        ]
 
 
 @dataclass(frozen=True)

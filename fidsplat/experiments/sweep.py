@@ -252,6 +252,12 @@ def merge(files: Sequence[Path], target: Path) -> Merged:
     return Merged(len(found), repeated, tuple(sorted(differ)))
 
 
+def result_files(folders: Sequence[Path], name: str) -> list[Path]:
+    """Files with results of an experiment in folders, shards first."""
+    files = [file for folder in folders for file in sorted(folder.glob(f"{name}-*-of-*.jsonl"))]
+    return files + [file for folder in folders for file in [folder / f"{name}.jsonl"] if file.is_file()]
+
+
 def missing_shards(files: Iterable[Path]) -> list[str]:
     """Missing shards "i/n", by the file names of `--shard i/n`."""
     existing: dict[int, set[int]] = {}

@@ -10,6 +10,7 @@ import pytest
 from experiments.blender_shots import BOXES, SHOTS, blackman_harris, flat, ours, theirs
 
 import fidsplat as fs
+from fidsplat.cli import main
 from fidsplat.experiments import blender
 from fidsplat.experiments.setup import CATEGORIES
 from fidsplat.vision.metrics import psnr
@@ -87,6 +88,14 @@ def test_pictures_that_are_there_stay_and_the_others_are_drawn(fake):
     orders = json.loads(done[1].read_text())
     assert (orders["view"], orders["samples"], orders["filter"], orders["threads"]) == ("raw", 7, "BOX", 3)
     assert list(blender.render([job], "raw", fake)) == done
+
+
+def test_the_command_renders_every_view_of_the_markers(fake, capsys):
+    words = ["experiment", "blender", "-o", str(fake / "out"), "--category", "small", "--markers", "1"]
+    assert main([*words, "--samples", "7"]) == 0
+    assert f"40 images in {fake / 'out'}" in capsys.readouterr().out  # 20 test views, standard and raw
+    assert main([*words, "--view", "raw", "--samples", "0"]) == 2
+    assert "--samples must be at least 1, got 0" in capsys.readouterr().err
 
 
 def test_when_blender_stops_its_last_words_are_the_error(fake):
