@@ -99,11 +99,14 @@ _SHORTAGES = {
     errno.EDQUOT: "free space there or on the disk of the output",
     errno.EFBIG: "raise the limit on file sizes with ulimit -f",
     errno.EROFS: "give a writable folder",
+    errno.EACCES: "change the permissions of its folder, or give another path",
+    errno.EPERM: "change the permissions of its folder, or give another path",
+    errno.ELOOP: "give the path without symbolic links",
     errno.EMFILE: "raise the limit on open files with ulimit -n",
     errno.ENFILE: "the system's limit on open files is reached",
     errno.EIO: "the disk or the terminal failed",
 }
-"""remedies for shortages of the machine, which any command may meet"""
+"""remedies for shortages of the machine and paths without permission, which any command may meet"""
 
 
 def _parse(words: list[str]):

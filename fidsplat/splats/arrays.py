@@ -210,9 +210,27 @@ def joined_groups(clouds: Sequence[Any]) -> np.ndarray | None:
     given = [cloud.coplanar_groups for cloud in clouds]
     if all(ids is None for ids in given):
         return None
-    joined, first_free = [], 0
-    for cloud, own in zip(clouds, given, strict=True):
-        ids = np.full(len(cloud), -1, np.int32) if own is None else own
-        joined.append(np.where(ids >= 0, ids + first_free, -1).astype(np.int32))
-        first_free = max(first_free, int(joined[-1].max()) + 1)
-    return np.concatenate(joined)
+    filled = [
+        np.full(len(cloud), -1, np.int32) if own is None else own
+        for cloud, own in zip(clouds, given, strict=True)
+    ]
+    offsets = group_offsets([int(ids.max(initial=-1)) for ids in filled])
+    each = zip(filled, offsets, strict=True)
+    return np.concatenate([np.where(ids >= 0, ids + np.int32(offset), np.int32(-1)) for ids, offset in each])
+
+
+def group_offsets(largest: Sequence[int]) -> list[int]:
+    """Offsets that keep the coplanar group ids of several clouds distinct.
+
+    largest: largest id of each cloud, -1 for no group. Raises InputError if an id would exceed int32.
+    """
+    offsets, free = [], 0
+    for last in largest:
+        offsets.append(free if last >= 0 else 0)
+        free += last + 1
+        if free > 2**31:
+            raise InputError(
+                f"coplanar group ids of all clouds of a scene must be below 2^31 together, got up to {last}; "
+                "number the groups from 0"
+            )
+    return offsets

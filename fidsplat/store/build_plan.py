@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from fidsplat.formats.collect import WINDOW
-from fidsplat.store.layout import CHUNK, MAX_SPLATS, NODE, row_bytes, shapes_of
+from fidsplat.store.layout import CHUNK, MAX_CHUNK, MAX_SPLATS, NODE, row_bytes, shapes_of
 from fidsplat.store.merge import REDUCTION
 from fidsplat.store.morton import Grid, grid_around
 from fidsplat.store.sources import Source, degree_of, sample, spans
@@ -46,8 +46,8 @@ class BuildSettings:
 
     def __post_init__(self) -> None:
         chunk, memory = self.chunk, self.memory
-        if isinstance(chunk, bool) or not isinstance(chunk, int) or not 64 <= chunk <= 1 << 22:
-            raise InputError(f"chunk must be a whole number of splats from 64 to {1 << 22}, got {chunk!r}")
+        if isinstance(chunk, bool) or not isinstance(chunk, int) or not 64 <= chunk <= MAX_CHUNK:
+            raise InputError(f"chunk must be a whole number of splats from 64 to {MAX_CHUNK}, got {chunk!r}")
         if isinstance(memory, bool) or not isinstance(memory, int) or memory < _MIN_MEMORY:
             raise InputError(f"memory must be at least {_MIN_MEMORY >> 20} MiB, got {memory!r}")
         flag("levels", self.levels)

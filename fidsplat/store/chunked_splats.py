@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from fidsplat.capture.quality import Quality
+from fidsplat.splats.arrays import group_offsets
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.layout import MAX_SPLATS
 from fidsplat.store.partial_cloud import PartialCloud, colors_of_degree, concatenated
@@ -220,10 +221,9 @@ class ChunkedSplats:
     @cached_property
     def _first_groups(self) -> list[int]:
         """Offset added to the group ids of each store, and last of the cloud in memory."""
-        offsets = [0]
-        for store in self.stores:
-            offsets.append(offsets[-1] + store.last_group() + 1)
-        return offsets
+        ids = self.in_memory.coplanar_groups
+        own = -1 if ids is None else int(ids.max(initial=-1))
+        return group_offsets([*(store.last_group() for store in self.stores), own])
 
     def _relative(self, arrays: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
         """Arrays with means relative to this scene's origin instead of another."""

@@ -27,6 +27,7 @@ import numpy as np
 from fidsplat.util.arguments import LARGEST
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, open_input, read_input
+from fidsplat.util.limits import check_holes
 from fidsplat.util.npy import load_npy
 
 FORMAT, VERSION = "fidsplat store", 1
@@ -36,11 +37,15 @@ CHUNK = 32768
 """splats of a chunk: small enough for culling, large enough for a sequential read of about 2 MB"""
 FAR = 5.0
 """extent of the larger boxes of a node, in standard deviations"""
+MAX_CHUNK = 2**22
+"""limit on the splats of a chunk, which are read at once"""
 MAX_SPLATS = 2**31 - 1
 """limit on the splats of a scene: indices are int32"""
 NPY_HEADER = 128
 """bytes of the header of a column file"""
 
+_MAX_NODE = 2**24
+"""limit on the splats of a node of the levels of detail, which merges four of the level below"""
 _MAX_ROWS = 2**32
 """limit on the rows of a store: its splats and those of all levels of detail, which are fewer"""
 _TYPES = dict.fromkeys(("means", "quats", "scales", "opacities", "thickness"), ("<f4",))
@@ -145,7 +150,7 @@ def _check(header: Header) -> None:
     counts = (header.splats, header.rows, header.pinned, header.chunk, header.sh_degree, header.nodes_crc)
     if not all(type(value) is int for value in counts):
         raise ValueError("a count is not a whole number")
-    if not 0 <= header.splats <= header.rows <= _MAX_ROWS or not 0 < header.chunk <= MAX_SPLATS:
+    if not 0 <= header.splats <= header.rows <= _MAX_ROWS or not 0 < header.chunk <= MAX_CHUNK:
         raise ValueError("a count is out of range")
     if not (0 <= header.pinned <= header.splats and -1 <= header.sh_degree <= 3):
         raise ValueError("a count is out of range")
@@ -233,7 +238,11 @@ def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...], start
         )
     if not shape[0]:
         return np.empty(shape, kind)
-    return np.memmap(file, kind, "r", NPY_HEADER, shape).view(np.ndarray)
+    check_holes(file)
+    try:
+        return np.memmap(file, kind, "r", NPY_HEADER, shape).view(np.ndarray)
+    except OSError as error:  # such as a limit on the address space
+        raise InputError(f"cannot map {file} into memory: {error.strerror or error}") from error
 
 
 def write_nodes(folder: Path, nodes: np.ndarray) -> int:
@@ -268,6 +277,8 @@ def _misfit(nodes: np.ndarray, header: Header) -> str:
     chunk, ends = level == 0, np.cumsum(count)
     if (count < 1).any() or (count[chunk] > header.chunk).any():
         return f"a node must have 1 to {header.chunk} splats"
+    if count.max(initial=0) > _MAX_NODE:
+        return f"a node of the levels of detail must have at most {_MAX_NODE} splats"
     if ends.max(initial=0) != header.rows or (first != ends - count).any():
         return f"its nodes must be {header.rows} rows, one after the other"
     if not np.isin(np.diff(level, prepend=0), (0, 1)).all():

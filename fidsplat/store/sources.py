@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.formats.collect import WINDOW, Rows, window
 from fidsplat.formats.files import format_of, load_splats
 from fidsplat.formats.ply import ply_rows
-from fidsplat.splats.arrays import choose_origin, unit_quaternions
+from fidsplat.splats.arrays import choose_origin, group_offsets, unit_quaternions
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.partial_cloud import colors_of_degree
 from fidsplat.util.arguments import invalid
@@ -81,15 +81,16 @@ def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
 
 def with_distinct_groups(sources: list[Source]) -> list[Source]:
     """The sources, with distinct coplanar group ids."""
-    distinct, free = [], 0
-    for source in sources:
-        distinct.append(Source(source.rows, source.origin, source.stamp, free))
-        if "coplanar_groups" in source.rows.columns:
-            parts = (
-                window(source.rows, *span)[0]["coplanar_groups"] for span in spans(source.rows.count, WINDOW)
-            )
-            free += 1 + max((int(ids.max(initial=-1)) for ids in parts), default=-1)
-    return distinct
+    offsets = group_offsets([_last_group(source.rows) for source in sources])
+    return [replace(source, first_group=first) for source, first in zip(sources, offsets, strict=True)]
+
+
+def _last_group(rows: Rows) -> int:
+    """Largest coplanar group id; -1 without."""
+    if "coplanar_groups" not in rows.columns:
+        return -1
+    parts = (window(rows, *span)[0]["coplanar_groups"] for span in spans(rows.count, WINDOW))
+    return max((int(ids.max(initial=-1)) for ids in parts), default=-1)
 
 
 def spans(count: int, size: int) -> list[tuple[int, int]]:

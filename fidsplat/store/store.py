@@ -22,7 +22,7 @@ from fidsplat.store.partial_cloud import PartialCloud, concatenated, transformed
 from fidsplat.util.arguments import callback, flag, instance, invalid, real_array, whole_number
 from fidsplat.util.arguments import number as checked_number
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import path_of
+from fidsplat.util.files import kind_of, path_of
 from fidsplat.util.markup import Summarised, point
 from fidsplat.util.npy import load_npy
 
@@ -43,13 +43,13 @@ class Store(Summarised):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = path_of(path)
         if not self.path.is_dir():
-            raise InputError(f"{self.path} is not a store: the folder does not exist")
+            raise InputError(f"{self.path} must be the folder of a store, got {kind_of(self.path)}")
         header = self.header = layout.read_header(self.path)
         self.poses: np.ndarray | None = None
         """(p, 4, 4) float64 poses of an instanced store"""
         self._folder, own = self.path, header
         if header.store is not None:
-            self._folder = self.path / header.store
+            self._folder = path_of(self.path / header.store)
             own = layout.read_header(self._folder)
             if own.identity != header.identity or own.store is not None:
                 raise InputError(

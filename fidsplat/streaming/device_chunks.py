@@ -100,9 +100,10 @@ class DeviceChunks(ChunkedScene):
         """Arrays with dense indices of coplanar groups and integers for flags."""
         result = dict(arrays)
         if "coplanar_groups" in result:
-            known = np.append(self._group_ids, np.iinfo(np.int32).max)
-            dense = np.searchsorted(known, result["coplanar_groups"]).astype(np.int32)
-            result["coplanar_groups"] = np.where(result["coplanar_groups"] < 0, np.int32(-1), dense)
+            ids, known = result["coplanar_groups"], self._group_ids
+            dense = np.searchsorted(known, ids).astype(np.int32)
+            # a damaged store has ids in chunks that should have none
+            result["coplanar_groups"] = np.where(np.isin(ids, known), dense, np.int32(-1))
         if "boxes" in result:
             result["boxes"] = result["boxes"].astype(np.int32)
         return result

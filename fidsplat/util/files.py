@@ -35,6 +35,15 @@ def path_of(path: str | os.PathLike[str]) -> Path:
         raise InputError(
             f"a file name must have at most {MAX_NAME} bytes and a path {MAX_PATH}, got {name!r}"
         )
+    try:
+        os.stat(name)
+    except PermissionError as error:  # `Path.exists` raises it too
+        raise InputError(
+            f"cannot access {name}: {error.strerror}; change the permissions of its folder, or give another "
+            "path"
+        ) from None
+    except OSError:
+        pass
     return Path(name)
 
 
@@ -50,6 +59,7 @@ def ordinary_file(path: str | os.PathLike[str]) -> Path:
 
 
 _KINDS = {
+    stat.S_IFREG: "a file",
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a pipe",
     stat.S_IFSOCK: "a socket",
@@ -70,9 +80,16 @@ def regular_file(path: str | os.PathLike[str]) -> Path:
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from error
     if not stat.S_ISREG(mode):
-        kind = _KINDS.get(stat.S_IFMT(mode), "something else")
-        raise InputError(f"{file} must be a regular file, got {kind}; give the name of a file")
+        raise InputError(f"{file} must be a regular file, got {kind_of(file)}; give the name of a file")
     return file
+
+
+def kind_of(path: Path) -> str:
+    """What a path is, for messages: a file, a folder, a pipe, nothing and so on."""
+    try:
+        return _KINDS.get(stat.S_IFMT(path.stat().st_mode), "something else")
+    except OSError:
+        return "nothing"
 
 
 def open_input(path: str | os.PathLike[str]) -> BinaryIO:

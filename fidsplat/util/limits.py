@@ -57,8 +57,23 @@ def check_expansion(path: Path | str, need: float, what: str, size: int | None =
         )
 
 
-_IMPORTS, _DRIVER, _PER_CORE = 640 * 2**20, 640 * 2**20, 2**24
-"""bytes of address space: NumPy, OpenCV and so on; a driver with its compiler; the threads of a core"""
+def check_holes(path: Path | str) -> None:
+    """Raise InputError for a sparse file that is much larger than its data on the disk.
+
+    For files that are mapped into memory and may exceed it: they have no other limit.
+    """
+    status = Path(path).stat()
+    stored = 512 * status.st_blocks
+    if status.st_size > (limit := max(input_limit(0), RATIO * stored)):
+        raise InputError(
+            f"{path} must have at most {bytes_words(limit)}, as it has {bytes_words(stored)} on the disk, "
+            f"got {bytes_words(status.st_size)}; if you trust the file, set {VARIABLE}={status.st_size}"
+        )
+
+
+_IMPORTS, _DRIVER, _PER_CORE, _SPARE = 640 * 2**20, 640 * 2**20, 2**24, 2**28
+"""bytes of address space: NumPy, OpenCV and so on; a driver with its compiler; the threads of a core; further
+imports of a command and a small scene"""
 _FILE = 2**24
 """largest file of a driver's compiler in bytes"""
 _OPEN_FILES = 32
@@ -71,7 +86,7 @@ def check_imports() -> None:
     if (space := _limit("RLIMIT_AS")) < needed:
         raise InputError(
             f"the limit on memory must be at least {bytes_words(needed)}, got {bytes_words(space)}; "
-            f"raise it with `ulimit -v {needed // 2**10}`"
+            f"raise it with `ulimit -v {_sufficient() // 2**10}`"
         )
 
 
@@ -97,9 +112,14 @@ def check_driver(family: str) -> None:
     if space - used < needed:
         raise DeviceError(
             f"the limit on memory must leave at least {bytes_words(needed)} for the driver of {family}, got "
-            f"{bytes_words(max(0, space - used))}; raise it with `ulimit -v {(used + needed) // 2**10}`, or "
-            "use the device reference"
+            f"{bytes_words(max(0, space - used))}; raise it with "
+            f"`ulimit -v {max(_sufficient(), used + needed + _SPARE) // 2**10}`, or use the device reference"
         )
+
+
+def _sufficient() -> int:
+    """Bytes of address space that suffice for a small scene."""
+    return _IMPORTS + _DRIVER + 2 * _cores() * _PER_CORE + _SPARE
 
 
 def _limit(name: str) -> float:

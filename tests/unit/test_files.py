@@ -1,7 +1,10 @@
 """Files appear whole or not at all."""
 
+import ctypes
 import json
 import os
+import subprocess
+import sys
 import threading
 
 import cv2
@@ -17,6 +20,7 @@ from fidsplat.formats import load_splats, save_splats
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import read_image, read_images, write_png
 from fidsplat.render.gallery import Piece, write_gallery
+from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.sim import read_description
 from fidsplat.store.build import build_store
 from fidsplat.store.store import Store
@@ -360,3 +364,40 @@ def test_a_bag_that_names_a_file_outside_of_it(tmp_path):
     note.write_text(note.read_text().replace("bag.db3", "../other.db3"))
     with pytest.raises(InputError, match=r"cannot read .*bag/other\.db3"):
         next(log_images(tmp_path / "bag"))
+
+
+DROP = 24
+"""prctl's operation that removes a capability from those of later programs"""
+LINES = [
+    "info DIR/a.ply",
+    "convert DIR/a.spz out.ply",
+    "convert good.ply DIR/out.ply",
+    "detect DIR/a.png",
+    "store info DIR",
+    "store verify DIR/a.fss",
+    "train DIR -o out.ply",
+    "marker qr:a -o DIR/a.ply",
+    "experiment report DIR -o out",
+]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="root has Linux's capabilities")
+def test_paths_without_permission_are_one_line(tmp_path):
+    """As any user but root, who may access all folders."""
+    library = ctypes.CDLL(None)
+    save_splats(random_splats(3, 0), tmp_path / "good.ply")
+    (tmp_path / "closed").mkdir(mode=0)
+    code = "import sys; from fidsplat import cli; [print(cli.main(line.split())) for line in sys.argv[1:]]"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *(line.replace("DIR", "closed") for line in LINES)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: [library.prctl(DROP, capability, 0, 0, 0) for capability in (1, 2)],
+    )
+    assert set(done.stdout.split()) <= {"1", "2"}
+    errors = [line for line in done.stderr.splitlines() if "warning" not in line]
+    assert len(errors) == len(LINES)
+    for line in errors:
+        assert "Permission denied" in line, errors
+        assert "a fault of fidsplat" not in line, errors

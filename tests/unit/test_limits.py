@@ -1,6 +1,7 @@
 """Limits of the process that are too low end in one line before a driver is entered."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -30,3 +31,7 @@ def test_a_limit_that_is_too_low_is_one_line(tmp_path, limit, says):
     assert done.returncode in (1, 2)
     assert line.startswith(f"fidsplat: {says}")
     assert f"`ulimit {limit[:2]}" in line
+    if limit.startswith("-v"):
+        enough = re.search(r"`(ulimit -v \d+)`", line)[1]
+        command = f"{enough}; exec {sys.executable} -m fidsplat {RENDER}"
+        subprocess.run(["bash", "-c", command], cwd=tmp_path, check=True)

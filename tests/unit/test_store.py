@@ -121,7 +121,7 @@ def test_an_incomplete_store_is_refused(store, tmp_path):
             fs.Store(folder)
 
     folder = tmp_path / "none.fss"
-    refused("the folder does not exist")
+    refused("must be the folder of a store, got nothing")
     folder = copied(store, tmp_path)
     whole = contents(folder)
     for name in whole:

@@ -12,7 +12,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.store import build_plan
-from fidsplat.store.layout import NPY_HEADER, checksum, header_crc
+from fidsplat.store.layout import NPY_HEADER, checksum, header_crc, npy_header, row_bytes, shapes_of
+from fidsplat.util import limits
 
 COUNT, PLANAR = 600, 6
 VALUES = {
@@ -126,3 +127,57 @@ def test_large_ids_of_coplanar_groups_are_rendered(folder, tmp_path, renderer, v
 
     path = crafted(folder, tmp_path / "a.fss", "coplanar_groups", COUNT - 1, value)
     np.testing.assert_allclose(alpha(path), alpha(folder), atol=1e-5)
+
+
+def header_of(folder, **said):
+    """Change a store's header, with its checksum."""
+    header = json.loads((folder / "store.json").read_text()) | said
+    header.pop("crc")
+    (folder / "store.json").write_text(json.dumps(header | {"crc": header_crc(header)}))
+
+
+def test_sparse_columns_are_refused(folder, tmp_path, monkeypatch):
+    """A few kilobytes on the disk that declare 4 million splats."""
+    count = 2**22
+    shutil.copytree(folder, tmp_path / "a.fss")
+    path = tmp_path / "a.fss"
+    nodes = np.load(path / "nodes.npy")[:1]
+    nodes["count"], nodes["parent"] = count, -1
+    np.save(path / "nodes.npy", nodes)
+    columns = json.loads((path / "store.json").read_text())["columns"]
+    for name, kind in columns.items():
+        shape = (count, *shapes_of(1)[name])
+        with (path / f"{name}.npy").open("r+b") as stream:
+            stream.write(npy_header(kind, shape))
+            stream.truncate(NPY_HEADER + row_bytes(kind, shape))
+    said = {"nodes_crc": zlib.crc32(nodes.tobytes()), "splats": count, "rows": count, "pinned": count}
+    header_of(path, **said, chunk=count)
+    monkeypatch.setattr(limits, "FLOOR", 2**23)
+    with pytest.raises(fs.InputError, match=r"must have at most 8 MiB, as it has .*FIDSPLAT_INPUT_LIMIT="):
+        fs.Store(path)
+    header_of(path, chunk=count + 1)
+    with pytest.raises(fs.InputError, match="a count is out of range"):
+        fs.Store(path)
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "x/" * 3000, "a\0b", "\ud800"])
+def test_impossible_paths_of_the_instanced_store_are_refused(folder, tmp_path, name):
+    shutil.copytree(folder, tmp_path / "a.fss")
+    header_of(tmp_path / "a.fss", store=name, places_crc=0)
+    with pytest.raises(fs.InputError):
+        fs.Store(tmp_path / "a.fss")
+
+
+def test_group_ids_beyond_int32_together_are_refused(folder, tmp_path):
+    last = crafted(folder, tmp_path / "a.fss", "coplanar_groups", COUNT - 1, 2**31 - 1)
+    stores = (fs.Store(last), fs.Store(folder))
+    with pytest.raises(fs.InputError, match="must be below 2\\^31 together"):
+        fs.Renderer("reference").render(fs.Scene([], CAMERA, stores=stores))
+    ids = random_splats(3, 0).with_coplanar_groups(2**31 - 1)
+    with pytest.raises(fs.InputError, match="number the groups from 0"):
+        fs.SplatCloud.concatenate([ids, ids])
+    joined = fs.SplatCloud.concatenate([ids, random_splats(3, 0)])
+    np.testing.assert_array_equal(joined.coplanar_groups, [2**31 - 1] * 3 + [-1] * 3)
+    fs.save_ply(ids, tmp_path / "a.ply")
+    with pytest.raises(fs.InputError, match="number the groups from 0"):
+        fs.build_store([tmp_path / "a.ply"] * 2, tmp_path / "b.fss")
