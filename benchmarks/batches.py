@@ -3,7 +3,7 @@
     python benchmarks/batches.py --device opencl [--rows scenes agents few] [--repeats 5] [--json FILE]
 
 Splats and images stay on the device. A time is from the call until the device is done, over the views; `host`
-is the part of it in which the call had not returned. Cameras stand on an arc around what they look at.
+is the part until the call returns. Cameras are on an arc around their target.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from fidsplat.util.timing import Timer
 
 @dataclass(frozen=True)
 class Row:
-    """One batch."""
+    """Settings of one batch."""
 
     views: int
     splats: int
@@ -38,14 +38,14 @@ ROWS = {
     "agents": Row(4096, 10_000, 128, 128, ("rgb",)),
     "few": Row(64, 10_000, 128, 128, ("rgb",)),
 }
-"""`few` is for a CPU"""
+"""batches by name; `few` is for CPUs"""
 ARRAYS = ("means", "quats", "scales", "opacities", "colors")
 _ALONE = 32
-"""views that are drawn one by one, and compared"""
+"""number of views that are rendered one by one and compared"""
 
 
 def arc(views: int) -> np.ndarray:
-    """(views, 7) poses on a quarter of a circle of 2 metres around the point 6 metres ahead."""
+    """Poses (views, 7) on a quarter of a circle of 6 metres around the point 6 metres ahead."""
     target, poses = np.array([0.0, 0.0, 6.0]), []
     for angle in np.linspace(-np.pi / 4, np.pi / 4, views):
         position = target - 6.0 * np.array([np.sin(angle), 0.0, np.cos(angle)])
@@ -55,7 +55,7 @@ def arc(views: int) -> np.ndarray:
 
 
 def scene_of(row: Row) -> tuple[fs.SplatCloud, fs.Capture, np.ndarray]:
-    """The splats of a batch, how its pictures are taken, and from where."""
+    """Splats, capture and poses of a batch."""
     every = load_scene("r100k_720p")[0]
     some = {field: getattr(every, field)[: row.splats] for field in ARRAYS}
     cloud = fs.SplatCloud(**some, labels=np.arange(row.splats) % 50)
@@ -65,7 +65,7 @@ def scene_of(row: Row) -> tuple[fs.SplatCloud, fs.Capture, np.ndarray]:
 
 
 def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
-    """One row's figures, per view."""
+    """Figures of a row, per view."""
     row = ROWS[name]
     cloud, capture, poses = scene_of(row)
     resident = renderer.upload(cloud)
@@ -83,9 +83,9 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
     batch = draw()
     some = np.linspace(0, row.views - 1, min(_ALONE, row.views)).astype(int)
     captures = [Views((capture,), pose_matrices("poses", poses[[k]])).capture(0) for k in some]
-    alone = Timer(lambda: [renderer.render(resident, each) for each in captures][-1].wait())
+    single = Timer(lambda: [renderer.render(resident, each) for each in captures][-1].wait())
     for number in range(3):
-        alone.run(timed=number > 0)
+        single.run(timed=number > 0)
     for k, each in zip(some, captures, strict=True):
         frame, view = renderer.render(resident, each), batch.frame(int(k))
         assert all(np.array_equal(frame[output], view[output]) for output in row.outputs), k
@@ -98,7 +98,7 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
         **{"us_per_view": middle, "quartiles_us": [low, high], "repeats": repeats},
         "host_us_per_view": 1e3 * float(np.median(host[2:])) / row.views,
         "stages_us": {stage: 1e3 * ms / row.views for stage, ms in timer.part_medians.items()},
-        "alone_us_per_view": 1e3 * alone.median / len(some),
+        "alone_us_per_view": 1e3 * single.median / len(some),
         "pairs_per_view": batch.stats["pairs"] / row.views,
     }
 
@@ -109,7 +109,7 @@ def main() -> None:
     arguments = parser.parse_args()
     renderer, rows = fs.Renderer(arguments.device), []
     for name in arguments.rows:
-        with PROGRESS.status(f"drawing {name}"):
+        with PROGRESS.status(f"rendering {name}"):
             rows.append(measure(renderer, name, max(arguments.repeats, 1)))
     if keep(rows, arguments.json):
         return

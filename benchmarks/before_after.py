@@ -44,8 +44,8 @@ cloud = cloud if groups is None else grouped(groups)
 camera = fs.Camera.pinhole(int(width), int(height), focal, focal, width / 2, height / 2)
 renderer = fs.Renderer(sys.argv[2])
 resident = renderer.upload(cloud)
-knobs = {"arithmetic": "precise"} if "arithmetic" in fs.Quality.__dataclass_fields__ else {}
-quality = fs.Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, **knobs)
+settings = {"arithmetic": "precise"} if "arithmetic" in fs.Quality.__dataclass_fields__ else {}
+quality = fs.Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, **settings)
 how = (fs.Capture(camera, quality=quality),) if "Capture" in fs.__all__ else (camera, ("rgb",), quality)
 print(renderer.device.title, "|", renderer.device.version, flush=True)
 clock = getattr(time, sys.argv[3])
@@ -54,8 +54,8 @@ for line in sys.stdin:
     frame = renderer.render(resident, *how)
     getattr(frame, "wait", lambda: frame.timings)()
     spent = clock() - start
-    picture = hashlib.sha256(frame["rgb"].tobytes()).hexdigest()[:16]
-    print(spent * 1e3, picture, json.dumps(dict(frame.timings)), flush=True)
+    digest = hashlib.sha256(frame["rgb"].tobytes()).hexdigest()[:16]
+    print(spent * 1e3, digest, json.dumps(dict(frame.timings)), flush=True)
 """
 
 
@@ -84,7 +84,7 @@ class Tree:
             env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])},
         )
         self.device, self.clock = self._line(), Clock()
-        self.picture = ""
+        self.digest = ""
         self.stages: list[dict[str, float]] = []
         """stage times of each frame in milliseconds"""
 
@@ -93,7 +93,7 @@ class Tree:
         assert self.child.stdin is not None
         self.child.stdin.write("\n")
         self.child.stdin.flush()
-        spent, self.picture, stages = self._line().split(maxsplit=2)
+        spent, self.digest, stages = self._line().split(maxsplit=2)
         self.stages.append(json.loads(stages))
         self.clock.seconds += float(spent) / 1e3
 
@@ -145,7 +145,7 @@ def measure(commit: str, scene: str, device: str, repeats: int, clock: str) -> d
         "now_ms": now.median,
         "ratio": middle,
         "quartiles": [low, high],
-        "same_bits": trees[0].picture == trees[1].picture,
+        "same_bits": trees[0].digest == trees[1].digest,
         "stages_ms": [tree.medians() for tree in trees],
     }
 

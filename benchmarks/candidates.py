@@ -105,12 +105,12 @@ def main() -> int:
     plain = measure(grid)
     plain = plain.of(plain.pareto_front())
     say(f"{len(plain.candidates)} of {len(grid)} are on the front")
-    modifiers = [more for more in MODIFIERS if draws(renderer, scenes[0], more)]
-    finest = [settings for settings in FINEST if draws(renderer, scenes[0], settings)]
+    modifiers = [more for more in MODIFIERS if supports(renderer, scenes[0], more)]
+    finest = [settings for settings in FINEST if supports(renderer, scenes[0], settings)]
     combined = [settings | more for settings in plain.candidates for more in modifiers]
     both = measure(plain.candidates + combined + finest)
     final = both.of(both.pareto_front())
-    say(f"{len(final.candidates)} of {len(both.candidates)} are kept")
+    say(f"{len(final.candidates)} of {len(both.candidates)} are on the Pareto front")
 
     out = json.loads(FILE.read_text("utf-8")) if FILE.exists() else {"made": {}, "classes": {}}
     info = renderer.device
@@ -136,7 +136,7 @@ def quality(settings: dict) -> fs.Quality:
     return Candidate(settings, 0, 0, 0, 0).quality(fs.Quality())
 
 
-def draws(renderer: fs.Renderer, scene, settings: dict) -> bool:
+def supports(renderer: fs.Renderer, scene, settings: dict) -> bool:
     try:
         renderer.render(scene.cloud, scene.camera, quality=quality(settings))
     except InputError as error:
@@ -163,7 +163,7 @@ def all_errors(renderer: fs.Renderer, scenes, truths, candidates: list[dict]) ->
 def all_costs(renderer: fs.Renderer, candidates: list[dict], repeats: int) -> np.ndarray:
     """Time of a frame over that of the candidates' base (candidates,): the mean over the timed scenes."""
     qualities = [quality({}), *(quality(settings) for settings in candidates)]
-    # a processor's own time does not hang on what else runs there
+    # CPU time hardly depends on other processes
     clock = time.process_time if renderer.device.kind == "cpu" else time.perf_counter
     ratios = []
     for count, scale, width, height in TIMED:

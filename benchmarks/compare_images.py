@@ -58,7 +58,7 @@ def in_coplanar_groups(splats: fs.SplatCloud) -> fs.SplatCloud:
 
 
 def turning(time: float) -> np.ndarray:
-    """Pose of a camera that turns about its optical axis and moves sideways."""
+    """Pose of a camera that rotates about its optical axis and moves sideways."""
     pose, angle = np.eye(4), 0.5 * time
     pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     pose[0, 3] = -0.2 * time
@@ -222,7 +222,7 @@ def main() -> int:
         return 0
     if options.commit is None:
         parser.error("name a commit, or a folder with its files")
-    from before_after import ROOT, checked_out  # late: the package of another tree may lack what it imports
+    from before_after import ROOT, checked_out  # here: the package of another tree may lack these modules
 
     with tempfile.TemporaryDirectory() as folder:
         given = Path(options.commit).resolve()

@@ -1,5 +1,5 @@
-"""The benchmark suite: `pytest benchmarks/`, with `--device D` for another device and `--big` for scenes that
-are left out on a small machine. `--benchmark-json FILE` keeps the figures, with facts of the device.
+"""Benchmark suite: `pytest benchmarks/`, with `--device D` for another device and `--big` for scenes that are
+skipped on a small machine. `--benchmark-json FILE` writes the figures, with facts of the device.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ except ImportError:
 
 HEAVY = ("r5m_1080p", "r5m_1080p_3d", "r20m_4k", "qr_wall")
 SMALL_MACHINE = 8
-"""Compute units of a processor below which heavy scenes are left out."""
+"""Compute units of a processor below which large scenes are skipped."""
 
 
 CLOCK = Clock()
-"""what is measured moves it on: a stage by the device's clock, a part of a child process"""
+"""advanced by the measured time: of a stage by the device's clock, or of a part of a child process"""
 
 
 def pytest_addoption(parser) -> None:

@@ -1,5 +1,5 @@
-"""Makes the pictures of the pages again: docs/images/demo.jpg, and real-scene.jpg and ellipsoids.jpg when a
-captured scene is given.
+"""Make images of the docs: docs/images/demo.jpg and, with a captured scene, real-scene.jpg and
+ellipsoids.jpg.
 
 python benchmarks/docs_images.py [biker.compressed.ply]
 """
@@ -19,13 +19,13 @@ def save(sheet: Path, name: str) -> None:
     """Write a JPEG without chroma subsampling, so that edges of markers stay sharp."""
     image = cv2.imread(str(sheet))
     assert image is not None
-    wanted = [
+    options = [
         cv2.IMWRITE_JPEG_QUALITY,
         85,
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
     ]
-    cv2.imwrite(str(IMAGES / name), image, wanted)
+    cv2.imwrite(str(IMAGES / name), image, options)
 
 
 def main() -> None:

@@ -19,11 +19,11 @@ from fidsplat.worlds.yard import demo_scene
 WIDTH, HEIGHT, RATE = 480, 270, 16.0
 AIM = (0.0, 0.05, 0.0)
 WAY = ((-35, 2.4, -0.25), (-12, 1.7, -0.05), (12, 1.9, -0.15), (35, 2.3, -0.3))
-"""degrees to the side, metres away, metres down: there and back"""
+"""degrees to the side, metres away, metres down, of a closed path"""
 
 
 def main(out: str) -> None:
-    """Draw it and write the file."""
+    """Render the flight and write the file."""
     scene, poses = demo_scene(), []
     for degrees, away, down in (*WAY, *WAY[-2::-1]):
         angle = math.radians(degrees)
@@ -35,8 +35,8 @@ def main(out: str) -> None:
     flight = Flight(scene, path, path.sampled(RATE).times[:-1], scene.capture)
     with tempfile.TemporaryDirectory() as folder:
         renderer = fs.Renderer()
-        drawn = FlightFolder(folder, flight, renderer.device.title)
-        for number in drawn.render(renderer):
+        frames = FlightFolder(folder, flight, renderer.device.title)
+        for number in frames.render(renderer):
             print(f"{number + 1} of {len(flight)}", end="\r", file=sys.stderr)
         words = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-framerate", str(RATE)]
         words += ["-i", f"{folder}/rgb/%06d.png", "-c:v", "libwebp_anim", "-quality", "60", "-loop", "0", out]

@@ -3,11 +3,10 @@
     python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json FILE]
     python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effects.md
 
-Every frame with an effect is followed by one without, the picture left on the device, the queue drained
-before and after each, so that what else the machine does falls on both. The price is the median of the ratios
-of the two times less 1; the quartiles of the ratios say how far to trust it, and so does the row "base
-again", whose two times are of the same thing. Boxes have the places, turns and scales of the scene's
-Gaussians and cover less of the picture.
+Frames with and without the effect alternate, the images stay on the device, and the queue is drained before
+and after each frame, so that disturbances affect both. The price is the median of the ratios of the two
+times, less 1. The quartiles of the ratios, and the row "base again" with equal frames, show the uncertainty.
+Boxes have the positions, rotations and scales of the scene's Gaussians and cover fewer pixels.
 """
 
 from __future__ import annotations
@@ -41,13 +40,13 @@ SENSORS = {
 
 
 def turning(time: float) -> np.ndarray:
-    """A camera that turns by 30 degrees a second."""
+    """Pose of a camera that rotates by 30 degrees a second."""
     angle = math.radians(30) * time
     return fs.Camera.look_at(2, 2, 1.0, (0, 0, 0), (math.sin(angle), 0, math.cos(angle))).world_to_camera
 
 
 def moved(time: float) -> np.ndarray:
-    """A group that moves to the right at 1 m a second."""
+    """Pose of a group that moves to the right at 1 m a second."""
     matrix = np.eye(4)
     matrix[0, 3] = time
     return matrix
@@ -71,7 +70,7 @@ def lenses(base: fs.Camera) -> dict[str, dict]:
 
 
 def shutters() -> dict[str, dict]:
-    """What moves, and pictures that take time."""
+    """Arguments of `Renderer.render` for motions and shutters."""
     turn = fs.Motion(turning)
     return {
         # every tenth splat
@@ -90,7 +89,7 @@ def shutters() -> dict[str, dict]:
 
 
 def effects(base: fs.Camera) -> dict[str, dict]:
-    """Name of an effect -> what differs from the base in the call of `Renderer.render`; `cloud`: see
+    """Arguments of `Renderer.render` that differ from the base, by effect; `cloud` is an argument of
     `changed`."""
     sky = np.random.default_rng(0).uniform(0, 1, (512, 1024, 3)).astype(np.float32)
     return {

@@ -1,9 +1,9 @@
-"""How well a QR code of version 22 shows with each low-pass and footprint: PSNR against the ideal picture.
+"""Measure a QR code of version 22 with each low-pass and footprint: PSNR against the ideal image.
 
-    python benchmarks/filter_quality.py [--device opencl] [--picture FILE.png]
+    python benchmarks/filter_quality.py [--device opencl] [--image FILE.png]
 
-Frontal, over grey, a thousand characters at level L. Each pixel of the ideal picture is the exact mean of the
-texture over its area. `--picture` writes a crop of each at 2 pixels per module, enlarged.
+The code is frontal, over grey, with a thousand characters at level L. Each pixel of the ideal image is the
+exact mean of the texture over its area. `--image` writes a crop of each at 2 pixels per module, enlarged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WAYS = {
 
 
 def camera_of(made: fs.Marker, px: float) -> fs.Camera:
-    """A camera 4 m away in which a module is `px` pixels, the code's middle between pixels."""
+    """A camera 4 m away with modules of `px` pixels; the centre of the code is between pixels."""
     side = int(made.grid.shape[0] * px) + 20
     pose = np.eye(4)
     pose[2, 3] = 4
@@ -44,7 +44,7 @@ def camera_of(made: fs.Marker, px: float) -> fs.Camera:
 
 
 def area_sampled(made: fs.Marker, px: float, camera: fs.Camera) -> np.ndarray:
-    """The printed marker (h, w): every pixel the exact mean over its area."""
+    """Ideal image of the printed marker (h, w): every pixel is the exact mean over its area."""
 
     def overlap(edges: np.ndarray, pixels: int) -> np.ndarray:
         left = np.arange(pixels)[:, None]
@@ -58,7 +58,7 @@ def area_sampled(made: fs.Marker, px: float, camera: fs.Camera) -> np.ndarray:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--picture", help="PNG file of crops")
+    parser.add_argument("--image", help="PNG file of crops")
     arguments = parser.parse_args()
     renderer = fs.Renderer(arguments.device)
     text = "".join(random.Random(0).choices(string.ascii_letters + string.digits, k=1000))
@@ -77,8 +77,8 @@ def main() -> None:
                 crop = to_uint8(rgb[6:46, 6:46])
                 crops.append((name, cv2.resize(crop, (240, 240), interpolation=cv2.INTER_NEAREST)))
         rows.append({"way": name, "psnr_db": row})
-    if arguments.picture:
-        write_png(arguments.picture, contact_sheet([crops[:4], crops[4:]], width=240) // 16 * 16)
+    if arguments.image:
+        write_png(arguments.image, contact_sheet([crops[:4], crops[4:]], width=240) // 16 * 16)
     if keep({**facts(renderer), "rows": rows}, arguments.json):
         return
     heads = ("QR 22, PSNR in dB", *rows[0]["psnr_db"])

@@ -1,11 +1,11 @@
-"""How long the first picture takes in a new process: with empty kernel caches, with those that
-`fidsplat warm` filled, and with those that the same scene left.
+"""Measure the first frame of a new process with empty kernel caches, with caches filled by `fidsplat warm`,
+and with caches filled by the same scene.
 
     python benchmarks/first_frame.py [tag] [demo] [--device opencl] [--repeats 5] [--json FILE]
 
-Seconds from starting Python to the picture in NumPy, and what became of them: starting Python, importing,
-making the scene (markers included), opening the device, uploading and drawing, which includes all that is
-compiled. The caches of pyopencl, PoCL and NVIDIA's driver are pointed at folders of our own.
+Reported are the seconds from the start of Python to the image in NumPy, and of each part: start of Python,
+imports, construction of the scene with its markers, opening the device, upload and rendering with all
+compilation. The caches of pyopencl, PoCL and NVIDIA's driver are redirected to temporary folders.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SCENES = ("tag", "demo")
 CACHES = ("empty", "warmed", "kept")
 PARTS = ("python", "import", "scene", "device", "frame")
 
-# prints the time at which each part was done, in seconds since the epoch
+# prints the end time of each part in seconds since the epoch
 CHILD = """
 import time; marks = [time.time()]
 import sys, fidsplat as fs, numpy; marks.append(time.time())
@@ -46,7 +46,7 @@ print(*marks)
 
 
 def caches_in(folder: Path) -> dict[str, str]:
-    """An environment in which everything that is compiled is kept below `folder`."""
+    """Environment variables with all kernel caches below `folder`."""
     places = {
         "POCL_CACHE_DIR": str(folder / "pocl"),
         "XDG_CACHE_HOME": str(folder / "xdg"),
@@ -58,7 +58,7 @@ def caches_in(folder: Path) -> dict[str, str]:
 
 
 def first_frame(scene: str, device: str, folder: Path) -> dict[str, float]:
-    """Seconds of each part, and in `total`, of a new process that draws one picture."""
+    """Seconds of each part, and in `total`, of a new process that renders one frame."""
     begun = time.time()
     done = subprocess.run(
         [sys.executable, "-c", CHILD, scene, device], capture_output=True, text=True, env=caches_in(folder)
@@ -88,7 +88,7 @@ def measure(scenes: list[str], device: str, repeats: int) -> list[dict]:
         for scene in scenes:
             runs: dict[str, list[dict[str, float]]] = {cache: [] for cache in CACHES}
             for number in track(range(repeats), description=scene, console=PROGRESS):
-                # kept: what the first of the empty ones left
+                # kept: the caches of the first run with empty caches
                 folders = {"empty": top / f"{scene} {number}", "kept": top / f"{scene} 0"}
                 for cache in CACHES:
                     runs[cache].append(first_frame(scene, device, folders.get(cache, top / "warmed")))

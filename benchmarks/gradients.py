@@ -3,11 +3,11 @@
     PYTHONPATH=.:tests python benchmarks/gradients.py [--device D] [--scenes 200] [--json FILE]
     PYTHONPATH=.:tests python benchmarks/gradients.py --time r100k_720p r1m_1080p [--quality surfel]
 
-Errors are of random scenes as tests/contract/test_gradients.py has them: of each parameter's whole array the
-relative error and one less its cosine, the median and the largest of all scenes; how many scenes are beyond
-1e-4; and the largest error in units of what one unit in the last place of means and quaternions changes in
-those. Times are of a picture, and
-of its derivatives by colour, the splats resident: medians of the device's own clock, stage by stage.
+Errors are of the random scenes of tests/contract/test_gradients.py: for the array of each parameter the
+relative error and one less the cosine, as median and maximum over the scenes; the number of scenes with
+errors above 1e-4; and the maximum error relative to the change by one unit in the last place of means and
+quaternions. Times are of a frame and of its gradients by colour, with resident splats: medians of each stage
+by the device's clock.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def errors(backend: Backend, scenes: int) -> list[dict[str, float | str]]:
 
 
 def times(backend: Backend, scene: str, quality: str | None, repeats: int) -> dict[str, float | str]:
-    """Medians in milliseconds of a picture and its derivatives, and of each stage."""
+    """Medians in milliseconds of a frame and its gradients, and of each stage."""
     cloud, camera = load_scene(scene)
     features, view = prepare(cloud, fs.Capture(camera, quality=quality))
     pipeline, resident = backend.differentiate(features), backend.upload(cloud)
@@ -87,11 +87,11 @@ def main() -> None:
     given = parser.parse_args()
     renderer = fs.Renderer(given.device)
     if not renderer.backend.traits.differentiates:
-        raise InputError(f"{given.device} has no derivatives; use an OpenCL or a Warp device")
+        raise InputError(f"--device must have gradients, got {given.device}; use an OpenCL or a Warp device")
     backend = renderer.backend
     if given.time:
         rows = [times(backend, scene, given.quality, given.repeats) for scene in given.time]
-        heads, title = list(rows[0]), "Milliseconds of a picture and its derivatives"
+        heads, title = list(rows[0]), "Milliseconds of a frame and its gradients"
     else:
         rows = errors(backend, given.scenes)
         heads, title = list(rows[0]), f"Derivatives of {given.scenes} random scenes against float64"

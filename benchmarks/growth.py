@@ -1,13 +1,13 @@
 """Measure frame times against splats, pixels and overdraw, as JSON lines.
 
     python benchmarks/growth.py growth.jsonl --device opencl
-    python benchmarks/growth.py growth.jsonl more.jsonl --plot docs/images       plots what was measured
+    python benchmarks/growth.py growth.jsonl more.jsonl --plot docs/images       plots measurements
 
 A plot for each series, log-log, a panel for each device (`pip install '.[bench]'`): whole frames are bold,
 stages thin; titles give the exponent of the frame's upper half.
 
-A series ends when a frame takes longer than --longest, or when the device cannot hold the scene. Each point
-is written when it is done; a run that was stopped goes on where it was when it is given the same file
+A series ends when a frame takes longer than --longest, or when the scene does not fit on the device. Each
+point is written when it is done; a stopped run resumes with the same file
 (fidsplat/experiments/sweep.py).
 """
 
@@ -41,7 +41,7 @@ class Point:
 
     series: str
     x: float
-    """what the series is over: splats, pixels, or the factor on the splats' size"""
+    """abscissa of the series: splats, pixels, or factor of the splats' size"""
     count: int
     median_scale: float
     """metres"""
@@ -49,16 +49,16 @@ class Point:
     height: int
 
     def make(self) -> tuple[fs.SplatCloud, fs.Camera]:
-        """The random scene, as those of random_clouds.py."""
+        """The random scene, made like those of random_clouds.py."""
         return random_cloud(self.count, self.median_scale), standard_camera(self.width, self.height)
 
 
 def points() -> dict[str, list[Point]]:
-    """Every series, each from little to much.
+    """Points of every series, in increasing order.
 
-    splats: 10^4 to 2 x 10^7 in 1080p, smaller as they get more, so that they cover the same area in all.
-    pixels: 0.25 to 8 million of the million splats of r1m_1080p. overdraw: 300,000 splats in 1080p, from half
-    to eight times the size of those of r1m_1080p.
+    splats: 10^4 to 2 x 10^7 in 1080p, with sizes for the same total area. pixels: 0.25 to 8 million pixels of
+    the million splats of r1m_1080p. overdraw: 300,000 splats in 1080p, with 0.5 to 8 times the size of those
+    of r1m_1080p.
     """
     counts = [10_000, 30_000, 100_000, 300_000, MILLION, 3 * MILLION, 10 * MILLION, 20 * MILLION]
     over_splats = [Point("splats", n, n, 0.012 * math.sqrt(MILLION / n), 1920, 1080) for n in counts]
@@ -74,10 +74,10 @@ def points() -> dict[str, list[Point]]:
 
 
 def measure(point: Point, device: str, rates: Rates | None, repeats: int) -> dict:
-    """The record of a point: as in `fidsplat bench --json`, with its series and x; for the series `overdraw`
-    also `layers_per_pixel`, the fragments that lie over a pixel whether or not it lets light through to them.
+    """Record of a point as in `fidsplat bench --json`, with its series and x; for the series `overdraw` also
+    `layers_per_pixel`, the number of fragments at a pixel, occluded ones included.
 
-    A device that cannot draw it says so in `error`.
+    `error` has the reason if the device cannot render the scene.
     """
     cloud, camera = point.make()
     run = SceneRun(f"{point.series} {point.x:g}", device, rates, cloud, camera)
@@ -93,7 +93,7 @@ def measure(point: Point, device: str, rates: Rates | None, repeats: int) -> dic
 
 
 def run(series: dict[str, list[Point]], device: str, repeats: int, longest: float, file: Path) -> list[dict]:
-    """Measure what the file does not have yet; returns all of it."""
+    """Measure the points that are missing in the file; returns all records."""
     renderer = fs.Renderer(device)
     info, backend = renderer.device, renderer.backend
     results = Results(file, run_facts(f"{info.title}, {info.version}", 0))
@@ -118,13 +118,13 @@ def run(series: dict[str, list[Point]], device: str, repeats: int, longest: floa
 
 
 def abscissa(record: dict) -> float:
-    """What a record is plotted over: x, but in the series `overdraw` the layers per pixel."""
+    """Abscissa of a record: x, but for the series `overdraw` the layers per pixel."""
     return record.get("layers_per_pixel", record["x"])
 
 
 def exponent(x: Sequence[float], y: Sequence[float]) -> float | None:
-    """p of the least-squares fit y = c x^p through the upper half of the points, where what is fixed no
-    longer counts (all of them if there are at most three); None for fewer than two."""
+    """Exponent p of a least-squares fit y = c x^p to the upper half of the points, where constant costs are
+    negligible (to all of them if there are at most three); None for fewer than two."""
     pairs = [(a, b) for a, b in zip(x, y, strict=True) if a > 0 and b > 0]
     upper = pairs[len(pairs) // 2 :] if len(pairs) > 3 else pairs
     if len(upper) < 2:
@@ -134,11 +134,11 @@ def exponent(x: Sequence[float], y: Sequence[float]) -> float | None:
 
 
 def exponents(records: Sequence[dict]) -> Iterator[tuple[str, str, dict[str, float | None]]]:
-    """For each device and series: the exponents of `frame` and of each stage, from the fastest of the
-    repeats, which other work on the machine disturbs least."""
-    drawn = [record for record in records if not record.get("error") and "frame_ms" in record]
-    for title, series in dict.fromkeys((record["title"], record["series"]) for record in drawn):
-        chosen = [record for record in drawn if (record["title"], record["series"]) == (title, series)]
+    """Exponents of `frame` and of each stage for each device and series, from the fastest of the repeats,
+    which has the least disturbance by other processes."""
+    measured = [record for record in records if not record.get("error") and "frame_ms" in record]
+    for title, series in dict.fromkeys((record["title"], record["series"]) for record in measured):
+        chosen = [record for record in measured if (record["title"], record["series"]) == (title, series)]
         chosen.sort(key=abscissa)
         over = [abscissa(record) for record in chosen]
         found = {"frame": exponent(over, [record["fastest_ms"] for record in chosen])}
@@ -149,7 +149,7 @@ def exponents(records: Sequence[dict]) -> Iterator[tuple[str, str, dict[str, flo
 
 
 STAGES = ("project", "sort", "bin", "blend", "resolve")
-UNITS = {"splats": "splats", "pixels": "pixels", "overdraw": "splats over a pixel, seen or hidden"}
+UNITS = {"splats": "splats", "pixels": "pixels", "overdraw": "splats at a pixel, visible or occluded"}
 TITLES = {
     "splats": "1920 x 1080, the same covered area",
     "pixels": "a million splats",
@@ -158,7 +158,7 @@ TITLES = {
 
 
 def plot(series: str, records: list[dict], file: Path) -> None:
-    """One series: a panel for each device, all of one scale."""
+    """Plot a series: a panel for each device, all with one scale."""
     from matplotlib import pyplot as plt
 
     plt.switch_backend("agg")

@@ -4,10 +4,10 @@
         [--json]
 
 AprilTag 36h11 id 0, and QR codes in byte mode at level L of seeded random strings of 20, 100, 250 and 1000
-characters (versions 2, 5, 10 and 22), seen frontally at 800 x 800, the code's edge `--edge-px` pixels long,
-low-pass off, 3 x 3 samples per pixel, over grey. PSNR is taken against the ideal texture (each pixel the
-mean of 12 x 12 points) within the quiet zone's outer edge and one module around it. "layer" is how fidsplat
-draws a marker (Quality.order "auto"); "centre" composites by the depth of the splats' centres, here all
+characters (versions 2, 5, 10 and 22), rendered frontally at 800 x 800, the code's edge `--edge-px` pixels
+long, low-pass off, 3 x 3 samples per pixel, over grey. PSNR is taken against the ideal texture (each pixel
+the mean of 12 x 12 points) within the quiet zone's outer edge and one module around it. "layer" is fidsplat's
+order of a marker (Quality.order "auto"); "centre" composites by the depth of the splats' centres, here all
 equal, so by index, as other renderers do with the exported file; "tilted 30" is "centre" again from 30
 degrees, where the centres' depths decide. Seconds are the median time from the spec to the cloud in a warm
 process, on one thread.
@@ -33,7 +33,7 @@ import fidsplat as fs
 from fidsplat.capture.quality import TEMPLATE_SIZES
 from fidsplat.markers import Marker, marker
 
-PICTURE = 800
+IMAGE_SIZE = 800
 FINE = 12
 LENGTHS = {"QR 2": 20, "QR 5": 100, "QR 10": 250, "QR 22": 1000}
 MIXTURES = {
@@ -46,7 +46,7 @@ VIEWS = {"layer": ("auto", 0.0), "centre": ("centre", 0.0), "tilted 30": ("centr
 
 
 def categories(seed: int) -> dict[str, str]:
-    """Name -> spec of the five kinds of marker that the paper measures."""
+    """Specs of the paper's five categories of markers, by name."""
     specs = {"AprilTag": "apriltag:36h11:0"}
     for name, length in LENGTHS.items():
         text = "".join(random.Random(seed).choices(string.ascii_letters + string.digits, k=length))
@@ -55,26 +55,25 @@ def categories(seed: int) -> dict[str, str]:
 
 
 def camera_at(made: Marker, edge_px: float, tilt: float) -> fs.Camera:
-    """A camera 4 code edges away, the marker leaning back by ``tilt`` degrees, the code ``edge_px`` long
-    when 0.
-    """
+    """A camera 4 code edges away; the marker is tilted back by `tilt` degrees, and `edge_px` pixels long at
+    0."""
     distance = 4.0 * made.size
     focal = edge_px * 4.0
     a = math.radians(tilt)
     placed = np.eye(4)
     placed[1:3, 1:3] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
     placed[2, 3] = distance
-    return fs.Camera.pinhole(PICTURE, PICTURE, focal, focal, PICTURE / 2, PICTURE / 2, placed)
+    return fs.Camera.pinhole(IMAGE_SIZE, IMAGE_SIZE, focal, focal, IMAGE_SIZE / 2, IMAGE_SIZE / 2, placed)
 
 
 def ideal_image(made: Marker, camera: fs.Camera, background: float) -> tuple[np.ndarray, np.ndarray]:
-    """The printed marker itself, (h, w) in [0, 1], and the mask of the pixels that count."""
-    at = (np.arange(PICTURE * FINE) + 0.5) / FINE
+    """Ideal image of the printed marker, (h, w) in [0, 1], and the mask of the compared pixels."""
+    at = (np.arange(IMAGE_SIZE * FINE) + 0.5) / FINE
     to_plane = np.linalg.inv(camera.matrix @ camera.world_to_camera[:3, [0, 1, 3]])
-    picture = np.empty((PICTURE, PICTURE))
-    counts = np.empty((PICTURE, PICTURE), bool)
+    image = np.empty((IMAGE_SIZE, IMAGE_SIZE))
+    counts = np.empty((IMAGE_SIZE, IMAGE_SIZE), bool)
     h, w = made.grid.shape
-    for row in range(PICTURE):  # a row of pixels at a time: all points at once would take gigabytes
+    for row in range(IMAGE_SIZE):  # a row of pixels at a time: all points at once would take gigabytes
         x, y = np.meshgrid(at, at[row * FINE : (row + 1) * FINE])
         u, v, scale = np.einsum("ij,jyx->iyx", to_plane, np.stack([x, y, np.ones_like(x)]))
         column = np.floor(u / scale / made.module + w / 2).astype(int)
@@ -82,10 +81,10 @@ def ideal_image(made: Marker, camera: fs.Camera, background: float) -> tuple[np.
         inside = (column >= 0) & (column < w) & (line >= 0) & (line < h)
         value = np.full(x.shape, background)
         value[inside] = 1.0 - made.grid[line[inside], column[inside]]
-        picture[row] = value.reshape(FINE, PICTURE, FINE).mean((0, 2))
+        image[row] = value.reshape(FINE, IMAGE_SIZE, FINE).mean((0, 2))
         near = (column >= -1) & (column <= w) & (line >= -1) & (line <= h)
-        counts[row] = near.reshape(FINE, PICTURE, FINE).all((0, 2))
-    return picture, counts
+        counts[row] = near.reshape(FINE, IMAGE_SIZE, FINE).all((0, 2))
+    return image, counts
 
 
 def measure(renderer: fs.Renderer, made: Marker, edge_px: float, background: float, ideals: dict) -> dict:

@@ -14,21 +14,21 @@ import fidsplat as fs
 from fidsplat.util.files import atomic_write
 
 PROGRESS = Console(stderr=True)
-"""where progress is shown, so that stdout has figures alone"""
+"""console of progress messages, so that stdout has only figures"""
 
 
 def options(about: str | None, device: str = "opencl", repeats: int | None = None) -> argparse.ArgumentParser:
-    """A parser with --device and --json, and with --repeats where there is a default for it."""
+    """A parser with --device and --json, and --repeats if it has a default."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default=device, help=f"see `fidsplat devices` (default: {device})")
     if repeats is not None:
         parser.add_argument("--repeats", type=int, default=repeats, help=f"what counts (default: {repeats})")
-    parser.add_argument("--json", metavar="FILE", help="write the figures; - for stdout alone")
+    parser.add_argument("--json", metavar="FILE", help="write the figures; - for stdout only")
     return parser
 
 
 def facts(renderer: fs.Renderer) -> dict[str, str]:
-    """What the figures hold for."""
+    """Device, versions and date of a measurement."""
     device = renderer.device
     return {
         "device": f"{device.title} ({device.platform})",
@@ -50,12 +50,12 @@ def keep(figures: object, file: str | None) -> bool:
 
 
 def show(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """A table on stdout, first column to the left, numbers to the right."""
+    """Print a table, the first column left-aligned, numbers right-aligned."""
     table = Table(title=title, title_justify="left")
     for number, head in enumerate(heads):
         table.add_column(head, justify="right" if number else "left")
     for row in rows:
         table.add_row(*row)
     console = Console()
-    console.width = max(console.width, 140)  # numbers are not to be broken
+    console.width = max(console.width, 140)  # no line breaks in numbers
     console.print(table)

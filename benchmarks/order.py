@@ -6,7 +6,7 @@
 Jumps: the largest change of a pixel while a camera rotates in steps of 1e-4 degrees, with splats ordered by
 the depth of their centres and by depth at each pixel, and after shuffling the splats. Scenes at 240 x 192
 pixels: markers of Gaussians, one of them 5 cm in front of a wall of 2000 splats without coplanar group, 1000
-splats that intersect, and the captured scene of --scene. The 20 steps lie around the view in which the
+splats that intersect, and the captured scene of --scene. The 20 steps are around the view in which the
 centres of a fronto-parallel marker change order. The image shows a QR code before and after the worst step.
 For `pixel`, the float64 reference renders the 16 pixels with the largest jumps along the same path. Reported
 are its jumps and how far ours exceed them in the same or an adjacent step, since rounding may move an edge

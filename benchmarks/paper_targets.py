@@ -44,7 +44,7 @@ class Target(NamedTuple):
 
     kind: str
     what: str
-    wanted: str
+    required: str
     found: str
     reached: bool
 
@@ -165,18 +165,18 @@ def _paper_angles(rows: Frame) -> Iterator[Target]:
         means = rows.assign(value=rows[column].fillna(0.0)).groupby(["category", "method"])["value"]
         mean, count = means.mean(), means.count()
         for category, paper in ANGLES.items():
-            wanted = paper["ours"][1]
+            required = paper["ours"][1]
             ceiling = mean.get((category, IDEAL))
-            beside = "" if ceiling is None else f" (ideal: {ceiling:.1f})"
+            note = "" if ceiling is None else f" (ideal: {ceiling:.1f})"
             for _, method, _ in _best(rows):
                 value = mean.get((category, method))
                 if value is not None:
                     yield Target(
                         "the paper's angles",
                         f"{method}, {category}, fixed-module: {words}, mean",
-                        f">= {wanted} deg (paper)",
-                        f"{value:.1f} deg{beside}, mean of {count[category, method]}",
-                        bool(value >= wanted - _SLACK),
+                        f">= {required} deg (paper)",
+                        f"{value:.1f} deg{note}, mean of {count[category, method]}",
+                        bool(value >= required - _SLACK),
                     )
 
 
@@ -189,17 +189,17 @@ def _views(rows: Frame) -> Iterator[Target]:
 
     for truth, category in rows[["truth", "category"]].drop_duplicates().itertuples(index=False):
         ceiling = mean(IDEAL)
-        beside = "" if ceiling is None else f" (a perfect image of display values: {ceiling:.2f})"
+        note = "" if ceiling is None else f" (a perfect image of display values: {ceiling:.2f})"
         method = "exact/light" if truth in LINEAR else "exact/best"
-        for metric, least, unit in (("psnr", EXACT_PSNR, " dB"), ("ssim", EXACT_SSIM, "")):
+        for metric, minimum, unit in (("psnr", EXACT_PSNR, " dB"), ("ssim", EXACT_SSIM, "")):
             value = mean(method, metric)
             if value is not None:
                 yield Target(
                     "PSNR and SSIM of `exact`",
                     f"{method}, {category}, {metric} against {truth}",
-                    f">= {least}{unit}",
-                    f"{value:.4f}{unit}{beside if metric == 'psnr' else ''}",
-                    value >= least,
+                    f">= {minimum}{unit}",
+                    f"{value:.4f}{unit}{note if metric == 'psnr' else ''}",
+                    value >= minimum,
                 )
         fitted = mean("fitted/best")
         paper = {"paper/screen": mean("paper/screen"), "the paper's own figure": VIEWS[category]["ours"][0]}
@@ -209,7 +209,7 @@ def _views(rows: Frame) -> Iterator[Target]:
                     f"PSNR of `fitted` above {name}",
                     f"fitted/best above {name}, {category}, PSNR against {truth}",
                     f">= {FITTED_GAIN} dB",
-                    f"{fitted - theirs:+.2f} dB ({fitted:.2f} and {theirs:.2f}){beside}",
+                    f"{fitted - theirs:+.2f} dB ({fitted:.2f} and {theirs:.2f}){note}",
                     fitted - theirs >= FITTED_GAIN,
                 )
 

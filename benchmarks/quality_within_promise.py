@@ -1,12 +1,13 @@
-"""How often `fs.quality_within` keeps what it promises, on scenes that its candidates were not measured with.
+"""Measure how often `fs.quality_within` keeps its bounds, on scenes that its candidates were not measured
+with.
 
     python benchmarks/quality_within_promise.py [--device opencl:pocl] [--scenes 200] [--json FILE]
 
 Errors: random scenes with held-out seeds, each with every bound of BOUNDS, against the float64 reference.
-`promised` is the quality without a scene; `measured` the one that was calibrated on the scene
-and camera; `elsewhere` the same from another camera (turned by 5 degrees, moved by a tenth of the distance);
-`crossing` the promised quality in scenes whose other splats cross a coplanar group. Times: budgets of
-TIMES times what TIMED takes in each scene; then FRAMES frames are drawn, and those in time counted.
+`promised` is the quality without a scene; `measured` that calibrated on the scene and camera; `elsewhere` the
+same from another camera (rotated by 5 degrees, moved by a tenth of the distance); `crossing` the promised
+quality in scenes where other splats intersect a coplanar group. Times: budgets of TIMES times the frame time
+of TIMED in each scene; of FRAMES frames those within the budget are counted.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ FRAMES = 30
 
 
 @dataclass
-class Kept:
-    """How often a bound was kept."""
+class BoundStatistics:
+    """Errors relative to a bound, and how often it was kept."""
 
     worst: list[float] = field(default_factory=list)
-    """error of each scene over the bound"""
+    """error of each scene, divided by the bound"""
     refused: int = 0
-    """scenes of which nothing was promised"""
+    """scenes without a promise"""
 
     def as_dict(self) -> dict:
         kept = sum(ratio <= 1 for ratio in self.worst)
@@ -56,7 +57,7 @@ class Kept:
 
 
 def moved(scene: RandomScene) -> RandomScene:
-    """The scene from another camera."""
+    """The scene with another camera."""
     camera, (c, s) = scene.camera, (math.cos(math.radians(5)), math.sin(math.radians(5)))
     pose = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
     pose[0, 3] = 0.1 * float(np.median(scene.cloud.means[:, 2]))
@@ -71,10 +72,11 @@ def capture_of(scene: RandomScene) -> fs.Capture:
 
 
 def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
-    """A row for each way of asking and each bound: of `count` scenes, and of the first `measured` of them."""
+    """A row for each kind of quality and bound, over `count` scenes, and over the first `measured` of
+    them."""
     reference = fs.Renderer("reference")
     ways = ("promised", "crossing", "measured", "elsewhere")
-    kept = {(way, bound): Kept() for way in ways for bound in BOUNDS}
+    kept = {(way, bound): BoundStatistics() for way in ways for bound in BOUNDS}
     listed = {bound: fs.quality_within(error=bound, device=renderer) for bound in BOUNDS}
 
     def hold(way: str, bound: float, scene: RandomScene, quality: fs.Quality, want: np.ndarray) -> None:
@@ -131,7 +133,7 @@ def times_kept(renderer: fs.Renderer, names: list[str]) -> list[dict]:
                 row
                 | {
                     "calibration_s": seconds,
-                    "chosen": found.knobs,
+                    "chosen": found.settings,
                     "error": found.error,
                     "frames": FRAMES,
                     "in_time": int((np.array(taken.ms) <= ms).sum()),
@@ -143,7 +145,7 @@ def times_kept(renderer: fs.Renderer, names: list[str]) -> list[dict]:
 
 
 def timed(renderer: fs.Renderer, resident, camera, quality, count: int) -> Timer:
-    """The times of so many frames, after one that does not count."""
+    """Times of some frames, after a warm-up frame."""
     timer = frame_timer(renderer, resident, camera, quality=quality)
     time_interleaved([timer], count, warm_up=1)
     return timer
@@ -156,7 +158,7 @@ def main() -> None:
     parser.add_argument("--timed", default=",".join(SCENES), help="bench scenes, or nothing")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["XDG_CACHE_HOME"] = folder  # nothing that was measured before counts
+        os.environ["XDG_CACHE_HOME"] = folder  # ignore earlier cached measurements
         renderer = fs.Renderer(arguments.device)
         found = {
             **facts(renderer),

@@ -1,6 +1,6 @@
-"""Small random scenes of as many kinds as can be, the same on every machine for the same seed: the
-candidates of `quality_within` are measured with some (candidates.py), and its promises are checked with
-others (quality_within_promise.py)."""
+"""Small and diverse random scenes, identical on every machine for a seed: for measuring the candidates of
+`quality_within` (candidates.py) and, with other seeds, checking its promises (quality_within_promise.py).
+"""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from fidsplat.splats.rotations import quaternion_to_matrix
 MOST_SPLATS = 1500
 MOST_HAZE = 600
 HELD_OUT = 1_000_000
-"""First seed of the scenes that no table is made of."""
+"""First seed of the held-out scenes."""
 
 
 @dataclass(frozen=True)
 class RandomScene:
-    """What is drawn, from where, and before what."""
+    """Splats, camera and background."""
 
     cloud: SplatCloud
     camera: Camera
@@ -32,17 +32,17 @@ class RandomScene:
 def random_scene(seed: int, crossing: bool = False) -> RandomScene:
     """The scene of a seed: 1 to 2100 splats, 16 to 96 pixels wide and 12 to 72 high.
 
-    Splats from far below a pixel to larger than the picture, of one size or of many, round or drawn out;
-    opaque, of any opacity, or so faint that only hundreds of them make a haze; some printed on a plane, some
+    Splats from far below a pixel to larger than the image, of one size or of many, isotropic or elongated;
+    opaque, of any opacity, or so faint that hundreds of them make a haze; some in a coplanar group, some
     across the near plane; cameras from wide to narrow, near and far; any background.
 
-    Every fifth scene is printed on one plane, as a marker is, with nothing else. `crossing`: every scene is
-    half printed on a plane and half not, all mixed up.
+    Every fifth scene is a single coplanar group, like a marker. `crossing`: in every scene half of the splats
+    are in a coplanar group that the others intersect.
     """
     generator = np.random.default_rng([seed, 7])
     width, height = int(generator.integers(16, 97)), int(generator.integers(12, 73))
     focal = max(width, height) * float(log_uniform(generator, 0.5, 3.0))
-    middle = float(log_uniform(generator, 0.5, 50.0))  # metres to the middle of the splats
+    middle = float(log_uniform(generator, 0.5, 50.0))  # metres to the centre of the splats
     parts = [_splats(generator, _count(generator, MOST_SPLATS), focal, (width, height), middle, faint=False)]
     printed = crossing or generator.random() < 0.2
     if not printed and generator.random() < 0.5:

@@ -1,11 +1,11 @@
-"""Markers in a captured scene: an AprilTag and a QR code set beside a figure, three views drawn and read
-back; and the figure close by in each way of drawing 3D Gaussians.
+"""Render and detect markers in a captured scene: an AprilTag and a QR code next to a figure in three views;
+and render the figure at close distance with each projection of 3D Gaussians.
 
     python benchmarks/real_scene.py biker.compressed.ply -o real-scene
 
-Takes any splat file whose y axis points down; the signs are sized and placed by its bounds. Writes the
-pictures, sheets of them (sheet.png, ways.png) and figures.json into the folder, and prints times and pose
-errors. Exit status 1 when a sign is missed.
+Accepts any splat file whose y axis points down; size and position of the signs follow from its bounds. Writes
+images, sheets of them (sheet.png, ways.png) and figures.json into the folder, and prints times and pose
+errors. The exit status is 1 if a sign is missed.
 """
 
 import argparse
@@ -29,21 +29,21 @@ from fidsplat.vision import read_back
 
 WIDTH, HEIGHT, FOV_X = 1280, 720, math.radians(60.0)
 BACKGROUND = (0.72, 0.74, 0.76)
-# degrees that the camera stands to the side of the signs' front, and what share of the distance above their
-# middle
+# horizontal angle of the camera to the normal of the signs in degrees, and height above their centre relative
+# to the distance
 VIEWS = {"front": (0.0, 0.0), "40 degrees": (40.0, 0.15), "60 degrees": (-60.0, 0.05)}
 FRAMES = 5
-WAYS = ("flattened", "ewa", "exact")
-# distances of the camera from what is seen close by, in heights of the figure
+PROJECTIONS = ("flattened", "ewa", "exact")
+# distances of close views in heights of the figure
 CLOSE = {"0.55 heights away": 0.55, "0.15 heights away": 0.15}
-# the signs face -x, as the figure does: columns right, down and away of someone who looks along +x
+# the signs face -x like the figure: columns are right, down and forward for a viewer who looks along +x
 FACING = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("file", help="splat file, y down")
-    parser.add_argument("-o", "--out", default="real-scene", help="folder for pictures and figures")
+    parser.add_argument("-o", "--out", default="real-scene", help="folder for images and figures")
     parser.add_argument("--device", default="opencl")
     words = parser.parse_args()
     try:
@@ -91,12 +91,12 @@ def run(file: str, folder: Path, device: str) -> int:
         figures["views"][view] = {
             "stages_ms": best,
             "frame_ms": sum(best.values()),
-            "frame_cpu_ms": min(busy),  # of all cores, whatever else holds them
+            "frame_cpu_ms": min(busy),  # CPU time of all cores, without other processes
             "detect_ms": reading_ms,
             "markers": [reading.as_dict() for reading in readings],
         }
     write_png(folder / "sheet.png", contact_sheet([sheet], width=600))
-    rows, figures["psnr_to_ewa_db"] = in_all_ways(renderer, cloud)
+    rows, figures["psnr_to_ewa_db"] = with_each_projection(renderer, cloud)
     write_png(folder / "ways.png", contact_sheet(rows, width=480))
     (folder / "figures.json").write_text(json.dumps(figures, indent=2))
     report(figures)
@@ -104,8 +104,7 @@ def run(file: str, folder: Path, device: str) -> int:
 
 
 def with_signs(cloud: fs.SplatCloud) -> fs.Scene:
-    """The cloud with a tag to the left and a QR code to the right of it, as one who looks along +x sees
-    them."""
+    """The cloud with a tag to the left and a QR code to the right of it, for a viewer who looks along +x."""
     low, high = extent(cloud)
     middle, height = (low + high) / 2, high[1] - low[1]
     reach = 0.35 * height
@@ -131,9 +130,9 @@ def views(cloud: fs.SplatCloud) -> dict[str, fs.Camera]:
     return cameras
 
 
-def in_all_ways(renderer: fs.Renderer, cloud: fs.SplatCloud) -> tuple[list, dict]:
-    """Rows of a sheet, each a distance with the figure flattened, by EWA and exact; and PSNR against EWA, by
-    distance and way."""
+def with_each_projection(renderer: fs.Renderer, cloud: fs.SplatCloud) -> tuple[list, dict]:
+    """Rows of a sheet, one for each distance, with the figure flattened, by EWA and exact; and PSNR against
+    EWA by distance and projection."""
     low, high = extent(cloud)
     height = high[1] - low[1]
     target = (low + high) / 2 - [0.0, 0.28 * height, 0.0]
@@ -148,12 +147,12 @@ def in_all_ways(renderer: fs.Renderer, cloud: fs.SplatCloud) -> tuple[list, dict
                 quality=fs.Quality() if way == "flattened" else fs.Quality(ellipsoid=way),
                 background=BACKGROUND,
             )["rgb"]
-            for way in WAYS
+            for way in PROJECTIONS
         }
         rows.append([(f"{way}, {name}", to_uint8(image)) for way, image in images.items()])
         figures[name] = {
             way: -10 * math.log10(float(((images[way] - images["ewa"]) ** 2).mean()))
-            for way in WAYS
+            for way in PROJECTIONS
             if way != "ewa"
         }
     return rows, figures

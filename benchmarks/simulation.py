@@ -26,45 +26,46 @@ from fidsplat.vision import read_back
 from fidsplat.vision.readback import Reading
 
 SIZE, DISTANCE = 0.16, 1.5
-"""metres: the tag's edge, and how far it is"""
+"""metres: edge of the tag, and its distance"""
 TILT = math.radians(50)
-"""of the tag, at most"""
+"""maximum tilt of the tag in radians"""
 
 
 def tag_poses(count: int) -> np.ndarray:
-    """(count, 7) camera from tag: anywhere in a picture of 640 x 480 and 60 degrees, tilted by up to TILT."""
+    """Random poses (count, 7) camera from tag within an image of 640 x 480 and 60 degrees, tilted by up to
+    TILT."""
     rng = np.random.default_rng(0)
     across, down = rng.uniform(-0.45, 0.45, count), rng.uniform(-0.32, 0.32, count)
     rays = np.stack([across, down, np.ones(count)], 1)
     places = DISTANCE * rays / np.linalg.norm(rays, axis=1, keepdims=True)
     axes, angles = rng.normal(size=(count, 2)), rng.uniform(0, TILT, count)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    turns = np.column_stack([np.cos(angles / 2), np.sin(angles / 2)[:, None] * axes, np.zeros(count)])
-    return np.concatenate([places, turns], 1)
+    quaternions = np.column_stack([np.cos(angles / 2), np.sin(angles / 2)[:, None] * axes, np.zeros(count)])
+    return np.concatenate([places, quaternions], 1)
 
 
 def readings(renderer: fs.Renderer, count: int) -> list[Reading]:
-    """A tag before the camera, read in every environment."""
+    """Readings of a tag in front of the camera, for random poses."""
     camera = fs.Camera.look_at(640, 480, math.radians(60), (0, 0, 0), (0, 0, 1))
     scene = fs.Scene(markers=(PlacedMarker(fs.marker("apriltag:36h11:5", size=SIZE)),), background=(0.5,) * 3)
     rig = Rig(scene, {1: "tag"}, {"camera": camera}, renderer=renderer)
     found = []
     for pose in tag_poses(count):
-        pictures = rig.render({"tag": pose[None]})
-        found += read_back(pictures.of("camera").frame(0), scene).readings
+        images = rig.render({"tag": pose[None]})
+        found += read_back(images.of("camera").frame(0), scene).readings
     return found
 
 
 def environments_a_second(
     renderer: fs.Renderer, count: int, side: int, splats: int, repeats: int, quality: str
 ) -> dict[str, float]:
-    """The median of steps in which every environment's tag has moved: a second, and a second that the process
-    had of a core, which on a busy machine tells more, rgb on the host; and a second, rgb left on the device.
+    """Environments per second, per second of CPU time (more reliable on a busy machine), both with rgb on the
+    host, and per second with rgb on the device. Medians over steps in which every tag moves.
     """
-    room = random_splats(splats, 3, depth=(2.0, 6.0), scale=(0.02, 0.2), across=1.5)
+    background = random_splats(splats, 3, depth=(2.0, 6.0), scale=(0.02, 0.2), across=1.5)
     tag = PlacedMarker(fs.marker("apriltag:36h11:5", size=0.5), rigid_matrix((0, 0, 0)))
     camera = fs.Camera.look_at(side, side, math.radians(60), (0, 0, 0), (0, 0, 1))
-    scene = fs.Scene((room.with_labels(0),), markers=(tag,), quality=quality)
+    scene = fs.Scene((background.with_labels(0),), markers=(tag,), quality=quality)
     rig = Rig(scene, {1: "tag"}, {"c": camera}, renderer=renderer)
     rng = np.random.default_rng(1)
     seconds: list[tuple[float, float, float]] = []
@@ -72,24 +73,24 @@ def environments_a_second(
         pose = np.tile([0, 0, DISTANCE, 1.0, 0, 0, 0], (count, 1))
         pose[:, :2] += rng.uniform(-0.3, 0.3, (count, 2))
         start, begun = time.perf_counter(), time.process_time()
-        pictures = rig.render({"tag": pose}).wait()
-        drawn = time.perf_counter()
-        _ = pictures["rgb"]
-        seconds.append((time.perf_counter() - start, time.process_time() - begun, drawn - start))
-    # the first compiles
+        images = rig.render({"tag": pose}).wait()
+        rendered = time.perf_counter()
+        _ = images["rgb"]
+        seconds.append((time.perf_counter() - start, time.process_time() - begun, rendered - start))
+    # the first step compiles
     rates = (count / np.median(seconds[1:], axis=0)).tolist()
     names = ("environments_a_second", "environments_a_core_second", "environments_a_second_on_the_device")
     return dict(zip(names, rates, strict=True))
 
 
 def main() -> int:
-    """Measure, print, and keep."""
+    """Measure, print and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--device", default=None)
     parser.add_argument("--tags", type=int, default=50, help="poses of the tag")
     parser.add_argument("--environments", type=int, default=64)
     parser.add_argument("--side", type=int, default=128, help="pixels")
-    parser.add_argument("--splats", type=int, default=2000, help="of the room that environments share")
+    parser.add_argument("--splats", type=int, default=2000, help="of the background that environments share")
     parser.add_argument("--quality", default="standard", help="of environments: standard,order=centre ...")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", default=None, help="file for the figures")

@@ -2,13 +2,13 @@
 
     python benchmarks/store_views.py [--splats 20e6] [--places 1 5 50] [--errors 0.004 0.016] [--json FILE]
 
-Builds a city once (`fidsplat.worlds.city`; under --folder it is kept), measures its levels of detail, and
-places it on a grid. For each number of places a camera comes down from where all is in the picture to a
-street. Of each view and allowed error: seconds of the first frame, of the next view, 1 % of its distance
-further, and of that once more; splats and nodes that it is drawn of, of how many; its largest difference from
-the exact picture, where that is drawn: of scenes of at most --exact splats in sight; what the device holds,
-and the process's peak memory. With --path also the milliseconds of so many views from the first to the last,
-each once. `standard` are exact pictures at the default quality, which leave out what lies beside the picture.
+Builds a city once (`fidsplat.worlds.city`, cached in --folder), measures its levels of detail, and places it
+on a grid. For each number of instances there are three views, from an overview to a street. Reported for each
+view and allowed error: seconds of the first frame, of the next view (moved by 1 % of the distance) and of
+that view repeated; numbers of rendered splats and nodes; the maximum difference from the exact frame, which
+is rendered if at most --exact splats are visible; device memory and peak memory of the process. --path adds
+the milliseconds of the views of a path through these views. `standard` are exact frames at the default
+quality, with frustum culling only.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from fidsplat.worlds.city import City
 
 
 def path_of(city: City, folder: Path) -> Path:
-    """Where the city's store is kept."""
+    """Path of the city's store."""
     return folder / f"city-{city.splats}-{city.houses}.fss"
 
 
 def placed(store: fs.Store, city: City, places: int, folder: Path) -> fs.Store:
-    """The city so many times, on a grid of streets."""
+    """The city instanced on a grid of streets."""
     if places == 1:
         return store
     side = math.ceil(math.sqrt(places))
@@ -47,7 +47,7 @@ def placed(store: fs.Store, city: City, places: int, folder: Path) -> fs.Store:
 
 
 def views(store: fs.Store, size: tuple[int, int]) -> dict[str, fs.Camera]:
-    """From above all, over the roofs at one side, and in a street."""
+    """Cameras of an overview, above the roofs at one side, and in a street."""
     low, high = store.bounds()
     middle, side = (low + high) / 2, float((high - low).max())
     street = np.array([middle[0], -1.7, low[2] - 4.0])
@@ -61,27 +61,27 @@ def views(store: fs.Store, size: tuple[int, int]) -> dict[str, fs.Camera]:
 
 
 def further(camera: fs.Camera) -> fs.Camera:
-    """The camera moved by 1 % of its distance from the ground."""
+    """The camera moved by 1 % of its height above the ground."""
     pose = camera.world_to_camera.copy()
     pose[0, 3] += 0.01 * abs(camera.position[1])
     return camera.with_pose(pose)
 
 
 def timed(renderer: fs.Renderer, resident, capture: fs.Capture) -> tuple[np.ndarray, list[float], dict]:
-    """A picture; seconds of it, of the next view and of that once more; and its counts."""
-    seconds, pictures, frame = [], [], None
+    """An image; seconds of it, of the next view and of that view repeated; and counts of the last frame."""
+    seconds, images, frame = [], [], None
     next_view = capture.with_(camera=further(capture.camera))
     for one in (capture, next_view, next_view):
         begun = time.perf_counter()
         frame = renderer.render(resident, one)
-        pictures.append(frame["rgb"])
+        images.append(frame["rgb"])
         seconds.append(time.perf_counter() - begun)
     assert frame is not None
-    return pictures[0], seconds, dict(frame.stats)
+    return images[0], seconds, dict(frame.stats)
 
 
 def along(store: fs.Store, renderer: fs.Renderer, arguments, error: float) -> dict:
-    """Milliseconds of each view of a path from above all to the street."""
+    """Milliseconds of each view of a path from the overview to the street."""
     width, height = map(int, arguments.size.split("x"))
     size = width, height
     places = [camera.position for camera in views(store, size).values()]
@@ -117,19 +117,19 @@ def measure(store: fs.Store, renderer: fs.Renderer, arguments) -> list[dict]:
             begun = time.perf_counter()
             selection = select(splats, [view], features, splats.cell_sizes(quality))
             chosen = time.perf_counter() - begun
-            seen = sum(int(store.counts(np.array(nodes)).sum()) for nodes in selection.nodes if nodes)
-            row = {"view": name, "splats": len(store), "error": error, "drawn": seen}
+            visible = sum(int(store.counts(np.array(nodes)).sum()) for nodes in selection.nodes if nodes)
+            row = {"view": name, "splats": len(store), "error": error, "drawn": visible}
             row |= {"nodes": len(selection), "choose_s": chosen}
-            if seen <= arguments.exact:
+            if visible <= arguments.exact:
                 resident = renderer.upload(store)
-                picture, row["s"], row["stats"] = timed(renderer, resident, capture)
+                image, row["s"], row["stats"] = timed(renderer, resident, capture)
                 row["device_bytes"] = resident.memory_bytes
-                exact = picture if error == 0 else exact
+                exact = image if error == 0 else exact
                 if exact is not None:
-                    row["off"] = float(np.abs(picture - exact).max())
+                    row["off"] = float(np.abs(image - exact).max())
             row["peak_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
             rows.append(row)
-            PROGRESS.print(f"{len(store):,} {name} {error}: {seen:,} splats, {row.get('s')}")
+            PROGRESS.print(f"{len(store):,} {name} {error}: {visible:,} splats, {row.get('s')}")
     return rows
 
 
@@ -139,12 +139,14 @@ def main() -> None:
     parser.add_argument("--houses", type=int, default=8)
     parser.add_argument("--places", type=int, nargs="+", default=[1, 5, 50])
     parser.add_argument("--errors", type=float, nargs="+", default=[1 / 255, 4 / 255])
-    parser.add_argument("--exact", type=float, default=1e8, help="most splats in sight that are drawn")
+    parser.add_argument(
+        "--exact", type=float, default=1e8, help="maximum number of visible splats of exact frames"
+    )
     parser.add_argument("--views", nargs="+", default=["all", "roofs", "street"], help="of these three")
     parser.add_argument("--path", type=int, default=0, help="views of a path, for each error")
     parser.add_argument("--measured", type=int, default=8, help="views that errors are measured with")
     parser.add_argument("--size", default="1920x1080")
-    parser.add_argument("--folder", default="fidsplat-stores", help="where stores are kept")
+    parser.add_argument("--folder", default="fidsplat-stores", help="folder of the stores")
     arguments = parser.parse_args()
     city, folder = City(int(arguments.splats), arguments.houses), Path(arguments.folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -168,7 +170,18 @@ def main() -> None:
         keep({**about, "rows": rows, "paths": paths}, arguments.json)
     show(
         f"{about['device']}, {arguments.size}",
-        ("splats", "view", "error", "drawn", "first [s]", "next [s]", "same [s]", "off by", "device", "peak"),
+        (
+            "splats",
+            "view",
+            "error",
+            "rendered",
+            "first [s]",
+            "next [s]",
+            "same [s]",
+            "off by",
+            "device",
+            "peak",
+        ),
         (
             (
                 f"{row['splats']:,}",

@@ -4,8 +4,8 @@ import pytest
 from conftest import CLOCK
 
 
-def drawn(run):
-    """One frame, finished."""
+def render(run):
+    """Render one frame and wait for it."""
     return run.render().wait()
 
 
@@ -16,13 +16,13 @@ def facts(benchmark, run) -> None:
 @pytest.mark.benchmark(group="frame")
 def test_frame(benchmark, run):
     facts(benchmark, run)
-    benchmark.pedantic(drawn, (run,), rounds=10, warmup_rounds=2)
+    benchmark.pedantic(render, (run,), rounds=10, warmup_rounds=2)
 
 
 @pytest.mark.benchmark(group="stage", timer=CLOCK)
 def test_stage(benchmark, run, stage):
     def one():
-        CLOCK.seconds += 1e-3 * drawn(run).timings[stage]
+        CLOCK.seconds += 1e-3 * render(run).timings[stage]
 
     facts(benchmark, run)
     benchmark.pedantic(one, rounds=10, warmup_rounds=2)

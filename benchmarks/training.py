@@ -2,11 +2,10 @@
 
     python benchmarks/training.py [SCENE ...] [--device opencl] [--degree 3] [--repeats 30] [--json FILE]
 
-A step is a picture, its loss, its derivatives and the optimiser, all splats included; none are made. It is
-timed on the clock, from the end of one step to that of the next, which waits for the loss: the median and the
-quartiles of the steps after ten that are not counted. The process's CPU time of a step, all cores together,
-is the mean of them; on a CPU that others use too it says more. The host's: of the thread that
-launches.
+A step is a frame, its loss, its gradients and the optimiser for all splats, without densification. It is
+timed by the clock, from the end of one step to the end of the next, which waits for the loss: median and
+quartiles of the steps after ten warm-up steps. CPU time of the process is the mean over steps and all cores,
+which is more reliable on a busy CPU. `host` is the CPU time of the launching thread.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ WARM = 10
 
 
 def trainer_of(name: str, renderer: fs.Renderer, degree: int, steps: int) -> Trainer:
-    """A trainer whose SH have their degree after a few steps, and that makes no splats."""
+    """A trainer without densification whose SH degree is reached after a few steps."""
     cloud, camera = load_scene(name)
     other, _ = load_scene(name, seed=1)
     aside = camera.world_to_camera.copy()
@@ -51,7 +50,7 @@ def trainer_of(name: str, renderer: fs.Renderer, degree: int, steps: int) -> Tra
 
 
 def measure(name: str, renderer: fs.Renderer, degree: int, repeats: int) -> dict:
-    """Milliseconds of a step."""
+    """Milliseconds of a training step."""
     trainer = trainer_of(name, renderer, degree, WARM + repeats)
     for _ in range(WARM):
         trainer.step()

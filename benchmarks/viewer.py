@@ -1,9 +1,9 @@
-"""How fast the viewer draws while one looks around: pictures a second, their size, and the time from a new
+"""Measure the viewer while the camera moves: frames per second, their size, and the latency from a new
 viewpoint to its JPEG.
 
-Random splats, as `fidsplat bench` has them, are looked at by a browser that is none: it turns its view as
-soon as it has a picture, and takes the JPEG that a page would get, which is made while the next picture is
-drawn. Drawn: until its bytes are on the host. CPU time is of all cores together, of one picture.
+A simulated browser rotates its view of the random splats of `fidsplat bench` after each frame, and receives
+the JPEG of the page, which is encoded while the next frame is rendered. `rendered` is the time until the
+bytes are on the host. CPU time is of one frame, over all cores.
 
     PYTHONPATH=. python benchmarks/viewer.py
     PYTHONPATH=. python benchmarks/viewer.py --device opencl:nvidia --splats 1000000 --size 1920 1080
@@ -27,7 +27,7 @@ from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
 
 STEP, SWING = 0.01, 0.3
-"""radians that the view turns from picture to picture, to and fro, and how far: the splats stay in view"""
+"""radians: rotation between frames, and amplitude of the oscillation, which keeps the splats visible"""
 
 
 def main() -> None:
@@ -55,8 +55,8 @@ def main() -> None:
     title = session.state.renderer.device.title
     print(f"{words.splats:,} splats, {width} x {height}, {title}")
     print(
-        "| aim | pictures a second | scale | drag to JPEG, median | 95 % | drawn | JPEG | CPU time | size "
-        "| exact picture |"
+        "| aim | frames a second | scale | drag to JPEG, median | 95 % | rendered | JPEG | CPU time | size "
+        "| exact frame |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for rate in words.rate:
@@ -65,13 +65,13 @@ def main() -> None:
 
 
 def measured(session: Session, start: Viewpoint, rate: float, seconds: float) -> str:
-    """A row of the table."""
-    latencies, sizes, scales, drawn, encoding, arguments = [], [], [], [], [], 0.0
+    """Measure a row of the table."""
+    latencies, sizes, scales, rendering, encoding, arguments = [], [], [], [], [], 0.0
 
     def moving(viewpoint: Viewpoint, scale: float) -> Callable[[], None]:
         begun = arguments
         image = session.render_moving(viewpoint, scale).to_uint8()
-        drawn.append(time.perf_counter() - begun)
+        rendering.append(time.perf_counter() - begun)
 
         def send() -> None:
             taken = time.perf_counter()
@@ -86,35 +86,35 @@ def measured(session: Session, start: Viewpoint, rate: float, seconds: float) ->
         encoded(session.render(viewpoint).frame.to_uint8(), "png")
 
     stream = Stream(moving, rest, rate=rate)
-    for warm in range(10):  # the scale finds its place
-        stream.set_viewpoint(turned(start, -STEP * (warm + 1)))
+    for warm in range(10):  # the scale converges
+        stream.set_viewpoint(rotated(start, -STEP * (warm + 1)))
         arguments = time.perf_counter()
         stream.step()
-    del latencies[:], sizes[:], scales[:], drawn[:], encoding[:]
+    del latencies[:], sizes[:], scales[:], rendering[:], encoding[:]
     begun, worked = time.perf_counter(), time.process_time()
     while time.perf_counter() - begun < seconds:
-        stream.set_viewpoint(turned(start, SWING * math.sin(STEP / SWING * len(drawn))))
+        stream.set_viewpoint(rotated(start, SWING * math.sin(STEP / SWING * len(rendering))))
         arguments = time.perf_counter()
         stream.step()
-    fps = len(drawn) / (time.perf_counter() - begun)
-    work = 1e3 * (time.process_time() - worked) / len(drawn)
+    fps = len(rendering) / (time.perf_counter() - begun)
+    work = 1e3 * (time.process_time() - worked) / len(rendering)
     begun = time.perf_counter()
     rest(start)
     exact = time.perf_counter() - begun
     middle, late = 1e3 * np.percentile(latencies, (50, 95))
     return (
         f"| {rate:g} | {fps:.1f} | {np.median(scales):.2f} | {middle:.1f} ms | {late:.1f} ms "
-        f"| {1e3 * np.median(drawn):.1f} ms | {1e3 * np.median(encoding):.1f} ms | {work:.0f} ms "
+        f"| {1e3 * np.median(rendering):.1f} ms | {1e3 * np.median(encoding):.1f} ms | {work:.0f} ms "
         f"| {np.median(sizes) / 1e3:.0f} kB | {1e3 * exact:.0f} ms |"
     )
 
 
-def turned(start: Viewpoint, angle: float) -> Viewpoint:
-    """The viewpoint after turning by an angle about the page's vertical."""
-    turn = np.eye(3)
-    turn[0, 0] = turn[2, 2] = math.cos(angle)
-    turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
-    rotation = start.pose[:3, :3] @ turn
+def rotated(start: Viewpoint, angle: float) -> Viewpoint:
+    """The viewpoint rotated by an angle about the page's vertical."""
+    about_vertical = np.eye(3)
+    about_vertical[0, 0] = about_vertical[2, 2] = math.cos(angle)
+    about_vertical[0, 2], about_vertical[2, 0] = math.sin(angle), -math.sin(angle)
+    rotation = start.pose[:3, :3] @ about_vertical
     return replace(start, quaternion=tuple(matrix_to_quaternion(rotation).tolist()))
 
 

@@ -1,6 +1,6 @@
-"""Makes examples/data again, which some examples read: a sky, and a globe whose colours depend on the view.
+"""Generate examples/data for the examples: a sky, and a globe with view-dependent colours.
 
-python examples/make_data.py [FOLDER]        default: examples/data, beside this file
+python examples/make_data.py [FOLDER]        default: examples/data
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from fidsplat.images.files import write_png
 
 
 def sky() -> np.ndarray:
-    """A panorama with clouds, made of a few waves: (128, 256, 3), 0 to 1."""
+    """Panorama with clouds from a few waves: (128, 256, 3), 0 to 1."""
     v, u = np.mgrid[0:128, 0:256] / [[[128]], [[256]]]
     waves = sum(np.sin(2 * np.pi * (k * u + 3 * v * k) + k * k) / k for k in (3, 5, 8, 13, 21)) / 2
     cloud = np.clip(1.5 * waves + 0.4, 0, 1)[..., None] * np.clip(2.4 - 4 * v, 0, 1)[..., None]
@@ -24,17 +24,17 @@ def sky() -> np.ndarray:
 
 
 def globe(degree: int = 3, n: int = 1500) -> fs.SplatCloud:
-    """A sphere of radius 0.5 m around the origin, of n splats with spherical harmonics up to a degree."""
+    """Sphere of radius 0.5 m around the origin, of n splats with spherical harmonics up to a degree."""
     z = 1 - (2 * np.arange(n) + 1) / n
     turn = np.pi * (1 + 5**0.5) * np.arange(n)
     normals = np.column_stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
-    # the quaternion that turns (0, 0, 1) to the normal
+    # quaternion that rotates (0, 0, 1) to the normal
     quats = np.column_stack([1 + z, -normals[:, 1], normals[:, 0], np.zeros(n)])
     sh = np.zeros((n, (degree + 1) ** 2, 3), np.float32)
     shade = 0.5 + 0.35 * np.sin(7 * turn)[:, None] * [0.2, 0.6, 1.0]
     sh[:, 0] = (shade - 0.5) / 0.2820948
     shine = np.random.default_rng(0).normal(0, 0.5, sh.shape[1])
-    # each degree falls off as its square, so that what a degree adds is seen and does not drown the rest
+    # coefficients fall with the square of the degree, so that all degrees are visible
     weights = np.concatenate([np.full(2 * k + 1, 1 / max(k, 1) ** 1.5) for k in range(degree + 1)])
     sh[:, 1:] = (shine * weights)[1:, None]
     return fs.SplatCloud(0.5 * normals, quats, np.full((n, 2), 0.97 / np.sqrt(n)), np.full(n, 0.95), sh=sh)

@@ -1,4 +1,4 @@
-"""A headless Chromium, driven through its DevTools protocol by the websockets that viser brings."""
+"""Control of a headless Chromium by the DevTools protocol, with viser's dependency websockets."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _FLAGS = (
 
 
 def program() -> str | None:
-    """The Chromium of this machine, if there is one."""
+    """Path of an installed Chromium, or None."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
 class Page:
-    """One page of a browser of its own, of (width, height) pixels; a context manager."""
+    """Context manager of a page of (width, height) pixels in its own browser."""
 
     def __init__(self, address: str, width: int, height: int) -> None:
         self._address, self._size, self._number = address, (width, height), 0
@@ -95,22 +95,22 @@ class Page:
                 return answer["result"]
 
     def evaluate(self, script: str) -> Any:
-        """The value of an expression in the page."""
+        """Evaluate an expression in the page."""
         found = self._call("Runtime.evaluate", expression=script, returnByValue=True)
         return found["result"].get("value")
 
-    def picture(self) -> np.ndarray:
-        """What the page shows, (h, w, 3) uint8 RGB."""
+    def screenshot(self) -> np.ndarray:
+        """Screenshot of the page, (h, w, 3) uint8 RGB."""
         data = base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
 
     def mouse(self, kind: str, x: float, y: float) -> None:
-        """mousePressed, mouseMoved or mouseReleased, by the left button."""
-        held = {"button": "left", "buttons": 0 if kind == "mouseReleased" else 1, "clickCount": 1}
-        self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
+        """Send mousePressed, mouseMoved or mouseReleased, with the left button."""
+        pressed = {"button": "left", "buttons": 0 if kind == "mouseReleased" else 1, "clickCount": 1}
+        self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **pressed)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
-        """Press at a place, move to another in steps, release there."""
+        """Drag with the left button from start to end in steps."""
         self.mouse("mousePressed", *start)
         for k in range(1, steps + 1):
             share = k / steps
@@ -119,7 +119,7 @@ class Page:
         self.mouse("mouseReleased", *end)
 
     def key(self, name: str) -> None:
-        """Press and release a key, "ArrowRight" say, of what has the focus."""
+        """Press and release a key, e.g. "ArrowRight", in the focused element."""
         code = {"ArrowRight": 39, "ArrowLeft": 37, "Home": 36, "End": 35}[name]
         for kind in ("keyDown", "keyUp"):
             self._call("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=code)

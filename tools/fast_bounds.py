@@ -1,10 +1,11 @@
-"""The error of the short exponential and logarithm (`Quality.arithmetic`) over every argument, on a device.
+"""Measure the error of the fast exponential and logarithm (`Quality.arithmetic`) over all arguments on a
+device.
 
     python tools/fast_bounds.py [--device D] [--no-fma]     about a minute on two cores
 
-Every float32 from -87 to -2^-26 for the exponential (nearer to 0 it is 1), every one from 2^-24 to 1 for the
-logarithm, against float64. The functions are sums and products that all devices round alike, so that what one
-device shows, all keep that fuse or do not fuse multiply-adds as it does (--no-fma).
+Compares every float32 from -87 to -2^-26 for the exponential (it is 1 closer to 0), and every one from 2^-24
+to 1 for the logarithm, with float64. The functions consist of sums and products, which all devices round
+equally: the result holds for all devices with fused multiply-adds, or for all without them (--no-fma).
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ NAMES = {"exp": np.exp, "fast_exp": np.exp, "log": np.log, "fast_log": np.log}
 
 
 def every(low: float, high: float) -> Iterator[np.ndarray]:
-    """Every float32 from low > 0 to high as float64, `AT_ONCE` at a time, the last of them `high` again and
-    again."""
+    """Every float32 from low > 0 to high as float64, in arrays of `AT_ONCE`, the last one padded by
+    `high`."""
     first, end = _bits(low, high)
     for start in range(first, end, AT_ONCE):
         bits = np.minimum(start + np.arange(AT_ONCE), end - 1).astype(np.uint32)
@@ -45,15 +46,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--device", help="see `fidsplat devices`")
-    parser.add_argument("--no-fma", action="store_true", help="as on a device without them (OpenCL)")
+    parser.add_argument(
+        "--no-fma", action="store_true", help="emulate a device without fused multiply-adds (OpenCL)"
+    )
     options = parser.parse_args()
     renderer = fs.Renderer(options.device)
     backend = renderer.backend
     if not backend.traits.probed:
-        parser.error(f"{renderer.device.name} runs no functions alone")
+        parser.error(f"--device must run single functions, got {renderer.device.name}; use an OpenCL device")
     if options.no_fma:
         if not isinstance(backend, OpenCLBackend):
-            parser.error("--no-fma: only OpenCL draws without them")
+            parser.error("--no-fma must be used with an OpenCL device")
         backend.shape = replace(backend.shape, fast_fma=False)
     most = dict.fromkeys(NAMES, 0.0)
     pairs = zip_longest(every(*EXPONENTS), every(*SHARES), fillvalue=np.ones(AT_ONCE))

@@ -2,19 +2,18 @@
 
     python tools/fit_templates.py [-o FILE] [--sizes N ...] [--starts N] [--rounds N]
 
-A size is the number of Gaussians of a rectangle that is not long; those that are not named stay in the file
-as they are.
-Needs scipy (extra `dev`); takes some minutes on one core; the same numbers on every run of one set of library
-versions. Two stages, both L-BFGS-B on analytic gradients, symmetric under mirrors by construction:
+A size is the number of Gaussians of a rectangle that is not long; sizes that are not named stay unchanged in
+the file. Requires scipy (extra `dev`) and some minutes on one core; results are reproducible with the same
+library versions. There are two stages, both L-BFGS-B with analytic gradients, mirror-symmetric by
+construction:
 
-1. For each class of aspect ratio, one rectangle alone: the mean square of (coverage - indicator) around it,
-   from several random starts. Of one colour alone the order of compositing does not matter.
+1. For each class of aspect ratio, a single rectangle: the mean square of (coverage - indicator) around it,
+from several random starts. With one colour the order of compositing does not matter.
 2. All classes together on parts of real markers, both colours, against the ideal texture, over black, grey
-   and white backgrounds: as the renderer draws coplanar splats (one layer, colours weighted by optical
-   depth) and as others do, in the order of the splats' centres along two directions.
+   and white backgrounds: composited as a coplanar group (one layer, colours weighted by optical depth), and
+   like other renderers in the order of the splats' centres along two directions.
 
-Samples stand at random places of a stratified grid: on a regular one, lines thinner than its step would
-slip through.
+Samples have random positions in the cells of a grid: a regular grid would miss lines thinner than its step.
 """
 
 from __future__ import annotations
@@ -37,13 +36,13 @@ from fidsplat.markers.seams import grow
 from fidsplat.util.files import atomic_write
 
 GROWTH = 0.4  # modules; measured together with the templates, see docs/markers.md
-THINNEST = 0.025  # least sigma in half widths: thinner lines alias between the samples of a pixel
-LONGEST = {"c": 0.42, "x": 0.42, "y": 0.42, "q": 0.25}  # largest sigma: longer lines show as hairs at corners
-FEW, LONGEST_OF_FEW = 13, 0.8  # below so many Gaussians they must be wide, hairs or not
+THINNEST = 0.025  # minimum sigma in half widths: thinner lines alias between the samples of a pixel
+LONGEST = {"c": 0.42, "x": 0.42, "y": 0.42, "q": 0.25}  # maximum sigma: longer lines are visible at corners
+FEW, LONGEST_OF_FEW = 13, 0.8  # fewer Gaussians than this must be wide, in spite of these lines
 CUT = 1 / 255
-# largest aspect ratio, aspect ratio of stage 1
+# maximum aspect ratio of each class, and aspect ratio of stage 1
 CLASSES = ((2.5, 1.0), (6.0, 4.0), (10.0, 9.0))
-# of each class, beside the one in the middle: pairs on the long axis, pairs on the short axis, fours
+# for each class, in addition to the central Gaussian: pairs on the long axis, pairs on the short axis, fours
 COUNTS = {
     1: ((0, 0, 0), (0, 0, 0), (0, 0, 0)),
     5: ((1, 1, 0), (1, 1, 0), (1, 1, 0)),
@@ -91,7 +90,7 @@ class Symmetric:
 def minimise(
     function, raw: np.ndarray, thinnest: np.ndarray, longest: np.ndarray, iterations: int
 ) -> tuple[np.ndarray, float]:
-    """L-BFGS-B within bounds; thinnest (m, 2) and longest (m,) are the least and largest sigmas."""
+    """L-BFGS-B within bounds; thinnest (m, 2) and longest (m,) are the minimum and maximum sigmas."""
     low = np.column_stack([np.zeros((len(raw), 2)), np.log(thinnest), np.full(len(raw), 0.02)])
     reach, one = np.log(longest), np.ones(len(raw))
     high = np.column_stack([1.3 * one, 1.3 * one, reach, reach, one])
@@ -101,10 +100,12 @@ def minimise(
     return found.x.reshape(raw.shape), float(found.fun)
 
 
-# ---- stage 1: one rectangle alone
+# ---- stage 1: a single rectangle
 
 
-def alone(slots: np.ndarray, x: np.ndarray, y: np.ndarray, inside: np.ndarray) -> tuple[float, np.ndarray]:
+def coverage_loss(
+    slots: np.ndarray, x: np.ndarray, y: np.ndarray, inside: np.ndarray
+) -> tuple[float, np.ndarray]:
     """Mean square error of coverage on a grid of one quadrant, and its gradient (n, 5)."""
     px, py, sx, sy, opacity = slots.T[:, :, None]
     ux, uy = (x - px) / sx, (y - py) / sy
@@ -121,8 +122,8 @@ def alone(slots: np.ndarray, x: np.ndarray, y: np.ndarray, inside: np.ndarray) -
     return float((off * off).sum() / inside.sum()), np.column_stack(columns)
 
 
-def fit_alone(aspect: float, counts: tuple[int, int, int], starts: int) -> np.ndarray:
-    """The best of several random starts for one rectangle of that aspect ratio: raw (m, 5)."""
+def fit_single(aspect: float, counts: tuple[int, int, int], starts: int) -> np.ndarray:
+    """Raw parameters (m, 5) of the best of several random starts for a rectangle of an aspect ratio."""
     model = Symmetric([counts])
     thinnest = np.tile([THINNEST / aspect, THINNEST], (model.m, 1))
 
@@ -133,7 +134,7 @@ def fit_alone(aspect: float, counts: tuple[int, int, int], starts: int) -> np.nd
 
         def function(v: np.ndarray):
             slots = model.slots(v.reshape(-1, 5))
-            error, g = alone(slots, x, y, inside)
+            error, g = coverage_loss(slots, x, y, inside)
             return error, model.gradient(slots, g).ravel()
 
         return minimise(function, raw, thinnest, model.longest, iterations)
@@ -159,7 +160,7 @@ def fit_alone(aspect: float, counts: tuple[int, int, int], starts: int) -> np.nd
 
 @dataclass
 class Layout:
-    """A window of a marker, sampled; `loss` compares its splats with the ideal texture."""
+    """Sampled window of a marker; `loss` compares its splats with the ideal texture."""
 
     grid: np.ndarray
     model: Symmetric
@@ -201,7 +202,8 @@ class Layout:
         return np.column_stack([self.centre + self.half * t[:, :2], self.half * t[:, 2:4], t[:, 4]])
 
     def freeze(self, slots: np.ndarray) -> None:
-        """Fix which splat meets which sample, and the orders, for one round; with room for splats to grow."""
+        """Compute the pairs of splats and samples, and the orders, for one round, with a margin for larger
+        splats."""
         x, y, sx, sy, opacity = self._placed(slots).T
         reach = 1.3 * np.sqrt(2 * np.log(np.maximum(opacity, 1.01 * CUT) / CUT))
         x0, x1 = np.searchsorted(self.x, x - reach * sx), np.searchsorted(self.x, x + reach * sx)
@@ -248,18 +250,18 @@ class Layout:
 
 
 def _off(value: np.ndarray, left: np.ndarray, ideal: np.ndarray, sample: np.ndarray):
-    """Error of pictures over each background: yields background, its mean square error, the error at
-    samples hit.
-    """
+    """Errors for each background: yields background, its mean square error, and the errors at covered
+    samples."""
     for background in BACKGROUNDS:
-        picture = np.full(len(ideal), background)
-        picture[sample] = value + left * background
-        off = picture - np.where(np.isnan(ideal), background, ideal)
+        image = np.full(len(ideal), background)
+        image[sample] = value + left * background
+        off = image - np.where(np.isnan(ideal), background, ideal)
         yield background, float(np.mean(off * off)) / len(BACKGROUNDS), off[sample]
 
 
 def _layered(alpha, light, start, ideal, sample) -> tuple[float, np.ndarray]:
-    """Coplanar splats as one layer (kernels/opencl/slot/compose_coplanar.cl): error, gradient of alpha."""
+    """Compositing of coplanar splats as one layer (kernels/opencl/slot/compose_coplanar.cl): error, gradient
+    by alpha."""
     tau = -np.log1p(-alpha)
     n = np.diff(start, append=len(alpha))
     depth, shone = np.add.reduceat(tau, start), np.add.reduceat(tau * light, start)
@@ -275,7 +277,7 @@ def _layered(alpha, light, start, ideal, sample) -> tuple[float, np.ndarray]:
 
 
 def _ordered(alpha, light, start, ideal, sample) -> tuple[float, np.ndarray]:
-    """Front-to-back compositing in the order given: error, gradient of alpha."""
+    """Front-to-back compositing in the given order: error, gradient by alpha."""
     n = np.diff(start, append=len(alpha))
     log_left = np.log1p(-alpha)
     total = np.cumsum(log_left)
@@ -295,7 +297,7 @@ def _ordered(alpha, light, start, ideal, sample) -> tuple[float, np.ndarray]:
 
 
 def training_grids() -> list[tuple[np.ndarray, float]]:
-    """Grids and samples per module; none of them is among those of benchmarks/marker_quality.py."""
+    """Grids and samples per module, different from those of benchmarks/marker_quality.py."""
 
     def code(length: int, seed: int) -> np.ndarray:
         text = "".join(random.Random(seed).choices(string.ascii_letters + string.digits, k=length))
@@ -306,7 +308,7 @@ def training_grids() -> list[tuple[np.ndarray, float]]:
 
 
 def fit_together(raw: np.ndarray, model: Symmetric, rounds: int) -> tuple[np.ndarray, float]:
-    """Raw parameters of all classes after stage 2, and what they reach there in dB."""
+    """Raw parameters of all classes after stage 2, and their PSNR in dB."""
     aspects = np.repeat([aspect for _, aspect in CLASSES], np.diff(model.quadrant))
     thinnest = np.column_stack([THINNEST / aspects, np.full(len(aspects), THINNEST)])
     layouts = [Layout(grid, model, per, seed) for seed, (grid, per) in enumerate(training_grids())]
@@ -314,7 +316,7 @@ def fit_together(raw: np.ndarray, model: Symmetric, rounds: int) -> tuple[np.nda
     def function(v: np.ndarray):
         slots = model.slots(v.reshape(-1, 5))
         parts = [layout.loss(slots) for layout in layouts]
-        # scaled so that the stopping rule of L-BFGS-B does not take a small error for convergence
+        # scaled, since the stopping rule of L-BFGS-B would mistake a small error for convergence
         scale = 100 / len(layouts)
         g = model.gradient(slots, sum(part[1] for part in parts))
         return scale * sum(part[0] for part in parts), scale * g.ravel()
@@ -330,10 +332,13 @@ def fit_together(raw: np.ndarray, model: Symmetric, rounds: int) -> tuple[np.nda
 
 
 def fit(size: int, starts: int, rounds: int) -> dict:
-    """The templates of a size, as the file holds them."""
+    """Fit the templates of a size, in the layout of the file."""
     model = Symmetric(list(COUNTS[size]))
     raw = np.concatenate(
-        [fit_alone(aspect, counts, starts) for (_, aspect), counts in zip(CLASSES, COUNTS[size], strict=True)]
+        [
+            fit_single(aspect, counts, starts)
+            for (_, aspect), counts in zip(CLASSES, COUNTS[size], strict=True)
+        ]
     )
     print(f"size {size}: stage 1 done", flush=True)
     raw, reached = fit_together(raw, model, rounds)
@@ -341,7 +346,7 @@ def fit(size: int, starts: int, rounds: int) -> dict:
     for (limit, _), a, b in zip(CLASSES, model.quadrant[:-1], model.quadrant[1:], strict=True):
         slots = np.column_stack([raw[a:b, :2], np.exp(raw[a:b, 2:4]), raw[a:b, 4]])
         signs = [np.abs(model.signs[model.parameter == i][0]) for i in range(a, b)]
-        # what stands for twins keeps off the axis between them
+        # mirrored Gaussians must not be on the mirror axis
         slots[:, :2] = np.maximum(slots[:, :2], 1e-4) * signs
         templates.append({"max_aspect": limit, "quadrant": np.round(slots, 4).tolist()})
     return {"size": size, "fit_db": round(reached, 2), "templates": templates}

@@ -1,14 +1,13 @@
-"""Interrupts and full disks: whether anything whole is lost, and whether the next run has the same bits.
+"""Test interrupts and full disks: no complete file may be lost, and the next run must be bit-identical.
 
     python tools/interrupt.py trials.jsonl [--commands demo,render,...] [--most 20] [--jobs 1] [--seed 0]
 
-Each command runs twice undisturbed: what agrees is its result, bit for bit (of figures and logs each value
-and each line), and the rest (times, durations) need only parse. Then it is started again and again in an
-empty folder and sent SIGINT, SIGTERM or SIGKILL at a random moment, or writes to a file system (tmpfs,
-which only root can mount) that is full after a part of what it writes. Every file that has its final name
-is looked at, and the same command runs once more, with room. A trial is a line of the file; a run that was
-stopped goes on where it was, and ends with a table of all trials. The exit status is 1 if anything was
-lost.
+Each command runs twice undisturbed: content that agrees is its expected result (values of figures and logs,
+lines of texts), and the rest (times, durations) must only parse. Each trial starts the command in an empty
+folder and sends SIGINT, SIGTERM or SIGKILL at a random moment, or lets it write to a file system (tmpfs,
+which requires root) that becomes full. All files with their final names are checked, and the same command
+runs again with enough disk space. A trial is a line of the file; a stopped run resumes, and ends with a table
+of all trials. The exit status is 1 if anything was lost.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from fidsplat.scenes.random_clouds import random_splats
 SIGNALS = ("SIGINT", "SIGTERM", "SIGKILL")
 DISK = "full disk"
 TIMED = ("repeats", "seconds.svg")
-"""values and charts that depend on the time that something takes, and may agree by chance"""
+"""values and charts that depend on measured times, which may agree by chance"""
 FIDSPLAT = (sys.executable, "-m", "fidsplat")
 SCENE = """\
 [camera]
@@ -58,18 +57,18 @@ FLIGHT = "0 0.3 0.1 -0.8 0 0 0 1\n1 0.2 0.1 -0.8 0 0 0 1\n"
 
 
 class Command(NamedTuple):
-    """A command that writes into the folder in which it runs."""
+    """A command that writes into its working folder."""
 
     words: str
     kills: int
-    """trials with a signal"""
+    """number of trials with a signal"""
     disks: int
-    """trials with a full disk"""
+    """number of trials with a full disk"""
     own_cache: bool = False
-    """compiles its kernels, into a cache in its folder"""
+    """whether it compiles its kernels, into a cache in its folder"""
 
 
-RENDER = "render ../scene.toml -o picture.png --outputs rgb,depth,normal,label"
+RENDER = "render ../scene.toml -o image.png --outputs rgb,depth,normal,label"
 COMMANDS = {
     "render": Command(RENDER, 96, 14),
     "marker": Command("marker qr-v22-L:text -o marker.ply", 61, 8),
@@ -87,16 +86,16 @@ Facts = dict[Any, Any]
 
 
 def files_below(folder: Path) -> dict[str, Path]:
-    """Files with their final names, by their names below the folder; what is temporary begins with a dot."""
+    """Files below a folder by name, without temporary ones, whose names begin with a dot."""
     names = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
     return {str(name): folder / name for name in names if not any(part[0] == "." for part in name.parts)}
 
 
 def facts(path: Path) -> Facts:
-    """What a file says: values of figures and logs by their places, lines of texts, else its digest.
+    """Content of a file: values of figures and logs by key, lines of texts, else its digest.
 
-    Raises ValueError, OSError or EOFError for a file that is not whole. A log may end within a line, which
-    the run that goes on drops.
+    Raises ValueError, OSError or EOFError for an incomplete file. A log may end within a line, which the
+    resumed run drops.
     """
     content = path.read_bytes()
     match path.suffix:
@@ -107,18 +106,18 @@ def facts(path: Path) -> Facts:
             return {
                 (json.dumps(row["key"]), *place): value
                 for row in rows
-                if "key" in row  # and not the facts of a run
+                if "key" in row  # excludes the header with facts of a run
                 for place, value in _leaves(row["result"])
                 if place[-1] not in TIMED
             }
         case ".png" | ".jpg":
             if cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) is None:
-                raise ValueError("no picture")
+                raise ValueError("not an image")
         case ".npy":
             np.load(path)
         case ".md" | ".csv" | ".svg" | ".html":
             if not content.endswith(b"\n"):
-                raise ValueError("cut off")
+                raise ValueError("truncated")
             if path.name in TIMED:
                 return {}
             return dict(enumerate(content.splitlines()))
@@ -159,12 +158,12 @@ class Trial:
         self.bytes = sum(path.stat().st_size for path in (work / "second").rglob("*") if path.is_file())
 
     def folder(self, name: str) -> Path:
-        """An empty one."""
+        """Create an empty folder."""
         (self.work / name).mkdir()
         return self.work / name
 
     def start(self, folder: Path) -> subprocess.Popen[str]:
-        """The command in a folder."""
+        """Start the command in a folder."""
         cache = {"POCL_CACHE_DIR": str(folder / ".cache")} if self.command.own_cache else {}
         (folder / ".cache").mkdir(exist_ok=True)
         words, pipe = (*FIDSPLAT, *self.command.words.split()), subprocess.PIPE
@@ -172,12 +171,12 @@ class Trial:
         return subprocess.Popen(words, cwd=folder, env=env, stdout=pipe, stderr=pipe, text=True)
 
     def run(self, folder: Path) -> tuple[int, str]:
-        """To its end: exit status, and what was said on stderr."""
+        """Run the command to its end; returns the exit status and stderr."""
         child = self.start(folder)
         return _end(child)
 
     def lost(self, folder: Path, status: int, said: str) -> Iterator[str]:
-        """What a run that was disturbed has broken, and what the next does not mend."""
+        """Damage of a disturbed run, and damage that the next run does not repair."""
         if not is_clear(status, said):
             yield f"ended with {status}: {said}"
         if status != -signal.SIGKILL:
@@ -196,7 +195,7 @@ class Trial:
             try:
                 found = facts(path)
             except (ValueError, OSError, EOFError) as error:
-                yield f"{name} is not whole: {error}"
+                yield f"{name} is incomplete: {error}"
                 continue
             for place, value in self.result.get(name, {}).items():
                 if found.get(place) != value and (place in found or path.suffix not in growing):
@@ -210,16 +209,16 @@ def _end(child: subprocess.Popen[str]) -> tuple[int, str]:
 
 
 def is_clear(status: int, said: str) -> bool:
-    """Whether a run ended well, in one line, or was killed outright."""
+    """Whether a run succeeded, failed with a one-line message, or was killed by a signal."""
     if status in [-getattr(signal, name) for name in SIGNALS] and ", in main" not in said:
-        return True  # by Python, before our first line
+        return True  # during Python's start
     known = status == 0 or any(line.startswith("fidsplat: ") for line in said.splitlines())
     return known and "Traceback" not in said and "a fault of fidsplat" not in said
 
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[None]:
-    """A file system of `size` bytes at a folder."""
+    """Mount a file system of `size` bytes at a folder."""
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder], check=True)
     try:
         yield
@@ -228,8 +227,8 @@ def small_disk(folder: Path, size: int) -> Iterator[None]:
 
 
 def disturb(trial: Trial, name: str, how: str, at: float) -> dict[str, Any]:
-    """A signal at a share of the command's time, or a disk with room for a share of what it writes: whether
-    that stopped it, and what was lost."""
+    """Disturb the command by a signal at a share of its time, or a disk for a share of its output; returns
+    whether it stopped, and the damage."""
     folder = trial.folder(name)
     full = how == DISK
     with small_disk(folder, max(1, int(trial.bytes * at) // 4096) * 4096) if full else nullcontext():
@@ -244,7 +243,7 @@ def disturb(trial: Trial, name: str, how: str, at: float) -> dict[str, Any]:
 
 
 def planned(name: str, seed: int) -> dict[str, tuple[str, float]]:
-    """How each trial of a command is disturbed, and where, by the trial's name."""
+    """Kind and share of the disturbance of each trial of a command, by name."""
     command = COMMANDS[name]
     kinds = [*(f"{SIGNALS[k % 3]} {k // 3}" for k in range(command.kills))]
     kinds += [f"{DISK} {k}" for k in range(command.disks)]
@@ -254,7 +253,7 @@ def planned(name: str, seed: int) -> dict[str, tuple[str, float]]:
 
 
 def run_all(name: str, trials: list[tuple[str, str, float]], jobs: int) -> Iterator[dict[str, Any]]:
-    """Trials (name, how, at) of a command, several at once: a row of each as it ends."""
+    """Run trials (name, how, at) of a command concurrently; yields a row for each as it ends."""
     with tempfile.TemporaryDirectory() as temporary:
         trial, pool = Trial(COMMANDS[name], Path(temporary)), ThreadPoolExecutor(jobs)
         try:
@@ -263,18 +262,18 @@ def run_all(name: str, trials: list[tuple[str, str, float]], jobs: int) -> Itera
                 part, how, at = running[ended]
                 yield {"command": name, "trial": part, "how": how, "at": round(at, 3), **ended.result()}
         finally:
-            pool.shutdown(cancel_futures=True)  # Ctrl-C ends after what is under way
+            pool.shutdown(cancel_futures=True)  # after Ctrl-C the running trials end
 
 
 def read(file: Path) -> list[dict[str, Any]]:
-    """The trials that a file has."""
+    """Trials in a file."""
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
 def table_of(done: list[dict[str, Any]]) -> Table:
-    """By command: how many trials of each kind, how many of them stopped it, how long the slowest took to end
-    after its signal, and in how many something was lost."""
-    table = Table("command", *SIGNALS, DISK, "of these, stopped it", "slowest end, s", "lost something")
+    """Table by command: trials of each kind, stopped runs, longest time to end after a signal, trials with
+    damage."""
+    table = Table("command", *SIGNALS, DISK, "stopped", "slowest end [s]", "with damage")
     for name in [*dict.fromkeys(row["command"] for row in done), None]:
         rows = [row for row in done if name in (None, row["command"])]
         kinds = [sum(row["how"] == how for row in rows) for how in (*SIGNALS, DISK)]

@@ -1,12 +1,12 @@
-"""Load: threads, processes, damaged kernel caches, and a soak.
+"""Load tests: threads, processes, damaged kernel caches, and a soak test.
 
     python tools/load.py threads [--device D]     one renderer used by 16 threads; 16 renderers in 16 threads
     python tools/load.py processes [--device D]   8 processes that share one empty kernel cache
-    python tools/load.py caches [--device D]      every file of a kernel cache cut off, noise, empty
+    python tools/load.py caches [--device D]      every file of a kernel cache truncated, random or empty
     python tools/load.py soak [--minutes 120] [--devices opencl,warp:cpu,reference]
 
-Each compares pictures, bit for bit, with those of one renderer in one thread. The soak draws random scenes
-with random effects in one process, draws them again much later, and watches the memory.
+Images must be bit-identical to those of one renderer in one thread. The soak test renders random scenes with
+random effects in one process, renders them again much later, and monitors the memory.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ OUTPUTS = ("rgb", "depth", "normal", "label")
 CHILD = """import sys
 sys.path[:0] = sys.argv[2:]
 import load
-print(load.pictures(load.fs.Renderer(sys.argv[1])))"""
+print(load.digest_of_views(load.fs.Renderer(sys.argv[1])))"""
 SIZE = (160, 120)
 FOUR_KINDS = ("perspective", "distortion", "fisheye", "orthographic")
 
 
 def cloud_of(seed: int) -> fs.SplatCloud:
-    """A few hundred splats before the camera."""
+    """A few hundred splats in front of the camera."""
     return random_splats(400, seed, depth=(0.8, 4.0), scale=(0.02, 0.3), across=1.2)
 
 
@@ -64,7 +64,7 @@ def digest(frame: fs.Frame) -> str:
     return state.hexdigest()
 
 
-def pictures(renderer: fs.Renderer, seed: int = 0) -> str:
+def digest_of_views(renderer: fs.Renderer, seed: int = 0) -> str:
     """Digest of all views of one scene."""
     resident = renderer.upload(cloud_of(seed))
     frames = [renderer.render(resident, camera_of(view), outputs=OUTPUTS) for view in range(VIEWS)]
@@ -72,13 +72,13 @@ def pictures(renderer: fs.Renderer, seed: int = 0) -> str:
 
 
 def threads(device: str) -> dict[str, int]:
-    """One renderer for all threads, then one for each."""
+    """Number of wrong threads with one renderer for all, and with one for each."""
     seeds = range(THREADS)
-    truth = [pictures(fs.Renderer(device), seed) for seed in seeds]
+    truth = [digest_of_views(fs.Renderer(device), seed) for seed in seeds]
     shared = fs.Renderer(device)
     with ThreadPoolExecutor(THREADS) as pool:
-        together = list(pool.map(lambda seed: pictures(shared, seed), seeds))
-        apart = list(pool.map(lambda seed: pictures(fs.Renderer(device), seed), seeds))
+        together = list(pool.map(lambda seed: digest_of_views(shared, seed), seeds))
+        apart = list(pool.map(lambda seed: digest_of_views(fs.Renderer(device), seed), seeds))
     return {
         "one renderer, wrong of 16 threads": sum(a != b for a, b in zip(truth, together, strict=True)),
         "16 renderers, wrong of 16 threads": sum(a != b for a, b in zip(truth, apart, strict=True)),
@@ -86,7 +86,7 @@ def threads(device: str) -> dict[str, int]:
 
 
 def _start(device: str, cache: Path) -> subprocess.Popen[str]:
-    """A process that draws with the kernel caches in a folder."""
+    """Start a process that renders with kernel caches in a folder."""
     folders = {
         name: str(cache / name.lower()) for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME", "WARP_CACHE_PATH")
     }
@@ -105,13 +105,13 @@ def _start(device: str, cache: Path) -> subprocess.Popen[str]:
 def _wrong(child: subprocess.Popen[str], truth: str) -> bool:
     said, errors = child.communicate(timeout=900)
     if said.strip() != truth:
-        print(errors.strip()[-400:] or f"other pictures: {said.strip()}", file=sys.stderr)
+        print(errors.strip()[-400:] or f"different images: {said.strip()}", file=sys.stderr)
     return said.strip() != truth
 
 
 def processes(device: str) -> dict[str, int]:
-    """Several processes and one empty cache."""
-    truth = pictures(fs.Renderer(device))
+    """Number of wrong processes that share an empty cache."""
+    truth = digest_of_views(fs.Renderer(device))
     with tempfile.TemporaryDirectory() as folder:
         children = [_start(device, Path(folder)) for _ in range(PROCESSES)]
         return {f"wrong of {PROCESSES} processes": sum(_wrong(child, truth) for child in children)}
@@ -122,15 +122,15 @@ def _noise(content: bytes) -> bytes:
 
 
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
-    "cut off": lambda content: content[: len(content) // 2],
+    "truncated": lambda content: content[: len(content) // 2],
     "noise": _noise,
     "empty": lambda content: b"",
 }
 
 
 def caches(device: str) -> dict[str, int]:
-    """Every file of a full cache damaged, in three ways."""
-    truth = pictures(fs.Renderer(device))
+    """Number of wrong processes after every file of a cache was damaged, for each kind of damage."""
+    truth = digest_of_views(fs.Renderer(device))
     figures = {}
     for name, damage in track(DAMAGES.items(), "damaged caches", transient=True):
         with tempfile.TemporaryDirectory() as folder:
@@ -150,7 +150,7 @@ def _resident_bytes() -> int:
 
 
 def _random_frame(renderers: dict[str, fs.Renderer], seed: int) -> str:
-    """A picture of everything that a seed chooses."""
+    """Digest of a frame whose scene, camera and effects depend on a seed."""
     chance = random.Random(seed)
     width, height = chance.randrange(16, 400), chance.randrange(16, 300)
     camera = {
@@ -172,14 +172,14 @@ def _random_frame(renderers: dict[str, fs.Renderer], seed: int) -> str:
 
 
 def soak(minutes: float, devices: list[str]) -> dict[str, float]:
-    """Random frames for a while."""
+    """Render random frames for some minutes; returns differences and memory."""
     renderers = {device: fs.Renderer(device) for device in devices}
     first: dict[int, str] = {}
     memory: list[tuple[float, int]] = []
     wrong, seed, start = 0, 0, time.monotonic()
     with Console().status("soaking") as status:
         while (spent := time.monotonic() - start) < 60 * minutes:
-            value = _random_frame(renderers, seed % 997)  # again after 997 frames
+            value = _random_frame(renderers, seed % 997)  # repeated after 997 frames
             wrong += first.setdefault(seed % 997, value) != value
             seed += 1
             if seed % 50 == 0:
@@ -191,7 +191,7 @@ def soak(minutes: float, devices: list[str]) -> dict[str, float]:
     return {
         "minutes": round(minutes, 1),
         "frames": seed,
-        "frames that differ from their first drawing": wrong,
+        "frames that differ from their first rendering": wrong,
         "MiB after ten minutes": round(early / 2**20, 1),
         "MiB at the end": round(late / 2**20, 1),
         "growth in %": round(100 * (late / early - 1), 2),
@@ -199,8 +199,8 @@ def soak(minutes: float, devices: list[str]) -> dict[str, float]:
 
 
 def levels(memory: list[tuple[float, int]], seconds: float) -> tuple[float, float]:
-    """Medians of (time, bytes) over ten minutes after the first ten, which fill caches and pools, and over
-    the last ten: what a picture needs comes and goes."""
+    """Median memory of (time, bytes) over ten minutes after the first ten, which fill caches and pools, and
+    over the last ten. Medians ignore the buffers of single frames."""
     span = min(600.0, seconds / 6)
     early = [size for at, size in memory if span <= at <= 2 * span] or [memory[0][1]]
     late = [size for at, size in memory if at >= seconds - span] or [memory[-1][1]]
@@ -219,7 +219,7 @@ def main() -> int:
     given = parser.parse_args()
     if given.what == "soak":
         figures = soak(given.minutes, given.devices.split(","))
-        bad = figures["frames that differ from their first drawing"] + (figures["growth in %"] > 5)
+        bad = figures["frames that differ from their first rendering"] + (figures["growth in %"] > 5)
     else:
         figures = {"threads": threads, "processes": processes, "caches": caches}[given.what](given.device)
         bad = sum(figures.values())

@@ -1,11 +1,11 @@
-"""Runs the kernels under oclgrind, an interpreter of OpenCL that sees every access to memory, and reports
-invalid reads and writes, data races between work-items, and values used before anything has set them.
+"""Run the kernels in oclgrind, an OpenCL interpreter that checks memory accesses, and report invalid reads
+and writes, data races between work-items, and uninitialized values.
 
     python tools/memory_check.py [--log FILE]
 
-It needs oclgrind (21.10 was used); on Debian: apt-get update && apt-get install oclgrind. Exit status 0:
-nothing was reported, and every picture agrees with the reference. Kernels with planted errors run first: if
-oclgrind does not report those, the check is worth nothing and fails too.
+Requires oclgrind (tested with 21.10); on Debian: apt-get update && apt-get install oclgrind. The exit status
+is 0 if nothing was reported and every frame agrees with the reference. Kernels with injected bugs run first:
+the check also fails if oclgrind does not report these.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-# Without optimisation, which may remove the very access that is wrong, and brings in LLVM's `freeze`, which
-# oclgrind's record of what has been set does not know.
+# Without optimisation, which may remove the invalid access and inserts LLVM's `freeze`, which oclgrind's
+# detection of uninitialized values does not support.
 OCLGRIND = ["--data-races", "--uninitialized", "--build-options", "-cl-opt-disable", "--max-errors", "1000"]
 INSTALL = "apt-get update && apt-get install oclgrind"
 
-PLANTED = {
+INJECTED = {
     "Invalid read": "a[i] = b[i + 64];",
     "Invalid write": "a[i - 64] = 1;",
     "data race": "a[0] = a[0] + i;",
     "uninitialized": "int x[4]; x[i & 1] = 1; if (x[2 + (b[i] & 1)] > 0) a[i] = 3;",
 }
-"""part of oclgrind's message -> body of a kernel that has this error"""
+"""bodies of kernels with a bug, by a part of oclgrind's message"""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--log", type=Path, help="keep oclgrind's messages about our kernels in this file")
-    parser.add_argument("--inside", choices=("planted", "pictures"), help=argparse.SUPPRESS)
+    parser.add_argument("--log", type=Path, help="write oclgrind's messages about the kernels to this file")
+    parser.add_argument("--inside", choices=("injected", "frames"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.inside:
-        return plant() if arguments.inside == "planted" else draw()
+        return run_injected() if arguments.inside == "injected" else run_frames()
     if shutil.which("oclgrind") is None:
-        print(f"oclgrind is not here; on Debian install it with: {INSTALL}", file=sys.stderr)
+        print(f"oclgrind must be installed, on Debian by: {INSTALL}", file=sys.stderr)
         return 2
     version = subprocess.run(["oclgrind", "--version"], capture_output=True, text=True).stdout.split()[1]
     print(f"oclgrind {version} {' '.join(OCLGRIND)}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        planted, _ = under_oclgrind("planted", Path(folder))
-        missing = [words for words in PLANTED if not any(words in message for message in planted)]
-        print(f"planted errors: {len(PLANTED)}, not reported: {', '.join(missing) or 'none'}", flush=True)
-        messages, status = under_oclgrind("pictures", Path(folder), arguments.log)
-    print(f"errors in our kernels: {sum(messages.values())}")
+        injected, _ = under_oclgrind("injected", Path(folder))
+        missing = [words for words in INJECTED if not any(words in message for message in injected)]
+        print(f"injected bugs: {len(INJECTED)}, not reported: {', '.join(missing) or 'none'}", flush=True)
+        messages, status = under_oclgrind("frames", Path(folder), arguments.log)
+    print(f"errors in the kernels: {sum(messages.values())}")
     for message, count in messages.most_common(20):
         print(f"  {count} x {message}")
     clean = status == 0 and not missing and not messages
@@ -63,10 +63,10 @@ def main() -> int:
 
 
 def under_oclgrind(part: str, folder: Path, keep: Path | None = None) -> tuple[Counter[str], int]:
-    """Run a part of this script; oclgrind's messages, each with the kernel's name, and the exit status."""
+    """Run a part of this script in oclgrind; returns its messages with kernel names, and the exit status."""
     log = folder / f"{part}.log"
     command = ["oclgrind", *OCLGRIND, "--log", str(log), sys.executable, __file__, "--inside", part]
-    # what an earlier run compiled with other options must not be taken from pyopencl's cache
+    # pyopencl's cache may have kernels compiled with other options
     status = subprocess.run(command, env=os.environ | {"PYOPENCL_NO_CACHE": "1"}).returncode
     text = log.read_text("utf-8", "replace") if log.exists() else ""
     if keep:
@@ -76,14 +76,14 @@ def under_oclgrind(part: str, folder: Path, keep: Path | None = None) -> tuple[C
     return Counter(f"{addresses.sub('', message)}, in {kernel}" for message, kernel in found), status
 
 
-def plant() -> int:
-    """Under oclgrind: kernels that each have an error."""
+def run_injected() -> int:
+    """In oclgrind: run kernels with a bug each."""
     import numpy as np
     import pyopencl as cl
 
     context = cl.Context(cl.get_platforms()[0].get_devices())
     queue = cl.CommandQueue(context)
-    for body in PLANTED.values():
+    for body in INJECTED.values():
         text = f"kernel void faulty(global int *a, global int *b) {{ int i = get_global_id(0); {body} }}"
         program = cl.Program(context, text).build()
         flags, zeros = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, np.zeros(64, np.int32)
@@ -93,27 +93,26 @@ def plant() -> int:
     return 0
 
 
-def draw() -> int:
-    """Under oclgrind: pictures in both schedules, each compared with the reference."""
+def run_frames() -> int:
+    """In oclgrind: render frames in both schedules, and compare each with the reference."""
     import fidsplat as fs
     from fidsplat.backends.opencl.buffers import BufferPool
 
     renderer = fs.Renderer("opencl:oclgrind")
-    kept = []
+    buffers = []
 
-    class Keeping(BufferPool):
-        """Releases no buffer: oclgrind gives the address of a released one to the next, and takes what is in
-        that for never written if it is larger.
-        """
+    class RetainingPool(BufferPool):
+        """Pool that releases no buffers: oclgrind reuses addresses, and reports a larger new buffer as
+        uninitialized."""
 
         def fresh(self, name, size):
-            kept.append(super().fresh(name, size))
-            return kept[-1]
+            buffers.append(super().fresh(name, size))
+            return buffers[-1]
 
     wrong = 0
-    for title, work in pictures(renderer):
-        # new ones for each picture, so that none reads what an earlier one wrote
-        renderer.backend.pool = Keeping(renderer.backend.context, renderer.backend.device)
+    for title, work in frames(renderer):
+        # new buffers for each frame, which cannot read values of an earlier one
+        renderer.backend.pool = RetainingPool(renderer.backend.context, renderer.backend.device)
         start = time.perf_counter()
         error = work()
         wrong += not error < 2e-5
@@ -121,11 +120,12 @@ def draw() -> int:
     return 1 if wrong else 0
 
 
-def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
-    """A title, and what draws it and gives its largest error beyond certificates, in colour and alpha.
+def frames(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
+    """Titles, and functions that render a frame and return its largest error beyond the certificates, in rgb
+    and alpha.
 
-    Few splats and few pixels in small tiles: lists of none to 90 splats, tiles cut by the picture's edge, and
-    several groups in each launch.
+    Few splats and few pixels in small tiles: tile lists of 0 to 90 splats, tiles cut by the image border, and
+    several work-groups in each launch.
     """
     import numpy as np
 
@@ -149,17 +149,17 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
             chosen = quality or fs.Quality()
             features = select(cloud, fs.Capture(outputs=outputs, quality=chosen))
             view = View.of(fs.Capture(view_from, quality=chosen, background=(0.1, 0.2, 0.3)), cloud.origin)
-            backend.pair_budget, kept = budget or backend.pair_budget, backend.pair_budget
-            planes = backend.pipeline(features, shape).render_view(backend.upload(cloud), view)
-            drawn = {name: planes.read(name, 0) for name in ("rgb", *features.outputs)}
-            backend.pair_budget = kept
+            backend.pair_budget, before = budget or backend.pair_budget, backend.pair_budget
+            images = backend.pipeline(features, shape).render_view(backend.upload(cloud), view)
+            rendered = {name: images.read(name, 0) for name in ("rgb", *features.outputs)}
+            backend.pair_budget = before
             truth = reference_images(FrameSpec(cloud, view_from, chosen, outputs))
             worst = 0.0
-            for name in {"rgb", "alpha"} & set(drawn):
-                error = np.abs(drawn[name] - truth[name])
+            for name in {"rgb", "alpha"} & set(rendered):
+                error = np.abs(rendered[name] - truth[name])
                 error = error.max(-1) if error.ndim > 2 else error
                 worst = max(worst, float((error - truth["certificate"]).max()))
-            return worst if all(np.isfinite(plane).all() for plane in drawn.values()) else float("nan")
+            return worst if all(np.isfinite(image).all() for image in rendered.values()) else float("nan")
 
         return work
 

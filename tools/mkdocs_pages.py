@@ -25,7 +25,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Turn links between docs/ and devlog/, neighbours in the tree, into links of the site."""
+    """Convert links between docs/ and devlog/ in the tree to links of the site."""
     if page.file.src_uri.startswith("devlog/"):
         return markdown.replace("](../docs/", "](../")
     return markdown.replace("](../devlog/", "](devlog/")

@@ -1,14 +1,14 @@
-"""Batches of fidsplat beside gsplat's on one NVIDIA GPU, the same views in the same run: disks.
+"""Compare batches of disks of fidsplat and gsplat on one NVIDIA GPU, with the same views in the same run.
 
     pip install . torch gsplat       # 1.5.3
     python benchmarks/peers/gsplat_batches.py --rows scenes --json gsplat-batches.json
 
-What it needs, and how constants differ: gsplat_cuda.py. gsplat draws as many cameras in a call of
-`rasterization_2dgs` as is quickest of CAMERAS, colours and what it draws with them in any case, median
-depths among it (its mean depths take longer); it has no labels. Ours draw the row's outputs as
-benchmarks/batches.py times them, the same with gsplat's constants and float32 for set-up, as it has, and its
-outputs with these. Its images are dropped call by call, ours stay. All are timed from the first call until
-the GPU is done.
+gsplat_cuda.py has the requirements and the differences of constants. gsplat renders the fastest number of
+cameras per call of CAMERAS by `rasterization_2dgs`, with colours and the outputs that it always computes,
+median depth included (mean depth takes longer); it has no labels. fidsplat renders the outputs of the row as
+in benchmarks/batches.py, the same with gsplat's constants and a float32 set-up, and gsplat's outputs with
+these. gsplat's images are discarded after each call, fidsplat's are retained. Times are from the first call
+until the GPU is done.
 """
 
 from __future__ import annotations
@@ -31,26 +31,27 @@ from batches import ROWS, scene_of
 from measuring import PROGRESS, facts, keep, options, show
 
 CAMERAS = 4, 16, 64, 256
-"""in a call of gsplat"""
+"""cameras per call of gsplat"""
 SAME = fs.Quality.named("gsplat").with_(opacity_ceiling=0.999)
 """the constants of gsplat 1.5.3"""
 ITS_OUTPUTS = "rgb", "alpha", "normal", "depth_median"
-"""what gsplat draws in any case, by our names"""
+"""outputs that gsplat always computes, by fidsplat's names"""
 
 
 def on_gpu(array: np.ndarray) -> torch.Tensor:
-    """Convert to float32."""
+    """A float32 tensor on the GPU."""
     return torch.tensor(np.asarray(array, np.float32), device="cuda")
 
 
 def peer(cloud: fs.SplatCloud, capture: fs.Capture, poses: np.ndarray) -> Callable[[int], torch.Tensor]:
-    """What draws all views by gsplat, so many cameras in a call, and gives the first view (h, w, 3)."""
+    """Function that renders all views by gsplat, for a number of cameras per call, and returns the first view
+    (h, w, 3)."""
     camera, colors = capture.camera, cloud.colors
     if camera is None or colors is None:
-        raise SystemExit("gsplat_batches: it draws plain colours from the cameras of a batch")
-    stands = np.tile(np.eye(4), (len(poses), 1, 1))
-    stands[:, :3, :3], stands[:, :3, 3] = quaternion_to_matrix(poses[:, 3:]), poses[:, :3]
-    views = on_gpu(np.linalg.inv(stands))
+        raise SystemExit("gsplat_batches: the batch must have plain colours and a camera")
+    poses_of_camera = np.tile(np.eye(4), (len(poses), 1, 1))
+    poses_of_camera[:, :3, :3], poses_of_camera[:, :3, 3] = quaternion_to_matrix(poses[:, 3:]), poses[:, :3]
+    views = on_gpu(np.linalg.inv(poses_of_camera))
     matrix = on_gpu(camera.matrix)
     given = {
         "means": on_gpu(cloud.means + cloud.origin),
@@ -60,13 +61,13 @@ def peer(cloud: fs.SplatCloud, capture: fs.Capture, poses: np.ndarray) -> Callab
         "width": camera.width,
         "height": camera.height,
     }
-    shown = on_gpu(colors)
+    rgb = on_gpu(colors)
 
     def draw(cameras: int) -> torch.Tensor:
         first = None
         for some in views.split(cameras):
             each = {"viewmats": some, "Ks": matrix.expand(len(some), 3, 3)}
-            each["colors"] = shown.expand(len(some), *shown.shape)
+            each["colors"] = rgb.expand(len(some), *rgb.shape)
             images, *_ = gsplat.rasterization_2dgs(**given, **each)
             first = images[0].clone() if first is None else first
         torch.cuda.synchronize()
@@ -76,18 +77,18 @@ def peer(cloud: fs.SplatCloud, capture: fs.Capture, poses: np.ndarray) -> Callab
     return torch.no_grad()(draw)
 
 
-def ways(capture: fs.Capture) -> list[fs.Capture]:
-    """How ours are drawn."""
+def captures_of(capture: fs.Capture) -> list[fs.Capture]:
+    """Captures of fidsplat's measurements."""
     same = capture.with_(quality=SAME.with_(setup_precision="float32"))
     return [capture, same, same.with_(outputs=ITS_OUTPUTS)]
 
 
-def quickest(draw: Callable[[int], torch.Tensor]) -> dict[int, float]:
-    """Milliseconds of gsplat by how many cameras are in a call, as far as memory goes."""
+def times_by_cameras(draw: Callable[[int], torch.Tensor]) -> dict[int, float]:
+    """Milliseconds of gsplat by cameras per call, as far as memory allows."""
     found = {}
     for cameras in CAMERAS:
         try:
-            draw(cameras)  # what is made on first use does not count
+            draw(cameras)  # allocations on first use are not timed
             found[cameras] = Timer(lambda cameras=cameras: draw(cameras)).run()
         except torch.cuda.OutOfMemoryError:
             break
@@ -97,18 +98,18 @@ def quickest(draw: Callable[[int], torch.Tensor]) -> dict[int, float]:
 
 
 def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
-    """The figures of one row per view: each of ours, and gsplat's after it."""
+    """Figures of one row per view: each of fidsplat's, and gsplat's after it."""
     row = ROWS[name]
     cloud, capture, poses = scene_of(row)
     resident, draw = renderer.upload(cloud), peer(cloud, capture, poses)
-    captures = ways(capture)
+    captures = captures_of(capture)
     ours = [
         Timer(lambda taken=taken: renderer.render_batch(resident, taken, poses=poses).wait())
         for taken in captures
     ]
     for timer in ours:
-        timer.run(counts=False)
-    by_cameras = quickest(draw)
+        timer.run(timed=False)
+    by_cameras = times_by_cameras(draw)
     best = min(by_cameras, key=by_cameras.__getitem__)
     theirs = Timer(lambda: draw(best))
     time_interleaved([*ours, theirs], repeats)
@@ -146,10 +147,10 @@ def main() -> None:
     parser.add_argument("--rows", nargs="*", default=["scenes"], choices=[*ROWS], metavar="ROW")
     arguments = parser.parse_args()
     if not torch.cuda.is_available():
-        raise SystemExit("gsplat_batches: PyTorch sees no CUDA device; gsplat draws on nothing else")
+        raise SystemExit("gsplat_batches: PyTorch must have a CUDA device, which gsplat requires")
     renderer, records = fs.Renderer(arguments.device), []
     for name in arguments.rows:
-        with PROGRESS.status(f"drawing {name}"):
+        with PROGRESS.status(f"rendering {name}"):
             records += measure(renderer, name, max(arguments.repeats, 1))
     if keep(records, arguments.json):
         return

@@ -1,14 +1,14 @@
-"""fidsplat beside gsplat on one NVIDIA GPU, the same scenes in the same run: disks by `rasterization_2dgs`,
-scenes of 3D Gaussians (r100k_720p_3d ...) by `rasterization`, 3DGS.
+"""Compare fidsplat and gsplat on one NVIDIA GPU, with the same scenes in the same run: disks by
+`rasterization_2dgs`, 3D Gaussians (r100k_720p_3d ...) by `rasterization`.
 
     pip install . torch gsplat       # 1.5.3; the latest: git+https://github.com/nerfstudio-project/gsplat
     python benchmarks/peers/gsplat_cuda.py r100k_720p r1m_1080p r5m_1080p r20m_4k --json gsplat.json
 
-It needs CUDA, and a compiler for it: gsplat builds its kernels on first use (a minute on 16 cores). The
-driver's OpenCL must be visible to us (docs/rendering.md, "Devices"). Both keep the splats and
-the picture on the GPU; both are timed from the call until the GPU is done. gsplat draws with its own
-constants (opacity ceiling 0.999, exclusive stop), we with ours, which leave no less undone; how far the two
-pictures are apart where we draw with gsplat's is a figure of its own.
+Requires CUDA with a compiler: gsplat builds its kernels on first use (a minute on 16 cores). The driver's
+OpenCL must be visible (docs/rendering.md, "Devices"). Splats and images of both stay on the GPU; both are
+timed from the call until the GPU is done. gsplat renders with its constants (opacity ceiling 0.999, exclusive
+stop), fidsplat with its own, which are more accurate. The PSNR between both with gsplat's constants is
+reported too.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import gsplat
 import numpy as np
 import torch
-from turns import arguments, compared, peer_device, report
+from interleaved import arguments, compared, peer_device, report
 
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
@@ -31,10 +31,10 @@ SAME = Quality.named("gsplat").with_(opacity_ceiling=0.999)
 
 
 def tensors(cloud: SplatCloud, camera: Camera) -> dict:
-    """The arguments of both rasterizations, on the GPU: one camera, plain colours, three scales, the last of
-    which disks do not use."""
+    """Arguments of both rasterizations on the GPU: one camera, plain colours, three scales (disks ignore the
+    last)."""
     if cloud.colors is None:
-        raise SystemExit("gsplat_cuda: this scene has colours that depend on the view; choose another")
+        raise SystemExit("gsplat_cuda: the scene must have plain colours; choose another")
     third = np.ones(len(cloud), np.float32) if cloud.thickness is None else cloud.thickness
     scales = np.column_stack([cloud.scales, third])
     arrays = {
@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--packed", action="store_true", help="gsplat's packed mode: less memory")
     options = parser.parse_args()
     if not torch.cuda.is_available():
-        raise SystemExit("gsplat_cuda: PyTorch sees no CUDA device; gsplat draws on nothing else")
+        raise SystemExit("gsplat_cuda: PyTorch must have a CUDA device, which gsplat requires")
     facts = torch.cuda.get_device_properties(0)
     version = f"PyTorch {torch.__version__}, CUDA {torch.version.cuda}"
     device = peer_device("cuda:0", facts.name, "CUDA", version, "gpu", facts.multi_processor_count)
@@ -71,7 +71,7 @@ def main() -> None:
         given = tensors(cloud, camera)
         torch.cuda.reset_peak_memory_stats()
 
-        last = {}  # what gsplat tells of the latest frame
+        last = {}  # gsplat's data of the latest frame
 
         rasterize = gsplat.rasterization_2dgs if cloud.thickness is None else gsplat.rasterization
 
@@ -79,7 +79,7 @@ def main() -> None:
             with torch.no_grad():
                 colors, *_, last["meta"] = rasterize(**given, packed=options.packed)
             torch.cuda.synchronize()
-            return _Picture(colors)
+            return _Image(colors)
 
         size = camera.width, camera.height
         peer = Result(name, device, *size, Timer(draw), renderer=f"gsplat {gsplat.__version__}")
@@ -88,19 +88,21 @@ def main() -> None:
         same = ours.renderer.render(ours.resident, camera, quality=SAME)["rgb"]
         records[-1]["psnr_same_constants_db"] = psnr(same, np.asarray(draw()))
         radii, pairs = last["meta"]["radii"], last["meta"]["flatten_ids"]
-        seen = radii.reshape(-1, 2).amin(-1) if radii.shape[-1] == 2 else radii.reshape(-1)  # 1.4: one radius
+        visible = (
+            radii.reshape(-1, 2).amin(-1) if radii.shape[-1] == 2 else radii.reshape(-1)
+        )  # version 1.4: one radius
         records[-1] |= {
-            "visible": int((seen > 0).sum()),
+            "visible": int((visible > 0).sum()),
             "pairs": int(pairs.shape[0]),
             "memory_bytes": torch.cuda.max_memory_allocated(),
         }
-        del given, last, draw, radii, pairs, seen
+        del given, last, draw, radii, pairs, visible
         torch.cuda.empty_cache()
     report(records, list(names), options.json)
 
 
-class _Picture:
-    """A picture on the GPU that NumPy can read."""
+class _Image:
+    """An image on the GPU that NumPy can read."""
 
     def __init__(self, colors: torch.Tensor) -> None:
         self.colors = colors  # (1, h, w, 3)

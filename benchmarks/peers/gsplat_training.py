@@ -1,18 +1,20 @@
-"""Training of disks by fidsplat beside gsplat and the 2DGS authors' rasterizer on one NVIDIA GPU, in one run.
+"""Compare the training of disks by fidsplat, gsplat and the 2DGS authors' rasterizer on one NVIDIA GPU, in
+one run.
 
     pip install . torch gsplat       # 1.5.3
     python benchmarks/peers/gsplat_training.py r100k_720p r1m_1080p --json gsplat-training.json
     python benchmarks/peers/gsplat_training.py --dataset yard --iterations 2000 --authors
 
-Of scenes: ten steps of benchmarks/training.py, SH of degree 3, in turn with ten of each peer: picture, loss
-(the same, in PyTorch: 0.8 L1 and 0.2 D-SSIM by separable convolutions), `backward`, fused Adam of all values;
-beside it the time of its picture and `backward` alone. Of a data set: a whole training by each with the same
-constants and gsplat's `DefaultStrategy`; PSNR is of the views held out, each drawn by its own renderer, ours
-by gsplat too. (In gsplat 1.5.3 that strategy never resets opacities: its condition is never true. With the
-authors' rasterizer they are reset, as in the authors' trainer.)
+Scenes: ten steps of benchmarks/training.py, with SH of degree 3, alternate with ten of each peer: frame, loss
+(the same, in PyTorch: 0.8 L1 and 0.2 D-SSIM by separable convolutions), `backward`, fused Adam of all values.
+The time of the peer's frame and `backward` without the optimiser is reported too. Data sets: a complete
+training by each with the same constants and gsplat's `DefaultStrategy`. PSNR is of the held-out views, each
+rendered by its own renderer, fidsplat's splats by gsplat too. (In gsplat 1.5.3 that strategy never resets
+opacities: its condition is never true. With the authors' rasterizer they are reset, as in the authors'
+trainer.)
 
---authors wants `pip install eden-diff-surfel-rasterization`: the authors' sources of 2024, free for research
-and evaluation alone, which PyTorch compiles at the first import.
+--authors requires `pip install eden-diff-surfel-rasterization`: the authors' sources of 2024, licensed only
+for research and evaluation, which PyTorch compiles at the first import.
 """
 
 from __future__ import annotations
@@ -41,16 +43,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from measuring import facts, keep, options
 from training import trainer_of
 
-TURN = 10
-"""steps in a row, as a training makes them: nobody waits for the GPU between"""
+STEPS = 10
+"""consecutive steps without synchronization, as in a training"""
 SHARE = 0.2
-"""of D-SSIM in the loss"""
+"""weight of D-SSIM in the loss"""
 NEAR, FAR = 0.2, 100.0
-"""metres, as the authors have them"""
+"""near and far plane of the authors, metres"""
 
 
 class Peer:
-    """gsplat's splats with an optimiser of each of their values, at the rates of a `TrainSettings`."""
+    """gsplat's splats with an optimiser for each parameter, at the rates of a `TrainSettings`."""
 
     resets = False
     """whether opacities are reset"""
@@ -87,7 +89,7 @@ class Peer:
         ]
 
     def draw(self, view: torch.Tensor, matrix: torch.Tensor, size: tuple[int, int], degree: int) -> Any:
-        """A picture (h, w, 3), and what gsplat tells of it."""
+        """Render an image (h, w, 3); returns it with gsplat's data."""
         values = self.params
         images, *_, meta = gsplat.rasterization_2dgs(
             means=values["means"],
@@ -109,9 +111,9 @@ class Peer:
     def step(
         self, number: int, degree: int, before: Any = None, after: Any = None, optimise: bool = True
     ) -> None:
-        """One view: picture, loss, derivatives, and the optimisers where they are wanted.
+        """One view: frame, loss, gradients, and optionally the optimisers.
 
-        before, after: called with what is told of the picture, before and after the derivatives.
+        before, after: called with gsplat's data before and after the backward pass.
         """
         view, matrix, truth = self._views[number]
         image, meta = self.draw(view, matrix, (truth.shape[1], truth.shape[0]), degree)
@@ -130,18 +132,19 @@ class Peer:
             optimizer.zero_grad(set_to_none=True)
 
     def rate(self, iteration: int) -> None:
-        """Sets the means' learning rate."""
+        """Set the learning rate of the means."""
         rate = self._settings.position_rate_at(iteration) * self._extent
         self.optimizers["means"].param_groups[0]["lr"] = rate
 
 
 class AuthorsPeer(Peer):
-    """gsplat's training with the rasterizer of the 2DGS authors, whose principal points are image centres."""
+    """gsplat's training with the 2DGS authors' rasterizer, which assumes principal points at the image
+    centre."""
 
     resets = True
 
     def draw(self, view: torch.Tensor, matrix: torch.Tensor, size: tuple[int, int], degree: int) -> Any:
-        """A picture (h, w, 3), and what gsplat's strategy wants to know of it."""
+        """Render an image (h, w, 3); returns it with the data for gsplat's strategy."""
         surfels, values, (width, height) = authors_rasterizer(), self.params, size
         slopes = width / (2 * float(matrix[0, 0, 0])), height / (2 * float(matrix[0, 1, 1]))
         projection = torch.zeros((4, 4), device="cuda")
@@ -174,23 +177,24 @@ class AuthorsPeer(Peer):
             scales=torch.exp(values["scales"][:, :2]),
             rotations=torch.nn.functional.normalize(values["quats"]),
         )
-        # its derivatives by places are in half pictures already: gsplat would multiply them by half the size
+        # its gradients by positions are relative to half images already: gsplat would multiply them by half
+        # the size
         meta = {"gradient_2dgs": screen, "width": 2, "height": 2, "n_cameras": 1, "gaussian_ids": None}
         return image.permute(1, 2, 0), meta | {"radii": radii[None, :, None].expand(1, count, 2)}
 
 
 def authors_rasterizer() -> Any:
-    """The authors' module."""
+    """Module of the authors' rasterizer."""
     return importlib.import_module("diff_surfel_rasterization")
 
 
 def tensor(array: np.ndarray) -> Any:
-    """On the GPU, float32."""
+    """A float32 tensor on the GPU."""
     return torch.tensor(np.asarray(array, np.float32), device="cuda")
 
 
 def loss_of(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """0.8 L1 and 0.2 (1 - SSIM), window of 11 pixels, sigma 1.5."""
+    """Loss 0.8 L1 + 0.2 (1 - SSIM), window of 11 pixels, sigma 1.5."""
     x = torch.arange(11, device="cuda") - 5.0
     row = torch.exp(-(x**2) / 4.5)
     row = (row / row.sum()).expand(15, 1, 1, 11)
@@ -209,22 +213,22 @@ def loss_of(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
 def finished(
     work: Callable[[], Any], finish: Callable[[], Any] = torch.cuda.synchronize
 ) -> Callable[[], float]:
-    """What does the work `TURN` times and gives the milliseconds of one until the GPU is done with all."""
+    """Function that runs the work `STEPS` times and returns the milliseconds of one, with all GPU work."""
 
     def timed() -> float:
         finish()
         begun = time.perf_counter()
-        for _ in range(TURN):
+        for _ in range(STEPS):
             work()
         finish()
-        return (time.perf_counter() - begun) * 1e3 / TURN
+        return (time.perf_counter() - begun) * 1e3 / STEPS
 
     return timed
 
 
 def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[Peer]]) -> dict[str, Any]:
-    """Median milliseconds of a step by each, in turn."""
-    trainer = trainer_of(name, renderer, 3, TURN * (1 + repeats))
+    """Median milliseconds of a step by each, interleaved."""
+    trainer = trainer_of(name, renderer, 3, STEPS * (1 + repeats))
     splats = trainer._model.read()
     backend: Any = renderer.backend
 
@@ -240,7 +244,7 @@ def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[
 
 
 def train(dataset: Dataset, iterations: int, kind: type[Peer]) -> tuple[Peer, float]:
-    """A whole training by a peer, and its seconds."""
+    """A complete training by a peer, and its seconds."""
     settings = TrainSettings(iterations=iterations)
     peer = kind(initial_splats(dataset, settings), settings, dataset)
     strategy = gsplat.DefaultStrategy(
@@ -263,7 +267,7 @@ def train(dataset: Dataset, iterations: int, kind: type[Peer]) -> tuple[Peer, fl
             if kind.resets and given[-1] % settings.reset_every == 0:
                 reset_opa(*given[:3], value=settings.reset_opacity)
 
-        # splats that are made after the last iteration would not be fitted, neither here nor there
+        # no densification after the last iteration: new splats would not be optimised
         makes = after if iteration < iterations else None
         peer.step(
             views.pop(), settings.degree_at(iteration), partial(strategy.step_pre_backward, *given), makes
@@ -273,7 +277,7 @@ def train(dataset: Dataset, iterations: int, kind: type[Peer]) -> tuple[Peer, fl
 
 
 def score(peer: Peer, views: tuple[TrainingView, ...]) -> float:
-    """Mean PSNR of 8-bit pictures, drawn by the peer."""
+    """Mean PSNR of 8-bit images rendered by the peer."""
     found = []
     for view in views:
         camera = view.camera
@@ -287,13 +291,13 @@ def score(peer: Peer, views: tuple[TrainingView, ...]) -> float:
 def trainings(
     dataset: Dataset, renderer: fs.Renderer, iterations: int, kinds: dict[str, type[Peer]]
 ) -> dict[str, Any]:
-    """Seconds, splats and PSNR of all; what is compiled is compiled before ours."""
+    """Seconds, splats and PSNR of all trainings; kernels are compiled before fidsplat's."""
     Trainer(dataset, renderer, iterations=8, sh_every=2).run()
     begun = time.perf_counter()
     ours = Trainer(dataset, renderer, iterations=iterations)
     ours.run()
     seconds = time.perf_counter() - begun
-    drawn = Peer(ours._model.read(), ours.settings, dataset)
+    by_gsplat = Peer(ours._model.read(), ours.settings, dataset)
     found: dict[str, Any] = {
         "dataset": dataset.name,
         "iterations": iterations,
@@ -301,7 +305,7 @@ def trainings(
             "seconds": seconds,
             "splats": len(ours.cloud()),
             "psnr": float(np.mean([one.psnr for one in ours.evaluate()])),
-            "psnr_drawn_by_gsplat": score(drawn, dataset.held_out),
+            "psnr_drawn_by_gsplat": score(by_gsplat, dataset.held_out),
         },
     }
     for title, kind in kinds.items():
@@ -320,10 +324,12 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="as in benchmarks/training.py")
     parser.add_argument("--dataset", action="append", default=[], metavar="DIR", help="as of fidsplat train")
     parser.add_argument("--iterations", type=int, default=7000, help="of a training (default: 7000)")
-    parser.add_argument("--authors", action="store_true", help="beside the 2DGS authors' rasterizer too")
+    parser.add_argument(
+        "--authors", action="store_true", help="compare with the 2DGS authors' rasterizer too"
+    )
     given = parser.parse_args()
     if not torch.cuda.is_available():
-        raise SystemExit("gsplat_training: PyTorch sees no CUDA device; gsplat draws on nothing else")
+        raise SystemExit("gsplat_training: PyTorch must have a CUDA device, which gsplat requires")
     kinds: dict[str, type[Peer]] = {"gsplat": Peer}
     if given.authors:
         authors_rasterizer()

@@ -1,16 +1,16 @@
-"""fidsplat beside Mitsuba 3 on the processor, the same scenes in the same run.
+"""Compare fidsplat and Mitsuba 3 on the processor, with the same scenes in the same run.
 
     pip install . mitsuba
     DRJIT_LIBLLVM_PATH=.../libLLVM-19.so python benchmarks/peers/mitsuba_cpu.py r100k_720p --json mitsuba.json
 
 Mitsuba's variant llvm_ad_rgb compiles with the system's LLVM. LLVM 15, the default of Debian 12, aborts on
-its code ("Cannot select: fminimum"); LLVM 19 works, and need not be installed: the package can be unpacked
-anywhere (`apt-get download libllvm19 && dpkg -x libllvm19*.deb DIR`).
+its code ("Cannot select: fminimum"); LLVM 19 works, and can be used without installation by unpacking the
+package anywhere (`apt-get download libllvm19 && dpkg -x libllvm19*.deb DIR`).
 
-Nothing on processors draws 2D splats but us. The nearest in meaning is the shape `ellipsoidsmesh` with the
-integrator `volprim_rf_basic`: ray-traced Gaussians in the order in which the ray meets them. Splats become
-ellipsoids of 0.1 mm thickness, with the plugin's own extent of 3 standard deviations, one sample in the
-middle of each pixel and at most 64 fragments per pixel, its default. The picture stays in Mitsuba's memory.
+No other renderer of 2D splats for processors is known. The most similar method is the shape `ellipsoidsmesh`
+with the integrator `volprim_rf_basic`: Gaussians are ray-traced in the order of intersection. Splats become
+ellipsoids of 0.1 mm thickness, with the plugin's extent of 3 standard deviations, one sample at the centre of
+each pixel and at most 64 fragments per pixel, its default. The image stays in Mitsuba's memory.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import math
 
 import mitsuba as mi
 import numpy as np
-from turns import arguments, compared, peer_device, report
+from interleaved import arguments, compared, peer_device, report
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
@@ -28,13 +28,13 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.timing import Timer
 
 THICKNESS = 1e-4  # metres, standard deviation
-C0 = 0.28209479177387814  # of the constant spherical harmonic
+C0 = 0.28209479177387814  # value of the constant spherical harmonic
 
 
 def mitsuba_scene(cloud: SplatCloud, camera: Camera) -> dict:
-    """The cloud and the camera in Mitsuba's words."""
+    """Cloud and camera as a Mitsuba scene."""
     if cloud.colors is None:
-        raise SystemExit("mitsuba_cpu: this scene has colours that depend on the view; choose another")
+        raise SystemExit("mitsuba_cpu: the scene must have plain colours; choose another")
     count = len(cloud)
     scales = np.concatenate([cloud.scales, np.full((count, 1), THICKNESS, np.float32)], 1)
     means = cloud.means + cloud.origin.astype(np.float32)
@@ -63,7 +63,7 @@ def mitsuba_scene(cloud: SplatCloud, camera: Camera) -> dict:
                 "rfilter": {"type": "box"},
                 "pixel_format": "rgb",
             },
-            # one sample of a stratified grid, without jitter, is the middle of the pixel
+            # one sample of a stratified grid without jitter is the centre of the pixel
             "sampler": {"type": "stratified", "sample_count": 1, "jitter": False},
         },
     }
@@ -72,7 +72,7 @@ def mitsuba_scene(cloud: SplatCloud, camera: Camera) -> dict:
 def main() -> None:
     options = arguments(__doc__, repeats=5, device="opencl:cpu").parse_args()
     mi.set_variant("llvm_ad_rgb")
-    import drjit as dr  # after the variant, so that it finds the same LLVM
+    import drjit as dr  # after set_variant, so that it uses the same LLVM
 
     records, names = [], scene_names(options.scenes)
     for name in names:
@@ -85,10 +85,10 @@ def main() -> None:
         device = peer_device("cpu", f"{threads} threads", "Dr.Jit LLVM", mi.__version__, "cpu", threads)
 
         def draw(scene=scene):
-            picture = mi.render(scene, spp=1)
-            dr.eval(picture)
+            image = mi.render(scene, spp=1)
+            dr.eval(image)
             dr.sync_thread()
-            return picture
+            return image
 
         size = camera.width, camera.height
         peer = Result(name, device, *size, Timer(draw), renderer=f"Mitsuba {mi.__version__}")

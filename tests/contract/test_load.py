@@ -11,11 +11,11 @@ import fidsplat as fs
 @pytest.mark.parametrize("device", ["opencl", "warp:cpu"])
 def test_threads_share_a_renderer_or_have_their_own(device):
     seeds = range(6)
-    truth = [load.pictures(fs.Renderer(device), seed) for seed in seeds]
+    truth = [load.digest_of_views(fs.Renderer(device), seed) for seed in seeds]
     shared = fs.Renderer(device)
     with ThreadPoolExecutor(len(seeds)) as pool:
-        assert list(pool.map(lambda seed: load.pictures(shared, seed), seeds)) == truth
-        assert list(pool.map(lambda seed: load.pictures(fs.Renderer(device), seed), seeds)) == truth
+        assert list(pool.map(lambda seed: load.digest_of_views(shared, seed), seeds)) == truth
+        assert list(pool.map(lambda seed: load.digest_of_views(fs.Renderer(device), seed), seeds)) == truth
 
 
 def test_processes_share_an_empty_kernel_cache(monkeypatch):

@@ -129,7 +129,7 @@ def _output_of_a_silent_process():
     ],
     ids=["sleep", "task", "process", "output"],
 )
-def test_what_waits_is_interrupted(waiting):
+def test_waiting_is_interrupted(waiting):
     later = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM))
     with interrupts.handled():
         later.start()
@@ -138,7 +138,7 @@ def test_what_waits_is_interrupted(waiting):
     interrupts.check()  # the next command begins without the flag
 
 
-def test_what_is_waited_for_comes():
+def test_an_awaited_result_is_returned():
     task = Future()
     task.set_result(3)
     assert interrupts.result_of(task) == 3
@@ -172,22 +172,22 @@ def test_a_full_disk_loses_nothing(trial, tmp_path):
     assert (found["stopped"], found["lost"]) == (True, [])
 
 
-def test_what_is_lost_is_seen(trial):
+def test_damage_is_found(trial):
     folder = trial.work / "damaged"
     shutil.copytree(trial.work / "second", folder)
-    (folder / ".picture.png.x.part").touch()
+    (folder / ".image.png.x.part").touch()
     images = sorted(name for name in interrupt.files_below(folder) if name.endswith(".png"))
     (folder / images[0]).write_bytes((folder / images[1]).read_bytes())
     (folder / images[-1]).write_bytes((folder / images[-1]).read_bytes()[:-9])
     assert [words.partition(":")[0] for words in trial.lost(folder, 1, "Traceback")] == [
         "ended with 1",
-        "left .picture.png.x.part",
+        "left .image.png.x.part",
         f"{images[0]} differs",
-        f"{images[-1]} is not whole",
+        f"{images[-1]} is incomplete",
     ]
 
 
-def test_logs_and_figures_by_their_values(tmp_path):
+def test_logs_and_figures_are_compared_by_value(tmp_path):
     log = tmp_path / "rows.jsonl"
     log.write_text('{"run": {}}\n{"key": {"n": 1}, "result": {"a": [1, 2]}}\n{"key": {')
     assert interrupt.facts(log) == {('{"n": 1}', "a", 0): 1, ('{"n": 1}', "a", 1): 2}
@@ -202,16 +202,16 @@ def test_logs_and_figures_by_their_values(tmp_path):
         interrupt.facts(figures)
 
 
-def test_charts_of_times_need_only_be_whole(tmp_path):
+def test_charts_of_times_must_only_be_complete(tmp_path):
     chart = tmp_path / "seconds.svg"
     chart.write_text("<svg>\n</svg>\n")
     assert interrupt.facts(chart) == {}
     chart.write_text("<svg>\n</sv")
-    with pytest.raises(ValueError, match="cut off"):
+    with pytest.raises(ValueError, match="truncated"):
         interrupt.facts(chart)
 
 
-def test_how_a_run_may_end():
+def test_clear_ends_of_a_run():
     assert interrupt.is_clear(0, "")
     assert interrupt.is_clear(143, "half of a bar\nfidsplat: terminated")
     assert interrupt.is_clear(-2, "Traceback ...\n  File site.py, line 3, in getpath\nKeyboardInterrupt")
@@ -223,7 +223,7 @@ def test_how_a_run_may_end():
     )
 
 
-def test_the_trials_are_planned_alike_each_time():
+def test_the_plan_of_trials_is_deterministic():
     plans = {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
     assert plans == {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
     kills = {name: sum(how != interrupt.DISK for how, _ in plan.values()) for name, plan in plans.items()}

@@ -1,4 +1,4 @@
-"""The notebooks of examples/ run as they stand, cell by cell, and hold no results of a machine."""
+"""The notebooks of examples/ run unchanged, cell by cell, and contain no outputs."""
 
 import ast
 import json
@@ -33,18 +33,18 @@ def named(stem: str):
 
 
 @pytest.mark.parametrize("shown", [named("markers")], indirect=True)
-def test_a_marker_is_drawn_and_read(shown):
+def test_a_marker_is_rendered_and_detected(shown):
     values, names = shown
     assert [reading.pose is not None for reading in names["readings"]] == [True, True]
     assert max(reading.position_error for reading in names["readings"]) < 5e-3
-    pictures = [value._repr_png_() for value in values if hasattr(value, "_repr_png_")]
-    assert len(pictures) == 2
-    assert all(png.startswith(b"\x89PNG") for png in pictures)
+    images = [value._repr_png_() for value in values if hasattr(value, "_repr_png_")]
+    assert len(images) == 2
+    assert all(png.startswith(b"\x89PNG") for png in images)
     assert sum("<table>" in value._repr_html_() for value in values if hasattr(value, "_repr_html_")) == 3
 
 
-@pytest.mark.parametrize("shown", [named("pictures")], indirect=True)
-def test_pictures_go_to_other_libraries(shown, tmp_path):
+@pytest.mark.parametrize("shown", [named("images")], indirect=True)
+def test_images_are_converted_for_other_libraries(shown, tmp_path):
     values, _ = shown
     assert values[1] == (5, 120, 160, 3)
     assert values[2] == ((120, 160, 3), np.float32)
@@ -54,7 +54,7 @@ def test_pictures_go_to_other_libraries(shown, tmp_path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
-def test_notebooks_are_kept_without_results(path):
+def test_notebooks_have_no_stored_results(path):
     notebook = json.loads(path.read_text("utf-8"))
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
     ids = [cell["id"] for cell in notebook["cells"]]

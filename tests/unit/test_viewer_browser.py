@@ -31,7 +31,7 @@ def shown(viewer, page):
     wide, tall = page.evaluate(f"{CANVAS}.width"), page.evaluate(f"{CANVAS}.height")
     rows = ((np.arange(HEIGHT) + 0.5) * rgb.shape[0] / tall).astype(int).clip(0, rgb.shape[0] - 1)
     columns = ((np.arange(int(wide)) + 0.5) * rgb.shape[1] / wide).astype(int).clip(0, rgb.shape[1] - 1)
-    page_shows = page.picture()[:, : int(wide)]
+    page_shows = page.screenshot()[:, : int(wide)]
     # a notice about the missing GPU is above, the panel next to it
     part = (slice(HEIGHT // 2, HEIGHT), slice(0, int(wide) - 10))
     return float(np.abs(rgb[rows][:, columns][part].astype(int) - page_shows[part]).mean())

@@ -41,8 +41,8 @@ WIDTH, HEIGHT = 480, 300
 DUSK = (0.0, 0.15, 0.6), (1.0, 0.7, 0.3)  # above, below
 
 
-def room(mixture: str) -> fs.Scene:
-    """Three tags on a path of grey splats."""
+def path_with_tags(mixture: str) -> fs.Scene:
+    """Scene of three tags on a path of grey splats."""
     generator = np.random.default_rng(2)
     n = 4000
     means = np.column_stack([generator.uniform(-4, 4, n), np.full(n, 0.6), generator.uniform(0.5, 14, n)])
@@ -65,17 +65,17 @@ def room(mixture: str) -> fs.Scene:
 
 def save(file: Path, image: np.ndarray) -> None:
     """Write a JPEG without chroma subsampling, so that edges of markers stay sharp."""
-    wanted = [
+    options = [
         cv2.IMWRITE_JPEG_QUALITY,
         88,
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
         cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
     ]
-    cv2.imwrite(str(file), image[:, :, ::-1], wanted)
+    cv2.imwrite(str(file), image[:, :, ::-1], options)
 
 
 def examples(renderer: fs.Renderer, out: Path) -> None:
-    """The scene files whose picture stands beside them in the pages, each drawn WIDTH pixels wide."""
+    """Render the scene files that the pages show with an image, WIDTH pixels wide."""
     folder = ROOT / "examples"
     files = sorted(
         file for name in ("lens-*", "shutter-*", "together") for file in folder.glob(f"{name}.toml")
@@ -95,7 +95,7 @@ def examples(renderer: fs.Renderer, out: Path) -> None:
 
 
 def turned(degrees: float) -> Callable[[float], np.ndarray]:
-    """The room's camera, turning by so many degrees a second."""
+    """Motion of the scene's camera, which rotates by some degrees a second."""
 
     def pose(time: float) -> np.ndarray:
         angle = math.radians(degrees) * time
@@ -112,15 +112,15 @@ def shining(degree: int) -> fs.Scene:
 
 
 def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
-    """A titled picture of each of twelve effects, all of one shape."""
-    marked = room("exact")
+    """A titled image of each of twelve effects, all of one shape."""
+    marked = path_with_tags("exact")
     camera = marked.camera
     assert camera is not None
 
     def through(lens=None, **focal) -> fs.Camera:
         return replace(camera, lens=lens, **focal)
 
-    def seen(scene: fs.Scene = marked, **call) -> np.ndarray:
+    def rendered(scene: fs.Scene = marked, **call) -> np.ndarray:
         return to_uint8(renderer.render(scene, **call)["rgb"])
 
     def example(name: str) -> fs.Scene:
@@ -130,24 +130,26 @@ def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
     wide = fs.Camera.orthographic(WIDTH, HEIGHT, 4.0, world_to_camera=camera.world_to_camera)
     turn = fs.Motion(turned(150))
     panels = {
-        "pinhole": seen,
-        "distortion (Brown-Conrady)": lambda: seen(camera=through(fs.BrownConrady(-0.4, 0.12))),
-        "fisheye, 200 degrees": lambda: seen(example("lens-fisheye"), camera=fisheye),
-        "panorama": lambda: seen(example("lens-panorama"), camera=fs.Camera.equirectangular(WIDTH, HEIGHT)),
-        "parallel rays": lambda: seen(camera=wide),
-        "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure_time=0.03, sub_poses=16)),
-        "rolling shutter": lambda: seen(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=1)),
-        "fog": lambda: seen(fog=fs.Fog(0.15, (0.75, 0.78, 0.8))),
-        "background: gradient": lambda: seen(background=fs.Gradient(*DUSK)),
-        "background: panorama": lambda: seen(background=fs.Panorama(sky())),
-        "vignetting": lambda: seen(sensor=fs.Sensor(vignetting=(-0.6,))),
-        "noise": lambda: seen(sensor=fs.Sensor(full_well=200, read_noise=6)),
+        "pinhole": rendered,
+        "distortion (Brown-Conrady)": lambda: rendered(camera=through(fs.BrownConrady(-0.4, 0.12))),
+        "fisheye, 200 degrees": lambda: rendered(example("lens-fisheye"), camera=fisheye),
+        "panorama": lambda: rendered(
+            example("lens-panorama"), camera=fs.Camera.equirectangular(WIDTH, HEIGHT)
+        ),
+        "parallel rays": lambda: rendered(camera=wide),
+        "motion blur": lambda: rendered(motion=turn, shutter=fs.Shutter(exposure_time=0.03, sub_poses=16)),
+        "rolling shutter": lambda: rendered(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=1)),
+        "fog": lambda: rendered(fog=fs.Fog(0.15, (0.75, 0.78, 0.8))),
+        "background: gradient": lambda: rendered(background=fs.Gradient(*DUSK)),
+        "background: panorama": lambda: rendered(background=fs.Panorama(sky())),
+        "vignetting": lambda: rendered(sensor=fs.Sensor(vignetting=(-0.6,))),
+        "noise": lambda: rendered(sensor=fs.Sensor(full_well=200, read_noise=6)),
     }
     return [(name, draw()) for name, draw in track(panels.items(), "effects", console=Console(stderr=True))]
 
 
 def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
-    """Six outputs of one picture, two in a row, with the key of what stands on the right."""
+    """Six outputs of one frame, two in a row, with the colour key of the right one."""
     frame = renderer.render(scene, outputs=("rgb", "normal", "depth", "distance", "label", "blended"))
     depth, distance = frame["depth"], frame["distance"]
     span = depth_span([depth, distance])
@@ -162,7 +164,7 @@ def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
 
 
 def drawing_sheet(renderer: fs.Renderer) -> np.ndarray:
-    """A drawing, tilted, and a corner of it from a twelfth as far."""
+    """A tilted drawing, and a corner of it from a twelfth of the distance."""
     sign = fs.Scene(markers=[PlacedMarker(fs.marker(f"svg:{ROOT / 'examples/data/sign.svg'}"))])
     eye, panels = np.array((0.3, -0.2, -1.1)), []
     for name, target, away in (
@@ -183,9 +185,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images")
     options = parser.parse_args()
     renderer = fs.Renderer(options.device)
-    scene, exact = room("fitted"), room("exact")
+    scene, exact = path_with_tags("fitted"), path_with_tags("exact")
 
-    def picture(what: fs.Scene, **call) -> np.ndarray:
+    def image(what: fs.Scene, **call) -> np.ndarray:
         return to_uint8(renderer.render(what, **call)["rgb"])
 
     near = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(14), (0.1, -0.5, -0.4), (-0.55, 0.0, 2.2))
@@ -193,25 +195,25 @@ def main() -> None:
         near, world_to_camera=fs.Camera.look_at(8, 8, 1, (0.1, -0.5, -0.4), (-0.2, 0, 8)).world_to_camera
     )
     boxes = [
-        [("fitted, near", picture(scene, camera=near)), ("exact, near", picture(exact, camera=near))],
-        [("fitted, far", picture(scene, camera=far)), ("exact, far", picture(exact, camera=far))],
+        [("fitted, near", image(scene, camera=near)), ("exact, near", image(exact, camera=near))],
+        [("fitted, far", image(scene, camera=far)), ("exact, far", image(exact, camera=far))],
     ]
     save(options.out / "effect-boxes.jpg", contact_sheet(boxes, width=WIDTH))
     save(options.out / "drawing.jpg", drawing_sheet(renderer))
     save(options.out / "effect-outputs.jpg", outputs_sheet(renderer, exact))
 
-    seen = [
-        ("plain", picture(exact)),
-        ("fog, 0.15 / m", picture(exact, fog=fs.Fog(0.15, (0.75, 0.78, 0.8)))),
-        ("gradient", picture(exact, background=fs.Gradient(*DUSK))),
-        ("panorama", picture(exact, background=fs.Panorama(sky()))),
-        ("vignetting, -0.6", picture(exact, sensor=fs.Sensor(vignetting=(-0.6,)))),
-        ("noise, 200 electrons", picture(exact, sensor=fs.Sensor(full_well=200, read_noise=6))),
+    panels = [
+        ("plain", image(exact)),
+        ("fog, 0.15 / m", image(exact, fog=fs.Fog(0.15, (0.75, 0.78, 0.8)))),
+        ("gradient", image(exact, background=fs.Gradient(*DUSK))),
+        ("panorama", image(exact, background=fs.Panorama(sky()))),
+        ("vignetting, -0.6", image(exact, sensor=fs.Sensor(vignetting=(-0.6,)))),
+        ("noise, 200 electrons", image(exact, sensor=fs.Sensor(full_well=200, read_noise=6))),
     ]
-    save(options.out / "effect-sensor.jpg", contact_sheet([seen[:2], seen[2:4], seen[4:]], width=WIDTH))
+    save(options.out / "effect-sensor.jpg", contact_sheet([panels[:2], panels[2:4], panels[4:]], width=WIDTH))
 
     globes = [("plain" if degree == 0 else f"degree {degree}", shining(degree)) for degree in range(4)]
-    colors = [(name, picture(what)) for name, what in globes]
+    colors = [(name, image(what)) for name, what in globes]
     save(options.out / "effect-color.jpg", contact_sheet([colors[:2], colors[2:]], width=WIDTH))
 
     examples(renderer, options.out)

@@ -1,4 +1,4 @@
-"""fidsplat and a peer draw a scene frame by frame in turn, so that what disturbs one disturbs both."""
+"""Interleaved frames of fidsplat and another renderer, so that disturbances affect both."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from measuring import PROGRESS, keep, options, show
 
 
 def arguments(about: str | None, repeats: int, device: str) -> argparse.ArgumentParser:
-    """What every peer's script takes; --device is where fidsplat draws."""
+    """Parser of the comparison scripts; --device is fidsplat's device."""
     parser = options(about, device, repeats)
     parser.add_argument("scenes", nargs="*", default=["r100k_720p"], help="as in `fidsplat bench --help`")
     return parser
 
 
 def peer_device(name: str, title: str, platform: str, version: str, kind: str, units: int) -> DeviceInfo:
-    """Where a peer draws."""
+    """Device of the other renderer."""
     return DeviceInfo(
         name=name,
         title=title,
@@ -45,19 +45,19 @@ def peer_device(name: str, title: str, platform: str, version: str, kind: str, u
 
 
 def compared(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], repeats: int) -> list[dict]:
-    """Time both and return their records, the peer's with the ratio of the medians and the PSNR of its
-    picture against ours.
+    """Time both renderers; returns their records, the peer's with the ratio of medians and the PSNR of its
+    image against fidsplat's.
 
     Args:
-        peer: its `timer` times `draw`, which draws one frame, waits until it is done, and returns the
-        picture,
-            (h, w, 3 or more), as something that NumPy can read. The reading is not timed.
+        peer: result whose `timer` times `draw`.
+        draw: renders one frame, waits for it, and returns an array-like image (h, w, 3 or more); its
+        conversion to NumPy is not timed.
     """
-    drawn = []
-    peer.first_frame_ms = Timer(lambda: drawn.append(np.asarray(draw())[..., :3])).run()
-    picture = drawn.pop()
-    peer.mean_rgb = float(picture.mean(dtype=np.float64))
-    error = np.mean((np.clip(picture, 0, 1).astype(np.float64) - np.clip(ours.image, 0, 1)) ** 2)
+    images = []
+    peer.first_frame_ms = Timer(lambda: images.append(np.asarray(draw())[..., :3])).run()
+    image = images.pop()
+    peer.mean_rgb = float(image.mean(dtype=np.float64))
+    error = np.mean((np.clip(image, 0, 1).astype(np.float64) - np.clip(ours.image, 0, 1)) ** 2)
     with Progress(console=PROGRESS) as progress:
         task = progress.add_task(peer.scene, total=2 * repeats)
         time_interleaved([ours.result.timer, peer.timer], repeats, tick=lambda: progress.advance(task))
@@ -68,7 +68,7 @@ def compared(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], repea
 
 
 def report(records: list[dict], scenes: list[str], file: str | None) -> None:
-    """Print a table, and write the file if there is one, as `fidsplat bench --json` does."""
+    """Print a table, or write the file in the format of `fidsplat bench --json`."""
     figures = {"fidsplat": fs.__version__, "scenes": scenes, "interrupted": False, "results": records}
     if keep(figures, file):
         return
@@ -87,4 +87,4 @@ def report(records: list[dict], scenes: list[str], file: str | None) -> None:
         )
 
     heads = ("scene", "renderer", "device", "ms per frame", "times ours", "mean RGB", "PSNR against ours")
-    show("fidsplat and its peer, in turns", heads, map(cells, records))
+    show("fidsplat and the other renderer, interleaved", heads, map(cells, records))

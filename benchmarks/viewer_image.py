@@ -17,22 +17,22 @@ CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(
 
 
 def main(source: str, out: str) -> None:
-    """The page at rest, turned a little, with the errors of what was read."""
+    """Save a screenshot of the page after a small rotation, with the errors of the detected markers."""
     viewer = Viewer(fs.Scene.load(source), Path(source), port=0)
     with chromium.Page(viewer.address, 1240, 780) as page:
-        rests(viewer)
+        wait_for_exact_image(viewer)
         page.drag((420.0, 500.0), (480.0, 490.0))
         page.evaluate(CLOSE)
         time.sleep(1.0)
-        rests(viewer)
+        wait_for_exact_image(viewer)
         viewer.detect_markers(next(iter(viewer.server.get_clients().values())))
         time.sleep(1.0)
-        cv2.imwrite(out, page.picture()[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+        cv2.imwrite(out, page.screenshot()[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
     viewer.close()
 
 
-def rests(viewer: Viewer) -> None:
-    """Wait until the picture at rest has been sent and shown."""
+def wait_for_exact_image(viewer: Viewer) -> None:
+    """Wait until the exact image has been sent and displayed."""
     before = None
     while not viewer._views or before is not next(iter(viewer._views.values())):
         before = next(iter(viewer._views.values()), None)
