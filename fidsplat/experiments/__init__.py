@@ -1,1 +1,1 @@
-"""One module for each thing that is shown or measured with the whole program: the demo, tables, figures."""
+"""Experiments: the paper's tables and figures, the trade-off, the benchmark, the demo."""

@@ -1,5 +1,7 @@
-"""Ground truth from Blender as in the paper: Cycles renders a textured plane, by `bpy` in a separate process
-and environment (bpy needs Python 3.11 and NumPy below 2, and has the GPL)."""
+"""Ground truth from Blender as in the paper: Cycles renders a textured plane.
+
+`bpy` runs in a separate process and environment: it needs Python 3.11 and NumPy below 2, and has the GPL.
+"""
 
 from __future__ import annotations
 
@@ -167,8 +169,10 @@ def render(
 def run_worker(
     python: Path, worker: Path, objects: Iterable[dict], job: dict, threads: int | None = None
 ) -> Iterator[Path]:
-    """Render the missing images of objects with a worker; yields each file when it is complete, existing ones
-    first. Raises DeviceError if Blender fails; complete images stay."""
+    """Render the missing images of objects with a worker; yields each file, existing ones first.
+
+    Raises DeviceError if Blender fails; complete images stay.
+    """
     missing = []
     for one in objects:
         existing = [image["file"] for image in one["images"] if Path(image["file"]).is_file()]

@@ -88,8 +88,7 @@ def plain_ticks(axis) -> None:
 
 
 def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
-    """Label points, each at the nearest position that overlaps no other label, labelled point, text, or line
-    across the panel."""
+    """Label points without overlaps with other labels, labelled points, texts and horizontal lines."""
     figure.canvas.draw()
     inside = axes.get_window_extent()
     dots = [axes.transData.transform((x, y)) for x, y, _ in points]

@@ -71,8 +71,7 @@ class DemoResult:
 
     @property
     def passed(self) -> bool:
-        """Whether all completely visible markers, at least one, were located within the limit, and no other
-        code was detected."""
+        """Whether all completely visible markers, at least one, were located, and nothing else."""
         decided = [s.passed for s in self.sightings if s.passed is not None]
         return bool(decided) and all(decided) and not self.unexpected
 

@@ -1,5 +1,4 @@
-"""Training data set of the demo scene: images from an arc, their cameras, and noisy points of a
-reconstruction."""
+"""Training data set of the demo scene: images from an arc, their cameras, and noisy points."""
 
 from __future__ import annotations
 
@@ -67,8 +66,10 @@ def write_demo_views(
 
 
 def _cameras(count: int, width: int, shift: float) -> list[Camera]:
-    """Cameras on an arc with alternating distances and heights; a shift of 0.5 places them between those
-    without."""
+    """Cameras on an arc with alternating distances and heights.
+
+    shift: 0.5 places cameras between those of 0.
+    """
     height = round(width * 9 / 16)
     cameras = []
     for i in range(count):

@@ -79,8 +79,10 @@ def _errors(plain: Marker, camera: Camera, image: np.ndarray) -> dict[str, float
 
 
 def camera_at(distance: float, tilt: float, seed: str) -> Camera:
-    """Camera at a distance in metres and a tilt in degrees from the marker's normal, with random azimuth, a
-    roll of up to 20 degrees, and an aim of up to 3 degrees beside the marker."""
+    """Camera at a distance in metres and a tilt in degrees from the marker's normal.
+
+    Azimuth, a roll of up to 20 degrees, and an aim of up to 3 degrees beside the marker are random.
+    """
     generator = random.Random(seed)
     a, b = math.radians(tilt), generator.uniform(0, 2 * math.pi)
     direction = np.array([math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), -math.cos(a)])

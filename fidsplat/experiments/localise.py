@@ -61,7 +61,7 @@ class Variant:
 
     @property
     def rendering(self) -> Variant | None:
-        """The variant with equal images and without other changes; None without images."""
+        """Key of the rendered images; None without images."""
         return None if self.mixture is None else replace(self, ideal=False, reach=math.inf)
 
 
@@ -101,7 +101,6 @@ class Drive:
 
     @cached_property
     def house(self) -> Greenhouse:
-        """Greenhouse of the drive."""
         return Greenhouse(self.rows, self.plants, self.seed)
 
     @property
@@ -197,7 +196,7 @@ class Drive:
     def _known(
         self, run: Run, detections: list[list[Detection]]
     ) -> Iterator[tuple[int, list[tuple[Detection, PlacedMarker]], np.ndarray]]:
-        """Index of the pose, detections with their tags, and pose of the robot, for each image."""
+        """Pose index, detections with their tags, and robot pose of each image."""
         for k, codes in zip(self.image_indices(run).tolist(), detections, strict=True):
             yield k, [(code, self.tags[code.id]) for code in codes if code.id in self.tags], run.poses[k]
 
@@ -211,8 +210,10 @@ class Drive:
     def corner_errors(
         self, run: Run, detections: list[list[Detection]], camera: Camera
     ) -> list[dict[str, Any]]:
-        """Number of detected tags and median corner error (root mean square per tag, pixels) by bin of
-        `DISTANCES`."""
+        """Number of detected tags and median corner error in pixels by bin of `DISTANCES`.
+
+        The corner error of a tag is a root mean square.
+        """
         errors: list[list[float]] = [[] for _ in range(len(DISTANCES) + 1)]
         for _, pairs, pose in self._known(run, detections):
             at = camera_at(camera, pose)
@@ -224,8 +225,10 @@ class Drive:
 
 
 def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
-    """Errors of estimated poses (n, 4, 4): ATE without alignment (root mean square and worst) and RPE over a
-    metre (root mean square), in metres on the floor; heading in degrees."""
+    """Errors of estimated poses (n, 4, 4): metres on the floor, heading in degrees.
+
+    ATE without alignment (root mean square and worst), RPE over a metre (root mean square).
+    """
     distance = np.linalg.norm(poses[:, :2, 3] - run.poses[:, :2, 3], axis=1)
     rotation = np.einsum("nji,njk->nik", run.poses[:, :3, :3], poses[:, :3, :3])
     heading = np.degrees(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
@@ -246,8 +249,9 @@ def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
 def write_log(
     drive: Drive, name: str, renderer: Renderer, path: str, overwrite: bool, source: str = ""
 ) -> Iterator[np.ndarray]:
-    """Write the drive of a variant as a log: JPEG images, intrinsics, detections, gyroscope, camera poses
-    (/tf) and estimated poses (/odom). Yields the logged images.
+    """Write the drive of a variant as a log; yields the logged images.
+
+    Logged are JPEG images, intrinsics, detections, gyroscope, camera poses (/tf), estimated poses (/odom).
 
     Raises InputError for a variant without images, or if the log cannot be written.
     """

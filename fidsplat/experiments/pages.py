@@ -18,8 +18,11 @@ NOTHING = "-"
 
 
 def page_and_folder(out: Path) -> tuple[Path, Path]:
-    """Report file, and folder of its charts and tables: report.md in a folder, or a name that ends in .md and
-    a folder of that name without .md. Raises InputError when the folder cannot be written."""
+    """Report file, and folder of its charts and tables.
+
+    These are report.md in a folder, or a name that ends in .md and a folder of that name without .md. Raises
+    InputError when the folder cannot be written.
+    """
     if out.suffix == ".md":
         return out, writable_folder(out.with_suffix(""))
     return writable_folder(out) / "report.md", out

@@ -45,8 +45,9 @@ def plane_image(
 
 
 def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Segments (n, 2) and (n, 2) in modules between modules of different value, and the value on the right of
-    their direction (y down) minus that on the left.
+    """Segments (n, 2) and (n, 2) in modules between modules of different value, with their jumps.
+
+    A jump is the value on the right of the direction (y down) minus that on the left.
 
     Segments point down on vertical lines and left on horizontal ones; runs of equal jumps are one segment.
     """
@@ -105,8 +106,7 @@ def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tup
 
 
 def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Segments cut where x or y is a whole number: number of the segment, and the piece's parameters in
-    [0, 1]."""
+    """Pieces of segments between pixel borders: number of the segment, and parameters in [0, 1]."""
     n = len(begin)
     owner, cut = [np.arange(n), np.arange(n)], [np.zeros(n), np.ones(n)]
     for axis in (0, 1):

@@ -1,5 +1,4 @@
-"""Plants from Blender: meshes rendered by Cycles from many poses, and splats trained on the images, starting
-from disks on the mesh."""
+"""Plants from Blender: meshes rendered by Cycles, and splats trained on the images."""
 
 from __future__ import annotations
 
@@ -74,13 +73,14 @@ class PlantSettings:
         return [(kind, number) for number in range(self.each) for kind in self.kind or KINDS]
 
     def mesh(self, kind: str, number: int) -> Mesh:
-        """Mesh of a plant."""
         return KINDS[kind](np.random.default_rng([self.seed, list(KINDS).index(kind), number]))
 
 
 def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:
-    """Cameras on a spiral around a mesh, from below to far above; a shift of 0.5 places them between those
-    without."""
+    """Cameras on a spiral around a mesh, from below to far above.
+
+    shift: 0.5 places cameras between those of 0.
+    """
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     offsets = mesh.vertices - middle
     radius, side = (float(np.linalg.norm(part, axis=1).max()) for part in (offsets, offsets[:, :2]))
@@ -177,8 +177,7 @@ def _render(settings: PlantSettings, mesh: Mesh, out: Path, python: Path, progre
 def _train(
     settings: PlantSettings, mesh: Mesh, folder: Path, file: Path, renderer: Renderer, progress: Progress
 ) -> float:
-    """Train on the images from disks on the mesh, and write the visible splats; returns the mean test
-    PSNR."""
+    """Train disks on the mesh and write the visible splats; returns the mean test PSNR."""
     training = TrainSettings(
         iterations=settings.iterations,
         seed=settings.seed,

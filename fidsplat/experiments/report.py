@@ -198,8 +198,10 @@ def _views(rows: Frame, folder: Path) -> dict:
 
 
 def _trained(rows: Frame, viewed: Frame | None, scans: Frame | None) -> dict:
-    """The paper's baseline: the paper's figures and ours of the first seed, by category and number of views;
-    the other seeds show the random spread of PSNR."""
+    """Section on the paper's baseline: figures of the paper and ours by category and number of views.
+
+    Ours are of the first seed; the other seeds show the random spread of PSNR.
+    """
     first = rows[rows["seed"] == 0]
     read, flips = {}, {}
     if scans is not None:
@@ -279,8 +281,10 @@ def _spread(rows: Frame) -> dict | None:
 
 
 def _enough(table: Frame) -> list[dict]:
-    """Per category, the fewest training views after which a marker is read to the same tilt as the
-    training-free one; if there are none, the views with the smallest difference in degrees, `before`."""
+    """Fewest training views per category after which a marker is readable like the training-free one.
+
+    If there are none, the views with the smallest difference of tilt in degrees, `before`.
+    """
     ours, free, seconds = (
         pd.Series(pd.to_numeric(table[name], errors="coerce"))
         for name in ("read to, ours", "read to, training-free", "seconds, several at once")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 from fidsplat.experiments.angles import parse_tilts
@@ -48,11 +49,9 @@ class CountedSettings(MarkerSettings):
 
     @property
     def marker_count(self) -> int:
-        """Number of markers of each category."""
         return MARKERS if self.markers is None else self.markers
 
     def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
         super().check()
         if not 1 <= self.marker_count <= MARKERS:
             raise InputError(f"--markers must be 1 to {MARKERS}, got {self.markers}")
@@ -140,7 +139,6 @@ class MeasureSettings(SweepSettings):
 
     @property
     def marker_count(self) -> int:
-        """Number of markers of each category."""
         return 1 if self.quick and self.markers is None else super().marker_count
 
 
@@ -161,12 +159,8 @@ class RenderSettings(MarkerSettings):
         return method_names(self.mixture, self.trained)
 
     def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
         super().check()
         method_names(self.mixture)
-        self._check_trained()
-
-    def _check_trained(self) -> None:
         folder = self.trained
         if folder is None or self.methods == (IDEAL,):
             return
@@ -177,14 +171,12 @@ class RenderSettings(MarkerSettings):
         models = [method for method in self.methods if method.startswith("2dgs-")]
         if not models:
             raise InputError(f"{folder} holds none of 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17")
-        for model in models:
-            for category in chosen_categories(self.category):
-                for index in range(self.marker_count):
-                    file = folder / model / f"{category.name}-{index}.ply"
-                    if not file.is_file():
-                        raise InputError(
-                            f"{file} is missing; --category and --markers leave out untrained markers"
-                        )
+        for model, category, index in product(
+            models, chosen_categories(self.category), range(self.marker_count)
+        ):
+            file = folder / model / f"{category.name}-{index}.ply"
+            if not file.is_file():
+                raise InputError(f"{file} is missing; --category and --markers leave out untrained markers")
 
 
 @dataclass(frozen=True)
@@ -195,7 +187,6 @@ class ImageSettings(RenderSettings, MeasureSettings):
     """Number of threads that evaluate images. By default one per core."""
 
     def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
         super().check()
         if self.workers < 1:
             raise InputError(f"--workers must be at least 1 thread, got {self.workers}")
@@ -214,11 +205,9 @@ class AngleSettings(ImageSettings):
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Rows of the tables."""
         return (IDEAL,) if self.ideal else super().methods
 
     def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
         super().check()
         for name in self.protocol:
             if name not in PROTOCOLS:
@@ -238,11 +227,9 @@ class ViewSettings(ImageSettings):
 
     @property
     def blender_folder(self) -> Path:
-        """Folder with Blender's images."""
         return self.folder / "blender" if self.blender is None else self.blender
 
     def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
         super().check()
         if self.blender is not None and not self.blender.is_dir():
             raise InputError(

@@ -34,8 +34,7 @@ class Category:
     """version of the QR code"""
 
     def spec(self, index: int, seed: int = SEED) -> str:
-        """Marker spec of marker 0 to 4: tags 0 to 4 of 36h11, QR codes of seeded random letters and
-        digits."""
+        """Marker spec of marker 0 to 4: a tag of 36h11, or a QR code of seeded random characters."""
         if self.kind == "apriltag":
             return f"apriltag:36h11:{index}"
         letters = string.ascii_letters + string.digits

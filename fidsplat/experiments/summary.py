@@ -40,8 +40,9 @@ class Summary:
     """notes for readers of the numbers"""
 
     def write(self, file: Path) -> Summary:
-        """Write the table, with numbers to four digits; returns it as read from the file, so that raw results
-        and summaries make equal reports.
+        """Write the table, with numbers to four digits; returns it as read from the file.
+
+        Thus raw results and summaries make equal reports.
 
         Raises InputError when the file cannot be written.
         """

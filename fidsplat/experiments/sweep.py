@@ -36,7 +36,6 @@ class Record(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Key as a string."""
         return name_of(self.key)
 
     @property
@@ -122,7 +121,6 @@ class Sweep:
 
     @property
     def left(self) -> list[Key]:
-        """Missing points."""
         return self.results.left(self.points)
 
     def run(self) -> Iterator[Record]:
@@ -148,8 +146,10 @@ class Sweep:
 
 
 def run_interleaved(sweeps: Sequence[Sweep]) -> Iterator[Record]:
-    """Measure the missing points of sweeps, the first batch of each before the second of any; yields each
-    record when it is in its file, so that an interrupt loses at most one batch."""
+    """Measure the missing points of sweeps, one batch of each in turn; yields each record.
+
+    A record is in its file when it is yielded, so an interrupt loses at most one batch.
+    """
     batches = [
         [sweep.points[first : first + sweep.batch] for first in range(0, len(sweep.points), sweep.batch)]
         for sweep in sweeps

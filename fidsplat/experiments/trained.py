@@ -1,5 +1,7 @@
-"""Baseline of the paper: 2DGS trained on 3, 5, 9 and 17 views of each marker, evaluated on novel views (table
-4) and on the largest readable tilts (table 3)."""
+"""Baseline of the paper: 2DGS trained on 3, 5, 9 and 17 views of each marker.
+
+Models are evaluated on novel views (table 4) and by the largest readable tilt (table 3).
+"""
 
 from __future__ import annotations
 
@@ -50,11 +52,9 @@ class BaselineSettings(SweepSettings):
 
     @property
     def folder(self) -> Path:
-        """Folder for splats and results."""
         return self.out or Path("fidsplat-baseline")
 
     def check(self) -> None:
-        """Raise InputError for settings that cannot be used."""
         super().check()
         for number in self.views:
             if number not in COLLECTIONS:
@@ -67,7 +67,7 @@ class BaselineSettings(SweepSettings):
 
     @property
     def points(self) -> list[Key]:
-        """The trainings, one marker of each category first."""
+        """Points of the trainings, one marker of each category first."""
         points = [
             {
                 **{"category": category.name, "index": index, "views": number},
@@ -83,8 +83,9 @@ class BaselineSettings(SweepSettings):
 
 @contextmanager
 def baseline_sweeps(settings: BaselineSettings, renderer: Renderer) -> Iterator[list[Sweep]]:
-    """Sweeps of the trainings, and of the views and angles of the first seed, to run interleaved so that an
-    interrupted run has evaluated its trained models.
+    """Sweeps of the trainings, and of the views and angles of the first seed, to run interleaved.
+
+    Thus an interrupted run has evaluated its trained models.
 
     Raises InputError if files cannot be written, or hold results of another device, version, code, seed or
     number of iterations.

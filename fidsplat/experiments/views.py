@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from threading import Lock
 
@@ -54,30 +55,20 @@ def views_points(
         lpips: digest of the LPIPS weights, if measured.
     """
     points = []
-    for category in categories:
-        for index in range(markers):
-            truths = ["exact", "exact-linear"]
-            truths += [
-                f"blender-{view}"
-                for view in VIEW_NAMES
-                if all(
-                    image_file(blender, view, category.name, index, TEST, i).is_file() for i in range(views)
-                )
-            ]
-            for method in with_linear_light(methods):
-                for truth in truths:
-                    point = {
-                        "category": category.name,
-                        "index": index,
-                        "method": method,
-                        "truth": truth,
-                        "views": views,
-                        "flip": has_flip(),
-                        "lpips": lpips,
-                    }
-                    equal = method == IDEAL and truth == "exact"  # by definition
-                    if not equal and (truth in LINEAR or not in_linear_light(method)):
-                        points.append(point)
+    for category, index in product(categories, range(markers)):
+        truths = ["exact", "exact-linear"]
+        for view in VIEW_NAMES:
+            files = (image_file(blender, view, category.name, index, TEST, i) for i in range(views))
+            if all(file.is_file() for file in files):
+                truths.append(f"blender-{view}")
+        common = {"category": category.name, "index": index}
+        metrics = {"views": views, "flip": has_flip(), "lpips": lpips}
+        points += [
+            {**common, "method": method, "truth": truth, **metrics}
+            for method, truth in product(with_linear_light(methods), truths)
+            # equal by definition, or averages of different light
+            if (method, truth) != (IDEAL, "exact") and (truth in LINEAR or not in_linear_light(method))
+        ]
     return points
 
 

@@ -45,8 +45,10 @@ def tag_in_million() -> tuple[SplatCloud, Camera]:
 
 
 def qr_wall() -> tuple[SplatCloud, Camera]:
-    """200 QR codes of version 22 (1000 characters, level L) in 20 columns and 10 rows on a wall that fills
-    1920 x 1080 pixels; ten different codes alternate."""
+    """200 QR codes in 20 columns and 10 rows on a wall that fills 1920 x 1080 pixels.
+
+    Ten different codes of version 22 (1000 characters, level L) alternate.
+    """
     letters = random.Random(0)
     texts = ("".join(letters.choices(string.ascii_letters, k=1000)) for _ in range(_WALL_CODES))
     codes = [marker(f"qr-v22-L:{text}", size=0.1) for text in texts]
@@ -79,8 +81,9 @@ MOST_VIEWS = 8
 
 
 def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, BenchScene]:
-    """Benchmark scenes of a user's scene: its camera, or poses of a trajectory (camera to world), by names
-    such as `room.toml@2`.
+    """Benchmark scenes of a user's scene by name, such as `room.toml@2`.
+
+    The view is its camera, or poses of a trajectory (camera to world).
 
     Raises InputError for a scene without a camera.
     """

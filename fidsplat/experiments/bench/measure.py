@@ -165,7 +165,6 @@ class SceneRun:
             timer.error = str(error)
 
     def render(self) -> Frame:
-        """Render a frame."""
         return self.renderer.render(self.resident, self.capture)
 
     def _complete(self) -> Frame:

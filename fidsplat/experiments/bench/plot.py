@@ -11,8 +11,9 @@ from fidsplat.experiments.charts import bars, chart, legend_above, plain_ticks
 
 
 def write_plot(results: Sequence[Result], file: Path) -> None:
-    """Write a chart: for each scene a bar per device with the median milliseconds of a frame on a logarithmic
-    axis, its quartiles, and the roofline of the device if it is known.
+    """Write a chart with a bar per device for each scene: median milliseconds of a frame and quartiles.
+
+    The axis is logarithmic; a line shows the roofline of the device if it is known.
 
     Raises InputError when the file cannot be written.
     """

@@ -1,5 +1,7 @@
-"""Kernel compilation in advance, by rendering small frames: CPU drivers compile a kernel at its first launch,
-and again for launches of more than 65,535 work-items."""
+"""Kernel compilation in advance, by rendering small frames.
+
+CPU drivers compile a kernel at its first launch, and again for launches of more than 65,535 work-items.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Errors of a frame: against the reference image, beyond float32 certificates, and the largest readable tilt
-of a marker."""
+"""Errors of frames relative to references, and the largest readable tilt of a marker."""
 
 from __future__ import annotations
 
@@ -141,8 +140,10 @@ def compare_marker(image: np.ndarray, scene: TradeScene) -> dict:
 
 
 def check_reference(reference: np.ndarray, scene: TradeScene, full: Quality) -> dict:
-    """Compare a reference image with the NumPy reference at random pixels: their number `pixels`, and
-    `maximum`, the largest difference of their colours."""
+    """Compare a reference image with the NumPy reference at random pixels.
+
+    Returns their number `pixels` and `maximum`, the largest difference of their colours.
+    """
     height, width = reference.shape[:2]
     count = max(4, min(_MAX_CHECKED, _PAIRS // max(1, len(scene.cloud) * full.samples**2)))
     chosen = random.Random(SEED).sample(range(height * width), min(count, height * width))

@@ -1,5 +1,4 @@
-"""Quality settings of the trade-off: values of each setting, constants of other renderers in an exact frame,
-presets, and combinations."""
+"""Quality settings of the trade-off: values, constants of other renderers, presets, combinations."""
 
 from __future__ import annotations
 

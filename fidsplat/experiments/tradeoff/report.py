@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from fidsplat.experiments.charts import Axes, chart, label_points, literal, plain_ticks
-from fidsplat.experiments.pages import fixed, number, page_and_folder, percent, write_page
-from fidsplat.experiments.summary import Frame, Row, provenance
+from fidsplat.experiments.pages import NOTHING, fixed, number, page_and_folder, percent, write_page
+from fidsplat.experiments.summary import Frame, provenance
 from fidsplat.experiments.tradeoff.points import ABLATION, COMBINED, MARKER, PRESET
 from fidsplat.experiments.tradeoff.run import REFERENCE
 from fidsplat.experiments.tradeoff.scenes import GAUSSIANS_3D, HARD, RANDOM
@@ -25,6 +25,10 @@ _SMALLEST = 1e-7
 """smaller errors are plotted here"""
 SHOWN_MARKER = "qr10"
 """marker of the table of mixtures"""
+
+
+_EXACT = (ABLATION, "exact")
+"""setting and value of the exact image"""
 
 
 class Constant(NamedTuple):
@@ -73,8 +77,9 @@ _LABELS = {
 
 
 def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Write the report, and for each device a chart and its results as a table; returns the files, the report
-    first. The tables suffice to make the same report again.
+    """Write the report, and for each device a chart and a table; returns the files, the report first.
+
+    The tables suffice to make the same report again.
 
     Args:
         folders: folders with results, see `load`.
@@ -144,8 +149,10 @@ def write_plot(folders: Sequence[Path], file: Path) -> None:
 
 
 def write_chart(devices: Sequence[DeviceResults], scene: str, file: Path) -> None:
-    """Write a chart of milliseconds and largest errors of the settings with the image definition of the base,
-    with a panel for each device."""
+    """Write a chart of time and largest error of settings, with a panel for each device.
+
+    Only settings with the image definition of the base are comparable.
+    """
     with chart(file, len(devices), (9.0 * len(devices), 5.2)) as (figure, panels):
         labels = [_plot(axes, device, scene) for axes, device in zip(panels, devices, strict=True)]
         panels[0].set_ylabel("largest error (peak 1)")
@@ -190,38 +197,37 @@ def constants_table(devices: Sequence[DeviceResults]) -> Frame:
     """Time that each constant saves relative to the exact image, and its error; only measured constants."""
     rows = []
     shared = _shared_scene(devices)
-    scenes = (shared, HARD) if any(HARD in device.scenes for device in devices) else (shared,)
+    has_hard = any(HARD in device.scenes for device in devices)
     for constant in CONSTANTS:
-        row: dict[str, str] = {"constant": constant.text, "used by": constant.users}
-        measured = False
-        for scene in dict.fromkeys(scenes):
-            pairs = [(device, *_pair(device, scene, constant)) for device in devices]
-            if scene != HARD:
-                row |= {
-                    f"time, {device.kind}": percent(
-                        None if point is None or exact is None else point["ratio"] / exact["ratio"]
-                    )
-                    for device, point, exact in pairs
-                }
-            errors = [
-                point["maximum"] for _, point, exact in pairs if point is not None and exact is not None
-            ]
-            measured |= bool(errors)
-            row[f"largest error, {scene}"] = number(max(errors, default=None))
+        point = (constant.setting, constant.value)
+        times, error = _compare(devices, shared, point, _EXACT)
+        errors = {shared: error} | ({HARD: _compare(devices, HARD, point, _EXACT)[1]} if has_hard else {})
+        if all(error is None for error in errors.values()):
+            continue
         verdicts = [_verdict(device, constant) for device in devices]
-        row["verdict"] = " / ".join(dict.fromkeys(filter(None, verdicts)))
-        if measured:
-            rows.append(row)
+        rows.append(
+            {"constant": constant.text, "used by": constant.users}
+            | ({} if shared == HARD else {f"time, {device.kind}": NOTHING for device in devices} | times)
+            | {f"largest error, {scene}": number(error) for scene, error in errors.items()}
+            | {"verdict": " / ".join(dict.fromkeys(filter(None, verdicts)))}
+        )
     return pd.DataFrame(rows)
 
 
-def _pair(device: DeviceResults, scene: str, constant: Constant) -> tuple[Row | None, Row | None]:
-    """Rows of a constant and of the exact image."""
-    return device.at(scene, constant.setting, constant.value), device.at(scene, ABLATION, "exact")
+def _compare(
+    devices: Sequence[DeviceResults], scene: str, setting: tuple[str, str], base: tuple[str, str]
+) -> tuple[dict[str, str], float | None]:
+    """Columns of the time of a setting relative to another on each device with both, and its largest error on
+    them; None without any."""
+    pairs = [(device, device.at(scene, *setting), device.at(scene, *base)) for device in devices]
+    pairs = [pair for pair in pairs if pair[1] is not None and pair[2] is not None]
+    times = {f"time, {device.kind}": percent(row["ratio"] / other["ratio"]) for device, row, other in pairs}
+    return times, max((row["maximum"] for _, row, _ in pairs), default=None)
 
 
 def _verdict(device: DeviceResults, constant: Constant) -> str:
-    point, exact = _pair(device, _shared_scene([device]), constant)
+    scene = _shared_scene([device])
+    point, exact = device.at(scene, constant.setting, constant.value), device.at(scene, *_EXACT)
     if point is None or exact is None:
         return ""
     verdict = device.verdict(point, exact)
@@ -229,47 +235,40 @@ def _verdict(device: DeviceResults, constant: Constant) -> str:
 
 
 def ellipsoids_table(devices: Sequence[DeviceResults]) -> Frame:
-    """Time of each projection of 3D Gaussians relative to `ewa`, and its largest error; only measured
-    scenes."""
+    """Time of each projection of 3D Gaussians relative to `ewa`, and its largest error."""
     rows = []
     for name, text in ELLIPSOIDS.items():
         row = {"3D Gaussians": text}
         for scene in GAUSSIANS_3D:
-            errors = []
-            for device in devices:
-                point, ewa = (device.at(scene, "ellipsoid", one) for one in (name, "ewa"))
-                if point is not None and ewa is not None:
-                    errors.append(point["maximum"])
-                    row[f"time, {scene}, {device.kind}"] = percent(point["ratio"] / ewa["ratio"])
-            if errors:
-                row[f"largest error, {scene}"] = number(max(errors))
+            times, error = _compare(devices, scene, ("ellipsoid", name), ("ellipsoid", "ewa"))
+            if error is not None:
+                row |= {time.replace("time", f"time, {scene}"): value for time, value in times.items()}
+                row[f"largest error, {scene}"] = number(error)
         if len(row) > 1:
             rows.append(row)
     return pd.DataFrame(rows)
 
 
 def orders_table(devices: Sequence[DeviceResults]) -> Frame:
-    """Time of compositing by depth per pixel relative to the order of centres, and the largest errors of both
-    relative to the exact image in the same order; only scenes with both."""
-    rows = []
+    """Time of compositing by depth per pixel relative to the order of centres, and the errors of both.
+
+    Errors are relative to the exact image in the same order.
+    """
+    rows, pixel, centre = [], ("order", "pixel"), ("order", "centre")
     for scene in dict.fromkeys(scene for device in devices for scene in device.scenes):
-        errors: dict[str, list[float]] = {"pixel": [], "centre": []}
-        times = {}
-        for device in devices:
-            pixel, centre = (device.at(scene, "order", name) for name in errors)
-            if pixel is not None and centre is not None:
-                times[f"time, {device.kind}"] = percent(pixel["ratio"] / centre["ratio"])
-                errors["pixel"].append(pixel["maximum"])
-                errors["centre"].append(centre["maximum"])
+        times, error = _compare(devices, scene, pixel, centre)
         if times:
-            worst = {f"largest error, `{name}`": number(max(found)) for name, found in errors.items()}
-            rows.append({"`pixel` relative to `centre`": scene} | worst | times)
-    return pd.DataFrame(rows).fillna("-")
+            errors = {"pixel": error, "centre": _compare(devices, scene, centre, pixel)[1]}
+            columns = {f"largest error, `{name}`": number(error) for name, error in errors.items()}
+            rows.append({"`pixel` relative to `centre`": scene} | columns | times)
+    return pd.DataFrame(rows).fillna(NOTHING)
 
 
 def markers_table(device: DeviceResults) -> Frame:
-    """Marker qualities rendered without a low-pass with nine samples per pixel: time, PSNR relative to the
-    printed texture, largest readable tilt."""
+    """Marker qualities: time, PSNR relative to the printed texture, largest readable tilt.
+
+    Rendered without a low-pass with nine samples per pixel.
+    """
     view, rows = f"{SHOWN_MARKER}@{TILT}", []
     if view not in device.scenes:
         return pd.DataFrame()

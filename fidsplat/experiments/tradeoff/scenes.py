@@ -1,5 +1,4 @@
-"""Scenes of `fidsplat tradeoff`: random splats, 3D Gaussians, hard cases, markers at three tilts, and the
-user's files and cameras."""
+"""Scenes of `fidsplat tradeoff`: splats, hard cases, markers at three tilts, and the user's files."""
 
 from __future__ import annotations
 
@@ -52,7 +51,6 @@ class TradeScene:
 
     @cached_property
     def capture(self) -> Capture:
-        """Capture of the view."""
         return Capture(self.camera, background=self.background)
 
 

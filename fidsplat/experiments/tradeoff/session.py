@@ -1,5 +1,4 @@
-"""Measurement session: a renderer, uploaded scenes and reference images; interleaved timing of a quality and
-the base."""
+"""Measurement session: renderer, uploaded scenes, reference images, interleaved timing."""
 
 from __future__ import annotations
 
@@ -40,7 +39,6 @@ class Session:
         self._reference = lru_cache(_REFERENCES)(self._render_reference)
 
     def scene(self, view: str, marker: MarkerQuality) -> TradeScene:
-        """Scene of a view."""
         return self._own[view] if view in self._own else self._make(view, marker)
 
     def _resident(self, view: str, marker: MarkerQuality) -> ResidentCloud:

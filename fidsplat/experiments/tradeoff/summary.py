@@ -145,8 +145,10 @@ class DeviceResults:
         return statistics.median(self.points.loc[self.points["scene"] == scene, "base_ms"])
 
     def noise(self, scene: str) -> float:
-        """Relative difference of times that means nothing: of the base from itself, and of qualities that
-        were measured under two names."""
+        """Noise of times as a relative difference.
+
+        Measured on the base relative to itself, and on qualities with two names.
+        """
         base = self.points.loc[(scene, "base", "base")]
         ratios = self.of(scene).groupby("quality")["ratio"]
         repeated = (ratios.max() / ratios.min() - 1).max()
@@ -173,8 +175,10 @@ class DeviceResults:
         return _VERDICTS[int(slower) - int(faster), sum(errors)]
 
     def cheapest_within(self, scenes: Iterable[str], bound: float) -> list[Row]:
-        """Rows of the setting with the lowest product of costs over scenes whose error beyond certificates is
-        at most the bound on each; [] if there is none."""
+        """Rows of the cheapest setting with errors of at most a bound on all scenes; [] if there is none.
+
+        The cost is the product over scenes; errors within certificates do not count.
+        """
         scenes = list(scenes)
         rows: Frame = pd.concat([self.same_definition(scene) for scene in scenes])
         best: tuple[float, list[Row]] = (math.inf, [])
@@ -187,8 +191,10 @@ class DeviceResults:
         return best[1]
 
     def read_to(self, marker: str, setting: str, value: str) -> float | None:
-        """Largest tilt in degrees up to which a marker is read at every tilt of the scan; None if it was not
-        scanned or is not read frontally."""
+        """Largest tilt in degrees up to which a marker is read at every tilt of the scan.
+
+        None if it was not scanned or is not read frontally.
+        """
         rows = self.summary.rows
         key = dict(zip(KEYS, (DECODE, marker, setting, value), strict=True))
         found = rows.loc[rows[list(KEYS)].eq(pd.Series(key)).all(axis=1), "read_to"].dropna()
