@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.declarations import option
+from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import console, delayed_progress, print_json, print_lines, print_table
 from fidsplat.util.errors import InputError, several
@@ -30,15 +30,21 @@ class Check:
     --fuzz renders random scenes of up to 200 splats instead, until they add up to N splats. An interrupted
     run resumes (DIR/fuzz.json).
 
+    --digests renders 200 random scenes instead and compares the SHA-256 of each with those of the repository:
+    every device with float64 and fused multiply-adds renders the same bits. --json has the digest of each
+    scene, and of one that differs those of its outputs and of the results between the stages.
+
     Examples:
       fidsplat check
       fidsplat check --device opencl:nvidia --json
       fidsplat check --fuzz 100000
+      fidsplat check --digests --device warp:cuda
     """
 
     device: Device = None
     out: Annotated[str, option("DIR", "folder for the image and the fuzzer's state", "-o")] = "fidsplat-check"
     fuzz: Annotated[int | None, option("N", "render random scenes until they add up to N splats")] = None
+    digests: Annotated[bool, switch("compare the digests of 200 random scenes")] = False
     json: Json = False
 
     def run(self) -> int:
@@ -46,10 +52,14 @@ class Check:
 
         if self.fuzz is not None and self.fuzz < 1:
             raise InputError(f"--fuzz must be at least 1 splat, got {self.fuzz}")
-        folder = writable_folder(self.out)
+        if self.fuzz is not None and self.digests:
+            raise InputError("--fuzz and --digests are separate checks; give one of them")
         where = console(self.json)
         with where.status("opening the device"):
             renderer = fs.Renderer(self.device)
+        if self.digests:
+            return self._digests(renderer, where)
+        folder = writable_folder(self.out)
         if self.fuzz is not None:
             return self._fuzz(renderer, folder, where)
         from fidsplat.images.files import write_png
@@ -66,6 +76,52 @@ class Check:
             if file is not None:
                 print_lines(where, f"worst case in {file}")
         return 0 if result.passed else 1
+
+    def _digests(self, renderer: "Renderer", where: "Console") -> int:
+        from fidsplat.selftest import digests
+
+        expected = digests.read_table()
+        found: dict[int, digests.Digest] = {}
+        with delayed_progress(where) as progress:
+            for seed in expected:
+                progress(digests.kind_of(seed).name, len(found) / len(expected))
+                found[seed] = digests.digest_of(renderer, seed)
+        differing = {
+            seed: digest.differing(expected[seed])
+            for seed, digest in found.items()
+            if digest != expected[seed]
+        }
+        if self.json:
+            details = [
+                {
+                    "seed": seed,
+                    "scenes": digests.kind_of(seed).name,
+                    "differing": names,
+                    "outputs": found[seed].outputs,
+                    "stages": digests.stage_digests(renderer, seed),
+                }
+                for seed, names in differing.items()
+            ]
+            sums = {seed: digest.sha256 for seed, digest in found.items()}
+            name, passed = renderer.device.name, not differing
+            print_json({"device": name, "passed": passed, "sha256": sums, "differing": details})
+        else:
+            rows = [
+                (
+                    kind.name,
+                    f"{sum(seed not in differing for seed in own)} of {len(own)}",
+                    ", ".join(
+                        n for n in digests.OUTPUTS if any(n in differing.get(seed, ()) for seed in own)
+                    ),
+                    " ".join(str(seed) for seed in own if seed in differing),
+                )
+                for kind in digests.KINDS
+                if (own := [seed for seed in found if digests.kind_of(seed) is kind])
+            ]
+            heads = ("scenes", "identical", "outputs that differ", "seeds")
+            print_table(where, f"Digests on {renderer.device.title}", heads, rows)
+            print_lines(where, f"{len(found) - len(differing)} of {len(found)} scenes are bit-identical")
+        return 1 if differing else 0
 
     def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:
         from fidsplat.selftest.fuzz import fuzz_run

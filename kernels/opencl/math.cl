@@ -102,6 +102,36 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #define FMA(a, b, c) ((a) * (b) + (c))
 #endif
 //@@ arithmetic
+// EXP and LOG (slot/arithmetic_*.cl) of one number.
+#if LANES == 1
+#define FIRST_LANE(v) (v)
+#else
+#define FIRST_LANE(v) ((v).s0)
+#endif
+
+// ln x of the per-splat setup, for normal x > 0; finite for every other x. Sums and products that every device rounds alike: reduction and
+// polynomial of fdlibm (e_log.c), below 1 ulp in double.
+static inline real ln(real x) {
+#if SETUP_FP64
+    const long root_half = 0x3FE6A09E667F3BCDL;         // bits of sqrt(1/2)
+    long bits = as_long(x) - root_half;
+    real k = (real)(bits >> 52), f = as_double((bits & 0xFFFFFFFFFFFFFL) + root_half) - 1;
+#else
+    const int root_half = 0x3F3504F3;
+    int bits = as_int(x) - root_half;
+    real k = (real)(bits >> 23), f = as_float((bits & 0x7FFFFF) + root_half) - 1;
+#endif
+    real s = f / (2 + f), z = s * s, half_square = REAL(0.5) * f * f;
+    real r = REAL(1.531383769920937332e-01) + z * REAL(1.479819860511658591e-01);
+    r = REAL(1.818357216161805012e-01) + z * r;
+    r = REAL(2.222219843214978396e-01) + z * r;
+    r = REAL(2.857142874366239149e-01) + z * r;
+    r = REAL(3.999999999940941908e-01) + z * r;
+    r = z * (REAL(6.666666666666735130e-01) + z * r);
+    // ln 2 in two words
+    return k * REAL(6.93147180369123816490e-01)
+           - ((half_square - (s * (half_square + r) + k * REAL(1.90821492927058770002e-10))) - f);
+}
 
 typedef struct { real x, y, z; } real3_;
 

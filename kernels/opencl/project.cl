@@ -72,9 +72,9 @@ kernel void project(
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
 //@@ cull_frustum
-    wide log_opacity = (wide)log((real)opacity);
+    wide log_opacity = (wide)ln((real)opacity);
     wide half_r2 = log_opacity - (wide)view->log_cut;
-    if (!(half_r2 > 0.0f)) return;
+    if (!(half_r2 > 0.0f && opacity < INFINITY)) return;        // a NaN culls
 
     // columns of the rotation of an unnormalised quaternion
     real w = quat.x, x = quat.y, y = quat.z, z = quat.w;
@@ -122,8 +122,8 @@ kernel void project(
     }
 
     // anchor: the pixel of the image nearest to the centre
-    int anchor_i = (int)clamp((float)center_x, 0.0f, (float)(width - 1));
-    int anchor_j = (int)clamp((float)center_y, 0.0f, (float)(height - 1));
+    int anchor_i = (int)fmin(fmax((float)center_x, 0.0f), (float)(width - 1));       // 0 for NaN
+    int anchor_j = (int)fmin(fmax((float)center_y, 0.0f), (float)(height - 1));
     real anchor_x = anchor_i + REAL(0.5), anchor_y = anchor_j + REAL(0.5);
 //@@ camera_forms
     real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));

@@ -35,5 +35,5 @@ static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloa
 //@@ cross_functions
 // Opacity (the paper's alpha) of a fragment at half the squared distance, rho / 2.
 static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, wide ceiling) {
-//@@ opacity
+    return VMIN(EXP(s->log_opacity - half_rho), (vfloat)ceiling);
 }

@@ -25,10 +25,10 @@ _NONE, _ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
 def samples_each(effects: tuple[str, ...]) -> int:
-    """Samples of a row per thread on a GPU: two, which share the reading of a record, unless each has its own
-    ray or k-buffer.
+    """Samples of a column per thread on a GPU: two, which share the reading of a record, unless each has its
+    own ray or k-buffer.
     """
-    return CELL_W if {"rays", "compose_pixel"}.isdisjoint(effects) else 1
+    return 2 if {"rays", "compose_pixel"}.isdisjoint(effects) else 1
 
 
 @cache
@@ -49,8 +49,8 @@ def make_blend(
     )
     staged = splats.reading(staging.line)
     load, box_of, read = staged.load, staged.box_of, splats.read
-    row_of, cross, cross_ray, cross_slopes = (
-        *(intersection.row, intersection.cross),
+    column_of, cross, cross_ray, cross_slopes = (
+        *(intersection.column, intersection.cross),
         *(intersection.cross_ray, intersection.cross_slopes),
     )
     pixels = make_pixel(effects, outputs, k_buffer_size)
@@ -96,7 +96,7 @@ def make_blend(
     def blend_splat(
         pixel: Pixel,
         s: Splat,
-        row: wp.vec3,  # of the three forms, along the sample's row
+        column: wp.vec3,  # of the three forms, along the sample's column
         ray: wp.vec3,
         slopes: SLOPES,
         x: float,  # from the anchor
@@ -115,7 +115,7 @@ def make_blend(
             elif wp.static(bent):
                 c = cross_ray(s, ray, x, y, view)
             else:
-                c = cross(s, row[0], row[1], row[2], x, y, view)
+                c = cross(s, column[0], column[1], column[2], x, y, view)
             if wp.static(asking):
                 p = observe(p, s, c, x, y, view)
             if c.contributes:
@@ -149,12 +149,12 @@ def make_blend(
         cell_x = warp % across * 4 + lane / items % 4
         cell_y = warp / across * each + lane / items / 4
         cell = cell_y * (4 * across) + cell_x
-        x0 = left + cell_x * CELL_W + own % (CELL_W / each) * each
-        y0 = top + cell_y * CELL_H + own / (CELL_W / each)
+        x0 = left + cell_x * CELL_W + own % CELL_W
+        y0 = top + cell_y * CELL_H + own / CELL_W * each
         p = new_sample(x0, y0, rays, view)
         open = unfinished(p, view)
         if wp.static(pair):
-            q = new_sample(x0 + 1, y0, rays, view)
+            q = new_sample(x0, y0 + 1, rays, view)
             open = open or unfinished(q, view)
         ray, slopes = wp.vec3(), SLOPES()
         if wp.static(bent):
@@ -198,13 +198,12 @@ def make_blend(
                         if (cells >> wp.uint32(cell % 32) & _ONE) == _NONE:
                             continue
                     x, y = float(x0) - s.d[3], float(y0) - s.c[0]
-                    row = wp.vec3(row_of(s.u, y), row_of(s.v, y), row_of(s.d, y))
-                    p = blend_splat(
-                        p, s, row, ray, slopes, x, y, k + which, lines, lists, coplanar_groups, view
-                    )
+                    column = wp.vec3(column_of(s.u, x), column_of(s.v, x), column_of(s.d, x))
+                    at = k + which
+                    p = blend_splat(p, s, column, ray, slopes, x, y, at, lines, lists, coplanar_groups, view)
                     if wp.static(pair):
                         q = blend_splat(
-                            q, s, row, ray, slopes, x + 1.0, y, k + which, lines, lists, coplanar_groups, view
+                            q, s, column, ray, slopes, x, y + 1.0, at, lines, lists, coplanar_groups, view
                         )
                 open = unfinished(p, view)
                 if wp.static(pair):
@@ -223,8 +222,8 @@ def make_blend(
         store(finish(p), at, samples)
         if wp.static(pair):
             if wp.static(opaque):
-                q = cover(q, x0 + 1, y0, rays, view)
-            store(finish(q), at + 1, samples)
+                q = cover(q, x0, y0 + 1, rays, view)
+            store(finish(q), at + view.tiles_x * view.tile_w, samples)
 
     @wp.kernel(name=f"blend_cpu_{words}", **options)
     def blend_cpu(
@@ -265,11 +264,11 @@ def make_blend(
                 top, bottom = wp.max(top, y0), wp.min(bottom, y_end)
                 left, right = limits.span(b, top, bottom, view.width)
                 left, right = wp.max(left, x0), wp.min(right, x_end)
-                for row in range(top, bottom):
-                    y = float(row) - s.c[0]
-                    u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
-                    for column in range(left, right):
-                        x = float(column) - s.d[3]
+                for column in range(left, right):
+                    x = float(column) - s.d[3]
+                    u, v, d = column_of(s.u, x), column_of(s.v, x), column_of(s.d, x)
+                    for row in range(top, bottom):
+                        y = float(row) - s.c[0]
                         if wp.static(curved):
                             at = row * view.width + column
                             c = cross_slopes(s, rays.rays[at], rays.slopes[at], x, y, view)

@@ -30,17 +30,25 @@ def between(d: float, n: float, edges: wp.vec2) -> float:
 
 
 @wp.func
-def ramp(form: float, gradient: wp.vec2) -> float:
+def ramp(form: float, by_x: float, by_y: float) -> float:
     """Coverage of a sample on the side of an edge where its form is above 0."""
-    steep = wp.sqrt(wp.max(fma(gradient[0], gradient[0], gradient[1] * gradient[1]), 1.0e-36))
+    steep = wp.sqrt(wp.max(fma(by_x, by_x, by_y * by_y), 1.0e-36))
     return wp.clamp(form / steep + 0.5, 0.0, 1.0)
+
+
+@wp.func
+def along_ray(form: wp.vec3, slopes: SLOPES, k: int) -> float:
+    """Derivative of a form with these factors of a ray's X, Y, Z by the sample's column or row."""
+    return fma(form[2], slopes[k, 2], fma(form[1], slopes[k, 1], form[0] * slopes[k, 0]))
 
 
 @wp.func
 def between_curves(d: float, n: float, of_d: wp.vec3, of_n: wp.vec3, slopes: SLOPES) -> float:
     """`between`, of forms with these factors of a ray's X, Y, Z, and with the ray's derivatives."""
-    low = ramp(fma(SQRT2, n, d), slopes * (of_d + SQRT2 * of_n))
-    high = ramp(fma(-SQRT2, n, d), slopes * (of_d - SQRT2 * of_n))
+    d_x, d_y = along_ray(of_d, slopes, 0), along_ray(of_d, slopes, 1)
+    n_x, n_y = along_ray(of_n, slopes, 0), along_ray(of_n, slopes, 1)
+    low = ramp(fma(SQRT2, n, d), fma(SQRT2, n_x, d_x), fma(SQRT2, n_y, d_y))
+    high = ramp(fma(-SQRT2, n, d), fma(-SQRT2, n_x, d_x), fma(-SQRT2, n_y, d_y))
     return wp.max(low + high - 1.0, 0.0)
 
 
@@ -60,12 +68,11 @@ def make_boxes(real) -> SimpleNamespace:
         return one / wp.max(wp.sqrt(x * x + y * y), real(1e-30))
 
     @wp.func
-    def edges(d: vec2, n: vec2, scale: real) -> wp.vec2:
-        """Reciprocal gradient lengths of the forms D + n and D - n, divided by `scale`."""
-        per = one / wp.abs(scale)
+    def edges(scale: real, d_x: real, d_y: real, n_x: real, n_y: real) -> wp.vec2:
+        """Reciprocal gradient lengths of the forms D + n and D - n times `scale`."""
         return wp.vec2(
-            float(per * per_gradient(d[0] + n[0], d[1] + n[1])),
-            float(per * per_gradient(d[0] - n[0], d[1] - n[1])),
+            float(per_gradient(scale * d_x + scale * n_x, scale * d_y + scale * n_y)),
+            float(per_gradient(scale * d_x - scale * n_x, scale * d_y - scale * n_y)),
         )
 
     @wp.func

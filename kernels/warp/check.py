@@ -4,9 +4,10 @@ call."""
 import warp as wp
 
 from .common import STRICT, fma
-from .fast import fast_exp, fast_log
+from .fast import fast_exp, fast_log, make_log
 
 wp.set_module_options(STRICT)
+ln = make_log(wp.float64)
 
 
 @wp.kernel(enable_backward=False)
@@ -31,12 +32,12 @@ def arithmetic(
 def arithmetic_wide(
     above: wp.array(dtype=wp.float64),
     below: wp.array(dtype=wp.float64),
-    out: wp.array(dtype=wp.float64, ndim=2),  # (3, n): division, square root, log
+    out: wp.array(dtype=wp.float64, ndim=2),  # (3, n): division, square root, ln
 ):
     i = wp.tid()
     out[0, i] = above[i] / below[i]
     out[1, i] = wp.sqrt(below[i])
-    out[2, i] = wp.log(below[i])
+    out[2, i] = ln(below[i])
 
 
 @wp.kernel(enable_backward=False)

@@ -6,6 +6,8 @@ from functools import cache
 
 import warp as wp
 
+from .common import fma3
+
 # Y_k(x, y, z) = constant x polynomial, degrees 1 to 3; degree 0 is C0
 C0 = wp.constant(0.28209479177387814)
 
@@ -23,28 +25,28 @@ def basis_value(k: int, d: wp.vec3) -> float:
     elif k == 3:
         return -0.48860251190291992 * x
     elif k == 4:
-        return 1.0925484305920792 * x * y
+        return 1.0925484305920792 * (x * y)
     elif k == 5:
-        return -1.0925484305920792 * y * z
+        return -1.0925484305920792 * (y * z)
     elif k == 6:
         return 0.31539156525252005 * (2.0 * z * z - x * x - y * y)
     elif k == 7:
-        return -1.0925484305920792 * x * z
+        return -1.0925484305920792 * (x * z)
     elif k == 8:
         return 0.54627421529603959 * (x * x - y * y)
     elif k == 9:
-        return -0.59004358992664352 * y * (3.0 * x * x - y * y)
+        return -0.59004358992664352 * y * (3.0 * (x * x) - y * y)
     elif k == 10:
-        return 2.8906114426405538 * x * y * z
+        return 2.8906114426405538 * (x * y) * z
     elif k == 11:
         return -0.45704579946446572 * y * (4.0 * z * z - x * x - y * y)
     elif k == 12:
-        return 0.37317633259011546 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
+        return 0.37317633259011546 * z * (2.0 * z * z - 3.0 * (x * x) - 3.0 * (y * y))
     elif k == 13:
         return -0.45704579946446572 * x * (4.0 * z * z - x * x - y * y)
     elif k == 14:
         return 1.4453057213202769 * z * (x * x - y * y)
-    return -0.59004358992664352 * x * (x * x - 3.0 * y * y)
+    return -0.59004358992664352 * x * (x * x - 3.0 * (y * y))
 
 
 @cache
@@ -61,10 +63,11 @@ def make_color(sh_terms: int, real):
         length = wp.length(away)
         direction = wp.vec3(0.0, 0.0, 0.0)
         if length > real(0.0):
-            direction = wp.vec3(float(away[0] / length), float(away[1] / length), float(away[2] / length))
+            toward = away * (real(1.0) / length)
+            direction = wp.vec3(float(toward[0]), float(toward[1]), float(toward[2]))
         rgb = wp.vec3(0.5, 0.5, 0.5)
         for k in range(wp.static(max(sh_terms, 1))):
-            rgb += basis_value(k, direction) * colors[i * sh_terms + k]
+            rgb = fma3(basis_value(k, direction), colors[i * sh_terms + k], rgb)
         return wp.vec3(wp.max(rgb[0], 0.0), wp.max(rgb[1], 0.0), wp.max(rgb[2], 0.0))
 
     return harmonic if sh_terms else plain

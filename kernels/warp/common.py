@@ -97,6 +97,12 @@ def fma(a: float, b: float, c: float) -> float:
     ...
 
 
+@wp.func
+def fma3(a: float, b: wp.vec3, c: wp.vec3) -> wp.vec3:
+    """a b + c, rounded once."""
+    return wp.vec3(fma(a, b[0], c[0]), fma(a, b[1], c[1]), fma(a, b[2], c[2]))
+
+
 # One 16-byte load where the device has it: Warp's vectors are not known to be aligned, so the compiler would
 # take four.
 @wp.func_native("""

@@ -10,11 +10,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import output
-from .common import fma, struct_of
+from .common import fma, fma3, struct_of
 from .fast import fast_log
 
-FAINT = wp.constant(1e-3)
-"""below it the optical depth of an opacity a is a + a^2 / 2, to 3 parts in 10^7"""
 DARKEST = wp.constant(wp.float32(2.0**-24))
 """transmittance of an opaque fragment, whose optical depth would be infinite"""
 
@@ -24,10 +22,10 @@ NEARER = wp.constant(wp.float32(-(2.0**-16)))
 
 
 def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """The struct Layer and its functions: accumulate, accumulate_box; nothing, depth, averaged."""
+    """The struct Layer and its functions: accumulate, accumulate_box; nothing, depth."""
     log = fast_log if "arithmetic_fast" in effects else wp.log
-    accumulators, averages = (output.functions(outputs, part) for part in ("accumulate", "average"))
-    # tau: optical depth; `mean`: sums over fragments, each times its optical depth; of boxes, its opacity
+    accumulators = output.functions(outputs, "accumulate")
+    # tau: optical depth; `mean`: weighted by optical depths; of boxes, by opacities
     # place: of the first splat in the list; nearest: lower bound of the depths
     fields = {
         "plane": wp.int32,
@@ -58,26 +56,14 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         """Sort depth of the layer, nearer by slightly more than the rounding of depths, so that it is in
         front of ungrouped splats in its plane.
         """
-        z = layer.mean.z / layer.tau
+        z = layer.mean.z
         return wp.max(fma(wp.abs(z), NEARER, z), layer.nearest)
-
-    @wp.func
-    def averaged(layer: Layer):
-        """Attributes of the layer as one fragment: means weighted by optical depth."""
-        attributes = layer.mean
-        attributes.rgb = layer.mean.rgb / layer.tau
-        attributes.z = layer.mean.z / layer.tau
-        for k in range(wp.static(len(averages))):
-            attributes = wp.static(averages[k])(attributes, layer.tau)
-        return attributes
 
     @wp.func
     def accumulate(layer: Layer, attributes: Attributes, opacity: float):
         """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
-        tau = opacity + 0.5 * opacity * opacity  # of a faint one, which 1 - opacity would blur
-        if opacity > FAINT:
-            # an opaque fragment has the optical depth at which float32 leaves no light
-            tau = -log(wp.max(1.0 - opacity, DARKEST))
+        # an opaque fragment has the optical depth at which float32 leaves no light
+        tau = -log(wp.max(1.0 - opacity, DARKEST))
         after = with_fragment(layer, attributes, tau)
         after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
         return after
@@ -94,10 +80,13 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         """The layer with a fragment of optical depth tau that shows `attributes`."""
         after = layer
         after.tau = layer.tau + tau
-        after.mean.rgb = layer.mean.rgb + tau * attributes.rgb
-        after.mean.z = fma(tau, attributes.z, layer.mean.z)
+        share = float(0.0)
+        if tau > 0.0:
+            share = tau / after.tau
+        after.mean.rgb = fma3(share, attributes.rgb - layer.mean.rgb, layer.mean.rgb)
+        after.mean.z = fma(share, attributes.z - layer.mean.z, layer.mean.z)
         for k in range(wp.static(len(accumulators))):
-            after = wp.static(accumulators[k])(after, attributes, tau)
+            after = wp.static(accumulators[k])(after, attributes, tau, share)
         return after
 
     return SimpleNamespace(
@@ -105,7 +94,6 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         nothing=nothing,
         empty_layer=empty_layer,
         depth=depth,
-        averaged=averaged,
         accumulate=accumulate,
         accumulate_box=accumulate_box,
     )

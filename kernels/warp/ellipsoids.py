@@ -7,6 +7,7 @@ import warp as wp
 
 from .bounds import Bounds, box_bounds
 from .common import View
+from .fast import make_log
 
 EXACT = "ellipsoid_exact"
 EWA = ("ellipsoid_ewa", "ellipsoid_ewa_antialiased")
@@ -16,7 +17,7 @@ EWA = ("ellipsoid_ewa", "ellipsoid_ewa_antialiased")
 def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
     """Functions for the equivalent disk of a 3D Gaussian.
 
-    disk(tangent_u, tangent_v, sizes, p, view): its tangents. surface: its normal. rim: radius of the disk
+    disk(a, b, facet, sizes, p, view): its tangents. surface: its normal. rim: radius of the disk
     that bounds the ellipsoid. reach: half of the ellipsoid's depth range. clipped: bounds of an ellipsoid
     that crosses the plane of the camera.
     """
@@ -26,118 +27,123 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
     widening = real(0.3)
     sharp, antialiased = EXACT in effects, "ellipsoid_ewa_antialiased" in effects
     parallel = "camera_orthographic" in effects
+    ln = make_log(real)
     along_ray = "camera_fisheye" in effects or "camera_equirectangular" in effects
 
     @wp.func
-    def exact(u: vec3, v: vec3, w: vec3, sizes: vec3, towards: vec3):
-        """Equivalent disk with ellipsoid="exact", from unit axes and standard deviations.
+    def exact(a: vec3, b: vec3, c: vec3, sizes: vec3, towards: vec3):
+        """Equivalent disk with ellipsoid="exact", from scaled axes and their lengths.
 
         W maps the covariance to the identity. Returns the scaled tangents of the disk that is perpendicular
-        to W `towards` there, its area, and 1 / m, infinite if the camera is at the centre.
+        to W `towards` there, its unit normal, its area, and 1 / m, infinite if the camera is at the centre.
 
         With e the longest axis and W p = (g, h) along e and across it, the tangents are the images of (h, -g)
         / m in the plane of both, and of the vector perpendicular to that plane. Neither takes a difference
         along e, so needles do not cancel.
         """
-        e0, e1, e2 = u, v, w
+        e0, e1, e2 = a, b, c
         s0, s1, s2 = sizes[0], sizes[1], sizes[2]
         if s1 > s0 and s1 >= s2:
-            e0, e1, e2 = v, w, u
+            e0, e1, e2 = b, c, a
             s0, s1, s2 = sizes[1], sizes[2], sizes[0]
         elif s2 > s0:
-            e0, e1, e2 = w, u, v
+            e0, e1, e2 = c, a, b
             s0, s1, s2 = sizes[2], sizes[0], sizes[1]
         shortest = wp.min(s1, s2)
         # in units of the shortest axis, so that nothing overflows
-        g = wp.dot(e0, towards) * (shortest / s0)
-        h1, h2 = wp.dot(e1, towards) * (shortest / s1), wp.dot(e2, towards) * (shortest / s2)
-        h = wp.sqrt(h1 * h1 + h2 * h2)
-        m = wp.sqrt(g * g + h * h)
-        c1, c2 = one, zero
+        w0, w1, w2 = shortest / s0, shortest / s1, shortest / s2
+        g0 = wp.dot(e0, towards) / s0 * w0
+        g1, g2 = wp.dot(e1, towards) / s1 * w1, wp.dot(e2, towards) / s2 * w2
+        h = wp.sqrt(g1 * g1 + g2 * g2)
+        m = wp.sqrt(g0 * g0 + h * h)
+        k1, k2 = one, zero
         if h > zero:
-            c1 = h1 / h
-            c2 = h2 / h
+            k1 = g1 / h
+            k2 = g2 / h
         inverse_m = real(wp.inf)
-        a, b, area = u, v, one
+        u, v, facet, area = a, b, c, one
         if m > zero:
             inverse_m = shortest / m
-            a = e0 * (s0 * (h / m)) - (e1 * (s1 * c1) + e2 * (s2 * c2)) * (g / m)
-            b = e1 * (s1 * c2) - e2 * (s2 * c1)
-            # the inverse covariance times `towards`: the disk's normal
-            across = e0 * (g * (shortest / s0)) + e1 * (h1 * (shortest / s1)) + e2 * (h2 * (shortest / s2))
-            area = s0 * wp.max(s1, s2) * m / wp.dot(wp.normalize(across), towards)
-        return a, b, area, inverse_m
+            u = e0 * (h / m) - (g0 / m) * (k1 * e1 + k2 * e2)
+            v = k2 * e1 - k1 * e2
+            # the inverse covariance times `towards`
+            n = e0 * (g0 * w0 / s0) + e1 * (g1 * w1 / s1) + e2 * (g2 * w2 / s2)
+            facet = n / wp.sqrt(wp.dot(n, n))
+            area = s0 * wp.max(s1, s2) * m / wp.dot(facet, towards)
+        return u, v, facet, area, inverse_m
 
     @wp.func
     def ewa(a: vec3, b: vec3, c: vec3, p: vec3, view: View):
-        """Equivalent disk with ellipsoid="ewa", from scaled axes: tangents of a disk that faces the camera
-        and has the widened image, and the factor of the opacity."""
+        """Equivalent disk with ellipsoid="ewa", from scaled axes: half axes along x and of y along x and y of
+        a disk that faces the camera and has the widened image; the determinants of the covariance before and
+        after."""
         per_x, per_y = real(view.focal_x), real(view.focal_y)
         slope_x, slope_y = zero, zero
         if wp.static(not parallel):
-            per_x /= p[2]
-            per_y /= p[2]
-            slope_x = wp.clamp(p[0] / p[2], -real(view.slopes[0]), real(view.slopes[1]))
-            slope_y = wp.clamp(p[1] / p[2], -real(view.slopes[2]), real(view.slopes[3]))
-        across = vec3(a[0] - slope_x * a[2], b[0] - slope_x * b[2], c[0] - slope_x * c[2]) * per_x
-        down = vec3(a[1] - slope_y * a[2], b[1] - slope_y * b[2], c[1] - slope_y * c[2]) * per_y
+            ahead = one / p[2]
+            per_x *= ahead
+            per_y *= ahead
+            slope_x = wp.clamp(p[0] * ahead, -real(view.slopes[0]), real(view.slopes[1]))
+            slope_y = wp.clamp(p[1] * ahead, -real(view.slopes[2]), real(view.slopes[3]))
+        across = per_x * vec3(a[0] - slope_x * a[2], b[0] - slope_x * b[2], c[0] - slope_x * c[2])
+        down = per_y * vec3(a[1] - slope_y * a[2], b[1] - slope_y * b[2], c[1] - slope_y * c[2])
         spread = widening / real(view.per_pixel)
-        xx, yy = wp.dot(across, across) + spread, wp.dot(down, down) + spread
-        turned = wp.cross(across, down)  # so that the determinant does not cancel
-        before = wp.dot(turned, turned)
-        after = before + spread * (xx + yy - spread)
-        wide = wp.sqrt(xx)
-        share = one
-        if wp.static(antialiased):
-            share = wp.sqrt(before / after)
-        return (
-            vec3(wide / per_x, wp.dot(across, down) / wide / per_y, zero),
-            vec3(zero, wp.sqrt(after) / wide / per_y, zero),
-            share,
-        )
+        xx, xy, yy = wp.dot(across, across), wp.dot(across, down), wp.dot(down, down)
+        crossed = wp.cross(across, down)  # so that the determinant does not cancel
+        before = wp.dot(crossed, crossed)
+        after = before + spread * (xx + yy + spread)
+        l11 = wp.sqrt(xx + spread)
+        l21, l22 = xy / l11, wp.sqrt(after) / l11
+        return vec3(l11 / per_x, l21 / per_y, l22 / per_y), before, after
 
     @wp.func
-    def disk(tangent_u: vec3, tangent_v: vec3, sizes: vec3, p: vec3, view: View):
-        """Equivalent disk, from unit tangents and three standard deviations.
+    def disk(a: vec3, b: vec3, facet: vec3, sizes: vec3, p: vec3, view: View):
+        """Equivalent disk, from scaled tangents, unit normal and three standard deviations.
 
-        Returns its scaled tangents, the half axis that is conjugate to them, 1 / m^2, its area, and the
-        factor of the opacity, 0 if the splat is culled.
+        Returns its scaled tangents and unit normal, the distance of its plane, the half axis that is
+        conjugate to the tangents, 1 / m^2, two factors of its area, and the term of ln(opacity), -inf if the
+        splat is culled.
         """
-        tangent_w = wp.cross(tangent_u, tangent_v)
-        third = vec3()
-        inverse_m2, spanned, share = zero, one, zero
-        a, b = tangent_u, tangent_v
+        c = facet * sizes[2]
+        u, v, normal, offset, third = a, b, facet, zero, vec3()
+        inverse_m2, su, sv, log_share = zero, one, one, -real(wp.inf)
         if wp.static(sharp):
             towards = p
             if wp.static(parallel):
                 towards = vec3(zero, zero, one)
-            a, b, spanned, inverse_m = exact(tangent_u, tangent_v, tangent_w, sizes, towards)
+            u, v, normal, su, inverse_m = exact(a, b, c, sizes, towards)
             if inverse_m < real(wp.inf):  # else the camera is at its centre, and no ray has a maximum ahead
-                share = one
+                log_share = zero
+                offset = wp.dot(normal, towards)
                 third = towards * inverse_m
                 if wp.static(not parallel):
                     inverse_m2 = inverse_m * inverse_m
         else:
             if p[2] >= real(view.near):
-                scaled_u, scaled_v = tangent_u * sizes[0], tangent_v * sizes[1]
-                a, b, share = ewa(scaled_u, scaled_v, tangent_w * sizes[2], p, view)
-                spanned = a[0] * b[1]
-        return a, b, third, inverse_m2, spanned, share
+                axes, before, after = ewa(a, b, c, p, view)
+                u, v = vec3(axes[0], axes[1], zero), vec3(zero, axes[2], zero)
+                normal, offset = vec3(zero, zero, one), p[2]
+                if wp.static(parallel):
+                    offset = one
+                su, sv = axes[0], axes[2]
+                log_share = zero
+                if wp.static(antialiased):
+                    log_share = half * ln(before / after)
+        return u, v, normal, offset, third, inverse_m2, su, sv, log_share
 
     @wp.func
-    def surface(tangent_u: vec3, tangent_v: vec3, sizes: vec3, p: vec3) -> vec3:
+    def surface(tangent_u: vec3, tangent_v: vec3, tangent_w: vec3, sizes: vec3, p: vec3) -> vec3:
         """Unit normal of the surface of maxima along rays, at the centre, away from the camera: the inverse
         covariance times the ray, in units of the shortest axis."""
         towards = p
         if wp.static(parallel):
             towards = vec3(zero, zero, one)
-        shortest = wp.min(sizes[0], wp.min(sizes[1], sizes[2]))
+        shortest = wp.min(wp.min(sizes[0], sizes[1]), sizes[2])
         u, v, w = shortest / sizes[0], shortest / sizes[1], shortest / sizes[2]
-        tangent_w = wp.cross(tangent_u, tangent_v)
-        across = tangent_u * (u * u * wp.dot(tangent_u, towards)) + tangent_v * (
-            v * v * wp.dot(tangent_v, towards)
-        )
-        return wp.normalize(across + tangent_w * (w * w * wp.dot(tangent_w, towards)))
+        outward = wp.dot(tangent_u, towards) * u * u * tangent_u
+        outward += wp.dot(tangent_v, towards) * v * v * tangent_v
+        outward += wp.dot(tangent_w, towards) * w * w * tangent_w
+        return outward / wp.sqrt(wp.dot(outward, outward))
 
     @wp.func
     def rim(radius: real, inverse_m2: real) -> real:

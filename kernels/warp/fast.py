@@ -1,7 +1,11 @@
-"""Exponentials and logarithms that are shorter than the library's: `arithmetic="fast"`.
+"""Exponentials and logarithms of sums and products, which all devices round alike. Blending has them with
+`arithmetic="fast"`, the per-splat setup always.
 
-The polynomials and the bounds are those of kernels/opencl/slot/arithmetic_fast.cl, and so are the bits.
+The polynomials and the bounds are those of kernels/opencl/slot/arithmetic_fast.cl and of math.cl, and so are
+the bits.
 """
+
+from functools import cache
 
 import warp as wp
 
@@ -47,3 +51,30 @@ def fast_log(x: float) -> float:
     p = fma(p, m, 3.3333331174e-1)
     p = fma(m2, -0.5, p * m * m2)
     return fma(float(bits >> 23), _LN2, m + p)
+
+
+@cache
+def make_log(real):
+    """The natural logarithm of the setup, for normal x > 0; finite for every other x."""
+    integer, shift = (wp.int64, 52) if real is wp.float64 else (wp.int32, 23)
+    root_half = wp.constant(integer(0x3FE6A09E667F3BCD if real is wp.float64 else 0x3F3504F3))
+    mantissa, exponent = wp.constant(integer((1 << shift) - 1)), wp.constant(integer(shift))
+
+    @wp.func
+    def ln(x: real) -> real:
+        bits = wp.cast(x, integer) - root_half
+        k = real(bits >> exponent)
+        f = wp.cast((bits & mantissa) + root_half, real) - real(1.0)
+        s = f / (real(2.0) + f)
+        z, half_square = s * s, real(0.5) * f * f
+        r = real(1.531383769920937332e-01) + z * real(1.479819860511658591e-01)
+        r = real(1.818357216161805012e-01) + z * r
+        r = real(2.222219843214978396e-01) + z * r
+        r = real(2.857142874366239149e-01) + z * r
+        r = real(3.999999999940941908e-01) + z * r
+        r = z * (real(6.666666666666735130e-01) + z * r)
+        # ln 2 in two words
+        low = s * (half_square + r) + k * real(1.90821492927058770002e-10)
+        return k * real(6.93147180369123816490e-01) - ((half_square - low) - f)
+
+    return ln

@@ -1,11 +1,10 @@
 """What a splat's record says of the rays that meet it: the affine forms that each sample evaluates.
 
-A ray r = ((x - cx) / fx, (y - cy) / fy, 1) meets the plane of a splat with centre p, unit tangents t_u, t_v,
-normal n at depth (n p) / (n r), and there u = (t_v x p) r / (s_u n r), v = (p x t_u) r / (s_v n r): from n x
-(r x p) = r (n p) - p (n r). All three of n_u, n_v, D = n r are affine in the sample, and since p is
-orthogonal to the first two, n_u and n_v vanish at the projected centre. They are scaled by one factor: D > 0
-in front of the camera, the steepest slope is 1; n_u, n_v also by sqrt(1/2), so that (n_u^2 + n_v^2) / D^2 is
-rho / 2.
+With rows T_u, T_v, T_w of the projection of tangents and centre, (n_u, n_v, D) =
+T_u x T_v + x (T_v x T_w) + y (T_w x T_u): kernels/opencl/splat.cl. All three are affine in the sample. They
+are scaled by one factor: D > 0 in front of the camera, the steepest slope is 1; n_u, n_v also by sqrt(1/2),
+so that (n_u^2 + n_v^2) / D^2 is rho / 2. Operations and their order are those of kernels/opencl/project.cl,
+and so are the bits.
 """
 
 import math
@@ -15,7 +14,7 @@ import warp as wp
 
 from .boxes import make_boxes
 from .common import View
-from .ellipsoids import EXACT
+from .ellipsoids import EWA, EXACT
 from .lens import LENSES, make_lens, make_optics
 from .records import BOXES, Layout
 
@@ -24,13 +23,14 @@ from .records import BOXES, Layout
 def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     """The function that fills a record of these effects and outputs."""
     layout = Layout(effects, outputs)
-    vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
+    vec3 = wp.types.vector(3, real)
     words = wp.types.vector(4 * layout.lines, wp.float32)
     sqrt_half, edge_on = real(math.sqrt(0.5)), real(1e-13 if real is wp.float64 else 1e-6)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     has_depth, screen, parallel, exact = (
         name in effects for name in ("ray_depth", "lowpass_screen", "camera_orthographic", EXACT)
     )
+    ewa = any(name in effects for name in EWA)
     camera = next((name for name in effects if name in LENSES), None)
     bent = camera is not None
     edged = not bent and any(name in effects for name in BOXES)
@@ -44,84 +44,88 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     )
 
     @wp.func
+    def image_row(focal: real, offset: real, along: vec3, ahead: vec3) -> vec3:
+        return focal * along + offset * ahead
+
+    @wp.func
     def forms(
-        tangent_u: vec3,
-        tangent_v: vec3,
+        a: vec3,  # scaled tangents
+        b: vec3,
+        facet: vec3,  # unit normal
+        offset: real,  # of the plane from the camera's centre, along the normal
         p: vec3,
-        su: real,
+        su: real,  # su sv: area of the tangents
         sv: real,
         center_x: real,
         center_y: real,
-        in_front: bool,  # whether it is known where the centre falls
+        in_front: bool,  # whether the centre is imaged
         boxed: bool,
         itself: bool,  # whether it is filtered by its own footprint
+        thick: bool,
         inverse_m2: real,  # of an ellipsoid
         view: View,
         lens: Lens,
     ):
-        """The record but for opacity, colour, box and what outputs add; the normal, and the camera's height
-        above the plane; whether any ray meets the splat.
-        """
+        """The record without opacity, colour, box and what outputs add; whether any ray meets the splat."""
         record = words()
-        cx, cy = real(view.center_x), real(view.center_y)
-        per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
-        # about the sample of the picture that is nearest to the centre
+        fx, fy = real(view.focal_x), real(view.focal_y)
+        # relative to the sample of the image that is nearest to the centre
         ax = wp.clamp(wp.floor(float(center_x)), 0.0, float(view.width - 1))
         ay = wp.clamp(wp.floor(float(center_y)), 0.0, float(view.height - 1))
         anchor_x, anchor_y = real(ax) + half, real(ay) + half
-        normal = wp.cross(tangent_u, tangent_v)
-        height = wp.dot(normal, p)  # of the camera's centre above the plane, with its side
-        ray = vec3((anchor_x - cx) * per_fx, (anchor_y - cy) * per_fy, one)
-        form_u = wp.cross(tangent_v, p) * (one / su)
-        form_v = wp.cross(p, tangent_u) * (one / sv)
-        if wp.static(parallel):
-            # the same far away, per metre of distance: D is n_z
-            height = normal[2]
-            form_u = vec3(tangent_v[1], -tangent_v[0], zero) * (one / su)
-            form_v = vec3(-tangent_u[1], tangent_u[0], zero) * (one / sv)
+        k0, kx, ky, kz = vec3(), vec3(), vec3(), vec3()  # n_u, n_v, D: at the anchor, per x, per y, per z
+        determinant = zero
         if wp.static(bent):
             # forms of a ray, not of a sample
-            anchor = optics.anchor(int(ax), int(ay), p, view, lens)
+            anchor = optics.anchor(int(ax), int(ay), in_front, p, view, lens)
+            of_u, of_v, of_d = wp.cross(b, p), wp.cross(p, a), facet * su * sv
             ray = vec3(real(anchor[0]), real(anchor[1]), real(anchor[2]))
-            per_fx, per_fy = one, one
-        nux, nuy, nvx, nvy = form_u[0] * per_fx, form_u[1] * per_fy, form_v[0] * per_fx, form_v[1] * per_fy
-        steepest = wp.max(wp.max(wp.abs(nux), wp.abs(nuy)), wp.max(wp.abs(nvx), wp.abs(nvy)))
+            k0 = vec3(wp.dot(of_u, ray), wp.dot(of_v, ray), wp.dot(of_d, ray))
+            kx, ky = vec3(of_u[0], of_v[0], of_d[0]), vec3(of_u[1], of_v[1], of_d[1])
+            kz = vec3(of_u[2], of_v[2], of_d[2])
+            determinant = su * sv * offset
+        else:
+            row_x, row_y, tw = vec3(a[0], b[0], p[0]), vec3(a[1], b[1], p[1]), vec3(a[2], b[2], p[2])
+            if wp.static(parallel):
+                tw = vec3(zero, zero, one)
+            tu = image_row(fx, real(view.center_x) - anchor_x, row_x, tw)
+            tv = image_row(fy, real(view.center_y) - anchor_y, row_y, tw)
+            k0, kx, ky = wp.cross(tu, tv), wp.cross(tv, tw), wp.cross(tw, tu)
+            determinant = fx * fy * su * sv * offset
+            if wp.static(parallel):
+                k0 = vec3(k0[0], k0[1], determinant)
+        steepest = wp.max(wp.max(wp.abs(kx[0]), wp.abs(ky[0])), wp.max(wp.abs(kx[1]), wp.abs(ky[1])))
         if wp.static(bent):
-            steepest = wp.max(steepest, wp.max(wp.abs(form_u[2]), wp.abs(form_v[2])))
+            steepest = wp.max(steepest, wp.max(wp.abs(kz[0]), wp.abs(kz[1])))
+        if wp.static(ewa):
+            if thick:
+                steepest = wp.abs(k0[2])  # D is 1 at all samples
         met = steepest > zero and steepest < real(wp.inf)
-        nu0, nv0 = wp.dot(form_u, ray), wp.dot(form_v, ray)
-        if wp.static(not bent):
-            if wp.static(parallel) or in_front:
-                # both vanish at the projected centre
-                nu0 = nux * (anchor_x - center_x) + nuy * (anchor_y - center_y)
-                nv0 = nvx * (anchor_x - center_x) + nvy * (anchor_y - center_y)
-        scale = wp.where(height < zero, -one, one) / steepest
+        scale = wp.where(determinant < zero, -one, one) / steepest
         n_scale = scale * sqrt_half
-        # edge-on within rounding: no ray meets the plane, only the low-pass disc is drawn
-        away2 = wp.dot(p, p)
-        if wp.static(parallel):
-            away2 = one
-        facing = wp.where(height * height > edge_on * edge_on * away2, scale, zero)
+        # edge-on within rounding: no ray meets the plane, only the low-pass disc is rendered
+        away = one
+        if wp.static(not parallel):
+            away = wp.sqrt(wp.dot(p, p))
+        facing = wp.where(wp.abs(offset) > edge_on * away, scale, zero)
+        z_numerator = determinant * facing  # the depth is z_numerator / D
 
-        record[0] = float(nu0 * n_scale)
-        record[1] = float(nux * n_scale)
-        record[2] = float(nuy * n_scale)
-        record[4] = float(nv0 * n_scale)
-        record[5] = float(nvx * n_scale)
-        record[6] = float(nvy * n_scale)
-        record[7] = float(height * facing * real(view.per_near))
-        record[8] = float(wp.dot(normal, ray) * facing)
-        record[9] = float(normal[0] * per_fx * facing)
-        record[10] = float(normal[1] * per_fy * facing)
+        record[0] = float(k0[0] * n_scale)
+        record[1] = float(kx[0] * n_scale)
+        record[2] = float(ky[0] * n_scale)
+        record[4] = float(k0[1] * n_scale)
+        record[5] = float(kx[1] * n_scale)
+        record[6] = float(ky[1] * n_scale)
+        record[7] = float(z_numerator / real(view.near))
+        record[8] = float(k0[2] * facing)
+        record[9] = float(kx[2] * facing)
+        record[10] = float(ky[2] * facing)
         record[11] = ax
         record[12] = ay
         if wp.static(edged):
             if boxed:
-                of_d = vec2(normal[0] * per_fx, normal[1] * per_fy)
-                if wp.static(parallel):
-                    of_d = vec2(zero, zero)  # D is the same everywhere
-                of_u = of_box.edges(of_d, vec2(nux, nuy), scale)
-                of_v = of_box.edges(of_d, vec2(nvx, nvy), scale)
+                of_u = of_box.edges(scale, kx[2], ky[2], kx[0], ky[0])
+                of_v = of_box.edges(scale, kx[2], ky[2], kx[1], ky[1])
                 record[at_edges] = of_u[0]
                 record[at_edges + 1] = of_u[1]
                 record[at_edges + 2] = of_v[0]
@@ -135,25 +139,21 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         if wp.static(exact):
             record[at_bulge] = float(two * inverse_m2)
         if wp.static(parallel):
-            # D times the depth, which is p_z - (n_x X + n_y Y) / n_z at (X, Y) from the centre [m]
-            off_x, off_y = (anchor_x - center_x) * per_fx, (anchor_y - center_y) * per_fy
+            # D times the depth
             record[7] = wp.inf
-            record[8] = float(normal[2] * facing)
-            record[9] = 0.0
-            record[10] = 0.0
-            record[at_plane] = float((normal[2] * p[2] - normal[0] * off_x - normal[1] * off_y) * facing)
-            record[at_plane + 1] = float(-normal[0] * per_fx * facing)
-            record[at_plane + 2] = float(-normal[1] * per_fy * facing)
+            record[at_plane] = float((a[2] * k0[0] + b[2] * k0[1] + p[2] * k0[2]) * facing)
+            record[at_plane + 1] = float((a[2] * kx[0] + b[2] * kx[1]) * facing)
+            record[at_plane + 2] = float((a[2] * ky[0] + b[2] * ky[1]) * facing)
             record[at_plane + 3] = float(view.near)
         if wp.static(bent):
-            record[at_ray] = float(form_u[2] * n_scale)
-            record[at_ray + 1] = float(form_v[2] * n_scale)
-            record[at_ray + 2] = float(normal[2] * facing)
+            record[at_ray] = float(kz[0] * n_scale)
+            record[at_ray + 1] = float(kz[1] * n_scale)
+            record[at_ray + 2] = float(kz[2] * facing)
             record[at_ray + 3] = anchor[0]
             record[at_ray + 4] = anchor[1]
             record[at_ray + 5] = anchor[2]
         if wp.static(has_depth):
-            record[at_depth] = float(height * facing)
-        return record, normal, height, met
+            record[at_depth] = float(z_numerator)
+        return record, met
 
     return forms

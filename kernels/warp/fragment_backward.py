@@ -40,7 +40,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     """
     splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
     Splat, Intersection = splats.Splat, intersection.Intersection
-    cross, row_of, opacity_of = intersection.cross, intersection.row, intersection.opacity_of
+    cross, column_of, opacity_of = intersection.cross, intersection.column, intersection.opacity_of
     screen, exclusive, has_depth = (
         name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth")
     )
@@ -105,7 +105,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
 
     @wp.func
     def crossed(s: Splat, x: float, y: float, view: View):
-        return cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
+        return cross(s, column_of(s.u, x), column_of(s.v, x), column_of(s.d, x), x, y, view)
 
     @wp.func
     def opacity_at(s: Splat, column: int, row: int, light: float, view: View) -> float:
@@ -171,7 +171,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         loss = before
         x, y = float(column) - s.d[3], float(row) - s.c[0]
         c = crossed(s, x, y, view)
-        nu, nv = fma(s.u[1], x, row_of(s.u, y)), fma(s.v[1], x, row_of(s.v, y))
+        nu, nv = fma(s.u[2], y, column_of(s.u, x)), fma(s.v[2], y, column_of(s.v, x))
         inverse_d = float(0.0)
         if c.d > 0.0:
             inverse_d = 1.0 / c.d

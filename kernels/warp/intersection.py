@@ -20,8 +20,8 @@ HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
 
 @cache
 def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """The struct Intersection and functions row, cross, cross_ray, cross_slopes (None without boxes behind a
-    lens), is_box, opacity_of and depth_of.
+    """The struct Intersection and functions column, cross, cross_ray, cross_slopes (None without boxes
+    behind a lens), is_box, opacity_of and depth_of.
     """
     Splat = make_splat(effects, outputs).Splat
     layout = Layout(effects, outputs)
@@ -46,9 +46,9 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     zr_line, zr_lane = layout.place("z_reach")
 
     @wp.func
-    def row(form: wp.vec4, y: float) -> float:
-        """The part of an affine form that does not change along a row of samples."""
-        return fma(form[2], y, form[0])
+    def column(form: wp.vec4, x: float) -> float:
+        """The part of an affine form that does not change along a column of samples."""
+        return fma(form[1], x, form[0])
 
     @wp.func
     def is_box(s: Splat) -> bool:
@@ -60,18 +60,19 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
             return s.edges[0] > 0.0
 
     @wp.func
-    def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
-        """x, y: the sample from the anchor; row_*: `row` of the three forms at y."""
-        return meet(s, fma(s.u[1], x, row_u), fma(s.v[1], x, row_v), fma(s.d[1], x, row_d), x, y, view)
+    def cross(s: Splat, column_u: float, column_v: float, column_d: float, x: float, y: float, view: View):
+        """x, y: the sample from the anchor; column_*: `column` of the three forms at x."""
+        nu, nv, d = fma(s.u[2], y, column_u), fma(s.v[2], y, column_v), fma(s.d[2], y, column_d)
+        return meet(s, nu, nv, d, x, y, view)
 
     @wp.func
     def forms_of(s: Splat, ray: wp.vec3) -> wp.vec3:
         """n_u, n_v and D of a ray."""
         r = ray - s.origin
         return wp.vec3(
-            fma(s.w[0], r[2], fma(s.u[1], r[0], fma(s.u[2], r[1], s.u[0]))),
-            fma(s.w[1], r[2], fma(s.v[1], r[0], fma(s.v[2], r[1], s.v[0]))),
-            fma(s.w[2], r[2], fma(s.d[1], r[0], fma(s.d[2], r[1], s.d[0]))),
+            fma(s.w[0], r[2], fma(s.u[2], r[1], fma(s.u[1], r[0], s.u[0]))),
+            fma(s.w[1], r[2], fma(s.v[2], r[1], fma(s.v[1], r[0], s.v[0]))),
+            fma(s.w[2], r[2], fma(s.d[2], r[1], fma(s.d[1], r[0], s.d[0]))),
         )
 
     @wp.func
@@ -131,7 +132,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     def opacity_of(s: Splat, c: Intersection, inverse_d: float, view: View) -> float:
         if wp.static(boxes):
             if is_box(s):
-                return wp.min(wp.exp(s.u[3]), view.ceiling) * c.cover
+                return wp.min(exp(s.u[3]), view.ceiling) * c.cover
         half_rho = c.q * inverse_d * inverse_d
         if wp.static(screen):
             if c.inside:
@@ -174,7 +175,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
 
     return SimpleNamespace(
         Intersection=Intersection,
-        row=row,
+        column=column,
         cross=cross,
         cross_ray=cross_ray,
         cross_slopes=cross_slopes if curved else None,

@@ -46,7 +46,7 @@ def make_k_buffer(
     """
     layered = layer is not None
     last = size - 1
-    nothing, depth, averaged = (layer.nothing, layer.depth, layer.averaged) if layer else (None, None, None)
+    nothing, depth = (layer.nothing, layer.depth) if layer else (None, None)
 
     @wp.func
     def start(pixel: Pixel):
@@ -80,9 +80,9 @@ def make_k_buffer(
         """Attributes of a buffered fragment or layer."""
         if wp.static(layered):
             if place == _FIRST:
-                return averaged(p.k_buffer.first)
+                return p.k_buffer.first.mean
             if place == _SECOND:
-                return averaged(p.k_buffer.second)
+                return p.k_buffer.second.mean
         return attributes_of(lines, lists[place], z)
 
     @wp.func
@@ -242,7 +242,7 @@ def make_k_buffer(
             if full(p):
                 p = composite_until(p, wp.min(nearest, z), lines, lists, view)
             if full(p) and z <= nearest:
-                p = composite(p, averaged(p.k_buffer.open), opacity, view)
+                p = composite(p, p.k_buffer.open.mean, opacity, view)
             else:
                 if full(p):
                     p = drop_furthest(p)

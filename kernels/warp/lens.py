@@ -47,8 +47,8 @@ def make_optics(camera: str, real) -> SimpleNamespace:
     """Functions of a lens.
 
     image(p, view, lens): image coordinates of a point, and whether it is in the field of view. anchor(x, y,
-    p, view, lens): the ray to which a splat's forms are relative. Bounds in samples: mapped(x0, x1, y0, y1,
-    lens) of a box of the chart, enclose(a, b, p, radius, view, lens) of a disk.
+    imaged, p, view, lens): the ray to which a splat's forms are relative. Bounds in samples: mapped(x0, x1,
+    y0, y1, lens) of a box of the chart, enclose(a, b, p, radius, view, lens) of a disk.
     """
     Lens = make_lens(camera)
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
@@ -121,7 +121,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
         s1, s2, s3, s4 = real(lens.k[8]), real(lens.k[9]), real(lens.k[10]), real(lens.k[11])
         radial = (one + q * (k1 + q * (k2 + q * k3))) / (one + q * (k4 + q * (k5 + q * k6)))
         a = x * radial + two * p1 * x * y + p2 * (q + two * x * x) + q * (s1 + q * s2)
-        b = y * radial + two * p2 * x * y + p1 * (q + two * y * y) + q * (s3 + q * s4)
+        b = y * radial + p1 * (q + two * y * y) + two * p2 * x * y + q * (s3 + q * s4)
         return (
             real(view.focal_x) * a + real(view.center_x),
             real(view.focal_y) * b + real(view.center_y),
@@ -135,12 +135,11 @@ def make_optics(camera: str, real) -> SimpleNamespace:
         q = angle * angle
         k1, k2, k3, k4 = real(lens.k[0]), real(lens.k[1]), real(lens.k[2]), real(lens.k[3])
         away = angle * (one + q * (k1 + q * (k2 + q * (k3 + q * k4))))
-        x, y = zero, zero
+        factor = zero
         if across > zero:
-            x = p[0] / across * away
-            y = p[1] / across * away
-        x = real(view.focal_x) * x + real(view.center_x)
-        y = real(view.focal_y) * y + real(view.center_y)
+            factor = away / across
+        x = real(view.focal_x) * (factor * p[0]) + real(view.center_x)
+        y = real(view.focal_y) * (factor * p[1]) + real(view.center_y)
         return x, y, angle <= real(lens.limit)
 
     @wp.func
@@ -219,14 +218,15 @@ def make_optics(camera: str, real) -> SimpleNamespace:
         )
 
     @wp.func
-    def anchor(column: int, row: int, p: vec3, view: View, lens: Lens) -> wp.vec3:
-        """The ray of a sample; the direction of p outside of the field of view."""
+    def anchor(column: int, row: int, imaged: bool, p: vec3, view: View, lens: Lens) -> wp.vec3:
+        """The ray of a sample; the direction of p if the centre is not imaged, or that sample has no ray."""
         ray = lens.rays[row * view.width + column]
-        if ray[0] != ray[0]:
+        if not (imaged and ray[0] == ray[0]):
             away = wp.length(p)
             ray = wp.vec3(0.0, 0.0, 0.0)
             if away > zero:
-                ray = wp.vec3(float(p[0] / away), float(p[1] / away), float(p[2] / away))
+                per = one / away
+                ray = wp.vec3(float(p[0] * per), float(p[1] * per), float(p[2] * per))
         return ray
 
     image = {

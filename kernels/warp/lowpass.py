@@ -23,16 +23,16 @@ def make_filter(real):
 
     @wp.func
     def widened(a: vec3, b: vec3, by_x: vec3, by_y: vec3, by_depth: vec3):
-        """L_uu, L_vu, L_vv, and the factor of the area; of parallel rays, whose depth has no say, not finite
-        of a disk that is seen edge-on."""
+        """L_uu, L_vu, L_vv, and the square of the factor of the area, which with parallel rays is not
+        finite for a disk that is edge-on."""
         by_u = vec3(wp.dot(by_x, a), wp.dot(by_y, a), whole_depth * wp.dot(by_depth, a))
         by_v = vec3(wp.dot(by_x, b), wp.dot(by_y, b), whole_depth * wp.dot(by_depth, b))
         minors = wp.cross(by_u, by_v)
-        share = variance / wp.dot(minors, minors)
+        area2 = minors[2] * minors[2] + minors[1] * minors[1] + minors[0] * minors[0]
         uu, uv, vv = wp.dot(by_u, by_u), wp.dot(by_u, by_v), wp.dot(by_v, by_v)
         # det(1 + s^2 M^-1) = 1 + s^2 (tr M + s^2) / det M: no cancellation
-        grown = wp.sqrt(one + share * (uu + vv + variance))
-        l_uu = wp.sqrt(one + share * vv)
-        return vec4(l_uu, -share * uv / l_uu, grown / l_uu, grown)
+        grown = one + variance * (uu + vv + variance) / area2
+        l_uu = wp.sqrt(one + variance * vv / area2)
+        return vec4(l_uu, -variance * uv / area2 / l_uu, wp.sqrt(grown) / l_uu, grown)
 
     return widened

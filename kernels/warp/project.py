@@ -12,6 +12,7 @@ from .color import make_color
 from .common import CULLED, STRICT, View, as_bits, reread, sortable, store_line
 from .disk import make_disk
 from .ellipsoids import EWA, EXACT, make_ellipsoids
+from .fast import make_log
 from .forms import make_forms
 from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
@@ -46,7 +47,7 @@ def make_project(
     words = [layout.word(output.declared(name).record[0]) for name in recorded]
     real = wp.float64 if precision == "float64" else wp.float32
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
-    sqrt_two, two, zero = real(math.sqrt(2.0)), real(2.0), real(0.0)
+    sqrt_two, half, two, zero = real(math.sqrt(2.0)), real(0.5), real(2.0), real(0.0)
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
     boxes_too = all_boxes or mixed
     of_box, disk = make_boxes(real), make_disk(real)
@@ -55,6 +56,7 @@ def make_project(
     surfaced = drawn_ewa and len(projects) > 0
     ellipsoid = make_ellipsoids(effects, real)
     limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
+    ln = make_log(real)
     splat_pose = make_splat_pose(effects, real)
     Moving = splat_pose.Moving
     camera = next((name for name in effects if name in LENSES), None)
@@ -117,7 +119,7 @@ def make_project(
         counts[at] = wp.int64(0)
         visible[at] = 0
         # conditions are written so that a NaN culls
-        log_opacity = float(wp.log(real(opacity)))
+        log_opacity = float(ln(real(opacity)))
         half_r2 = log_opacity - view.log_cut
         if not (half_r2 > 0.0 and opacity < wp.inf):
             return
@@ -133,6 +135,10 @@ def make_project(
         tangent_u, tangent_v = splat_pose.tangents(rotation, quat)
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
         p = rotation * mean + translation
+        facet = wp.cross(tangent_u, tangent_v)
+        offset = wp.dot(facet, p)  # of the plane from the camera's centre
+        if wp.static(parallel):
+            offset = facet[2]
         a, b = tangent_u * su, tangent_v * sv
         depth = p[2]
         if wp.static(ray_depths):
@@ -146,7 +152,7 @@ def make_project(
         if wp.static(boxes_too):
             itself = boxed
         third = vec3()  # half axis of an ellipsoid that is conjugate to a and b
-        outward = vec3()  # its normal, where it is visible by a disk that has another
+        outward = vec3()  # its normal, if its disk has another
         inverse_m2 = zero
         thick = bool(False)
         if wp.static(thick_too):
@@ -154,23 +160,21 @@ def make_project(
             if thick:
                 sizes = vec3(su, sv, real(wp.max(thickness[i], SMALLEST_SCALE)))
                 if wp.static(surfaced):
-                    outward = ellipsoid.surface(tangent_u, tangent_v, sizes, p)
-                a, b, third, inverse_m2, spanned, share = ellipsoid.disk(tangent_u, tangent_v, sizes, p, view)
-                log_opacity += float(wp.log(share))
+                    outward = ellipsoid.surface(tangent_u, tangent_v, facet, sizes, p)
+                a, b, facet, offset, third, inverse_m2, su, sv, log_share = ellipsoid.disk(
+                    a, b, facet, sizes, p, view
+                )
+                log_opacity += float(log_share)
                 half_r2 = log_opacity - view.log_cut
                 if not (half_r2 > 0.0):
                     return
-                # of unit area, as a disk's
-                sv = wp.length(b)
-                su = spanned / sv
-                tangent_u, tangent_v = a / su, b / sv
                 itself = wp.static(drawn_ewa)
         if wp.static(filtered):
             if depth >= near and not itself:
                 by_x, by_y, by_depth, here = slopes_at(p, view, lens)
                 if here:
                     wide = widened(a, b, by_x, by_y, by_depth)
-                    log_opacity -= float(wp.log(wide[3]))
+                    log_opacity -= float(half * ln(wide[3]))
                     half_r2 = log_opacity - view.log_cut
                     if not (half_r2 > 0.0):
                         return  # to parallel rays edge-on too: infinitely thin, infinitely faint
@@ -178,7 +182,6 @@ def make_project(
                     b = wide[2] * b
                     su *= wide[0]
                     sv *= wide[2]
-                    tangent_u = a / su  # of unit area with tangent_v, whose direction stays
         radius = wp.sqrt(two * real(half_r2))
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range
         if wp.static(boxes_too):
@@ -205,9 +208,11 @@ def make_project(
         if wp.static(parallel):
             center_x, center_y = fx * p[0] + cx, fy * p[1] + cy
         elif wp.static(not bent):
+            center_x = wp.clamp(fx * p[0] / near + cx, zero, real(view.width))
+            center_y = wp.clamp(fy * p[1] / near + cy, zero, real(view.height))
             if in_front:
-                center_x = fx * (p[0] / p[2]) + cx
-                center_y = fy * (p[1] / p[2]) + cy
+                center_x = (fx * p[0] + cx * p[2]) / p[2]
+                center_y = (fy * p[1] + cy * p[2]) / p[2]
         box = Bounds()
         if wp.static(edged):
             if boxed:
@@ -242,9 +247,6 @@ def make_project(
         if wp.static(bent):
             if in_front:
                 center_x, center_y, in_front = optics.image(p, view, lens)
-        if wp.static(not parallel):
-            if not in_front:
-                center_x, center_y = real(box.x), real(box.y)
         if wp.static(screen):
             if in_front:
                 box.disc_x = float(center_x)
@@ -267,9 +269,9 @@ def make_project(
 
         # loaded again, here and above, so that no registers hold them meanwhile
         view = views[reread(number)]
-        record, normal, height, met = forms(
-            tangent_u, tangent_v, p, su, sv, center_x, center_y,
-            in_front, boxed, itself, inverse_m2, view, lens,
+        record, met = forms(
+            a, b, facet, offset, p, su, sv, center_x, center_y,
+            in_front, boxed, itself, thick, inverse_m2, view, lens,
         )  # fmt: skip
         if not met:
             return
@@ -300,9 +302,9 @@ def make_project(
             record[at_nearest] = key
         if wp.static(surfaced):
             if thick:
-                normal = outward
+                facet = outward
         for k in range(wp.static(len(projects))):
-            record = wp.static(projects[k])(record, wp.static(words[k]), normal, height)
+            record = wp.static(projects[k])(record, wp.static(words[k]), facet, offset)
         for line in range(wp.static(lines_each)):
             k = 4 * line
             store_line(

@@ -22,9 +22,10 @@ def make_slopes(camera: str | None, real):
     @wp.func
     def slopes_pinhole(p: vec3, view: View, lens: Lens):
         per_z = one / p[2]
-        by_x = vec3(per_z, zero, -p[0] * per_z * per_z)
-        by_y = vec3(zero, per_z, -p[1] * per_z * per_z)
-        return real(view.focal_x) * by_x, real(view.focal_y) * by_y, vec3(zero, zero, per_z), True
+        fx, fy = real(view.focal_x), real(view.focal_y)
+        by_x = vec3(fx * per_z, zero, -fx * p[0] * per_z * per_z)
+        by_y = vec3(zero, fy * per_z, -fy * p[1] * per_z * per_z)
+        return by_x, by_y, vec3(zero, zero, per_z), True
 
     @wp.func
     def slopes_parallel(p: vec3, view: View, lens: Lens):

@@ -54,6 +54,10 @@ def build_options(device: cl.Device) -> list[str]:
     # processors
     target = "".join(c if c.isalnum() else "_" for c in target)
     options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
+    rounds = device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
+    if rounds and not is_pocl(device):
+        # images are then bit-identical; PoCL needs no option for it
+        options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     if device.platform.name == "NVIDIA CUDA":
         # the projection uses 98 registers; with 96 the occupancy is a quarter higher
         options.append("-cl-nv-maxrregcount=96")

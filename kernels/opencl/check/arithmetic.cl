@@ -20,14 +20,14 @@ kernel void arithmetic_float(uint n, global const float *restrict exponents, glo
 }
 
 // Index space: one work-item per value.
-// Reads:  above, below (n). Writes: out, n of each: above / below, sqrt of below, log of below.
+// Reads:  above, below (n). Writes: out, n of each: above / below, sqrt of below, ln of below.
 kernel void arithmetic_real(uint n, global const real *restrict above, global const real *restrict below,
                             global real *restrict out) {
     uint at = get_global_id(0);
     if (at >= n) return;
     out[at] = above[at] / below[at];
     out[n + at] = sqrt(below[at]);
-    out[2 * (size_t)n + at] = log(below[at]);
+    out[2 * (size_t)n + at] = ln(below[at]);
 }
 
 // Index space: one work-item. Reads: in, (smallest normal float, 0.5). Writes: out: their product, and that times 2.

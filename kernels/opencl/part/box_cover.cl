@@ -22,7 +22,7 @@
 //@ footprint_disc
         if (BOX_HERE) record.disc_x = record.disc_y = 1e18f;
 //@ footprint_opacity
-    if (IS_BOX(s)) opacity = fmin(exp(s->log_opacity), constants->ceiling) * c.cover;
+    if (IS_BOX(s)) opacity = VMIN(EXP((vfloat)s->log_opacity), (vfloat)constants->ceiling) * c.cover;
 //@ footprint_tau
     // the optical depth of adjacent boxes is the area that they cover, and their colour its mean
     if (IS_BOX(s)) tau = opacity;

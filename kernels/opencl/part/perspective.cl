@@ -22,6 +22,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
         real box[4];
         if (!clipped_box(tu, tv, tw, radius, near, box)) return;
         bounds = box_bounds(box[0], box[1], box[2], box[3]);
-        center_x = pz >= near ? tu.z / pz : bounds.ex;
-        center_y = pz >= near ? tv.z / pz : bounds.ey;
+        // behind the near plane it is only the anchor
+        center_x = pz >= near ? tu.z / pz : fmin(fmax(view->focal_x * p.x / near + view->center_x, REAL(0.0)), (real)view->width);
+        center_y = pz >= near ? tv.z / pz : fmin(fmax(view->focal_y * p.y / near + view->center_y, REAL(0.0)), (real)view->height);
     }

@@ -15,14 +15,13 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     return c;
 }
 //@ camera_forms
-    // any ray can be the anchor; if that sample has none, the direction of the centre
+    // any ray can be the anchor: the direction of the centre, if the centre is not imaged or its sample has no ray
     size_t ray_stride = (width + TILE_W - 1) / TILE_W * TILE_W;
     size_t ray_plane = ray_stride * ((height + TILE_H - 1) / TILE_H * TILE_H);
-    float near_x = center_x == center_x ? (float)center_x : bounds.ex, near_y = center_y == center_y ? (float)center_y : bounds.ey;
-    size_t ray_at = (size_t)clamp(floor(near_y), 0.0f, (float)(height - 1)) * ray_stride
-                    + (size_t)clamp(floor(near_x), 0.0f, (float)(width - 1));
+    bool imaged = center_x == center_x;
+    size_t ray_at = imaged ? (size_t)anchor_j * ray_stride + (size_t)anchor_i : 0;
     float anchor_ray[3] = {rays[ray_at], rays[ray_plane + ray_at], rays[2 * ray_plane + ray_at]};
-    if (!(anchor_ray[0] == anchor_ray[0])) {
+    if (!(imaged && anchor_ray[0] == anchor_ray[0])) {
         real away = sqrt(dot3(p, p));
         away = away > 0 ? 1 / away : 0;
         anchor_ray[0] = (float)(p.x * away);

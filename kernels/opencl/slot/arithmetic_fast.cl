@@ -34,7 +34,6 @@ static inline vfloat fast_log(vfloat x) {
     p = FMA(m2, (vfloat)-0.5f, p * m * m2);
     return FMA(VFLOAT(bits >> 23), (vfloat)6.93147181e-1f, m + p);
 }
-//@ opacity
-    return VMIN(fast_exp(s->log_opacity - half_rho), (vfloat)ceiling);
-//@ layer_tau
-    vfloat tau = -fast_log(fmax(1.0f - opacity, (vfloat)0x1p-24f));
+
+#define EXP fast_exp
+#define LOG fast_log

@@ -48,7 +48,3 @@
                             fmin((real)(bounds.ex + bounds.hx), view->focal_x * (middle_x + half_x) / near + view->center_x),
                             fmax((real)(bounds.ey - bounds.hy), view->focal_y * (middle_y - half_y) / near + view->center_y),
                             fmin((real)(bounds.ey + bounds.hy), view->focal_y * (middle_y + half_y) / near + view->center_y));
-        if (pz < near) {
-            center_x = bounds.ex;
-            center_y = bounds.ey;
-        }

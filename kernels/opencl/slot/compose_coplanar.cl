@@ -90,7 +90,7 @@ static inline Layer no_layer(void) {
 static inline void layer_add(Layer *layer, const Splat *s, const Attributes *attributes, vfloat opacity, vint mask) {
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
     // clamped to the optical depth at which float32 transmittance is 0
-//@@ layer_tau
+    vfloat tau = -LOG(fmax(1.0f - opacity, (vfloat)0x1p-24f));
 //@@ footprint_tau
     layer->lanes |= mask;
     layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);

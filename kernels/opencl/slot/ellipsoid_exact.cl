@@ -18,7 +18,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     real w0 = min_length / s0, w1 = min_length / s1, w2 = min_length / s2;
     // W `towards`, scaled by `min_length` against overflow and underflow
     real g0 = dot3(e0, towards) / s0 * w0, g1 = dot3(e1, towards) / s1 * w1, g2 = dot3(e2, towards) / s2 * w2;
-    real h = hypot(g1, g2), m = hypot(g0, h);
+    real h = sqrt(g1 * g1 + g2 * g2), m = sqrt(g0 * g0 + h * h);       // `hypot` differs between devices
     if (!(m > 0)) return INFINITY;
     // along the longest axis any two perpendicular ones are valid
     real along = h / m, back = g0 / m, k1 = h > 0 ? g1 / h : 1, k2 = h > 0 ? g2 / h : 0;

@@ -42,11 +42,10 @@ class Output:
     read_attributes: Any = None
     """(attributes, numbers, index): numbers: the vector of those of the record; index: of the splat"""
     layer: Mapping[str, Any] = field(default_factory=dict)
-    """state of a layer in addition to the sums `layer.mean` of its fragments' attributes"""
+    """state of a layer in addition to the means `layer.mean` of its fragments' attributes"""
     accumulate: Any = None
-    """(layer, attributes, tau): adds a fragment of optical depth tau to a layer"""
-    average: Any = None
-    """(attributes, tau): attributes of a layer of optical depth tau from its sums"""
+    """(layer, attributes, tau, share): adds a fragment of optical depth tau, which is this share of the
+    layer's, to a layer"""
 
     state: Mapping[str, Any] = field(default_factory=dict)
     """state of a sample while its list is composited; 0 before the first fragment"""

@@ -17,7 +17,7 @@ def read_attributes(attributes: Any, numbers: float, index: int):
 
 
 @wp.func
-def accumulate(layer: Any, attributes: Any, tau: float):
+def accumulate(layer: Any, attributes: Any, tau: float, share: float):
     after = layer
     after.mean.blended = layer.mean.blended + attributes.blended
     return after

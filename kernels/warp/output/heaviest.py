@@ -18,7 +18,7 @@ def read_attributes(attributes: Any, numbers: float, index: int):
 
 
 @wp.func
-def accumulate(layer: Any, attributes: Any, tau: float):
+def accumulate(layer: Any, attributes: Any, tau: float, share: float):
     after = layer
     if tau > layer.thickest:
         after.thickest = tau

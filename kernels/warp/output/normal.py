@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from ..common import View
+from ..common import View, fma3
 from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
@@ -29,23 +29,16 @@ def read_attributes(attributes: Any, numbers: wp.vec3, index: int):
 
 
 @wp.func
-def accumulate(layer: Any, attributes: Any, tau: float):
+def accumulate(layer: Any, attributes: Any, tau: float, share: float):
     after = layer
-    after.mean.normal = layer.mean.normal + tau * attributes.normal
+    after.mean.normal = fma3(share, attributes.normal - layer.mean.normal, layer.mean.normal)
     return after
-
-
-@wp.func
-def average(attributes: Any, tau: float):
-    s = attributes
-    s.normal = attributes.normal / tau
-    return s
 
 
 @wp.func
 def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
     p = pixel
-    p.normal += weight * attributes.normal
+    p.normal = fma3(weight, attributes.normal, p.normal)
     return p
 
 
@@ -70,7 +63,7 @@ def unit_of(grid: PixelGrid, samples: Any) -> wp.vec3:
     length = wp.length(sum)
     unit = wp.vec3()
     if length > 0.0:
-        unit = sum / length
+        unit = sum * (1.0 / length)
     return unit
 
 
@@ -87,7 +80,6 @@ OUTPUT = Output(
     attributes={"normal": wp.vec3},
     read_attributes=read_attributes,
     accumulate=accumulate,
-    average=average,
     state={"normal": wp.vec3},
     composite=composite,
     clear=clear,

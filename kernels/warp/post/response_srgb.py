@@ -4,6 +4,8 @@ from typing import Any
 
 import warp as wp
 
+from ..common import fma
+from ..fast import fast_exp, fast_log
 from . import Step
 
 
@@ -12,7 +14,7 @@ def apply(v: float, x: int, y: int, channel: int, s: Any) -> float:
     light = wp.clamp(v, 0.0, 1.0)
     if light <= 0.0031308:
         return 12.92 * light
-    return 1.055 * wp.pow(light, 1.0 / 2.4) - 0.055
+    return fma(1.055, fast_exp(fast_log(light) * (1.0 / 2.4)), -0.055)
 
 
 STEP = Step(apply=apply)

@@ -1,0 +1,37 @@
+"""Random scenes have one digest on all devices."""
+
+import json
+from dataclasses import replace
+
+from fidsplat.cli import main
+from fidsplat.selftest import digests
+
+
+def test_devices_render_the_digests_of_the_table(renderer):
+    expected = digests.read_table()
+    assert list(expected) == list(range(digests.COUNT))
+    differing = {
+        seed: (digests.kind_of(seed).name, found.differing(expected[seed]))
+        for seed in expected
+        if (found := digests.digest_of(renderer, seed)) != expected[seed]
+    }
+    assert not differing
+
+
+def test_the_command_names_scenes_that_differ(renderer, monkeypatch, capsys):
+    expected = {seed: digests.read_table()[seed] for seed in (0, 20)}
+    command = ["check", "--digests", "--device", renderer.device.name]
+    monkeypatch.setattr(digests, "read_table", lambda: expected)
+    assert main(command) == 0
+    assert "2 of 2 scenes are bit-identical" in capsys.readouterr().out
+    outputs = expected[20].outputs | {"depth": "00000000"}
+    expected[20] = replace(expected[20], sha256="0" * 64, outputs=outputs)
+    assert main(command) == 1
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "1 of 2" in line and "disks" in line]
+    assert line.split() == ["disks", "1", "of", "2", "depth", "20"]
+    assert main([*command, "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert (found["passed"], list(found["sha256"])) == (False, ["0", "20"])
+    (only,) = found["differing"]
+    assert (only["seed"], only["differing"]) == (20, ["depth"])
+    assert {"nu0", "keys", "samples"} <= set(only["stages"])
