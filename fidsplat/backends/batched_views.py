@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fidsplat.backends.view import FAR_EYE, View
+from fidsplat.backends.view import FAR_EYE, View, rotated
 
 _SHARED = (
     *("width", "height", "samples", "log_cut", "ceiling", "stop", "background", "first_light", "sensor"),
@@ -113,15 +113,15 @@ class ViewBatch:
             world_to_camera[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
             rotation = world_to_camera[:, :3, :3]
             centre = poses[:, :3, 3] - origin
-            translation = _applied(-rotation, centre)
+            translation = rotated(-rotation, centre)
             eye = centre - FAR_EYE * rotation[:, 2] if view.parallel else centre
         rotations, translations, eyes = [rotation], [translation], [eye]
         for motion in groups.values():
             turn, move = motion[:, :3, :3], motion[:, :3, 3]
             turned = rotation @ turn
-            away = _applied(turn, np.broadcast_to(origin, (count, 3))) + move - origin
-            moved = translation + _applied(rotation, away)
-            own = _applied(-np.swapaxes(turned, 1, 2), moved)
+            away = rotated(turn, np.broadcast_to(origin, (count, 3))) + move - origin
+            moved = translation + rotated(rotation, away)
+            own = rotated(-np.swapaxes(turned, 1, 2), moved)
             rotations.append(turned)
             translations.append(moved)
             eyes.append(own - FAR_EYE * turned[:, 2] if view.parallel else own)
@@ -167,11 +167,6 @@ def _stacked(
         for name in ("rotation", "translation", "eye")
     )
     return ViewBatch(views[0], rotation, translation, eye, numbers, batch_indices, total, views=tuple(views))
-
-
-def _applied(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """The product of each matrix (n, 3, 3) and its vector (n, 3), rounded as `matrix @ vector`."""
-    return (matrices @ vectors[..., None])[..., 0]
 
 
 def _plain(value: np.ndarray) -> float | tuple[float, ...]:

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.view import FAR_EYE, SubFrame, View
+from fidsplat.backends.view import FAR_EYE, SubFrame, View, rotated
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import Views
 from fidsplat.effects import FeatureSet, select
@@ -111,8 +111,8 @@ def _moved(view: View, motion: np.ndarray, origin: np.ndarray) -> View:
     turn, move = motion[:3, :3], motion[:3, 3]
     rotation = view.rotation @ turn
     # of the cloud's origin, before the camera is where it is
-    translation = view.translation + view.rotation @ (turn @ origin + move - origin)
-    eye = -rotation.T @ translation
+    translation = view.translation + rotated(view.rotation, rotated(turn, origin) + move - origin)
+    eye = rotated(-rotation.T, translation)
     return replace(
         view,
         rotation=rotation,

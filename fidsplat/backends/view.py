@@ -24,6 +24,12 @@ MAX_GRID = 32767
 _NO_SENSOR = Sensor()
 
 
+def rotated(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """The product of each matrix (..., 3, 3) and its vector (..., 3), never -0. Its rounding is the same on
+    every processor; that of `@` depends on BLAS."""
+    return (matrices * vectors[..., None, :]).sum(axis=-1) + 0.0
+
+
 @dataclass(frozen=True)
 class View:
     """The uniforms of a frame, in float64.
@@ -195,7 +201,7 @@ class View:
             center_x=cx,
             center_y=cy,
             rotation=rotation,
-            translation=-rotation @ eye,
+            translation=rotated(-rotation, eye),
             # view-dependent colours of parallel rays are those of a distant eye
             eye=eye - FAR_EYE * rotation[2] if parallel else eye,
             near=camera.near,
