@@ -16,7 +16,7 @@ OF_BOXES = ("edges", "cover")
 FILTERS = ("make_boxes", "make_filter")
 OF_SAMPLES = ("depth_weight", "depth_median", "depth_first", "heaviest", "blended", "fog_slope", "fogged")
 TAKEN = {
-    "1.19.0": {"blend": {"registers": 64, "stack": 48}, "project": {"registers": 96, "stack": 64}},
+    "1.19.0": {"blend": {"registers": 64, "stack": 40}, "project": {"registers": 96, "stack": 16}},
 }
 """by Warp's version: registers and memory of kernels without effects on an H100 (sm_90)"""
 OF_LAYERS = ("Layer", "thickest", "tau")
