@@ -50,22 +50,16 @@ class Bench:
       fidsplat bench --scene room.ply --device opencl:nvidia --device opencl:pocl --plot room.svg
     """
 
-    scenes: Annotated[
-        tuple[str, ...],
-        option("NAME...", "scenes, or all (default: tag r100k_720p r1m_1080p tag_in_million)"),
-    ] = ()
+    scenes: tuple[str, ...] = ()
+    """NAME...: scenes, or all (default: tag r100k_720p r1m_1080p tag_in_million)"""
     scene: UserScenes = ()
     cameras: Cameras = None
     device: Devices = ()
     repeats: Annotated[int, option("N", "timed frames of each scene on each device")] = 20
-    json: Annotated[
-        str | None,
-        option("FILE", "also write all figures to a file after each scene; - for stdout only"),
-    ] = None
-    plot: Annotated[
-        str | None,
-        option("FILE.svg", "also write a chart of the frame times, or FILE.png (extra: experiments)"),
-    ] = None
+    json: str | None = None
+    """FILE: also write all figures to a file after each scene; - for stdout only"""
+    plot: str | None = None
+    """FILE.svg: also write a chart of the frame times, or FILE.png (extra: experiments)"""
 
     def run(self) -> int:
         from rich.progress import Progress, TextColumn

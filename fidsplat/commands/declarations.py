@@ -1,7 +1,8 @@
 """Options from dataclasses: rules for tyro, which parses the command line.
 
 The fields of a command and of the settings that it nests are its options. The docstring of a field is the
-help of its option, `option` adds a placeholder or a short form, and `-o` is short for a field `out`.
+help of its option, with a placeholder for the value as in `FILE.mp4: also write a video`. `-o` is short for a
+field `out`. `option` describes options that a docstring cannot.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ rules = ConstructorRegistry()
 _UNSET = "unset"
 _PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "DIR"}
 """placeholders of values in help, by type; settings have no paths but folders"""
+_PLACEHOLDER = re.compile(r"[A-Z]+([.|,][A-Za-z0-9.]*)*")
+"""placeholders in docstrings: `FILE.mp4: text`"""
 _Description = type(tyro.conf.arg())
 
 
@@ -136,8 +139,12 @@ def _described(name: str, kind: Any, text: str | None, repeated: bool) -> Any:
         return kind
     if base is bool:
         return Annotated[kind, switch(text)]
-    metavar = given.metavar if given is not None and given.metavar else _placeholder(kind, repeated)
-    return Annotated[kind, option(metavar, text, "-o" if name == "out" else None)]
+    placeholder, _, rest = (text or "").partition(": ")
+    if _PLACEHOLDER.fullmatch(placeholder):
+        text = rest
+    else:
+        placeholder = given.metavar if given is not None and given.metavar else _placeholder(kind, repeated)
+    return Annotated[kind, option(placeholder, text, "-o" if name == "out" else None)]
 
 
 def _placeholder(kind: Any, repeated: bool) -> str:

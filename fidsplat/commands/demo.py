@@ -68,10 +68,8 @@ class Demo:
 
     out: Annotated[str, option("DIR", "folder for images, scene and figures", "-o")] = "fidsplat-demo"
     device: Device = None
-    mixture: Annotated[
-        str,
-        option("NAME", "mixture of the markers: exact, fitted, facets or paper"),
-    ] = "exact"
+    mixture: str = "exact"
+    """NAME: mixture of the markers: exact, fitted, facets or paper"""
     json: Json = False
 
     def run(self) -> int:

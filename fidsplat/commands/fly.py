@@ -48,29 +48,21 @@ class Fly(RenderInput):
       fidsplat fly scene.toml --trajectory flight.tum --ray ray://HOST:10001       on a cluster
     """
 
-    trajectory: Annotated[
-        str | None, option("FILE", "poses of the camera (default: the scene's [[camera.motion]])")
-    ] = None
-    out: Annotated[
-        str,
-        option("DIR|RUN.mcap", "folder, or a log with its images in the folder RUN", "-o"),
-    ] = DEFAULT_FOLDER
+    trajectory: str | None = None
+    """FILE: poses of the camera (default: the scene's [[camera.motion]])"""
+    out: str = DEFAULT_FOLDER
+    """DIR|RUN.mcap: folder, or a log with its images in the folder RUN"""
     rate: Annotated[float, option("HZ", "frames per second, also of the video")] = 30.0
-    times: Annotated[str | None, option("T,T,...", "seconds on the trajectory's clock instead of --rate")] = (
-        None
-    )
+    times: str | None = None
+    """T,T,...: seconds on the trajectory's clock instead of --rate"""
     file_rate: Annotated[float, option("HZ", "poses per second of a file without times")] = 10.0
     smooth: Annotated[bool, switch("interpolate poses by smooth curves instead of straight lines")] = False
-    video: Annotated[
-        str | None, option("FILE.mp4", "also write a video of the first output (extra: video)")
-    ] = None
-    log: Annotated[
-        str | None,
-        option("FILE.mcap|BAG", "also write a ROS 2 log of images, intrinsics and poses (extra: logs)"),
-    ] = None
-    coco: Annotated[
-        str | None, option("FILE.json", "also write the markers in each image as COCO annotations")
-    ] = None
+    video: str | None = None
+    """FILE.mp4: also write a video of the first output (extra: video)"""
+    log: str | None = None
+    """FILE.mcap|BAG: also write a ROS 2 log of images, intrinsics and poses (extra: logs)"""
+    coco: str | None = None
+    """FILE.json: also write the markers in each image as COCO annotations"""
     ray: RayAddress = None
     workers: Workers = None
     overwrite: Overwrite = False

@@ -29,9 +29,8 @@ class Greenhouse:
 
     out: Annotated[str, option("DIR", "folder", "-o")] = "greenhouse"
     layout: GreenhouseSettings = field(default_factory=GreenhouseSettings)
-    plants_from: Annotated[
-        str | None, option("DIR", "folder of plants KIND-NUMBER.ply (default: plants are grown as disks)")
-    ] = None
+    plants_from: str | None = None
+    """DIR: folder of plants KIND-NUMBER.ply (default: plants are grown as disks)"""
     overwrite: Overwrite = False
     json: Json = False
 

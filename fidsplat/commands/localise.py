@@ -39,12 +39,10 @@ class Localise:
         tyro.conf.UseAppendAction[tuple[str, ...]],
         option("NAME", "variant to measure, repeat for several (default: all)"),
     ] = ()
-    log: Annotated[
-        str | None, option("FILE.mcap|BAG", "also write the drive of `exact` as a ROS 2 log (extra: logs)")
-    ] = None
-    video: Annotated[
-        str | None, option("FILE.mp4", "also write the images of `exact` as a video (extra: video)")
-    ] = None
+    log: str | None = None
+    """FILE.mcap|BAG: also write the drive of `exact` as a ROS 2 log (extra: logs)"""
+    video: str | None = None
+    """FILE.mp4: also write the images of `exact` as a video (extra: video)"""
     device: Device = None
     overwrite: Annotated[bool, switch("replace existing results")] = False
     json: Json = False

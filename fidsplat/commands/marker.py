@@ -52,14 +52,10 @@ class Marker:
 
     spec: Annotated[tyro.conf.Positional[str], option("SPEC", "marker, as above")]
     out: Annotated[str | None, option("FILE.ply", "file for the splats", "-o")] = None
-    size: Annotated[
-        float,
-        option("M", "edge of the code (width of a board) in metres, without the quiet zone"),
-    ] = 1.0
-    mixture: Annotated[
-        str | None,
-        option("NAME", "mixture: exact, fitted, facets, paper or refined (default: exact)"),
-    ] = None
+    size: float = 1.0
+    """M: edge of the code (width of a board) in metres, without the quiet zone"""
+    mixture: str | None = None
+    """NAME: mixture: exact, fitted, facets, paper or refined (default: exact)"""
     iterations: Annotated[int | None, option("N", "iterations of refined (default: 1000)")] = None
     device: Annotated[str | None, option("D", "device of refined (default: FIDSPLAT_DEVICE, or auto)")] = None
     quality: Annotated[str | None, option("Q", "quality with settings of the mixtures, as above")] = None

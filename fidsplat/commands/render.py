@@ -60,21 +60,14 @@ class Render(RenderInput):
       fidsplat render scene.toml --max-ms 20
     """
 
-    out: Annotated[
-        str | None, option("OUT", "PNG file or folder (default: the source's name with .png, here)", "-o")
-    ] = None
-    max_error: Annotated[
-        float | None,
-        option("E", "use the cheapest quality whose error of rgb is certified to be at most E"),
-    ] = None
-    max_ms: Annotated[
-        float | None,
-        option("T", "use the most accurate quality that takes at most T milliseconds per frame"),
-    ] = None
-    every: Annotated[
-        int | None,
-        option("N", "render every Nth pixel in both directions as a smaller image (device reference only)"),
-    ] = None
+    out: str | None = None
+    """OUT: PNG file or folder (default: the source's name with .png, here)"""
+    max_error: float | None = None
+    """E: use the cheapest quality whose error of rgb is certified to be at most E"""
+    max_ms: float | None = None
+    """T: use the most accurate quality that takes at most T milliseconds per frame"""
+    every: int | None = None
+    """N: render every Nth pixel in both directions as a smaller image (device reference only)"""
     json: Json = False
 
     def run(self) -> int:

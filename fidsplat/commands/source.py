@@ -33,10 +33,8 @@ class Source(SceneInput):
       diff <(fidsplat source a.toml) <(fidsplat source b.toml)
     """
 
-    schedule: Annotated[
-        Literal["lanes", "group"],
-        option("S", "lanes: for CPUs, one work-item per tile; group: for GPUs, one work-group per tile"),
-    ] = "lanes"
+    schedule: Literal["lanes", "group"] = "lanes"
+    """S: lanes: for CPUs, one work-item per tile; group: for GPUs, one work-group per tile"""
     device: Annotated[str | None, option("D", "OpenCL device, instead of a schedule")] = None
 
     def run(self) -> int:

@@ -99,10 +99,8 @@ class Tradeoff:
     measurement: Measurement = field(default_factory=Measurement)
     scene: UserScenes = ()
     cameras: Cameras = None
-    plot: Annotated[
-        str | None,
-        option("FILE.svg", "also write a chart of time and error, or FILE.png (extra: experiments)"),
-    ] = None
+    plot: str | None = None
+    """FILE.svg: also write a chart of time and error, or FILE.png (extra: experiments)"""
     json: Json = False
 
     def run(self) -> int:

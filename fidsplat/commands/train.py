@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.declarations import option, switch
+from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, new_file, require_packages, writable_file
 from fidsplat.commands.output import console, delayed_progress, print_lines, progress_bar, report
 from fidsplat.train.settings import TrainSettings
@@ -45,20 +45,15 @@ class Train:
     out: Annotated[str, option("FILE.ply", "file for the splats", "-o")]
     device: Device = None
     training: TrainSettings = field(default_factory=TrainSettings)
-    within_memory: Annotated[
-        float | None,
-        option("GIB", "memory of splats and images while training; reduces the number of splats"),
-    ] = None
-    hold_out: Annotated[
-        int | None, option("N", "hold out every Nth view, 0 for none (default: see above)")
-    ] = None
+    within_memory: float | None = None
+    """GIB: memory of splats and images while training; reduces the number of splats"""
+    hold_out: int | None = None
+    """N: hold out every Nth view, 0 for none (default: see above)"""
     random_points: Annotated[int, option("N", "start from N random points instead of the data set's")] = 0
-    report: Annotated[
-        str | None, option("DIR|FILE.md", "write a page with curves and images of the held-out views")
-    ] = None
-    overwrite: Annotated[
-        bool, switch("restart; the old checkpoint stays until the new run writes its first")
-    ] = False
+    report: str | None = None
+    """DIR|FILE.md: write a page with curves and images of the held-out views"""
+    overwrite: bool = False
+    """restart; the old checkpoint stays until the new run writes its first"""
     json: Json = False
 
     def run(self) -> int:

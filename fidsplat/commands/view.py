@@ -52,13 +52,8 @@ class View:
         tyro.conf.Positional[str | None],
         option("SCENE.toml|FILE.ply|STORE.fss|RUN", "scene to show (default: the demo's scene)"),
     ] = None
-    trajectory: Annotated[
-        str | None,
-        option(
-            "FILE",
-            "poses to show as keyframes (docs/formats.md#trajectories), e.g. a flight's trajectory.tum",
-        ),
-    ] = None
+    trajectory: str | None = None
+    """FILE: poses to show as keyframes (docs/formats.md#trajectories), e.g. a flight's trajectory.tum"""
     page: PageSettings = field(default_factory=PageSettings)
     device: SceneDevice = None
     quality: SceneQuality = None

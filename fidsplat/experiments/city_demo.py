@@ -22,7 +22,11 @@ IMAGE_ERROR = 1 / 255
 
 @dataclass(frozen=True)
 class CityDemoSettings(City):
-    """A city with markers and measured levels of detail. Raises InputError for numbers out of range."""
+    """A city with markers and measured levels of detail.
+
+    Raises:
+        InputError: numbers out of range.
+    """
 
     markers: int = 0
     """markers on the walls, 0 to 1,000"""

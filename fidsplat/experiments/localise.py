@@ -88,7 +88,11 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class Drive:
-    """A robot's drive through a greenhouse. Raises InputError for an impossible greenhouse."""
+    """A robot's drive through a greenhouse.
+
+    Raises:
+        InputError: an impossible greenhouse.
+    """
 
     rows: int = 5
     """Number of rows of plants; 5 make a path of 60 m."""
@@ -253,7 +257,8 @@ def write_log(
 
     Logged are JPEG images, intrinsics, detections, gyroscope, camera poses (/tf), estimated poses (/odom).
 
-    Raises InputError for a variant without images, or if the log cannot be written.
+    Raises:
+        InputError: a variant without images, or if the log cannot be written.
     """
     from fidsplat.logs import RobotLog
 

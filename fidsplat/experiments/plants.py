@@ -39,7 +39,11 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class PlantSettings:
-    """Number and training of plants. Raises InputError for numbers out of range, or an unknown kind."""
+    """Number and training of plants.
+
+    Raises:
+        InputError: numbers out of range, or an unknown kind.
+    """
 
     kind: tuple[str, ...] = ()
     """Kind of plant: tomato, cucumber or lettuce. By default all; repeat for several."""

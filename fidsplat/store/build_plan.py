@@ -31,7 +31,11 @@ a group is sorted as one"""
 
 @dataclass(frozen=True)
 class BuildSettings:
-    """Chunks and columns of a store. Raises InputError for an unusable value."""
+    """Chunks and columns of a store.
+
+    Raises:
+        InputError: an unusable value.
+    """
 
     chunk: int = CHUNK
     """maximum number of splats per chunk"""

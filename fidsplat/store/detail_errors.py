@@ -22,7 +22,11 @@ measured views, and a few still exceed the requested error"""
 
 @dataclass(frozen=True)
 class DetailSettings:
-    """Views of a measurement of levels of detail. Raises InputError for an unusable value."""
+    """Views of a measurement of levels of detail.
+
+    Raises:
+        InputError: an unusable value.
+    """
 
     views: int = 60
     """number of viewpoints, each for one level in turn"""

@@ -27,7 +27,11 @@ _LEAST, _MOST = 16, 16384  # pixels a side
 
 @dataclass(frozen=True)
 class PageSettings:
-    """Address and frame rate of the viewer's page. Raises InputError for an unusable rate."""
+    """Address and frame rate of the viewer's page.
+
+    Raises:
+        InputError: an unusable rate.
+    """
 
     port: int = 8080
     """port of the page; 0 selects a free one"""

@@ -43,7 +43,11 @@ DARK, EARTH, FRAME = (0.2, 0.16, 0.12), (0.45, 0.4, 0.34), (0.75, 0.77, 0.78)
 
 @dataclass(frozen=True)
 class GreenhouseSettings:
-    """Size and seed of a greenhouse. Raises InputError for numbers out of range."""
+    """Size and seed of a greenhouse.
+
+    Raises:
+        InputError: numbers out of range.
+    """
 
     rows: int = 8
     """Number of rows of plants."""
