@@ -72,7 +72,7 @@ def test_texts_of_all_effects_and_of_all_but_one(lens):
 
 # tests/contract has each effect on every device in a file of its own
 @pytest.mark.parametrize("name", sampled(list(SWITCHES), 3, 12))
-def test_each_effect_alone(renderer, name):
+def test_each_single_effect(renderer, name):
     assert_drawn(renderer, (name,))
 
 

@@ -179,7 +179,7 @@ def test_derivatives_read_records_where_they_lie(tmp_path):
     assert "staged" not in compiled(blending_back("stop_exclusive", "arithmetic_fast"), tmp_path / "back")
 
 
-def test_a_record_grows_by_what_is_asked_for():
+def test_a_record_grows_by_the_requested_fields():
     layout = runtime.kernels("records").Layout
     assert layout(()).lines == 5
     assert layout(("lowpass_screen",)).names[-2:] == ["disc_x", "disc_y"]

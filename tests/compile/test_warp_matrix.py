@@ -27,7 +27,7 @@ def test_warp_has_all_effects():
 
 
 @pytest.mark.parametrize("name", sampled(OWN, 3, 12))
-def test_each_effect_alone(renderer, name):
+def test_each_single_effect(renderer, name):
     assert_drawn(renderer, (name,))
 
 

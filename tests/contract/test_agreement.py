@@ -59,7 +59,7 @@ def test_near_and_far_planes_amid_the_splats(renderer):
     assert not renderer.render(wall, camera, ALL_OUTPUTS)["alpha"].any()
 
 
-def test_splats_much_larger_than_the_picture(renderer):
+def test_splats_much_larger_than_the_image(renderer):
     assert_agrees(renderer, random_splats(200, seed=7, scale=(1e-3, 50.0)), CAMERA)
 
 
@@ -115,7 +115,7 @@ def test_markers_at_five_tilts(renderer, spec, tilt):
     assert truth["alpha"].mean() > 0.3
 
 
-def test_principal_point_outside_the_picture_and_odd_sizes(renderer):
+def test_principal_point_outside_the_image_and_odd_sizes(renderer):
     camera = fs.Camera.pinhole(53, 31, 60.0, 75.0, -20.5, 44.25)
     assert_agrees(renderer, random_splats(300, seed=2, depth=(0.5, 5), scale=(0.01, 0.5)), camera)
 
@@ -143,7 +143,7 @@ def test_no_sample_that_a_rim_just_reaches_is_lost(renderer):
 
 
 @pytest.mark.parametrize("focal", FOCAL_LENGTHS)
-def test_the_least_and_the_longest_focal_lengths(renderer, focal):
+def test_the_shortest_and_the_longest_focal_lengths(renderer, focal):
     """What Camera lets pass is drawn as it should be: splats that fill the sphere, or the pixel."""
     camera = fs.Camera.pinhole(41, 31, focal, focal, 20.0, 15.0)
     assert_agrees(renderer, random_splats(60, seed=3, depth=(2, 4), scale=(0.05, 0.8)), camera)

@@ -63,7 +63,7 @@ def test_the_bits_are_the_same_on_every_device():
 
 @in_turn()
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
-def test_pictures_move_by_the_rounding_of_opacities(renderer, cloud):
+def test_images_move_by_the_rounding_of_opacities(renderer, cloud):
     for quality in (FAST, PRECISE):
         assert_agrees(renderer, cloud, CAMERA, quality=quality)
     # a relative error e of all opacities changes colours by e at most; without a stop no decision hangs on it
@@ -88,7 +88,7 @@ def test_faint_fragments_stay_faint(renderer):
 
 @in_turn(1)
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
-def test_both_schedules_draw_the_same_bits(renderer, cloud):
+def test_both_schedules_are_bit_identical(renderer, cloud):
     picture = FrameSpec(cloud, CAMERA, FAST, ALL_OUTPUTS)
     own, other = (
         trace(renderer, picture),

@@ -45,7 +45,7 @@ def camera_at(pose):
     return fs.Camera.pinhole(50, 40, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, matrix, position=pose[:3])
 
 
-def test_views_have_the_bits_of_themselves_alone(renderer, cloud):
+def test_views_are_bit_identical_to_single_frames(renderer, cloud):
     captures = [fs.Capture(camera, ALL_OUTPUTS) for camera in CAMERAS]
     batch = renderer.render_batch(cloud, captures)
     assert batch["rgb"].shape == (3, 40, 50, 3)
@@ -76,7 +76,7 @@ def test_groups_move_in_each_view_by_themselves(renderer, cloud):
         assert_same(batch, [renderer.render(each, CAMERA, ALL_OUTPUTS, motion=motion) for motion in motions])
 
 
-def test_masked_views_are_not_drawn(renderer, cloud):
+def test_masked_views_are_not_rendered(renderer, cloud):
     captures = [fs.Capture(camera, ALL_OUTPUTS, background=(0.5, 0.5, 0.5)) for camera in CAMERAS]
     mask = np.array([False, True, False])
     batch = renderer.render_batch(cloud, captures, mask=mask)
@@ -94,7 +94,7 @@ def test_a_batch_outlives_the_next(renderer, cloud):
     assert np.array_equal(frame["rgb"], renderer.render(cloud, CAMERA)["rgb"])
 
 
-def test_a_batch_is_given_where_it_was_drawn(renderer, cloud):
+def test_a_batch_stays_on_its_device(renderer, cloud):
     batch = renderer.render_batch(cloud, fs.Capture(CAMERA, ALL_OUTPUTS), poses=POSES).wait()
     arrays = {name: batch.device_array(name) for name in ALL_OUTPUTS}
     for name, array in arrays.items():
@@ -127,7 +127,7 @@ LENSES = {
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_effects_are_those_of_the_views_alone(renderer, cloud, lens):
+def test_effects_are_those_of_single_views(renderer, cloud, lens):
     """Rays of samples, fog, a sensor that counts in pixels, several samples; view by view where a picture has
     more of its own than a batch can hold."""
     capture = fs.Capture(
@@ -178,7 +178,7 @@ def test_exposures_of_a_batch_are_those_of_single_frames(renderer, cloud):
     assert not np.array_equal(batch["rgb"][0], still["rgb"])
 
 
-def test_what_moves_already_may_go_on_beside_poses(renderer, cloud):
+def test_what_moves_already_may_go_on_in_addition_to_poses(renderer, cloud):
     """A motion of the capture's own groups, a shutter that is open for a while, and masks, in one batch."""
     capture = fs.Capture(
         CAMERA, ("rgb",), motion=fs.Motion(groups={2: moved(POSES[0])}),
@@ -240,6 +240,6 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
         ),
     ],
 )
-def test_what_is_no_batch_is_named(renderer, cloud, given, words):
+def test_errors_name_what_is_not_a_batch(renderer, cloud, given, words):
     with pytest.raises(fs.InputError, match=words):
         renderer.render_batch(cloud, **{"captures": CAMERA, **given})

@@ -13,7 +13,7 @@ def same(first, second, names):
     return all(np.array_equal(first[name], second[name]) for name in names)
 
 
-def test_two_runs_give_the_same_bits(renderer):
+def test_two_runs_are_bit_identical(renderer):
     cloud = random_splats(500, seed=3)
     first, second = (renderer.render(cloud, CAMERA, outputs=ALL_OUTPUTS) for _ in range(2))
     assert same(first, second, ALL_OUTPUTS)
@@ -26,14 +26,14 @@ def test_more_outputs_leave_rgb_as_it_was(renderer):
     assert same(alone, renderer.render(cloud, CAMERA, outputs=ALL_OUTPUTS), ("rgb",))
 
 
-def test_a_frame_keeps_its_images_when_the_next_is_drawn(renderer):
+def test_a_frame_keeps_its_images_when_the_next_is_rendered(renderer):
     first, second = random_splats(100, seed=6), random_splats(100, seed=7)
     kept = renderer.render(first, CAMERA)
     renderer.render(second, CAMERA)
     assert same(kept, renderer.render(first, CAMERA), ("rgb",))
 
 
-def test_resident_cloud_draws_the_same(renderer):
+def test_resident_cloud_renders_the_same(renderer):
     cloud = random_splats(100, seed=8)
     resident = renderer.upload(cloud)
     assert len(resident) == 100
@@ -69,7 +69,7 @@ def test_camera_inside_a_splat(renderer):
     assert_agrees(renderer, cloud, shifted)
 
 
-def test_one_pixel_picture(renderer):
+def test_one_pixel_image(renderer):
     camera = fs.Camera.pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
     assert_agrees(renderer, random_splats(50, seed=10, depth=(0.5, 3)), camera)
 

@@ -173,7 +173,7 @@ def test_boxes_around_and_behind_the_camera(renderer, seed, quality):
     assert_agrees(renderer, random_splats(60, seed=seed).with_boxes(), SMALL, quality=quality)
 
 
-def test_a_sharp_corner_beside_the_picture_reaches_into_it(renderer):
+def test_a_sharp_corner_outside_the_image_reaches_into_it(renderer):
     """A box beside a disk, almost edge-on and 42 pixels left of the picture: between edges that meet at so
     sharp an angle lies a little of every sample far beyond the corner, in the picture's first columns too."""
     along = np.array([-37, 0, 30]) / math.hypot(37, 30)  # of the ray to its middle

@@ -53,7 +53,7 @@ def test_narrow_boxes(renderer, camera, narrow):
 
 
 @each_camera
-def test_boxes_much_larger_than_the_picture(renderer, camera):
+def test_boxes_much_larger_than_the_image(renderer, camera):
     cloud = random_splats(40, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0))
     assert_agrees(renderer, cloud.with_boxes(), camera, quality=EXACT)
 

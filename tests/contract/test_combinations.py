@@ -87,7 +87,7 @@ def test_distances_are_depths_where_depths_are_along_the_ray(renderer, name):
         {"blur": BLUR, "rolling": ROLLING},
     ),
 )
-def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
+def test_effects_of_the_image_under_a_shutter(renderer, around, shutter):
     cloud = BOXES if around == "boxes" else CLOUD
     quality = fs.Quality(lowpass="pixel" if around == "pixel" else "screen")
     behind = {"sky": SKY, "panorama": PANORAMA}.get(around, (0.1, 0.2, 0.3))

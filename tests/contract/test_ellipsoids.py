@@ -41,7 +41,7 @@ def mixed(seed):
 
 
 @pytest.mark.parametrize("way", ["exact", "ewa"])
-def test_all_kinds_of_splats_in_one_picture(renderer, way):
+def test_all_kinds_of_splats_in_one_frame(renderer, way):
     """Around the camera and across its plane, with every output."""
     assert_agrees(renderer, mixed(5), CAMERA, quality=fs.Quality(ellipsoid=way))
 
@@ -63,7 +63,7 @@ ALONE = {
 
 @pytest.mark.parametrize("order", ["centre", "pixel"])
 @pytest.mark.parametrize("place", ALONE)
-def test_alone_or_among_others_they_have_the_same_bits(renderer, place, order):
+def test_ellipsoids_are_bit_identical_in_any_cloud(renderer, place, order):
     """Clouds of nothing else have kernels without what disks need (`ellipsoids_only`), in either order the
     same: every fragment has its centre's depth."""
     alone, quality = ALONE[place](), fs.Quality(lowpass="none", order=order)

@@ -63,7 +63,7 @@ def test_facets_are_read_from_aside(renderer):
     assert [one.payload for one in detect(to_uint8(frame["rgb"]))] == ["splats"]
 
 
-def test_a_picture_keeps_its_colours_and_a_drawing_with_slants_is_refused(tmp_path):
+def test_an_image_keeps_its_colours_and_a_drawing_with_slants_is_refused(tmp_path):
     drawing = tmp_path / "slant.svg"
     drawing.write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M1 1L8 2L3 8Z" fill="red"/></svg>'

@@ -76,7 +76,7 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     assert drawn["rgb"].std() > 0.05
 
 
-def test_warp_reads_no_ray_beyond_the_picture():
+def test_warp_reads_no_ray_outside_the_image():
     """A tile has samples there too. The rays end at a page that nobody may read, in a process of its own."""
     pytest.importorskip("warp")
     process = multiprocessing.get_context("spawn").Process(target=draw_with_guarded_rays)

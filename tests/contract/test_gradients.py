@@ -165,7 +165,7 @@ def test_a_differentiable_frame_has_the_bits_of_render_and_of_the_backends_gradi
         frame.backward(weights)
 
 
-def test_pictures_that_nobody_waits_for_have_the_same_derivatives(backend, renderer):
+def test_frames_that_are_not_awaited_have_the_same_derivatives(backend, renderer):
     """Where lists are made before their length is known, one that had too little room says so when it is
     taken back, and the next has enough."""
     (shape,) = backend.shapes("schedule").values()
@@ -222,7 +222,7 @@ def test_outputs_without_a_gradient_given_have_one_of_zero(backend):
         assert np.array_equal(alone[name], beside[name]), name
 
 
-def test_derivatives_are_timed_and_another_picture_in_between_is_an_error(backend, renderer):
+def test_derivatives_are_timed_and_another_frame_in_between_is_an_error(backend, renderer):
     cloud, capture = random_picture(6)
     features, view = prepare(cloud, capture)
     pipeline = backend.differentiate(with_distortion(features))

@@ -30,7 +30,7 @@ def test_kernels_see_new_buffers_at_old_addresses(opencl):
     assert len({picture.tobytes() for picture in first}) == 6
 
 
-def test_a_picture_is_launched_again_for_each_view(opencl):
+def test_a_frame_is_replayed_for_each_view(opencl):
     """Of its kind, on a GPU: other poses, groups, colours and sizes come between, and frames are kept."""
     machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
     some = (
@@ -60,7 +60,7 @@ def test_a_picture_is_launched_again_for_each_view(opencl):
     assert kept[-1].wait() is kept[-1]
 
 
-def test_what_another_kind_of_picture_has_tallied_is_not_counted(opencl):
+def test_counts_of_another_kind_of_frame_are_ignored(opencl):
     """One that is drawn for the first time, into buffers that are there, leaves its tallies to whom comes
     next: a picture that is launched again."""
     machine = as_on_a_gpu(opencl)
@@ -75,7 +75,7 @@ def test_what_another_kind_of_picture_has_tallied_is_not_counted(opencl):
 
 
 @pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])
-def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, scale):
+def test_a_frame_that_exceeds_the_last_is_rendered_again(opencl, scale):
     """More pairs, or more splats of many tiles, than there is room for: found when the frame is read."""
     machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
     some = random_splats(6000, seed=4, scale=scale, depth=(2.0, 6.0))
@@ -89,7 +89,7 @@ def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, scale):
         assert np.array_equal(frame["rgb"], own.render(some, camera)["rgb"])
 
 
-def test_threads_share_launches_that_are_kept(opencl):
+def test_threads_share_cached_launches(opencl):
     """Sixteen draw pictures of two kinds with a GPU's kernels, of a cloud that outgrows its room at times,
     and read them, their times and their counts while others draw."""
     machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)

@@ -78,7 +78,7 @@ def test_small_splats_of_all_shapes(renderer, camera):
 
 
 @each_camera
-def test_splats_much_larger_than_the_picture(renderer, camera):
+def test_splats_much_larger_than_the_image(renderer, camera):
     assert_agrees(renderer, random_splats(80, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0)), camera)
 
 
@@ -198,7 +198,7 @@ def test_outside_the_lens_is_background(renderer):
 
 
 @pytest.mark.parametrize("name", ["fold", "fisheye 200"])
-def test_where_a_lens_sees_nothing_there_is_no_distance_and_no_gradient(renderer, name):
+def test_outside_of_a_lens_there_is_no_distance_and_no_gradient(renderer, name):
     picture = FrameSpec(
         random_splats(60, 3, depth=(1.0, 4.0)),
         CAMERAS[name],
@@ -219,7 +219,7 @@ def test_where_a_lens_sees_nothing_there_is_no_distance_and_no_gradient(renderer
     assert all(difference.agrees for difference in against_reference(renderer, picture))
 
 
-def test_a_splat_beside_the_camera_that_is_seen_edge_on_leaves_its_dot(renderer):
+def test_a_splat_next_to_the_camera_that_is_viewed_edge_on_leaves_its_dot(renderer):
     """All of its plane lies at z = 0: only the forms' z is not 0."""
     cloud = fs.SplatCloud([[1, 0.1, 0]], [[1, 0, 0, 0]], [[0.1, 0.2]], [0.9], colors=[[1, 0.5, 0.2]])
     camera = fs.Camera.fisheye(71, 67, math.radians(200))
@@ -249,7 +249,7 @@ def test_depths_of_a_fisheye_are_distances(renderer):
 
 
 @pytest.mark.parametrize("name", ["fisheye", "parallel"])
-def test_bands_give_the_same_bits(renderer, name):
+def test_bands_are_bit_identical(renderer, name):
     cloud, camera = random_splats(300, 2, depth=(-4.0, 5.0)), CAMERAS[name]
     first = renderer.render(cloud, camera, ALL_OUTPUTS)["rgb"]
     assert (renderer.render(cloud, camera, ALL_OUTPUTS)["rgb"] == first).all()

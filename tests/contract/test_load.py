@@ -23,7 +23,7 @@ def test_processes_share_an_empty_kernel_cache(monkeypatch):
     assert load.processes("opencl") == {"wrong of 3 processes": 0}
 
 
-def test_memory_that_comes_and_goes_is_no_growth():
+def test_temporary_memory_is_not_growth():
     each = [(10.0 * k, 500 + 100 * (k % 3 == 0) + k // 100) for k in range(720)]
     assert load.levels(each, 7200) == (501, 507)
     assert load.levels([(1.0, 7)], 60) == (7, 7)

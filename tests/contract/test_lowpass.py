@@ -54,7 +54,7 @@ def edge_on(tilt, size=1.0):
 
 
 @pytest.mark.parametrize("order", ["centre", "pixel"])
-def test_depths_of_splats_seen_edge_on_are_in_their_visible_part(renderer, order):
+def test_depths_of_splats_viewed_edge_on_are_in_their_visible_part(renderer, order):
     """The low-pass shows pixels where the ray meets the plane right before the camera, or behind it."""
     camera = fs.Camera.pinhole(65, 49, 60.0, 60.0, 32.5, 24.5)
     radius = math.sqrt(2 * math.log(255))  # of the part that is 1/255 of the opacity or more
@@ -74,7 +74,7 @@ def test_depths_of_splats_seen_edge_on_are_in_their_visible_part(renderer, order
     assert_agrees(renderer, edge_on(1e-3, 0.3), camera, quality=fs.Quality(order=order))
 
 
-def test_depths_change_steadily_as_a_splat_turns_through_edge_on(renderer):
+def test_depths_change_steadily_as_a_splat_rotates_through_edge_on(renderer):
     """A plane's horizon sweeps over the low-pass's dot; the depths there do not follow it from end to end."""
     camera, size = fs.Camera.pinhole(65, 49, 60.0, 60.0, 32.5, 24.5), 0.05
     tilts = np.linspace(-0.1, 0.1, 21)
@@ -121,7 +121,7 @@ def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
 
 
 @pytest.mark.parametrize("camera", [CAMERA, *LENSES.values()], ids=["pinhole", *LENSES])
-def test_splats_that_are_seen_nearly_edge_on(renderer, camera):
+def test_splats_that_are_viewed_nearly_edge_on(renderer, camera):
     """From a hundredth of a degree to thirty, on all sides: the depth of what a sample sees counts."""
     generator, count = np.random.default_rng(12), 250
     away = generator.normal(size=(count, 3)) * (1, 1, 0.3) + (0, 0, 1.5)
@@ -142,7 +142,7 @@ def test_splats_that_are_seen_nearly_edge_on(renderer, camera):
     assert frame["alpha"].max() > 0.1
 
 
-def test_walls_beside_the_camera_draw_no_streaks(renderer):
+def test_walls_next_to_the_camera_have_no_streaks(renderer):
     """A wall that is seen from its edge, in the columns at 300 x 1.5 mm / 0.1 to 0.9 m from the middle."""
     generator, count = np.random.default_rng(5), 600
     at = generator.uniform((0.3, -1, 0.1), (0.3, 1, 0.9), (count, 3))
@@ -156,7 +156,7 @@ def test_walls_beside_the_camera_draw_no_streaks(renderer):
     assert alpha[:, 42:].max() < 1e-3
 
 
-def test_disks_far_beside_the_picture_that_are_widened_into_it(renderer):
+def test_disks_far_outside_the_image_that_are_widened_into_it(renderer):
     """Their near ends, which a sample's depth brings nearer still, are in the picture: one by one, since all
     that they show is their rims."""
     generator, count = np.random.default_rng(4), 120
@@ -208,7 +208,7 @@ def test_a_splat_where_the_derivative_has_no_direction(renderer, name, mean):
     assert frame["alpha"].max() > 0.1
 
 
-def test_the_screen_dot_of_walls_that_are_nearly_seen_from_their_edge(renderer):
+def test_the_screen_dot_of_walls_that_are_viewed_nearly_edge_on(renderer):
     """Their horizon passes within a pixel or two of their centre: beyond it only the dot is drawn."""
     camera = fs.Camera.pinhole(41, 31, 40.0, 40.0, 20.0, 15.0)
     generator = np.random.default_rng(3)
@@ -246,7 +246,7 @@ def test_boxes_are_left_to_their_own_filter(renderer):
 
 
 @pytest.mark.parametrize("spread_px", [0.01, 0.1, 0.5, 2.0])
-def test_light_does_not_depend_on_where_a_splat_lies_between_pixels(renderer, spread_px):
+def test_light_does_not_depend_on_the_subpixel_position_of_a_splat(renderer, spread_px):
     """The sum of alpha over the picture is the splat's own, 2 pi opacity s_u s_v, at any shift: to 3 % of
     sigma 0.5 px, and what the cut-off takes.
     """

@@ -110,7 +110,7 @@ def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer
 @pytest.mark.parametrize(
     ("turn_deg", "blurred"), alternate({"0": 0, "30": 30}, {"sharp": False, "blurred": True})
 )
-def test_parallel_rays_show_where_a_tag_is_across_them_and_how_it_is_turned(renderer, turn_deg, blurred):
+def test_parallel_rays_show_where_a_tag_is_across_them_and_its_rotation(renderer, turn_deg, blurred):
     """How far along the rays it is and to which side it leans, they do not show. The affine map from the tag
     to the picture has its place, its turn in the picture and the cosine of its lean."""
     camera = fs.Camera.orthographic(480, 360, 1.6)
@@ -209,7 +209,7 @@ def test_steep_tags_have_their_corners(renderer, wide, position, target, up):
     assert np.linalg.norm(corners - camera.project(placed.corners), axis=1).max() < 0.5
 
 
-def test_pictures_that_cannot_be_undistorted():
+def test_images_that_cannot_be_undistorted():
     camera = CASES["distortion"][0]
     flat = pinhole_towards(camera, (0, 0, 1), 64, 48, 1.0)
     with pytest.raises(fs.InputError, match="size, 480 x 360 pixels, got 10 x 20"):

@@ -96,7 +96,7 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
 @pytest.mark.parametrize("views", [1, 2])
 @pytest.mark.parametrize("scale", [(0.05, 0.1), (1.0, 2.0)], ids=["windows", "big"])
 @machines
-def test_nothing_is_written_beyond_the_room_for_lists(opencl, monkeypatch, machine, scale, views):
+def test_nothing_is_written_beyond_the_capacity_of_lists(opencl, monkeypatch, machine, scale, views):
     """Neither where they just fit nor, on a GPU, where there are more pairs than there is room for: of splats
     that touch few tiles, and of big ones, whose pairs are written elsewhere, as those of many views are."""
     own, some = machine(opencl), random_splats(300, seed=4, scale=scale)
@@ -173,7 +173,7 @@ def test_many_big_splats_in_chunks(opencl):
 
 
 @pytest.mark.parametrize(("budget", "words"), [(2**20, "1 MiB"), (200_000, "195 KiB")])
-def test_a_budget_below_the_picture_is_an_error_with_a_remedy(opencl, cloud, budget, words):
+def test_a_budget_below_the_image_is_an_error_with_a_remedy(opencl, cloud, budget, words):
     with pytest.raises(fs.DeviceError, match=rf"budget of {words} is too small.*raise memory_budget"):
         own_device(opencl, budget).render(cloud, CAMERA, ALL_OUTPUTS)
 
@@ -207,7 +207,7 @@ def test_plans_hold_to_the_budget():
                 assert plan.chunk or (plan.capacity == count and not upload)
 
 
-def test_views_are_drawn_as_single_pictures_are(renderer):
+def test_views_are_rendered_like_single_frames(renderer):
     """Renderer.render_views: one upload, pictures in the order of the cameras."""
     some = random_splats(300, seed=4)
     cameras = [fs.Camera.look_at(40, 30, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)) for x in (-0.5, 0.0, 0.5)]
@@ -219,7 +219,7 @@ def test_views_are_drawn_as_single_pictures_are(renderer):
     assert list(renderer.render_views(some, [])) == []
 
 
-def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
+def test_frames_of_many_sizes_leave_no_heap_of_buffers(opencl):
     """Images go back to the pool when their frame dies; those of another size are let go."""
     some = random_splats(50, seed=5)
     own = fs.Renderer(opencl.device.name)
@@ -236,7 +236,7 @@ def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
 
 
 @machines
-def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl, machine):
+def test_a_pool_keeps_to_the_budget_whatever_was_rendered_before(opencl, machine):
     """Pictures at once and in chunks, few and many outputs: what one kind has left does not count against
     the next."""
     budget = 8 * 2**20
@@ -270,7 +270,7 @@ PICTURES = {
         {name: name for name in PICTURES}, {"in chunks": 7, "at once": 64}, dict(reversed(MACHINES.items()))
     ),
 )
-def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, mebibytes, name):
+def test_a_plan_counts_all_memory_of_a_frame(opencl, monkeypatch, machine, mebibytes, name):
     """Everything that is new on the device, the cloud and a lens's rays included."""
     own = machine(opencl, mebibytes * 2**20)
     pool, taken, planned = own.backend.pool, [], []
@@ -352,7 +352,7 @@ def test_neither_frames_nor_kernels_keep_a_cloud(opencl):
     assert frame.stats["splats"] == 100
 
 
-def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
+def test_a_leased_buffer_has_the_size_that_was_requested(opencl):
     pool = fs.Renderer(opencl.device.name).backend.pool
     pool.give_back([("plane", pool.fresh("plane", 64)), ("plane", pool.fresh("plane", 64))])
     assert pool.lease("plane", 4096).size == 4096

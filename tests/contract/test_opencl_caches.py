@@ -60,7 +60,7 @@ def test_a_batch_is_cut_where_no_buffer_holds_all_its_splats(opencl):
         own.render_batch(some, camera, poses=np.tile(poses, (5, 1)))
 
 
-def test_views_that_are_kept_ready_do_not_keep_what_was_around_them(opencl, monkeypatch):
+def test_cached_views_do_not_retain_their_surroundings(opencl, monkeypatch):
     """Each view has a panorama of its own, as it may have a layer: their arrays are not kept without end."""
     monkeypatch.setattr(recorded_frame, "_VIEWS_BYTES", 20_000)
     machine, rng = as_on_a_gpu(opencl), np.random.default_rng(1)

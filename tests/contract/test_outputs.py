@@ -46,7 +46,7 @@ def test_a_layer_shows_the_mean_of_what_its_splats_show(renderer):
 
 @in_turn()
 @pytest.mark.parametrize("name", ALL)
-def test_an_output_alone_is_what_it_is_among_all(renderer, name):
+def test_an_output_equals_itself_among_all_outputs(renderer, name):
     cloud = random_splats(150, 4)
     together, alone = (renderer.render(cloud, CAMERA, outputs) for outputs in (ALL, name))
     assert np.array_equal(alone[name], together[name])
@@ -62,7 +62,7 @@ def test_distances_are_depths_along_the_ray(renderer):
         assert (frame[f"depth{kind}"] > 0).any()
 
 
-def test_normals_in_the_world_are_the_cameras_turned(renderer):
+def test_normals_in_the_world_are_the_cameras_rotated(renderer):
     frame = renderer.render(random_splats(150, 6), CAMERA, ALL)
     turned = frame["normal"] @ CAMERA.world_to_camera[:3, :3]
     assert frame["normal_world"] == pytest.approx(turned, abs=1e-6)
@@ -176,7 +176,7 @@ def test_a_cutoff_below_all_floats(renderer):
     assert faint["blended"].sum() < fainter["blended"].sum() < 0.6 * fainter["blended"].size
 
 
-def test_a_wall_that_the_camera_almost_lies_in(renderer):
+def test_a_wall_that_the_camera_is_almost_in(renderer):
     """Its centre 10^9 m ahead, its plane 0.1 m aside: it covers all that lies on that side."""
     wall = fs.SplatCloud([(-0.1, 0, 1e9)], [(0.5, 0.5, 0.5, 0.5)], [(1e9, 1e9)], [1.0], colors=[(1, 1, 1)])
     frame = renderer.render(wall, fs.Camera.pinhole(9, 9, 9.0, 9.0, 4.5, 4.5), ALL)
@@ -255,7 +255,7 @@ def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
 
 
 @pytest.mark.parametrize(("opacity", "count", "seen"), [(1e-3, 3, False), (1e-3, 5, True), (2e-3, 700, True)])
-def test_haze_is_told_of_once_it_covers_enough(renderer, opacity, count, seen):
+def test_haze_is_reported_once_it_covers_enough(renderer, opacity, count, seen):
     """However little each layer is; the median lies where half of the light is left, within the layers that
     count together.
     """

@@ -33,7 +33,7 @@ def opencl(renderer):
     ],
     ids=["around", "dense", "sh", "planes"],
 )
-def test_blending_in_double_leaves_the_rounding_of_what_is_written_alone(opencl, cloud, samples):
+def test_blending_in_double_has_only_the_rounding_of_the_output(opencl, cloud, samples):
     """No certificate here: what float32 might change, double does not. A sample buffer is rounded when it
     is written, and the sum of the samples and the background once more each."""
     if not opencl.device.float64:

@@ -65,7 +65,7 @@ def test_more_gaussians_become_opaque(renderer):
     assert shown(renderer, refine(before, renderer, 40))[1].min() > 0.97
 
 
-def test_the_same_bits_again_and_other_bits_of_another_seed(renderer):
+def test_runs_are_bit_identical_and_differ_with_another_seed(renderer):
     first, again, other = (refine(made(template=5), renderer, 4, seed) for seed in (0, 0, 1))
     assert np.array_equal(first.cloud.means, again.cloud.means)
     assert np.array_equal(first.cloud.scales, again.cloud.scales)
@@ -80,7 +80,7 @@ def test_a_refined_marker_has_its_size(renderer):
     assert np.allclose(small.cloud.scales * 10, large.cloud.scales, rtol=1e-4)
 
 
-def test_what_cannot_be_refined_is_said(renderer, tmp_path):
+def test_what_cannot_be_refined_is_reported(renderer, tmp_path):
     drawing = tmp_path / "slant.svg"
     drawing.write_text('<svg viewBox="0 0 10 10"><path d="M1 1 L9 2 L5 9 Z" fill="#f00"/></svg>')
     with pytest.raises(InputError, match="edges across its modules"):

@@ -96,7 +96,7 @@ def test_a_wall_fades_by_its_distance_along_the_ray(renderer):
     assert nothing["rgb"] == pytest.approx(np.broadcast_to(color, (41, 61, 3)))
 
 
-def test_the_middle_of_a_panorama_lies_ahead(renderer):
+def test_the_centre_of_a_panorama_is_ahead(renderer):
     """One bright column and row: +z is in the middle, +x to the right of it, -y on top."""
     image = np.zeros((90, 180, 3))
     image[:, 135, 0] = 1  # +x
@@ -219,7 +219,7 @@ def test_values_that_mean_nothing_select_nothing(renderer):
     assert np.array_equal(renderer.render(around)["rgb"], frames[0]["rgb"])
 
 
-def test_the_sensor_leaves_the_other_outputs_alone(renderer):
+def test_the_sensor_keeps_the_other_outputs(renderer):
     names = ("rgb", "alpha", "depth", "normal", "label")
     plain = renderer.render(CLOUD, CAMERA, names)
     seen = renderer.render(CLOUD, CAMERA, names, sensor=SENSORS["all"], fog=fs.Fog(0.3), background=GREY)

@@ -106,7 +106,7 @@ def test_as_many_are_visible_as_in_the_fullest_pose(renderer):
     assert 10 < frame.stats["visible"] <= 50
 
 
-def test_colours_that_depend_on_the_view_turn_with_their_group(renderer):
+def test_colours_that_depend_on_the_view_rotate_with_their_group(renderer):
     """Of disks and of 3D Gaussians."""
     cloud = random_splats(100, 4, depth=(1, 5), scale=(0.05, 0.3), sh_degree=3)
     cloud = some_thick(cloud, np.where(np.arange(100) % 2 == 0, 0.1, 0))
@@ -161,7 +161,7 @@ def test_many_views_share_a_motion_and_a_shutter(renderer):
 
 
 @pytest.mark.parametrize(("lowpass", "samples"), alternate({"screen": "screen", "none": "none"}, SAMPLES))
-def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpass, samples):
+def test_what_bands_leave_out_by_its_sphere_renders_nothing_there(renderer, lowpass, samples):
     """The same bits with and without `shutter_rows`: near, behind, large and far below a pixel."""
     cloud = random_splats(3000, 11, depth=(-2.0, 6.0), scale=(1e-4, 1.0), across=2.0)
     cloud = cloud.with_labels(np.arange(3000) % 7)
@@ -221,7 +221,7 @@ def test_bands_are_off_by_at_most_their_stated_bound(renderer, rows):
     assert error >= 0.9 * bound - rim
 
 
-def test_the_same_bits_again_and_in_bands_of_tiles(renderer):
+def test_frames_are_bit_identical_again_and_in_bands_of_tiles(renderer):
     cloud, camera = random_splats(200, 7, depth=(-1, 5)), CAMERAS["fisheye"]
 
     def draw():

@@ -164,7 +164,7 @@ def test_loss_of_normals(renderer, views, works):
         ("mcmc", False, 1),
     ],
 )
-def test_a_step_and_what_is_drawn(renderer, views, works, strategy, sparse, lanes):
+def test_a_step_and_its_frame(renderer, views, works, strategy, sparse, lanes):
     """By the derivatives that the same picture has in arrays, which are the reference's. At degree 0, which
     has plain colours, then at degrees 2 and 3; a third of the splats are behind the camera but in the last
     step. Of a solid wall the picture depends by its colour alone; in the second step, by depths, by its
@@ -246,7 +246,7 @@ def taken_back(renderer, device, view, resident, lanes, outputs=("rgb",)):
 
 
 @pytest.mark.parametrize("sparse", [False, True])
-def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, views, works, sparse):
+def test_a_resumed_run_renders_the_same(renderer, views, works, sparse):
     """In every bit: after a stop it is made again from the values."""
     rate, view = learning_rates(TrainSettings(), 100, 1.5), views[2]
     device, _ = works(sh_degree=3, sparse_adam=sparse)
@@ -261,7 +261,7 @@ def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, views, works, spa
         np.testing.assert_array_equal(read(renderer, device.resident(3, np.zeros(3)), name), array, name)
 
 
-def test_a_step_by_a_picture_that_was_followed_is_refused(renderer, views, works):
+def test_a_step_by_an_outdated_frame_is_refused(renderer, views, works):
     device, _ = works(sh_degree=2)
     device.load(before_a_wall(views[2].camera))
     resident = device.resident(2, np.zeros(3))
@@ -283,7 +283,7 @@ def read(renderer, resident, name):
     return array
 
 
-def test_who_is_seen(renderer, views, works):
+def test_visibility_statistics(renderer, views, works):
     """Where splats are made next, and do not move."""
     device, host = works()
     origin = np.array([0.2, 0.1, -0.3])

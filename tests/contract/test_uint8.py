@@ -41,7 +41,7 @@ def put(frame, values):
 
 
 @pytest.mark.parametrize("size", [(37, 23), (64, 32)], ids=str)
-def test_a_picture_has_the_bits_of_the_host(renderer, size):
+def test_an_image_equals_the_hosts_bit_for_bit(renderer, size):
     frame = drawn(renderer, *size)
     assert frame._images.read_uint8("rgb") is not None
     on_device = frame.to_uint8()
@@ -72,7 +72,7 @@ def test_every_kind_of_value_by_a_gpus_work_items(renderer):
     assert np.array_equal(frame.to_uint8(), to_uint8(values))
 
 
-def test_frames_are_read_beside_one_another(renderer):
+def test_frames_are_read_concurrently(renderer):
     """Each keeps its own, though the device's buffer is used again."""
     frames = [drawn(renderer, 37, 23), drawn(renderer, 23, 37)]
     read = [frame.to_uint8() for frame in (*frames, *frames)]
@@ -81,7 +81,7 @@ def test_frames_are_read_beside_one_another(renderer):
         assert np.array_equal(first, to_uint8(frame["rgb"]))
 
 
-def test_the_reference_and_kept_frames_convert_on_the_host(reference):
+def test_the_reference_and_cached_frames_convert_on_the_host(reference):
     frame = drawn(reference, 9, 7)
     wanted = to_uint8(frame["rgb"])
     assert np.array_equal(frame.to_uint8(), wanted)

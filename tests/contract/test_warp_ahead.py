@@ -60,7 +60,7 @@ AGAIN = {"more and more": 2, "fewer splats, more pairs": 1}
 
 
 @pytest.mark.parametrize("case", CAMERAS)
-def test_pictures_are_those_that_wait(renderer, ahead, case):
+def test_frames_equal_those_that_wait(renderer, ahead, case):
     """Those that need more than the room that was left are drawn twice."""
     cameras, resident = CAMERAS[case], renderer.upload(CLOUD)
     drawn = []
@@ -76,7 +76,7 @@ def test_pictures_are_those_that_wait(renderer, ahead, case):
     assert wanted.stats["pairs"] > 2000 or case == "less and less"
 
 
-def test_a_batch_of_views_waits_for_the_first_alone(renderer, ahead):
+def test_a_batch_of_views_waits_for_the_first_only(renderer, ahead):
     cameras, resident = [FAR, *[CAPTURE.camera] * 2, ELSEWHERE], renderer.upload(CLOUD)
     batch = renderer.render_batch(resident, [CAPTURE.with_(camera=camera) for camera in cameras])
     for number, wanted in enumerate(waiting(renderer, cameras)):
@@ -93,7 +93,7 @@ def test_adopted_arrays_are_waited_for(renderer, ahead):
         assert pictures(ahead, lambda capture=capture: renderer.render(resident, capture)["rgb"]) == 1
 
 
-def test_a_budget_without_room_is_waited_for(renderer, ahead):
+def test_a_budget_that_is_full_is_waited_for(renderer, ahead):
     """A picture within it is drawn once its counts are known, in bands if need be."""
     resident = renderer.upload(CLOUD)
     renderer.render(resident, CAPTURE)
@@ -105,7 +105,7 @@ def test_a_budget_without_room_is_waited_for(renderer, ahead):
     assert np.array_equal(frame["rgb"], waiting(renderer, [CAPTURE.camera])[0]["rgb"])
 
 
-def test_images_that_nobody_reads_leave_at_once(ahead):
+def test_unread_images_are_released_immediately(ahead):
     """A loop that draws and never looks takes no more of the device."""
     resident = ahead.upload(CLOUD)
     features, view = prepare(resident, CAPTURE)
@@ -143,7 +143,7 @@ def assert_drawn(renderer, frames, cameras):
         assert frame.stats == wanted.stats
 
 
-def test_pictures_of_a_kind_are_replayed(renderer, replayed):
+def test_equal_frames_are_replayed(renderer, replayed):
     """From the fourth on, whatever the camera."""
     near = CAPTURE.camera
     cameras, resident = [near, near, near, ELSEWHERE, near, near], renderer.upload(CLOUD)
@@ -153,7 +153,7 @@ def test_pictures_of_a_kind_are_replayed(renderer, replayed):
     assert set(frames[-1].timings) == {"project", "sort", "bin", "blend", "resolve"}
 
 
-def test_a_replay_without_room_is_drawn_again_and_captured_anew(renderer, replayed):
+def test_a_replay_beyond_its_capacity_is_rendered_and_captured_again(renderer, replayed):
     cameras, resident = [FAR] * 4 + [CAPTURE.camera], renderer.upload(CLOUD)
     frames = [renderer.render(resident, CAPTURE.with_(camera=camera)) for camera in cameras]
     assert len(replayed) == 2
@@ -163,7 +163,7 @@ def test_a_replay_without_room_is_drawn_again_and_captured_anew(renderer, replay
     assert_drawn(renderer, more, [CAPTURE.camera] * 3)
 
 
-def test_what_another_kind_took_anew_is_not_replayed(renderer, replayed):
+def test_what_another_kind_reallocated_is_not_replayed(renderer, replayed):
     """Arrays that a larger picture has replaced are not those of the graph."""
     resident, large = (
         renderer.upload(CLOUD),
@@ -212,7 +212,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_a_picture_between_replays_leaves_its_view_to_none(renderer, replayed, monkeypatch, kind):
+def test_a_frame_between_replays_leaves_its_view_to_none(renderer, replayed, monkeypatch, kind):
     """Of a picture of the same size that was launched kernel by kernel, as it is no picture of the graph's,
     the next of these has nothing: the view is the same object as before it."""
     monkeypatch.setattr(renderer.backend, "pair_budget", renderer.backend.pair_budget)
@@ -264,7 +264,7 @@ def test_a_graph_keeps_no_splats(renderer, replayed):
         gc.enable()
 
 
-def test_nothing_is_drawn_ahead_too(renderer, replayed):
+def test_empty_frames_are_recorded_too(renderer, replayed):
     """A cloud without splats."""
     arrays = [getattr(CLOUD, name)[:0] for name in ("means", "quats", "scales", "opacities")]
     resident = renderer.upload(fs.SplatCloud(*arrays, colors=CLOUD.colors[:0]))
@@ -304,7 +304,7 @@ def test_views_together_in_blocks_of_threads(renderer):
         assert np.array_equal(banded[k], wanted["rgb"])
 
 
-def test_a_device_that_captures_nothing_draws_all_the_same(renderer, replayed, monkeypatch):
+def test_a_device_that_captures_nothing_renders_nevertheless(renderer, replayed, monkeypatch):
     """That is said once."""
 
     wp, resident = runtime.load(), renderer.upload(CLOUD)

@@ -17,7 +17,7 @@ from fidsplat.vision.metrics import psnr
 
 
 @pytest.mark.parametrize("name", SHOTS)
-def test_inside_the_cells_the_pictures_are_equal(name):
+def test_inside_the_cells_the_images_are_equal(name):
     inside = flat(name, 2)
     assert inside.mean() > 0.3
     difference = np.abs(ours(name) - theirs(name))[inside]
@@ -76,7 +76,7 @@ def fake(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_pictures_that_are_there_stay_and_the_others_are_drawn(fake):
+def test_existing_images_stay_and_missing_ones_are_rendered(fake):
     job = blender.marker_job(CATEGORIES["apriltag"], 1, 0, fake / "out", "raw", training=True)
     assert len(job["images"]) == 37
     first = Path(job["images"][0]["file"])

@@ -46,7 +46,7 @@ def test_the_group_lists_its_words(capsys):
     assert "see fidsplat experiment --help" in err
 
 
-def test_an_interrupted_scan_goes_on(capsys, tmp_path, monkeypatch):
+def test_an_interrupted_scan_continues(capsys, tmp_path, monkeypatch):
     words = ("angles", "--ideal", *SMALL, "--tilts", "0:80:40", "-o", tmp_path, "--json")
     real, done = angles.measure_angles, []
 
@@ -225,7 +225,7 @@ def test_merge_names_shards_that_are_missing(capsys, tmp_path):
     assert err == "fidsplat: warning: counts: missing shard 2/3, 3/3\n"
 
 
-def test_pictures_of_another_seed_are_not_the_truth(capsys, tmp_path):
+def test_images_of_another_seed_are_not_the_truth(capsys, tmp_path):
     """Blender's images are found by their names, which do not include the seed."""
     record_images(tmp_path / "b", "raw", 0, 16)
     for words in (

@@ -65,7 +65,7 @@ def test_colmap_reads_what_was_written(scene, tmp_path, suffix, which):
     assert np.array_equal(points[:, 3:], np.repeat(255 * (1 - grid[row, column])[:, None], 3, 1))
 
 
-def test_pictures_show_what_the_cameras_see(scene):
+def test_images_show_what_the_cameras_see(scene):
     spec = CATEGORIES["small"].spec(3)
     for folder, name, camera in (
         (scene, "view-04.png", training_cameras(5)[4]),
@@ -77,7 +77,7 @@ def test_pictures_show_what_the_cameras_see(scene):
     assert len(list((scene / "test" / "images").glob("*.png"))) == 20
 
 
-def test_a_scene_that_is_whole_stays_and_another_truth_draws_it_again(scene):
+def test_a_scene_that_is_whole_stays_and_another_truth_renders_it_again(scene):
     part = {"category": "small", "index": 3, "views": 5}
     picture = scene / "images" / "view-00.png"
     before = picture.stat().st_mtime_ns
@@ -91,7 +91,7 @@ def test_a_scene_that_is_whole_stays_and_another_truth_draws_it_again(scene):
     assert picture.stat().st_mtime_ns > before
 
 
-def test_blenders_pictures_become_the_scenes(tmp_path):
+def test_blenders_images_become_the_scenes(tmp_path):
     part = {"category": "apriltag", "index": 0, "views": 3}
     with pytest.raises(fs.InputError, match=r"view-00\.png is missing; run fidsplat experiment blender"):
         write_scene(part, tmp_path / "out", 0, "blender-raw", tmp_path / "blender")
@@ -105,7 +105,7 @@ def test_blenders_pictures_become_the_scenes(tmp_path):
     assert read_image(scene / "test" / "images" / "test-19.png")[0, 0].tolist() == [19, 19, 19]
 
 
-def test_a_scene_of_one_truth_that_a_stop_left_with_pictures_of_two_is_drawn_again(tmp_path):
+def test_a_scene_of_one_truth_that_a_stop_left_with_images_of_two_is_rendered_again(tmp_path):
     part = {"category": "apriltag", "index": 0, "views": 3}
     scene = write_scene(part, tmp_path / "out", 0, "exact", Path("nowhere"))
     first = (scene / "images" / "view-00.png").read_bytes()

@@ -56,7 +56,7 @@ def test_the_window_of_a_tag_is_the_bounds_of_its_corners(spec):
         assert _window(pose, PlacedMarker(made, pose), camera) == (left, top, right, bottom)
 
 
-def test_the_nearer_of_two_tags_is_seen(tag):
+def test_the_nearer_of_two_tags_is_visible(tag):
     near, far = (PlacedMarker(tag, rigid_matrix((0, 0, z))) for z in (0.7, 1.0))
     for tags in ((near, far), (far, near)):
         depth = tag_depth_image(tags, CAMERA, BEHIND).depth
@@ -68,7 +68,7 @@ def test_the_nearer_of_two_tags_is_seen(tag):
     [rigid_matrix((0, 0, -1.0)), rigid_matrix((0, 0, 1.0), (0, 1, 0, 0)), rigid_matrix((5, 0, 1.0))],
     ids=["behind the camera", "from behind", "beside the picture"],
 )
-def test_what_is_not_seen_leaves_the_picture_as_it_is(tag, pose):
+def test_invisible_tags_do_not_change_the_image(tag, pose):
     image = tag_depth_image([PlacedMarker(tag, pose)], CAMERA, BEHIND)
     assert not np.isfinite(image.depth).any()
     np.testing.assert_allclose(image.rgb, BEHIND, atol=1e-6)

@@ -161,7 +161,7 @@ def test_views_of_the_ideal_texture(pool, tmp_path):
         assert 30 < value < 36
 
 
-def test_pictures_are_drawn_once_for_all_truths(pool, tmp_path):
+def test_images_are_rendered_once_for_all_truths(pool, tmp_path):
     """And what is kept is the right marker's, method's and truth's."""
     drawn = []
 
@@ -196,7 +196,7 @@ def test_views_by_the_renderer_with_every_metric(renderer, pool, tmp_path):
     assert len(found["lpips"]) == 2
 
 
-def test_blenders_pictures_take_part_where_a_marker_has_all_of_them(pool, tmp_path):
+def test_blenders_images_take_part_where_a_marker_has_all_of_them(pool, tmp_path):
     category = CATEGORIES["small"]
     camera = novel_cameras(category, 0)[0]
     for index, number in ((0, 0), (0, 1), (1, 0)):

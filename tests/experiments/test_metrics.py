@@ -38,7 +38,7 @@ def test_ssim_is_that_of_its_definition():
 
 
 @pytest.mark.parametrize("shape", [(10, 30), (30, 10), (1, 1)])
-def test_ssim_of_pictures_smaller_than_its_window_is_not_a_number(shape):
+def test_ssim_of_images_smaller_than_its_window_is_not_a_number(shape):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.isnan(ssim(np.zeros(shape), np.ones(shape)))
@@ -52,7 +52,7 @@ def test_ssim_is_that_of_scikit_image():
     assert ssim(TRUTH, TRUTH) == pytest.approx(1.0)
 
 
-def test_flip_of_equal_and_of_opposite_pictures():
+def test_flip_of_equal_and_of_opposite_images():
     assert has_flip()
     assert flip(TRUTH, TRUTH) == 0.0
     black, white = np.zeros((64, 64)), np.ones((64, 64))

@@ -83,7 +83,7 @@ def test_modules_that_fill_pixels_keep_their_values():
     assert np.all(picture[:, [0, -1]] == 0.5)
 
 
-def test_a_plane_out_of_the_picture_and_one_without_contrast():
+def test_a_plane_out_of_the_image_and_one_without_contrast():
     aside = fs.Camera.look_at(20, 20, 0.3, (0, 0, -3), (9.0, 0, 0))
     assert plane_image(GRID, MODULE, aside, background=0.25) == pytest.approx(0.25, abs=1e-12)
     same = plane_image(GRID, MODULE, VIEWS["tilted"], dark=0.5, light=0.5, background=0.5)
@@ -96,13 +96,13 @@ def test_a_plane_that_reaches_behind_the_camera_is_an_error():
         plane_image(GRID, MODULE, camera)
 
 
-def test_what_is_seen_from_behind_is_mirrored():
+def test_what_is_viewed_from_behind_is_mirrored():
     front = plane_image(GRID, MODULE, VIEWS["front"])
     behind = fs.Camera.look_at(61, 47, 0.9, (0.0, 0.0, 2.5), (0.0, 0.0, 0.0))
     assert plane_image(GRID[:, ::-1], MODULE, behind) == pytest.approx(front, abs=1e-12)
 
 
-def test_means_do_not_depend_on_how_the_picture_is_cut():
+def test_means_do_not_depend_on_how_the_image_is_cut():
     whole = VIEWS["tilted"]
     picture = plane_image(GRID, MODULE, whole, **VALUES)
     part = fs.Camera.pinhole(

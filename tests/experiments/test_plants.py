@@ -19,7 +19,7 @@ from fidsplat.worlds.plants import KINDS, Mesh, load_plants
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_mesh_stands_on_its_foot_and_splats_cover_it(kind):
+def test_a_mesh_has_its_foot_at_the_origin_and_splats_cover_it(kind):
     mesh = KINDS[kind](np.random.default_rng(0))
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     assert -0.02 < low[2] < 0.02
@@ -33,7 +33,7 @@ def test_a_mesh_stands_on_its_foot_and_splats_cover_it(kind):
     assert np.ptp(mesh.splats(3000, seed=1).means - cloud.means) > 0.01
 
 
-def test_splats_lie_in_the_faces_and_have_their_colours():
+def test_splats_are_in_the_faces_and_have_their_colours():
     """Of two squares, one of three metres and one of one."""
     corners = np.array([[0, 0, 0], [3, 0, 0], [3, 3, 0], [0, 3, 0]], float)
     corners = np.concatenate([corners, corners / 3 + [5, 0, 0]])
@@ -129,7 +129,7 @@ for plant in json.load(open(sys.argv[1]))["objects"]:
 """
 
 
-def test_pictures_become_a_data_set_and_what_is_trained_a_plant(tmp_path, monkeypatch):
+def test_images_become_a_data_set_and_the_trained_splats_a_plant(tmp_path, monkeypatch):
     (tmp_path / "worker.py").write_text(FAKE)
     monkeypatch.setattr(plants, "WORKER", tmp_path / "worker.py")
     monkeypatch.setattr(blender, "environment_python", lambda environment: Path(sys.executable))
@@ -172,7 +172,7 @@ def test_pictures_become_a_data_set_and_what_is_trained_a_plant(tmp_path, monkey
     assert told[-1] == 1.0
 
 
-def test_blender_draws_a_plant(tmp_path):
+def test_blender_renders_a_plant(tmp_path):
     """Where it is installed: a lettuce, green in the middle, with nothing around it."""
     python = blender.environment_python(blender.default_environment())
     if not python.is_file():

@@ -63,7 +63,7 @@ def test_a_tilted_code_is_read_once_it_is_made_taller(category):
     assert attempt("zxing-tall", picture, target) == Attempt(True, True)
 
 
-def test_places_that_were_found_are_those_of_the_untouched_picture():
+def test_places_that_were_found_are_those_of_the_untouched_image():
     """The rows are cut out and stretched; the outline must come back to where the code is."""
     picture, target = ideal("medium", 75.0)
     assert not attempt("zxing", picture, target).read

@@ -139,7 +139,7 @@ def test_the_report_says_what_was_measured(reported):
         assert words in text, words
 
 
-def test_pictures_and_tables_are_where_the_page_names_them(reported):
+def test_images_and_tables_are_where_the_page_names_them(reported):
     folder, files = reported
     text = files[0].read_text()
     named = re.findall(r"\]\((results/[^)]+)\)", text)
@@ -150,7 +150,7 @@ def test_pictures_and_tables_are_where_the_page_names_them(reported):
         xml.dom.minidom.parse(str(file))
 
 
-def test_the_page_can_be_made_again_from_its_tables(reported, tmp_path):
+def test_the_page_can_be_regenerated_from_its_tables(reported, tmp_path):
     folder, files = reported
     make_report([folder / "results"], tmp_path / "results.md")
     assert (tmp_path / "results.md").read_bytes() == files[0].read_bytes()
@@ -223,7 +223,7 @@ def test_the_scan_with_more_tilts_counts_and_gaps_use_common_tilts(tmp_path):
     assert rows.loc[("small", 0, "fitted/best"), ["behind", "behind_all"]].tolist() == [0, 0]
 
 
-def test_a_hole_is_not_hidden_by_where_reading_ends(tmp_path):
+def test_a_gap_is_not_concealed_by_where_reading_ends(tmp_path):
     rows = angles_of(
         tmp_path,
         [
@@ -249,7 +249,7 @@ def test_results_of_another_version_are_one_line(tmp_path):
         make_report([tmp_path], tmp_path)
 
 
-def test_a_report_that_is_made_again_has_the_same_tables(tmp_path):
+def test_a_report_that_is_regenerated_has_the_same_tables(tmp_path):
     """From its results and from the tables that lie beside them."""
     results = Results(tmp_path / "counts.jsonl", run_facts(None, 0))
     part = {"dark": 3, "light": 4}
@@ -263,13 +263,13 @@ def test_a_report_that_is_made_again_has_the_same_tables(tmp_path):
     assert len(first.runs) == 1
 
 
-def test_what_all_was_shown_to_the_detectors_is_not_named(tmp_path):
+def test_complete_inputs_of_detectors_are_not_listed(tmp_path):
     write(tmp_path, "angles", SCANS)
     write(tmp_path, "trained", TRAININGS[:1])
     assert "Tilts of some markers" not in make_report([tmp_path], tmp_path / "page.md")[0].read_text()
 
 
-def test_notes_of_tables_stand_on_the_page(tmp_path):
+def test_notes_of_tables_are_on_the_page(tmp_path):
     folder = tmp_path / "kept"
     (made, *_) = make_report([Path(__file__).parents[2] / "devlog" / "results"], folder)
     notes = read_summary(folder / "angles.csv").notes

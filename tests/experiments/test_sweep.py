@@ -30,7 +30,7 @@ def sweep(file, measure=lambda key: {}, points=POINTS, overwrite=False, **change
     return Sweep("counts", results, points, lambda key: lambda: measure(key))
 
 
-def test_a_run_that_was_stopped_goes_on(tmp_path):
+def test_a_run_that_was_stopped_continues(tmp_path):
     file = tmp_path / "deep" / "counts.jsonl"
     asked = []
 
@@ -122,7 +122,7 @@ def test_results_of_other_circumstances_are_not_mixed(tmp_path, changes, named):
     assert read_records(file) == []
 
 
-def test_what_draws_nothing_goes_with_any_device(tmp_path):
+def test_experiments_without_rendering_resume_on_any_device(tmp_path):
     file = tmp_path / "angles.jsonl"
     list(sweep(file, points=POINTS[:2], device=None).run())
     with_device = sweep(file)
@@ -137,7 +137,7 @@ def test_another_commit_or_day_does_not_matter(tmp_path):
     assert sweep(file, commit="other", date="2030-01-01").left == []
 
 
-def test_a_disk_that_is_full_is_no_fault_of_ours(tmp_path):
+def test_a_disk_that_is_full_is_not_reported_as_a_bug(tmp_path):
     file = tmp_path / "counts.jsonl"
     running = sweep(file)
     running.results.append(POINTS[0], {"value": 1.0})
@@ -151,14 +151,14 @@ def test_a_disk_that_is_full_is_no_fault_of_ours(tmp_path):
     assert sweep(file).left == POINTS[1:]
 
 
-def test_a_result_that_is_no_json_is_a_fault_and_not_written(tmp_path):
+def test_a_result_that_is_not_json_is_a_bug_and_not_written(tmp_path):
     file = tmp_path / "counts.jsonl"
     with pytest.raises(ValueError, match="not JSON compliant"):
         list(sweep(file, lambda key: {"value": math.nan}).run())
     assert read_records(file) == []
 
 
-def test_numbers_are_kept_to_six_digits(tmp_path):
+def test_numbers_have_six_digits(tmp_path):
     (record,) = sweep(tmp_path / "a.jsonl", lambda key: {"a": [1 / 3, {"b": 2e-7 / 3}]}, POINTS[:1]).run()
     assert record.result == {"a": [0.333333, {"b": 6.66667e-08}]}
     assert read_records(tmp_path / "a.jsonl") == [record]
@@ -175,7 +175,7 @@ def test_numbers_are_kept_to_six_digits(tmp_path):
         ('{"run": {}}\n' + "[" * 100_000 + "\n", 2),
     ],
 )
-def test_files_that_are_not_ours_are_refused_and_left_alone(tmp_path, text, line):
+def test_files_that_are_not_ours_are_refused_and_unchanged(tmp_path, text, line):
     file = tmp_path / "notes.jsonl"
     file.write_text(text)
     with pytest.raises(fs.InputError, match=f"line {line}: not a result"):

@@ -47,7 +47,7 @@ def drawn(renderer: fs.Renderer, scene: TradeScene, quality: fs.Quality) -> np.n
     return renderer.render(scene.cloud, scene.camera, quality=quality, background=scene.background)["rgb"]
 
 
-def test_every_setting_is_one_knob_away_from_the_base():
+def test_every_setting_changes_one_option_of_the_base():
     for on_marker in (False, True):
         for point in points(SETTINGS, on_marker):
             near = EXACT if point.setting == ABLATION else BASE
@@ -62,7 +62,7 @@ def test_every_setting_is_one_knob_away_from_the_base():
                 assert point.value.split()[0] in turned
 
 
-def test_every_knob_is_turned():
+def test_every_quality_setting_is_varied():
     # first_hit decides where depth_first is, and nothing of rgb; detail_error what of a store is drawn, and
     # scenes here are none (docs/large-scenes.md prices it)
     assert {knob.name for knob in dataclasses.fields(fs.Quality)} - set(SETTINGS) == {
@@ -83,7 +83,7 @@ def test_the_constants_of_other_systems_are_among_the_options():
     assert {point.quality.marker.mixture for point in decode_points(SETTINGS)} == {"fitted", "paper", "exact"}
 
 
-def test_parts_are_all_different_and_the_telling_ones_come_first():
+def test_parts_are_all_different_and_the_informative_ones_come_first():
     for quick in (False, True):
         parts = run.all_points((), (), quick)
         assert len({json.dumps(part, sort_keys=True) for part in parts}) == len(parts)
@@ -117,7 +117,7 @@ def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(session):
     assert np.abs(dropped - picture)[cell_window(CELLS.index("opaque"))].max() > 0.5
 
 
-def test_3d_gaussians_are_held_against_the_gaussians_themselves(monkeypatch):
+def test_3d_gaussians_are_compared_with_the_gaussians_themselves(monkeypatch):
     """What EWA widens and what its linear image is wrong by are errors. A few of the scene's splats."""
     small = dataclasses.replace(SCENES["r100k_720p_3d"], count=3_000, width=160, height=90)
     monkeypatch.setitem(SCENES, "r100k_720p_3d", small)
@@ -152,7 +152,7 @@ def test_errors_are_those_of_the_cut_off():
     assert same["psnr"] is None or same["psnr"] > 120
 
 
-def test_a_certified_flip_is_no_error():
+def test_a_certified_flip_is_not_an_error():
     renderer, scene = fs.Renderer("opencl"), faint_rim()
     quality = fs.Quality(alpha_cutoff=0.1)
     reference = compare.reference_images(
@@ -176,7 +176,7 @@ def test_many_splats_have_no_certificates(monkeypatch):
     assert compare.beyond_certificates(np.zeros((48, 64)), faint_rim(), BASE) is None
 
 
-def test_a_marker_is_held_against_the_printed_texture(session):
+def test_a_marker_is_compared_with_the_printed_texture(session):
     result = {}
     for mixture in ("fitted", "exact"):
         quality = BASE.with_(marker=MarkerQuality(mixture))
@@ -195,7 +195,7 @@ def test_a_marker_is_held_against_the_printed_texture(session):
         assert found["ratio_quartiles"][0] <= found["ratio"] <= found["ratio_quartiles"][1]
 
 
-def test_memory_is_that_of_the_setting_alone(session):
+def test_memory_is_that_of_the_setting_only(session):
     def memory(quality):
         return time_point(session, "apriltag@0", quality, Effort(1, 1, 0.0))[1]["memory_bytes"]
 
@@ -204,7 +204,7 @@ def test_memory_is_that_of_the_setting_alone(session):
     assert memory(BASE) == small
 
 
-def test_memory_does_not_hang_on_what_was_drawn_before(session, monkeypatch):
+def test_memory_does_not_depend_on_earlier_frames(session, monkeypatch):
     """As on a GPU, where a cloud keeps its colours once a picture has asked for them."""
     held = property(lambda self: sum(buffer.size for buffer in self._buffers.values()))
     monkeypatch.setattr(Resident, "memory_bytes", held)
@@ -214,7 +214,7 @@ def test_memory_does_not_hang_on_what_was_drawn_before(session, monkeypatch):
     assert memory_of(session, "apriltag@0", BASE) == before
 
 
-def test_a_device_without_float64_is_held_against_one_with_it(session, monkeypatch):
+def test_a_device_without_float64_is_compared_with_one_with_it(session, monkeypatch):
     """As Warp's."""
     monkeypatch.setattr(session_module, "reference_renderer", lambda *_: session.renderer)
     lacking = fs.Renderer("opencl")
@@ -235,7 +235,7 @@ def test_a_definition_has_a_truth_of_its_own(session):
     assert found["maximum"] < 2e-6
 
 
-def test_nobody_sees_what_standard_leaves_out(session):
+def test_omissions_of_standard_are_invisible(session):
     """Half a step of 8 bits, on what constants hurt most."""
     standard = PRESETS["standard"]
     assert (
@@ -243,7 +243,7 @@ def test_nobody_sees_what_standard_leaves_out(session):
     )
 
 
-def test_ones_own_3d_gaussians_are_held_against_themselves_as_they_are_drawn():
+def test_captured_3d_gaussians_are_compared_with_themselves():
     """Captures look as they did to their trainer, who drew them by EWA."""
     scene = make_view("r100k_720p_3d", BASE.marker)
     own = Session(fs.Renderer("reference"), {"own.ply": dataclasses.replace(scene, name="own.ply")})

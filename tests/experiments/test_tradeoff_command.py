@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("optimised")
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--settings", "opacity_ceiling")
 
 
-def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
+def test_an_interrupted_run_continues(capsys, tmp_path, monkeypatch):
     words = [*WORDS, "-o", str(tmp_path), "--json"]
     real, begun = run._begin, []
 

@@ -223,7 +223,7 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
     assert {file: file.read_bytes() for file in (tmp_path / "docs").rglob("*.*")} == before
 
 
-def test_a_device_that_drew_3d_gaussians_alone_takes_nothing_from_the_others(tmp_path):
+def test_a_device_that_rendered_only_3d_gaussians_takes_nothing_from_the_others(tmp_path):
     write(tmp_path / "a", plain_records("r100k_720p"))
     again = [Record(each.key, each.result, each.run | {"device": "driver 2"}) for each in thick_records()]
     write(tmp_path / "b", again)
@@ -252,7 +252,7 @@ def test_names_in_a_chart_cover_neither_each_other_nor_the_legend(tmp_path):
     assert {"standard", "gsplat", "reference", "cut-off 1/1024", "only alpha up to 0.99"} <= set(comments)
 
 
-def test_devices_stand_side_by_side_in_one_chart(tmp_path):
+def test_devices_are_side_by_side_in_one_chart(tmp_path):
     """Of a scene that all of them have drawn."""
     write(tmp_path / "cpu", [*plain_records("hard"), *plain_records("r1m_1080p")])
     write(tmp_path / "gpu", plain_records("hard", **GPU))
@@ -346,7 +346,7 @@ def test_a_folder_without_results_is_not_passed_over(tmp_path):
         load([tmp_path / "a", tmp_path / "other"])
 
 
-def test_a_setting_knows_whether_it_draws_another_picture():
+def test_settings_that_change_the_image_are_known():
     point = Point("order", "centre", BASE.with_(order="centre"))
     base = Point("base", "base", BASE)
     for scene in ("hard", "qr10@60"):
@@ -354,7 +354,7 @@ def test_a_setting_knows_whether_it_draws_another_picture():
         assert len(device(records).same_definition(scene)) == 1
 
 
-def test_the_price_of_order_is_pixel_over_centre_where_both_were_drawn():
+def test_the_price_of_order_is_pixel_over_centre_where_both_were_rendered():
     def records(scene: str, **ratios: float) -> list[Record]:
         turned = [Point("order", name, BASE.with_(order=name)) for name in ratios]
         return [record(scene, one, result(ratios[one.value], 0.1 * ratios[one.value])) for one in turned]

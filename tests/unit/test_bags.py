@@ -132,7 +132,7 @@ KEY = "rosbag2_bagfile_information"
         (f"{KEY}: {{relative_file_paths: [], compression_mode: 1}}", "cannot read .* as a log"),
     ],
 )
-def test_metadata_that_is_no_bags(tmp_path, text, words):
+def test_metadata_that_is_not_of_a_bag(tmp_path, text, words):
     (tmp_path / "bag").mkdir()
     (tmp_path / "a.db3").write_bytes(b"")
     (tmp_path / "bag/metadata.yaml").write_text(text)

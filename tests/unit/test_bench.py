@@ -96,7 +96,7 @@ def test_rates_of_a_device_are_those_of_a_computer(renderer):
         assert 1e6 < rate < 1e16
 
 
-def test_drawn_fragments_are_counted_exactly(renderer):
+def test_rendered_fragments_are_counted_exactly(renderer):
     measurable(renderer)
 
     def count(cloud, **quality):
@@ -129,12 +129,12 @@ def test_fragments_are_counted_through_the_lens(renderer):
     np.testing.assert_array_equal(counted > 0, alpha > 0)
 
 
-def test_the_count_is_no_output_for_users(renderer):
+def test_the_count_is_not_a_public_output(renderer):
     with pytest.raises(fs.InputError, match="unknown output 'overdraw'"):
         renderer.render(facing([2.0], 0.5), CAMERA, outputs=("overdraw",))
 
 
-def test_memory_is_that_of_cloud_buffers_and_picture(renderer):
+def test_memory_is_of_cloud_buffers_and_image(renderer):
     before = measurable(renderer).memory_bytes
     resident = renderer.upload(random_cloud(1000, 0.1))
     assert renderer.backend.memory_bytes == before  # a cloud is no scratch
@@ -148,7 +148,7 @@ def test_memory_is_that_of_cloud_buffers_and_picture(renderer):
 
 
 @pytest.mark.usefixtures("rates_once")
-def test_devices_take_turns(monkeypatch):
+def test_devices_are_interleaved(monkeypatch):
     turns = []
     draw = measure.SceneRun.render
 
@@ -173,7 +173,7 @@ def test_devices_take_turns(monkeypatch):
 
 
 @pytest.mark.usefixtures("rates_once")
-def test_json_on_stdout_is_all_that_stands_there(capsys):
+def test_json_on_stdout_is_the_only_output(capsys):
     assert bench("--scenes", "small", "other", "--json", "-") == 0
     content = json.loads(capsys.readouterr().out)
     assert content["scenes"] == ["small", "other"]
@@ -227,7 +227,7 @@ def test_an_interrupt_keeps_what_was_measured(capsys, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("rates_once")
-def test_what_a_device_cannot_draw_is_said_and_the_rest_is_drawn(capsys, monkeypatch):
+def test_what_a_device_cannot_render_is_reported_and_the_rest_is_rendered(capsys, monkeypatch):
     def refuse_empty(self, scene, upload=fs.Renderer.upload):
         if len(scene) == 0:
             raise fs.DeviceError("no memory for this")
@@ -273,7 +273,7 @@ def test_the_help_names_every_scene(capsys):
     assert all(name in out for name in BENCH_SCENES if name not in ("small", "other"))
 
 
-def test_the_tag_stands_in_the_middle_of_its_picture():
+def test_the_tag_is_in_the_middle_of_its_image():
     cloud, camera = catalogue.tag()
     shown = camera.project(cloud.means + cloud.origin)
     np.testing.assert_allclose(shown.mean(0), (320, 240), atol=5)
@@ -281,7 +281,7 @@ def test_the_tag_stands_in_the_middle_of_its_picture():
     assert 160 < np.ptp(shown[:, 1]) < 210  # with its quiet zone
 
 
-def test_the_wall_fills_the_picture_with_200_codes(monkeypatch):
+def test_the_wall_fills_the_image_with_200_codes(monkeypatch):
     plain = fs.marker("qr-v1-L:a", size=0.1, quiet_zone=0)  # made at once, and no larger than a dense one
     asked = []
     monkeypatch.setattr(catalogue, "marker", lambda spec, size: asked.append((spec, size)) or plain)

@@ -36,7 +36,7 @@ def test_every_stage_that_a_frame_names_has_a_roofline(renderer):
 
 
 @pytest.mark.parametrize("what", ["splats", "visible", "pairs", "fragments", "pixels"])
-def test_more_to_draw_never_costs_less(what):
+def test_more_to_render_never_costs_less(what):
     more = dataclasses.replace(COUNTS, **{what: 10 * getattr(COUNTS, what)})
     before, after = roofline_ms(COUNTS, RATES), roofline_ms(more, RATES)
     assert all(after[stage] >= before[stage] for stage in before)
@@ -49,7 +49,7 @@ def test_colours_that_depend_on_the_view_are_read_of_visible_splats_only():
     assert degree_3.bytes - plain.bytes == 600 * 15 * 12
 
 
-def test_nothing_to_draw_costs_the_picture_alone():
+def test_nothing_to_render_costs_only_the_image():
     least = roofline_ms(Counts(0, 0, 0, 0, 1000), RATES)
     assert least.pop("resolve") == pytest.approx(0.012)
     assert set(least.values()) == {0.0}

@@ -136,7 +136,7 @@ def test_each_kind_of_figures_becomes_its_table(files):
     assert rows(made["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
 
 
-def test_a_table_replaces_what_stands_between_its_marks():
+def test_a_table_replaces_the_text_between_its_marks():
     page = "before\n<!-- begin rates -->\nold\n<!-- end rates -->\nafter\n"
     wanted = "before\n<!-- begin rates -->\nnew\n<!-- end rates -->\nafter\n"
     assert tables.insert(page, "rates", "new") == wanted

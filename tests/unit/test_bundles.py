@@ -66,7 +66,7 @@ def test_all_tags_together_say_more_than_one(markers):
     assert together < 0.5 * one
 
 
-def test_a_bundle_of_which_nothing_is_seen_has_no_pose(markers):
+def test_a_bundle_of_which_nothing_is_visible_has_no_pose(markers):
     (box,) = read_bundles([reading(placed, PINHOLE) for placed in markers[:3]], PINHOLE)
     assert (box.found, box.pose, box.position_error) == (0, None, None)
     assert box.as_dict()["camera_from_bundle"] is None

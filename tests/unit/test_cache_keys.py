@@ -85,7 +85,7 @@ def test_measured_qualities_have_a_key_of_every_ingredient(renderer, monkeypatch
     assert key_of_quality(monkeypatch, renderer, capture=rest) == first
 
 
-def test_runs_of_random_scenes_go_on_with_the_same_device_and_code_alone(renderer, monkeypatch):
+def test_runs_of_random_scenes_resume_only_with_the_same_device_and_code(renderer, monkeypatch):
     keys = {"": fuzz._key(renderer)}
     for name in FACTS[1:]:
         with monkeypatch.context() as patch:

@@ -50,7 +50,7 @@ def test_a_cache_that_cannot_be_written_is_replaced(ensure, name):
     assert Path(os.environ[name]).parent.name.startswith("fidsplat-cache-")
 
 
-def test_a_disk_without_room(ensure, monkeypatch):
+def test_a_full_disk(ensure, monkeypatch):
     monkeypatch.setattr(caches.shutil, "disk_usage", lambda _: namedtuple("Usage", "free")(2**20))
     said = ensure(POCL_CACHE_DIR="/tmp", XDG_CACHE_HOME="/tmp")
     assert "/tmp has room for 1 MB only" in said
@@ -76,7 +76,7 @@ def test_without_home_pocl_does_not_use_the_folder_for_temporary_files(ensure, m
     monkeypatch.delenv("POCL_CACHE_DIR")
 
 
-def test_nobody_without_a_home(ensure, monkeypatch, tmp_path):
+def test_a_user_without_a_home(ensure, monkeypatch, tmp_path):
     monkeypatch.setattr(caches.os.path, "expanduser", lambda text: text)
     monkeypatch.setenv("XDG_CACHE_HOME", "")
     monkeypatch.delenv("XDG_CACHE_HOME")
@@ -86,7 +86,7 @@ def test_nobody_without_a_home(ensure, monkeypatch, tmp_path):
     caches._remove(Path(os.environ["XDG_CACHE_HOME"]).parent, os.getpid())
 
 
-def test_a_picture_is_drawn_all_the_same(tmp_path):
+def test_a_frame_is_rendered_nevertheless(tmp_path):
     """And what it took is removed."""
     draw = (
         "import fidsplat as fs, tempfile; from fidsplat.scenes.random_clouds import random_splats;"

@@ -76,7 +76,7 @@ def test_field_of_view(fov_x, width):
     np.testing.assert_allclose(camera.project(edge)[:, 0], [0, width], atol=1e-8 * width)
 
 
-def test_a_turned_and_moved_camera():
+def test_a_rotated_and_moved_camera():
     turn = quaternion_to_matrix(np.array([0.9, 0.1, -0.3, 0.2]))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, [1, 2, 3]
@@ -87,7 +87,7 @@ def test_a_turned_and_moved_camera():
     np.testing.assert_allclose(turn @ camera.position + [1, 2, 3], 0, atol=1e-12)
 
 
-def test_a_position_far_from_the_origin_is_kept():
+def test_a_position_far_from_the_origin_is_exact():
     position = [500_000.125, 4_500_000.25, 300.5]
     camera = fs.Camera.look_at(64, 48, 1.0, position, [500_003, 4_500_001, 301])
     assert camera.position.tolist() == position

@@ -45,7 +45,7 @@ def test_a_part_of_the_wrong_kind_is_named_with_what_would_do(parts, message):
 
 
 @pytest.mark.parametrize("captures", [5, np.array("text")])
-def test_views_of_what_is_no_list(captures):
+def test_views_that_are_not_a_list(captures):
     views = fs.Renderer("reference").render_views(fs.SplatCloud.empty(), captures)
     with pytest.raises(fs.InputError, match=r"captures is .* must be a list of Capture or Camera"):
         list(views)
@@ -90,7 +90,7 @@ def test_a_scene_and_its_resident_cloud_have_the_same_capture():
     assert np.array_equal(view["rgb"], own["rgb"])
 
 
-def test_a_capture_and_its_parts_draw_the_same():
+def test_a_capture_and_its_parts_render_the_same():
     cloud = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.9], colors=[[1.0, 0.5, 0.25]])
     renderer = fs.Renderer("reference")
     capture = fs.Capture(CAMERA, ("rgb", "depth"), "fast", GREY, fog=fs.Fog(0.1))

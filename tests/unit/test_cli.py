@@ -264,7 +264,7 @@ def test_devices(capsys):
     assert "reference" in capsys.readouterr().out
 
 
-def test_work_is_shown_once_it_takes_long():
+def test_progress_is_shown_for_long_work():
     for after in (60.0, 0.0):
         shown = io.StringIO()
         with delayed_progress(Console(file=shown, force_terminal=True), after) as progress:

@@ -28,7 +28,7 @@ def test_marker_says_what_it_is_made_of(capsys, tmp_path):
     assert "rectangles" in capsys.readouterr().out
 
 
-def test_splats_that_are_there_are_replaced_where_that_is_asked_for(capsys, tmp_path):
+def test_splats_that_are_there_are_replaced_on_request(capsys, tmp_path):
     mine, other = tmp_path / "mine.ply", tmp_path / "other.ply"
     mine.write_bytes(b"a scan of months")
     other.write_bytes(b"another")
@@ -75,7 +75,7 @@ def test_a_marker_of_more_splats_than_allowed(capsys, tmp_path):
     assert facts["splats"] > 0
 
 
-def test_marker_writes_two_scales_when_asked(capsys, tmp_path):
+def test_marker_writes_two_scales_on_request(capsys, tmp_path):
     for words, scales in (([], 3), (["--native-2dgs"], 2)):
         overwrite = ["-o", str(tmp_path / "tag.ply"), "--overwrite"]
         assert main(["marker", "apriltag:36h11:5", *overwrite, *words]) == 0

@@ -48,7 +48,7 @@ def names(folder) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_a_budget_is_measured_and_told(scene, tmp_path, capsys, monkeypatch):
+def test_a_budget_is_measured_and_reported(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("fidsplat.accuracy.cache.folder", lambda: tmp_path / "cache")
     words = ["render", scene, "--max-error", "1e-3", "--max-ms", "60000"]
     assert main([*words, "--json"]) == 0
@@ -80,7 +80,7 @@ def test_impossible_bounds(scene, tmp_path, capsys, monkeypatch, words, message)
     assert message in capsys.readouterr().err
 
 
-def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
+def test_a_scene_is_rendered_and_read_back(scene, tmp_path, capsys):
     assert main(["render", scene, "--json"]) == 0
     facts = said(capsys)
     assert facts["files"] == ["scene.png"]
@@ -103,7 +103,7 @@ def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
     assert "position [mm]" in out
 
 
-def test_what_moves_is_held_against_where_it_is_at_the_shutters_time(scene, tmp_path, capsys):
+def test_what_moves_is_compared_with_its_pose_at_the_shutters_time(scene, tmp_path, capsys):
     """The camera has passed 0.06 m by then, the tag 0.03 m: far more than the error."""
     keyframes = """
 [[camera.motion]]
@@ -153,7 +153,7 @@ def test_every_output_is_a_file(scene, tmp_path, capsys):
     assert read_image("frames/normal.png")[60, 80].tolist() == [128, 128, 0]
 
 
-def test_a_name_with_png_is_the_colour_picture_and_other_planes_stand_beside_it(scene, tmp_path):
+def test_a_name_with_png_is_the_colour_image_and_other_planes_are_next_to_it(scene, tmp_path):
     assert main(["render", scene, "-o", "new/view.png", "--outputs", "rgb,label"]) == 0
     assert names(tmp_path / "new") == {"view.png", "view-label.png", "view-label.npy"}
 
@@ -182,7 +182,7 @@ def test_a_bare_splat_file_is_framed(scene, tmp_path, capsys):
     assert [code["name"] for code in said(capsys)["detections"]] == ["apriltag:36h11:5"]
 
 
-def test_nothing_to_draw_is_the_background(scene, tmp_path):
+def test_nothing_to_render_is_the_background(scene, tmp_path):
     fs.save_ply(fs.SplatCloud.empty(), "empty.ply")
     text = (
         SCENE.split("[[markers]]")[0]
@@ -205,7 +205,7 @@ def test_nothing_to_draw_is_the_background(scene, tmp_path):
         (["--outputs", ""], 2, "output"),
     ],
 )
-def test_what_cannot_be_drawn(scene, words, status, says, capsys):
+def test_invalid_frames(scene, words, status, says, capsys):
     assert main(["render", scene, *words]) == status
     out, err = capsys.readouterr()
     assert out == ""
@@ -245,7 +245,7 @@ def test_a_scene_needs_a_camera(scene, tmp_path, capsys):
     assert "[camera]" in capsys.readouterr().err
 
 
-def test_detect_wants_the_picture_of_that_scene(scene, tmp_path, capsys):
+def test_detect_requires_the_image_of_that_scene(scene, tmp_path, capsys):
     from fidsplat.images.files import write_png
 
     write_png("other.png", np.zeros((50, 60)))

@@ -101,7 +101,7 @@ def test_the_scene_is_the_same_every_time(scene):
     assert set(np.unique(one.labels)) == {0, 1, 2, 3}
 
 
-def test_disks_boxes_and_3d_gaussians_stand_in_it(scene):
+def test_the_demo_has_disks_boxes_and_3d_gaussians(scene):
     cloud = scene.cloud()
     assert (cloud.footprint, cloud.ellipsoids) == ("mixed", "some")
     assert 0.05 < np.mean(cloud.thickness[cloud.labels == 0] > 0) < 0.2

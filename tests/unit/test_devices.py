@@ -208,7 +208,7 @@ def test_what_needs_no_patch_is_preferred(monkeypatch, record):
 
 
 @pytest.mark.parametrize(("way", "named"), [("variable", target_patch.FORBID), ("hidden", "/proc/self/mem")])
-def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_remedy_told(
+def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_remedy_reported(
     monkeypatch, record, way, named
 ):
     pocl, other = pocl_that_mistakes(record), pocl_that_mistakes(record)

@@ -52,12 +52,12 @@ def test_derivatives_by_a_pose_are_those_of_central_differences(pose):
         assert found == pytest.approx(by_motion @ (ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-8)
 
 
-def test_a_rotation_vector_turns_about_itself_by_its_length():
+def test_a_rotation_vector_rotates_by_its_length():
     turned = motion(np.array([0, 0, np.pi / 2, 0, 0, 0]))
     np.testing.assert_allclose(turned[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
 
 
-def test_a_picture_goes_back_to_a_pose_that_is_not_0():
+def test_gradients_of_a_frame_reach_a_pose_that_is_not_0():
     """Central differences of the float32 images: what they round is 1e-4 of these derivatives."""
     renderer, cloud, pose = fs.Renderer("reference"), fs.SplatCloud(**arrays()), np.array(POSES[2] / 10)
 
@@ -219,7 +219,7 @@ def test_tensors_have_the_gradients_of_the_backend(degree):
         np.testing.assert_allclose(tensor.grad.numpy(), wanted[name], rtol=1e-4, atol=1e-5)
 
 
-def test_tensors_learn_a_picture():
+def test_tensors_are_fitted_to_an_image():
     torch = pytest.importorskip("torch", reason="torch is not installed")
     from fidsplat.train.torch_bridge import draw
 

@@ -81,7 +81,7 @@ def test_a_folder_that_is_missing_or_full_is_an_input_error(tmp_path, monkeypatc
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_ordinary_file_is_not_replaced(tmp_path):
+def test_only_regular_files_are_replaced(tmp_path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     with pytest.raises(InputError, match="must be a regular file"), atomic_write(pipe):
@@ -286,7 +286,7 @@ def test_pages_and_charts_of_names_that_are_not_utf8(tmp_path):
     assert "a%FF%24x%24-rgb" in page.read_text()
 
 
-def test_a_script_of_ffmpeg_is_no_video_and_opens_no_other_file(tmp_path):
+def test_a_script_of_ffmpeg_is_not_a_video_and_opens_no_other_file(tmp_path):
     """FFmpeg knows them by their content, whatever they are called."""
     write_avi(tmp_path / "secret.avi")
     for text in ("ffconcat version 1.0\nfile secret.avi\n", "#EXTM3U\n#EXTINF:1,\nsecret.avi\n"):

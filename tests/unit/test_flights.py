@@ -63,7 +63,7 @@ def small_flight(rate=2.0, **changes) -> Flight:
     return Flight(scene, path, path.sampled(rate).times, scene.capture.with_(**changes))
 
 
-def test_each_picture_is_that_of_its_pose(here):
+def test_each_image_has_its_pose(here):
     """As drawn alone from there, in every output."""
     assert fly("--rate", "2", "--outputs", "rgb,depth") == 0
     scene, renderer = fs.Scene.load("scene.toml"), fs.Renderer()
@@ -81,7 +81,7 @@ def test_each_picture_is_that_of_its_pose(here):
     assert (here / "out" / "contact-sheet.png").exists()
 
 
-def test_a_flights_pictures_are_read_from_where_its_camera_was(here, capsys):
+def test_a_flights_images_are_read_from_where_its_camera_was(here, capsys):
     (here / "scene.toml").write_text(SCENE.replace("33", "160").replace("24", "120"))
     assert fly("--times", "0,0.2,0.5") == 0
     capsys.readouterr()
@@ -163,7 +163,7 @@ def _bytes_of(log):
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "bag"])
-def test_a_flight_that_was_stopped_after_its_log_goes_on(here, capsys, monkeypatch, name):
+def test_a_flight_that_was_stopped_after_its_log_continues(here, capsys, monkeypatch, name):
     """The same command ends, with the same bytes; another flight's log stays."""
     pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
     words = ["--times", "0,1", "--log", name, "--coco", "truth.json"]
@@ -252,7 +252,7 @@ def test_the_scenes_own_motion(here):
         assert (here / "own" / name).read_bytes() == (here / "out" / name).read_bytes()
 
 
-def test_a_log_and_the_truth_beside_the_pictures(here):
+def test_a_log_and_the_truth_next_to_the_images(here):
     logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
     words = ("--rate", "2", "--outputs", "rgb,label", "--log", "run.mcap", "--coco", "truth.json")
     assert fly(*words) == 0
@@ -267,14 +267,14 @@ def test_a_log_and_the_truth_beside_the_pictures(here):
     assert truth["annotations"][1]["area"] == own.sum() > 50
 
 
-def test_a_log_named_as_the_output_has_its_pictures_beside_it(here):
+def test_a_log_named_as_the_output_has_its_images_next_to_it(here):
     pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
     assert fly("--rate", "1", "-o", "run.mcap") == 0
     assert (here / "run.mcap").is_file()
     assert len(list((here / "run/rgb").iterdir())) == 2
 
 
-def test_a_video_has_every_picture(here):
+def test_a_video_has_every_image(here):
     pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
     pictures = [np.full((33, 47, 3), 60 + 20 * k, np.uint8) for k in range(4)]
     assert list(write_video("v.mp4", pictures, 10.0)) == [0, 1, 2, 3]
@@ -316,7 +316,7 @@ def test_words_that_cannot_be_flown(here, capsys, words, message):
     assert not (here / "out").exists()
 
 
-def test_a_scene_that_stands_still_needs_a_trajectory(here, capsys):
+def test_a_scene_without_motion_needs_a_trajectory(here, capsys):
     assert main(["fly", "scene.toml"]) == 2
     assert "scene.toml must have [[camera.motion]] to fly along" in capsys.readouterr().err
 
@@ -331,7 +331,7 @@ def test_sizes_in_bytes():
             parse_bytes("--x", text)
 
 
-def test_pictures_that_are_not_whole_are_drawn_again(here):
+def test_incomplete_images_are_rendered_again(here):
     """One file of three is missing: the output is."""
     flight = small_flight(outputs=("depth",))
     renderer = fs.Renderer()

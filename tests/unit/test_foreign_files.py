@@ -120,7 +120,7 @@ PIXELS = RANDOM.integers(0, 256, (5, 7, 4), np.uint8)
         ("mono8", [0]),
     ],
 )
-def test_encodings_of_pictures_in_a_bag_of_rosbags(tmp_path, encoding, order):
+def test_encodings_of_images_in_a_bag_of_rosbags(tmp_path, encoding, order):
     """Rows longer than their pixels, too."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="pip install 'fidsplat[logs]'")
     from fidsplat.logs import log_images
@@ -206,7 +206,7 @@ def test_links_of_a_robot_are_where_mujoco_has_them(tmp_path):
         assert abs(turned[0]) == pytest.approx(1, abs=1e-9)
 
 
-def test_the_middle_of_a_picture_is_the_principal_point_that_is_left_out(tmp_path):
+def test_the_middle_of_an_image_is_the_principal_point_that_is_left_out(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((14, 21)))
     matrix = rigid_matrix(MOVE, TURN)
     frame = {"file_path": "a.png", "transform_matrix": matrix.tolist(), "fl_x": 30.0, "fl_y": 40.0}

@@ -55,7 +55,7 @@ def test_what_keeps_every_bit(tmp_path, suffix, thick):
     assert losses(cloud, f"a{suffix}") == []
 
 
-def test_a_gaussian_as_thin_as_a_disk_is_padded_is_no_disk(tmp_path):
+def test_a_gaussian_as_thin_as_a_disk_is_padded_is_not_a_disk(tmp_path):
     """But for rounding: half a percent more than the third scale of disks is a thickness."""
     disks, thin = some(4, thick=False), np.float32(1.005e-6)
     scales = np.column_stack([disks.scales, [0, thin, 0, 0.01]])
@@ -184,7 +184,7 @@ def test_a_usd_file_says_what_the_schema_wants(tmp_path):
     assert_same_bits(fs.load_splats(tmp_path / "a.usda"), cloud)
 
 
-def test_a_gltf_of_nodes_bytes_and_a_file_beside(tmp_path):
+def test_a_gltf_of_nodes_bytes_and_a_neighbouring_file(tmp_path):
     """By hand: two nodes below each other, opacity in bytes, rotation in shorts, data in another file."""
     half = round(32767 * math.sqrt(0.5))
     data = (
@@ -345,7 +345,7 @@ def test_what_cannot_be_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_format_cannot_hold_is_said():
+def test_what_a_format_cannot_hold_is_reported():
     cloud = some(labels=3, thick=False).with_coplanar_groups(1).transformed(rigid_matrix((1e6, 0, 0)))
     words = " ".join(losses(cloud, "a.splat"))
     for part in (

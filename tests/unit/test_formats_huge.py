@@ -27,7 +27,7 @@ def test_a_huge_file_that_is_something_else_is_not_read_as_a_whole(tmp_path, suf
         tracemalloc.stop()
 
 
-def test_of_a_huge_file_beside_a_gltf_its_splats_alone_are_read(tmp_path):
+def test_only_the_splats_of_a_huge_file_next_to_a_gltf_are_read(tmp_path):
     cloud, path, beside = some(count=9), tmp_path / "a.gltf", tmp_path / "data.bin"
     fs.save_splats(cloud, path)
     document = json.loads(path.read_bytes())

@@ -132,7 +132,7 @@ def test_a_sog_file_that_says_nothing_or_too_much(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("spare", "fits"), [(0, True), (-1, False)])
-def test_pictures_may_have_twice_the_pixels_that_are_meant(tmp_path, monkeypatch, spare, fits):
+def test_images_may_have_twice_the_pixels_that_are_meant(tmp_path, monkeypatch, spare, fits):
     """At that size exactly: two splats in pictures of 2 x 2."""
     monkeypatch.setattr("fidsplat.formats.sog.SPARE", spare)
     sog(tmp_path / "a.sog")

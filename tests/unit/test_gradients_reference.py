@@ -75,7 +75,7 @@ def weights_of(images, seed=0):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_frozen_pictures_are_the_references(name):
+def test_frozen_images_are_the_references(name):
     cloud, features, view = pictured(name)
     backend = ReferenceBackend()
     drawn = backend.pipeline(features).render_view(backend.upload(cloud), view)

@@ -26,7 +26,7 @@ def test_the_same_numbers_give_the_same_greenhouse(small):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_plants_stand_on_their_foot(kind):
+def test_plants_have_the_foot_at_the_origin(kind):
     cloud = KINDS[kind](np.random.default_rng(0)).splats(PLANT_SPLATS)
     low, high = cloud.bounds()
     assert -0.2 < low[2] < 0.1

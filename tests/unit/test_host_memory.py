@@ -23,7 +23,7 @@ def addresses(frames):
     return [frame["rgb"].ctypes.data for frame in frames]
 
 
-def test_images_that_are_kept_keep_their_memory(renderer):
+def test_retained_images_retain_their_memory(renderer):
     cloud = random_splats(50, 1)
     cameras = [fs.Camera.look_at(64, 48, 1.0, (0.05 * k, 0, -1), (0, 0, 2)) for k in range(6)]
     there, plain = renderer.upload(cloud), fs.Renderer("opencl")

@@ -487,7 +487,7 @@ def test_good_arguments_are_used(name, tmp_path, monkeypatch):
 
 @examples(40)
 @given(st.data())
-def test_arguments_that_nobody_expects(tmp_path, data):
+def test_unexpected_arguments(tmp_path, data):
     if not (tmp_path / "good.ply").exists():
         ground(tmp_path)
     function, arguments, use = CALLS[data.draw(st.sampled_from(sorted(CALLS)))](tmp_path)

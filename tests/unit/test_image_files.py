@@ -21,7 +21,7 @@ def test_floats_are_clamped_and_rounded():
         assert not to_uint8(np.full(7, np.nan)).any()
 
 
-def test_a_large_picture_is_converted_as_its_rows_are():
+def test_a_large_image_is_converted_as_its_rows_are():
     """In shares, by threads; the last share is not whole."""
     random = np.random.default_rng(3)
     large = random.uniform(-0.1, 1.1, (900, 857, 3)).astype(np.float32)
@@ -31,7 +31,7 @@ def test_a_large_picture_is_converted_as_its_rows_are():
     assert made[-1, -1].tolist() == [0, 255, 0]
 
 
-def test_sixteen_bits_are_kept(tmp_path):
+def test_sixteen_bits_are_preserved(tmp_path):
     depth = np.array([[0, 1, 65535], [300, 4000, 2]], np.uint16)
     write_png(tmp_path / "d.png", depth)
     assert np.array_equal(cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED), depth)
@@ -61,7 +61,7 @@ def test_a_panorama_of_other_numbers_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 2, 4), (0, 3, 3)])
-def test_a_png_needs_the_shape_of_a_picture(tmp_path, shape):
+def test_a_png_needs_the_shape_of_an_image(tmp_path, shape):
     with pytest.raises(InputError, match="image of a PNG must be"):
         write_png(tmp_path / "x.png", np.zeros(shape))
     with pytest.raises(InputError, match="rows of real numbers"):
@@ -99,7 +99,7 @@ def test_real_one_bit_files_grey_rgb_and_transparent_ones_read_alike(tmp_path):
 
 
 @pytest.mark.parametrize(("level", "bit"), [(0, 1), (255, 0)])
-def test_a_picture_of_one_level_is_dark_or_light(tmp_path, level, bit):
+def test_an_image_of_one_level_is_dark_or_light(tmp_path, level, bit):
     write_png(tmp_path / "c.png", np.full((3, 4), level, np.uint8))
     assert (read_bits(tmp_path / "c.png") == bit).all()
 

@@ -199,7 +199,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 @in_turn()
 @pytest.mark.parametrize("name", sorted(file.stem for file in EXAMPLES.glob("*.toml")))
-def test_the_examples_are_drawn(name, renderer):
+def test_the_examples_are_rendered(name, renderer):
     scene = fs.Scene.load(EXAMPLES / f"{name}.toml")
     frame = renderer.render(scene)
     assert scene.camera is not None

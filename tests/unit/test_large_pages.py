@@ -35,7 +35,7 @@ def test_large_buffers_are_the_devices_own(monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts pages by /proc/self/smaps")
-def test_a_large_buffer_lies_in_large_pages():
+def test_a_large_buffer_uses_large_pages():
     with open("/sys/kernel/mm/transparent_hugepage/enabled", encoding="ascii") as file:
         if "[never]" in file.read():
             pytest.skip("the system gives no large pages")

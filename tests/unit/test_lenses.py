@@ -83,7 +83,7 @@ def test_parallel_rays():
         camera.rays([[0, 0]])
 
 
-def test_beyond_the_fold_nothing_is_seen():
+def test_beyond_the_fold_nothing_is_visible():
     lens = BrownConrady(k1=-0.35)
     assert lens.fold == pytest.approx(math.sqrt(1 / (3 * 0.35)))
     camera = fs.Camera.pinhole(80, 60, 52.0, 52.0, 40.0, 30.0, lens=lens)

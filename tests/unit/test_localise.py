@@ -270,7 +270,7 @@ def test_with_ideal_corners_it_knows_its_way():
     assert [each["median_px"] for each in back] == pytest.approx([0.0, 0.0, None, None])
 
 
-def test_a_drive_at_another_speed_alone_has_a_page(tmp_path):
+def test_a_drive_at_another_speed_only_has_a_page(tmp_path):
     times = np.arange(20) / 10
     fs.save_trajectory(fs.Trajectory(times, np.tile(np.eye(4), (20, 1, 1))), tmp_path / "truth-0.25-m-s.tum")
     facts = {"ate_m": 0.01, "worst_m": 0.02, "rpe_m": 0.01, "heading_deg": 0.1, "tags": 3, "refused": 0}

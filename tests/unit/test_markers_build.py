@@ -234,7 +234,7 @@ def test_an_exact_marker_may_have_more_boxes_than_gaussians(noise):
         _ = made.gaussians
 
 
-def test_clouds_are_filled_part_by_part_with_the_same_bits(noise, monkeypatch):
+def test_clouds_are_filled_part_by_part_bit_identically(noise, monkeypatch):
     for mixture in ("fitted", "exact"):
         whole, said = marker(noise, mixture=mixture).cloud, []
         with monkeypatch.context() as patched:

@@ -86,7 +86,7 @@ def test_trees_need_no_search(monkeypatch):
     assert keep_right.sum() == n - n // 3
 
 
-def test_threads_leave_the_limit_alone():
+def test_threads_keep_the_limit():
     limit = sys.getrecursionlimit()
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda n: maximum_independent_set(n, n, *path(n)), [3000, 2000, 1500, 2500]))

@@ -99,7 +99,7 @@ def test_qr_capacity_is_exact(version, level):
         bits_of(parse_spec(f"qr-v{version}-{level}:{'x' * (room + 1)}"))
 
 
-def test_a_version_higher_than_needed_is_kept():
+def test_a_version_higher_than_needed_is_used():
     assert bits_of(parse_spec("qr-v22-L:hello"))[1].shape == (105, 105)
 
 

@@ -58,7 +58,7 @@ CURVED = (
 )
 
 
-def test_rectangles_cover_what_is_drawn_and_no_more(tmp_path):
+def test_rectangles_cover_exactly_the_drawing(tmp_path):
     """Circles, obtuse and acute corners, a sliver thinner than a module, of either colour at an edge."""
     made = drawn(tmp_path, CURVED, quiet_zone=2)
     rectangles = np.array(shapely.polygons(rotated(made.boxes, made.boxes, made.angles)))
@@ -115,7 +115,7 @@ def test_fill_rules():
 
 
 @pytest.mark.parametrize("body", ["", '<circle r="0"/>', '<rect x="50" width="9" height="9"/>'])
-def test_a_sheet_on_which_nothing_is_seen(tmp_path, body):
+def test_a_sheet_on_which_nothing_is_visible(tmp_path, body):
     assert len(drawn(tmp_path, body).boxes) == 1
     hidden = '<circle cx="9" cy="9" r="5" fill="red"/><rect width="40" height="20" fill="blue"/>'
     assert len(drawn(tmp_path, hidden).boxes) == 1
@@ -210,7 +210,7 @@ def test_circles():
         ("<g>" * 200 + "</g>" * 200, "nested at most 100 deep"),
     ],
 )
-def test_what_cannot_be_drawn_as_it_looks_is_refused(tmp_path, body, says):
+def test_unsupported_drawings_are_refused(tmp_path, body, says):
     with pytest.raises(fs.InputError) as error:
         drawn(tmp_path, body)
     assert says in str(error.value)
@@ -241,7 +241,7 @@ def test_files_that_are_no_drawings(tmp_path):
             parse_spec(text)
 
 
-def test_a_drawing_in_a_scene_file_is_beside_it(tmp_path):
+def test_a_drawing_in_a_scene_file_is_next_to_it(tmp_path):
     made = drawn(tmp_path, '<rect width="20" height="20" fill="red"/>')
     fs.Scene(markers=[PlacedMarker(made)]).save(tmp_path / "scene.toml")
     assert 'spec = "svg-40:sign.svg"' in (tmp_path / "scene.toml").read_text()
@@ -282,7 +282,7 @@ def test_colours_have_the_names_of_css():
     }
 
 
-def test_what_is_not_seen_is_not_drawn(tmp_path):
+def test_invisible_shapes_are_not_rendered(tmp_path):
     made = drawn(
         tmp_path,
         '<g visibility="hidden"><rect width="5" height="5"/><rect x="9" width="5" height="5" '

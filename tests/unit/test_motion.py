@@ -178,7 +178,7 @@ def test_scene_files_say_what_moves(tmp_path):
         np.testing.assert_allclose(moved @ [0.1, 0, 0, 1], [0.9, 0, 0, 1], atol=1e-12)
 
 
-def test_a_marker_moves_from_where_it_is_drawn(tmp_path):
+def test_a_marker_moves_from_where_it_is_rendered(tmp_path):
     """Its own pose is where its splats lie in the cloud; the motion takes it from there."""
     text = SCENE.replace("size = 0.2", "size = 0.2\nposition = [0.0, 3.0, 0.0]")
     (tmp_path / "a.toml").write_text(text)

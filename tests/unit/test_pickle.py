@@ -166,7 +166,7 @@ def test_a_renderer_is_refused_in_a_fork(device):
     assert ends("fork", is_refused, read.__getitem__, "rgb") == 2  # a copy in memory is everybody's
 
 
-def test_a_driver_that_a_fork_left_without_threads_is_not_asked():
+def test_a_driver_that_a_fork_left_without_threads_is_not_used():
     fs.Renderer("opencl")
     for use in ((fs.Renderer, "opencl"), (fs.devices,)):
         assert ends("fork", is_refused, *use) == ONE_LINE

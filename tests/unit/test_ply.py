@@ -285,7 +285,7 @@ def test_two_scales_cannot_hold_an_ellipsoid(tmp_path):
 
 
 @pytest.mark.parametrize("thin", range(3))
-def test_an_axis_of_0_is_flat_and_one_of_nan_is_no_splat(tmp_path, thin):
+def test_an_axis_of_0_is_flat_and_one_of_nan_is_not_a_splat(tmp_path, thin):
     scales = np.array([[1, 1, 1], [1, np.nan, 1], [1, 1, np.inf], [np.nan, 0, 1], [1, 1, 1]], float)
     scales[0, thin] = 0
     path = three_scales(tmp_path, np.ones((5, 4)), scales)

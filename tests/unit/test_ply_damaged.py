@@ -200,7 +200,7 @@ def sparse(path, content, rows=ROWS, good=0):
 
 
 @pytest.mark.parametrize("good", [0, 100])
-def test_memory_follows_what_is_kept(tmp_path, content, good, monkeypatch):
+def test_memory_grows_with_valid_splats(tmp_path, content, good, monkeypatch):
     """Of rows that are no splats, however many, only a window is in memory at a time."""
     monkeypatch.setattr(collect, "_INITIAL_CAPACITY", 1000)
     monkeypatch.setattr(collect, "WINDOW", 20_000)
@@ -229,7 +229,7 @@ def test_arrays_that_grow_while_a_file_is_read(tmp_path, content, monkeypatch):
             assert np.array_equal(getattr(read, name), getattr(whole, name)), name
 
 
-def test_progress_is_told(tmp_path, content, monkeypatch):
+def test_progress_is_reported(tmp_path, content, monkeypatch):
     monkeypatch.setattr(collect, "WINDOW", 128)
     path, said = tmp_path / "good.ply", []
     path.write_bytes(content)

@@ -150,7 +150,7 @@ def test_kernels_of_warp_are_checked_too(tmp_path):
     assert all(path.is_file() for path in folder.rglob("*.meta"))
 
 
-def test_a_damaged_record_of_checksums_is_made_again(full_cache, tmp_path):
+def test_a_damaged_record_of_checksums_is_regenerated(full_cache, tmp_path):
     folder = tmp_path / "cache"
     shutil.copytree(full_cache[0], folder)
     record, files = folder / "fidsplat-checksums.json", compiled(folder)
@@ -192,7 +192,7 @@ def test_the_cache_is_where_pocl_looks(monkeypatch, tmp_path):
     assert pocl_folder() == tmp_path / "mine"
 
 
-def test_what_another_process_is_about_to_finish_is_left_alone(tmp_path):
+def test_what_another_process_is_about_to_finish_is_unchanged(tmp_path):
     unfinished, broken = tmp_path / "tempfile_ab12cd.so", tmp_path / "blend.so"
     for file in (unfinished, broken):
         file.write_bytes(b"")

@@ -18,7 +18,7 @@ def test_a_still_capture_is_prepared_once_for_each_cloud():
     assert prepare(first, capture)[1] is not prepare(first, fs.Capture(CAMERA))[1]
 
 
-def test_what_moves_is_asked_again():
+def test_motions_are_evaluated_again():
     poses = iter(range(9))
 
     def stepping(time):

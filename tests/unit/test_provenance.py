@@ -74,7 +74,7 @@ class Resting:
 
 
 @pytest.mark.parametrize("pose", [resting, partial(resting), Resting(), Resting().__call__])
-def test_what_is_known_by_its_name_alone_has_no_digest(pose):
+def test_what_is_known_by_name_only_has_no_digest(pose):
     with pytest.raises(pickle.PicklingError, match="a function, not data"):
         provenance.digest_of(fs.Capture(motion=Motion(pose)))
 

@@ -36,7 +36,7 @@ def test_the_visible_share_counts_the_labels_inside_the_outline(scene):
     assert visible(placed, camera, np.zeros_like(label)).share == 0.0
 
 
-def test_what_is_outside_the_picture_or_turned_away_is_not_visible(scene):
+def test_what_is_outside_the_image_or_facing_away_is_not_visible(scene):
     placed = scene.markers[0]
     camera = demo_views()["frontal"]
     half = fs.Camera.pinhole(
@@ -114,7 +114,7 @@ def test_the_outline_of_a_marker_that_is_not_square(spec):
     assert visible(placed, camera).share == pytest.approx(1.0)
 
 
-def test_what_the_pictures_edge_cuts_off():
+def test_what_the_images_edge_cuts_off():
     """Half of a tag that is seen straight on; a tag that reaches behind the camera; one that is seen from
     behind."""
     placed, straight = outlined(position=(0, 0, -1))
@@ -199,7 +199,7 @@ def test_the_truth_is_where_the_frames_own_capture_had_camera_and_markers(render
     assert reading.position_error > 0.1
 
 
-def test_a_pickled_frame_is_made_again_by_its_capture(renderer):
+def test_a_pickled_frame_is_regenerated_by_its_capture(renderer):
     """Of a rolling shutter too, all of whose poses come along; of other times it says that it has none."""
     placed, camera = outlined()
     scene = fs.Scene(markers=[placed], camera=camera)
@@ -238,7 +238,7 @@ def test_markers_that_face_away_or_lie_outside_are_not_missed(tmp_path, monkeypa
         assert words in row
 
 
-def test_pictures_that_cannot_be_read_back():
+def test_images_that_cannot_be_read_back():
     scene, picture = fs.Scene(markers=[outlined()[0]]), np.zeros((240, 320, 3), np.uint8)
     with pytest.raises(fs.InputError, match="the scene must have a camera, got none; give camera="):
         read_back(picture, scene)

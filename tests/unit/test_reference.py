@@ -36,7 +36,7 @@ def clouds():
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("kind", clouds())
-def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camera, kind):
+def test_a_splat_that_is_left_out_of_a_tile_is_not_visible_there(monkeypatch, camera, kind):
     shares = []
 
     def counted(setup, view, x, y):
@@ -59,7 +59,7 @@ def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camer
     assert np.mean(shares) < 0.8
 
 
-def test_pixels_that_are_far_apart_are_those_of_the_whole_picture(monkeypatch):
+def test_pixels_that_are_far_apart_are_those_of_the_whole_image(monkeypatch):
     """Splats are chosen for many of them together."""
     monkeypatch.setattr(backend, "_BLOCK", 1000)
     chosen, choose = [], backend.may_contribute
@@ -77,7 +77,7 @@ def test_pixels_that_are_far_apart_are_those_of_the_whole_picture(monkeypatch):
 
 
 @pytest.mark.parametrize("exposed", [False, True])
-def test_every_third_pixel_is_that_of_the_whole_picture(monkeypatch, exposed):
+def test_every_third_pixel_is_that_of_the_whole_image(monkeypatch, exposed):
     monkeypatch.setattr(backend, "_BLOCK", 500)
     motion = fs.Motion(lambda time: rigid_matrix((time, 0, 0)))
     shutter = fs.Shutter(exposure_time=0.1, sub_poses=2, readout=0.1, rows_per_band=8)
@@ -99,7 +99,7 @@ def test_every_third_pixel_is_that_of_the_whole_picture(monkeypatch, exposed):
     assert renderer.render_every(100, cloud, capture)["label"].shape == (1, 1)
 
 
-def test_what_cannot_be_drawn_in_part():
+def test_partial_frames_that_cannot_be_rendered():
     camera = fs.Camera.look_at(20, 16, 1.0, (0, 0, -2), (0, 0, 0))
     with pytest.raises(fs.InputError, match=r"step must be .* got 0"):
         fs.Renderer("reference").render_every(0, random_splats(4, 3), camera)

@@ -113,7 +113,7 @@ def test_items_reach_workers_and_results_come_back(cluster):
     assert cluster.shut == 1
 
 
-def test_one_machine_is_no_address(cluster):
+def test_one_machine_is_not_an_address(cluster):
     with ray_engine("local", work(str), workers=7) as engine:
         assert cluster.address is None
         assert engine.workers == 7

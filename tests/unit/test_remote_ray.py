@@ -34,7 +34,7 @@ def flight() -> Flight:
     return Flight(scene, path, np.linspace(0, 1, VIEWS), scene.capture)
 
 
-def test_a_worker_that_is_killed_costs_no_picture_and_none_is_drawn_twice(tmp_path):
+def test_a_worker_that_is_killed_costs_no_image_and_none_is_rendered_twice(tmp_path):
     flown = flight()
     with ray_engine("local", FlightWork(flown, "reference"), workers=3) as engine:  # of two cores
         folder = FlightFolder(tmp_path / "many", flown, engine.title)
@@ -71,7 +71,7 @@ def test_what_a_device_refuses_is_said_once(tmp_path):
         pass
 
 
-def test_the_command_draws_by_workers(tmp_path, monkeypatch, capsys):
+def test_the_command_renders_by_workers(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(
         "[camera]\nwidth = 16\nheight = 12\nfov_x_deg = 60.0\nposition = [0.0, 0.0, -1.0]\n"

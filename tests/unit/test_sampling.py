@@ -31,14 +31,14 @@ def kept(marks_of):
     return [item.name for item in items if "exhaustive" not in item.marks and item.name[:3] != "gpu"], items
 
 
-def test_each_case_runs_on_one_device_in_turn_and_on_every_gpu():
+def test_each_case_runs_on_one_device_round_robin_and_on_every_gpu():
     names, items = kept(lambda case: [in_turn().mark])
     assert names == ["one-0", "one-2", "one-4", "two-1", "two-3"]
     assert not any("exhaustive" in item.marks for item in items[10:])
     assert kept(lambda case: [in_turn(1).mark])[0] == ["one-1", "one-3", "two-0", "two-2", "two-4"]
 
 
-def test_what_is_left_out_anyway_has_no_turn():
+def test_what_is_left_out_anyway_is_not_scheduled():
     rest = pytest.mark.exhaustive.mark
     assert kept(lambda case: [in_turn().mark] + [rest] * (case % 2))[0] == ["one-0", "one-4", "two-2"]
 

@@ -64,7 +64,7 @@ def test_quaternions_of_many_matrices_are_those_of_each():
         assert np.abs(np.abs(one @ matrix_to_quaternion(turn)) - 1) < 1e-14
 
 
-def test_an_environment_has_the_same_bits_alone_and_among_others(scene):
+def test_an_environment_is_bit_identical_in_any_batch(scene):
     rig = a_rig(scene, fs.Renderer("opencl:pocl"))
     poses = some_poses(3)
     many = rig.render(poses)
@@ -134,7 +134,7 @@ def test_arrays_in_the_rigs_order_say_the_same_as_names(rig):
     assert rig.render(stacked)["rgb"].tobytes() == rig.render(poses)["rgb"].tobytes()
 
 
-def test_a_camera_that_is_given_a_pose_stands_there_whatever_carries_it(rig):
+def test_a_camera_that_is_given_a_pose_has_it_on_any_body(rig):
     poses = some_poses(1)
     pictures = rig.render(poses, {"mounted": [[0, 0, 0, 1, 0, 0, 0]]})
     assert pictures["rgb"][0, 1].tobytes() == pictures["rgb"][0, 0].tobytes()
@@ -175,7 +175,7 @@ def test_each_environment_has_its_own_external_depth_image(scene):
         rig.render({"box": box}, external_depths=[near, far])
 
 
-def test_masked_environments_are_not_drawn(rig):
+def test_masked_environments_are_not_rendered(rig):
     poses = some_poses(2)
     pictures = rig.render(poses, mask=np.array([False, True]))
     assert not pictures["rgb"][0].any()

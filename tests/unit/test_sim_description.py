@@ -89,7 +89,7 @@ def test_a_sensor_looks_along_its_x_with_z_up(world):
     assert camera.project([[0, 0.1, 1.0]])[0, 0] < 32  # its y is to the left
 
 
-def test_roll_pitch_and_yaw_turn_about_the_fixed_axes(world):
+def test_roll_pitch_and_yaw_rotate_about_the_fixed_axes(world):
     found = read_description(world, [world.parent / "models"])
     r, p, y = 0.1, 0.2, 0.3
     turns = [

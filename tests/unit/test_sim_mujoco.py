@@ -90,7 +90,7 @@ def test_a_tag_is_read_where_mujoco_says_it_is(model, rig):
 
 
 @pytest.mark.parametrize("name", ["front", "lens", "plain", "above"])
-def test_intrinsics_are_those_that_mujoco_draws_with(model, name):
+def test_intrinsics_are_those_that_mujoco_renders_with(model, name):
     """Against the frustum of MuJoCo's own renderer, which needs no window."""
     from fidsplat.sim.mujoco import camera_of
 
@@ -126,7 +126,7 @@ def test_what_a_camera_of_the_model_says_of_itself(model):
     assert isinstance(above.camera.lens, Orthographic)
 
 
-def test_outputs_of_the_model_are_what_is_drawn(model, rig):
+def test_outputs_of_the_model_are_what_is_rendered(model, rig):
     pictures = rig.render(moved(model, 0))
     depth = pictures.of("front")["depth"]
     assert depth.shape == (1, 240, 320)
@@ -170,7 +170,7 @@ class Worlds:
             setattr(self, name, OnDevice(np.stack(arrays)))
 
 
-def test_batched_data_stands_where_its_worlds_do(model, rig):
+def test_batched_data_has_the_poses_of_its_worlds(model, rig):
     states = [moved(model, seed) for seed in (4, 5, 6)]
     for batched, single in zip(rig.poses(Worlds(states, model)), rig.poses(states), strict=True):
         assert batched.shape == single.shape
@@ -243,7 +243,7 @@ def test_gymnasium_observes_what_the_cameras_see(model, scene):
     assert near[0] - near[1] == pytest.approx(0.1, abs=0.01)
 
 
-def test_the_ten_lines_of_the_pages_draw_a_tag_that_is_read():
+def test_the_ten_lines_of_the_pages_render_a_tag_that_is_read():
     root, names = Path(__file__).resolve().parents[2], {}
     readme, page = (
         re.search(r"```python\n(import mujoco.*?)```", (root / name).read_text("utf-8"), re.DOTALL)[1]

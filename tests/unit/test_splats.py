@@ -234,7 +234,7 @@ def test_a_splat_that_is_left_out_has_no_say_in_the_origin():
         assert np.allclose(fs.SplatCloud(**given).origin, origin, atol=10)
 
 
-def test_given_origin_is_kept_and_means_are_relative_to_it():
+def test_given_origin_is_used_and_means_are_relative_to_it():
     given = parts()
     cloud = fs.SplatCloud(**given, origin=[5e5, 4.5e6, 300])
     assert np.array_equal(cloud.means, given["means"])

@@ -41,7 +41,7 @@ def test_a_third_scale_of_0_throughout_is_none():
     assert cloud_of(thickness=0).ellipsoids == "none"
 
 
-def test_a_thickness_below_0_or_not_finite_is_no_splat():
+def test_a_thickness_below_0_or_not_finite_is_not_a_splat():
     with pytest.warns(UserWarning, match="3 of 6 splats left out"):
         cloud = cloud_of(thickness=[0, -1, 2, np.nan, 3, np.inf])
     assert cloud.thickness.tolist() == [0, 2, 3]
@@ -99,7 +99,7 @@ def test_of_equal_axes_the_third_is_lost_and_disks_stay_as_they_are():
     assert flat.flattened() is flat
 
 
-def test_an_ellipsoid_is_no_box_and_lies_in_no_plane():
+def test_an_ellipsoid_is_not_a_box_and_has_no_coplanar_group():
     cloud = cloud_of(thickness=[0, 1, 1, 1, 1, 1])
     first = np.arange(6) == 0
     assert cloud.with_boxes(first).boxes.tolist() == first.tolist()

@@ -58,12 +58,12 @@ def test_quaternions_and_matrices_agree(a, b):
 
 
 @pytest.mark.parametrize("axis", np.eye(3))
-def test_half_turns_have_quaternions(axis):
+def test_rotations_by_180_degrees_have_quaternions(axis):
     turn = 2 * np.outer(axis, axis) - np.eye(3)
     np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(turn)), turn, atol=1e-15)
 
 
-def test_an_origin_is_scaled_turned_and_moved():
+def test_an_origin_is_scaled_rotated_and_moved():
     local = cloud_of()
     cloud = fs.SplatCloud(
         local.means, local.quats, local.scales, local.opacities, sh=local.sh, origin=[9, 0, -4]
@@ -93,7 +93,7 @@ def test_transform_moves_centres_and_covariances(turn, move, scale):
 
 @given(quaternion, vector, st.floats(0.1, 10), vector, st.integers(0, 3))
 @settings(max_examples=60, deadline=None)
-def test_transform_turns_the_colours_with_the_splats(turn, move, scale, eye, degree):
+def test_transform_rotates_the_colours_with_the_splats(turn, move, scale, eye, degree):
     matrix = rigid_matrix(move, turn, scale)
     before = cloud_of(degree=degree)
     moved_eye = matrix[:3, :3] @ np.array(eye) + move
@@ -253,7 +253,7 @@ def test_unknown_degree():
 
 @given(quaternion)
 @settings(max_examples=30)
-def test_turning_coefficients_keeps_bands_apart_and_lengths(turn):
+def test_rotating_coefficients_keeps_bands_apart_and_lengths(turn):
     rotation = quaternion_to_matrix(np.array(turn))
     matrix = rotation_of_coefficients(3, rotation)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(16), atol=1e-10)

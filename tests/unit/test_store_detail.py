@@ -314,7 +314,7 @@ def test_an_error_bound_allows_levels_of_detail(store, renderer):
     assert np.array_equal(exact, reference_image(renderer, store.cloud(), capture))
 
 
-def test_an_error_that_levels_of_detail_exceed_is_kept_without_them(store, renderer):
+def test_an_error_that_levels_of_detail_exceed_is_met_without_them(store, renderer):
     """Measured errors hold for measured views; here they are wrong for all."""
     copy = fs.Store(store.path)
     copy.detail_errors = [measured(level, (4.0,), (1e-9,)) for level in range(1, copy.levels + 1)]

@@ -19,7 +19,7 @@ def test_every_predefined_dictionary_of_opencv_is_known():
 
 
 @pytest.mark.parametrize("family", families())
-def test_bits_are_the_printed_picture(family):
+def test_bits_are_the_printed_image(family):
     kind, _ = parse_family(family)
     size, count = families()[family]
     for tag_id in (0, count - 1):

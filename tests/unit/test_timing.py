@@ -26,7 +26,7 @@ def timers(order, *seconds):
     return [Timer(work(k, iter(given)), clock, catch_errors=True) for k, given in enumerate(seconds)]
 
 
-def test_turns_alternate_and_warm_up_does_not_count():
+def test_timers_alternate_and_warm_up_is_not_timed():
     order, ticks = [], []
     one, other = timers(order, [9, 1, 2, 3, 4], [9, 2, 2, 2, 2])
     time_interleaved([one, other], 4, warm_up=1, tick=lambda: ticks.append(1))
@@ -55,7 +55,7 @@ def test_what_fails_catch_errors_or_raises():
 
 
 @pytest.mark.parametrize(("least", "done"), [(3, 3), (None, 10), (20, 10)])
-def test_no_more_than_the_least_once_time_is_up(least, done):
+def test_only_the_minimum_once_time_is_up(least, done):
     (timer,) = timers([], [0.001] * 12)
     time_interleaved([timer], 10, min_rounds=least, seconds=0.0)
     assert len(timer.ms) == done

@@ -78,7 +78,7 @@ def toy(tmp_path, monkeypatch):
     return fs.Renderer("toy")
 
 
-def test_it_is_listed_and_draws(toy):
+def test_it_is_listed_and_renders(toy):
     assert "toy" in [info.name for info in registry.devices()]
     capture = fs.Capture(CAMERA, ("rgb", "alpha"), "fast,samples=2", (0.25, 0.5, 1.0))
     resident = toy.upload(CLOUD)

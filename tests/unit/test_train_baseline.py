@@ -32,7 +32,7 @@ def test_the_baseline_of_a_marker(folder, tmp_path, monkeypatch):
     assert first.read_bytes() != other.read_bytes()
 
 
-def test_the_baseline_trained_anew_forgets_what_was_stopped(folder, tmp_path, monkeypatch):
+def test_the_baseline_trained_again_forgets_what_was_stopped(folder, tmp_path, monkeypatch):
     from fidsplat.experiments import trained
 
     monkeypatch.setattr(trained, "write_scene", lambda *_: folder)

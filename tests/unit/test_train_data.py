@@ -74,7 +74,7 @@ def test_a_model_of_pycolmap_is_read_as_pycolmap_reads_it(folder):
     assert len(ours.points) == len(theirs.points3D)
 
 
-def test_what_colmap_found_in_its_pictures_is_passed_over(folder):
+def test_colmaps_keypoints_are_skipped(folder):
     """Two points in each, which our own files have none of, as text and as binary."""
     model = folder / "sparse/0"
     before = load_colmap(model)
@@ -151,7 +151,7 @@ def test_points_as_text(made, tmp_path):
             load_dataset(folder)
 
 
-def test_pictures_of_colmap_are_read_as_they_are_stored(made, folder):
+def test_images_of_colmap_are_read_as_they_are_stored(made, folder):
     """Not turned as EXIF says; what is transparent shows the background; 16 bits are cut to 8."""
     import cv2
 

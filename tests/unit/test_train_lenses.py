@@ -108,7 +108,7 @@ def test_what_lenses_took_is_flat(folder, tmp_path, model):
         np.testing.assert_array_equal(ours.mask, theirs.mask)
 
 
-def test_a_lens_that_sees_all_of_a_flat_picture_leaves_no_mask():
+def test_a_lens_that_sees_all_of_a_flat_image_leaves_no_mask():
     view = scene(count=6).views[0]
     camera = replace(view.camera, lens=BROWN(k1=-0.01))
     assert undistorted_view("a.png", camera, view.image, None).mask is None

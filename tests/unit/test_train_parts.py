@@ -113,7 +113,7 @@ def test_the_loss_is_what_its_definition_says():
     np.testing.assert_allclose(blurred(np.ones((30, 30, 1)))[15, 15], 1)
 
 
-def test_a_value_that_is_not_finite_is_seen_unless_it_is_masked():
+def test_a_value_that_is_not_finite_is_detected_unless_it_is_masked():
     image, truth = pictures()
     image[3, 4, 1] = np.nan
     assert np.isnan(image_loss(image, truth, None, 0.2)[0].value)
@@ -142,7 +142,7 @@ def test_adam_takes_the_step_that_is_written_out():
         np.testing.assert_allclose(splats.second[name], v, rtol=1e-5)
 
 
-def test_coefficients_that_were_not_drawn_stay():
+def test_coefficients_that_were_not_rendered_stay():
     splats = splats_of(5, degree=2)
     before = splats.values["sh"].copy()
     gradients = splats_of(5, seed=1, degree=1).values
@@ -206,7 +206,7 @@ def test_philox_gives_what_its_authors_print():
         assert tuple(philox(np.array([counter], np.uint32), key)[0]) == answer
 
 
-def test_random_numbers_are_of_their_splat_iteration_and_purpose_alone():
+def test_random_numbers_are_of_their_splat_iteration_and_purpose_only():
     few, many = (uniform(5, Purpose.SPLITS, 100, count) for count in (10, 1000))
     np.testing.assert_array_equal(few, many[:10])
     others = [(6, Purpose.SPLITS, 100), (5, Purpose.NOISE, 100), (5, Purpose.SPLITS, 101)]

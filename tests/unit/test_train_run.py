@@ -83,7 +83,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_pa
     assert sha(tmp_path / "scene.ply") == sha(whole[3])
 
 
-def test_a_picture_that_had_too_little_room_is_drawn_again(whole, dataset, tmp_path):
+def test_a_frame_that_exceeds_its_capacity_is_rendered_again(whole, dataset, tmp_path):
     """A device that did not wait finds out when it takes the picture back: the run gives the same bytes."""
     trainer, refused = Trainer(dataset, whole[0].renderer, iterations=ITERATIONS, **QUICK), []
     differentiate = trainer._differentiate
@@ -125,7 +125,7 @@ def test_a_run_that_ends_where_opacities_fall_keeps_its_own(whole, dataset, tmp_
     assert sha(tmp_path / "scene.ply") == sha(whole[3])
 
 
-def test_a_run_that_begins_again_keeps_the_old_checkpoint_until_it_has_its_own(dataset, tmp_path):
+def test_a_run_that_restarts_keeps_the_old_checkpoint_until_it_has_its_own(dataset, tmp_path):
     file, renderer = tmp_path / "scene.training.npz", fs.Renderer("reference")
     Trainer(dataset, renderer, iterations=2, checkpoint=file, **QUICK).run()
     kept = sha(file)
@@ -426,7 +426,7 @@ def test_memory_bounds_the_number_of_splats(dataset):
         splats_within(TrainSettings(), 1000, dataset)
 
 
-def test_scores_are_those_of_the_pictures_that_are_drawn(whole, dataset):
+def test_scores_are_those_of_the_rendered_images(whole, dataset):
     score = whole[0].evaluate()[0]
     difference = score.image / 255.0 - dataset.held_out[0].image / 255.0
     assert score.psnr == pytest.approx(-10 * np.log10((difference**2).mean()))

@@ -100,7 +100,7 @@ def test_samples_are_taken_at_a_rate():
         (lambda: some().sampled(1e9), "more than 10,000,000; give a lower rate"),
     ],
 )
-def test_what_is_no_trajectory(make, words):
+def test_values_that_are_not_a_trajectory(make, words):
     with pytest.raises(fs.InputError, match=words):
         make()
 

@@ -65,7 +65,7 @@ def test_a_marker_is_where_it_was_put(truth):
     assert 1 - tag.visible == pytest.approx((71 - left) / (right - left), abs=0.02)
 
 
-def test_a_marker_that_is_seen_from_behind_is_tilted_by_more_than_a_right_angle(scene, frame):
+def test_a_marker_that_is_viewed_from_behind_is_tilted_by_more_than_a_right_angle(scene, frame):
     behind = fs.Camera.look_at(*SIZE, 1.0, (0, 0, 4), (0, 0, 1.5))
     (tag,) = truth_of(frame, scene, behind).markers
     assert tag.tilt == pytest.approx(math.pi - 2 * math.atan(0.15))
@@ -121,7 +121,7 @@ def test_flow_that_cannot_be(frame, scene):
         points_of(frame["depth"][1:], scene.camera)
 
 
-def test_truth_of_a_picture_of_another_size(scene, frame):
+def test_truth_of_an_image_of_another_size(scene, frame):
     with pytest.raises(fs.InputError, match="must have the camera's size, 80 x 60 pixels, got 160 x 120"):
         truth_of(frame, scene, fs.Camera.pinhole(80, 60, 50, 50, 40, 30))
     with pytest.raises(fs.InputError, match="the scene must have a camera, got none; give camera="):
@@ -176,7 +176,7 @@ def test_a_camera_of_bop_is_where_ours_is(tmp_path, scene, renderer):
     np.testing.assert_allclose(1000 * tag.corners @ turn.T + move, by_marker, atol=1e-9)
 
 
-def test_bop_has_what_its_format_asks_for(tmp_path, truth, frame, scene):
+def test_bop_follows_its_format(tmp_path, truth, frame, scene):
     folder = tmp_path / "set/train/000000"
     with BopScene(folder) as ours:
         ours.add(frame, truth)

@@ -68,7 +68,7 @@ def test_only_what_moves_has_a_shutter():
     assert not settings.capture(scene(), HERE.camera(scene())).exposed
 
 
-def test_a_moving_picture_has_coarser_constants_and_its_colours_alone():
+def test_a_moving_frame_has_coarser_constants_and_its_colours_only():
     settings, camera = Settings.of(scene()), HERE.camera(scene())
     moving, rest = settings.moving(scene(), camera), settings.capture(scene(), camera)
     assert moving.outputs == ("rgb",)
@@ -82,7 +82,7 @@ def test_a_moving_picture_has_coarser_constants_and_its_colours_alone():
     assert fine == expected.with_(order=fine.order, marker=fine.marker)
 
 
-def test_a_picture_is_that_of_the_renderer(session):
+def test_an_image_equals_the_renderers(session):
     view = session.render(HERE)
     camera = fs.Camera.look_at(48, 36, 2 * math.atan(48 / 36 * math.tan(0.4)), (0, 0, -1), (0, 0, 0))
     frame = fs.Renderer("reference").render(scene(), camera, outputs=AT_REST)
@@ -112,7 +112,7 @@ def test_settings_and_scenes_are_exchanged(session):
     assert messages == [None, None]
 
 
-def test_what_cannot_be_drawn_changes_nothing(session):
+def test_invalid_frames_change_nothing(session):
     messages = []
     state = session.state
     for wrong in ({"device": "opencl:nowhere"}, {"quality": "best"}, {"fog": -1.0, "exposure": -1.0}):
@@ -148,7 +148,7 @@ def test_a_switch_never_blocks(session, monkeypatch):
     assert changed == [0.5]
 
 
-def test_numbers_alone_open_no_renderer(session, monkeypatch):
+def test_numbers_open_no_renderer(session, monkeypatch):
     session.request(settings=replace(session.state.settings, fog=0.5))
     assert session.settle()
     monkeypatch.setattr(session_module, "Renderer", None)

@@ -54,7 +54,7 @@ def test_the_mark_of_an_editor_stays():
     ("text", "number"),
     [(FILE, 2), ('markers = [{spec = "a", size = 1.0}]\n', 0), ("x = '''\n[[markers]]\n'''", 0), ("[", 0)],
 )
-def test_a_file_that_is_written_otherwise_is_left_alone(text, number):
+def test_a_file_that_is_written_otherwise_is_unchanged(text, number):
     with pytest.raises(fs.InputError, match=rf"s.toml: marker {number} must be a plain .*write position"):
         with_pose(text, number, POSE, "s.toml")
 

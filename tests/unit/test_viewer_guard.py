@@ -46,7 +46,7 @@ def test_a_server_that_is_not_guarded_is_stopped():
     assert stopped == [True]
 
 
-def test_a_port_in_use_is_said():
+def test_a_port_in_use_is_reported():
     from fidsplat.viewer.server import check_port
 
     with socket.socket() as other:
@@ -63,7 +63,7 @@ def test_a_port_in_use_is_said():
             check_port("127.0.0.1", none)
 
 
-def test_a_port_that_another_takes_meanwhile_is_said(monkeypatch):
+def test_a_port_that_another_takes_meanwhile_is_reported(monkeypatch):
     """Between the check and viser, which would silently use the next port."""
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     from fidsplat.viewer import server
@@ -92,7 +92,7 @@ def test_a_port_that_another_takes_meanwhile_is_said(monkeypatch):
         ("a..b", "--host must be an address of this machine"),
     ],
 )
-def test_a_host_that_is_none_of_ours_is_said(host, words):
+def test_an_unknown_host_is_reported(host, words):
     from fidsplat.viewer.server import check_port
 
     with pytest.raises(fs.InputError, match=words):

@@ -118,7 +118,7 @@ def test_texts_of_a_scene_are_no_markup(viewer, monkeypatch):
     is_text(viewer._controls.status.content, f"**{shown}**")
 
 
-def test_the_page_runs_its_own_scripts_alone(viewer):
+def test_the_page_runs_its_own_scripts_only(viewer):
     with urllib.request.urlopen(viewer.address) as answer:
         policy, page = answer.headers["Content-Security-Policy"], answer.read().decode()
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
@@ -159,7 +159,7 @@ def test_a_camera_that_is_none_does_not_end_a_stream(viewer):
     assert 0.15 < far.sum() / near.sum() < 0.35, "the image after the move: a quarter of the area"
 
 
-def test_what_a_button_cannot_do_is_said(viewer, monkeypatch):
+def test_what_a_button_cannot_do_is_reported(viewer, monkeypatch):
     client = Client()
     viewer._messages[1] = client.said
     viewer.detect_markers(client)
@@ -381,7 +381,7 @@ def test_keyframes_do_not_take_the_place_of_another_file(viewer, tmp_path):
     assert len(list(tmp_path.glob("*.tum"))) == 2
 
 
-def test_a_trajectory_stands_there_as_keyframes(tmp_path):
+def test_a_trajectory_is_shown_as_keyframes(tmp_path):
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     from fidsplat.viewer.server import Viewer
 

@@ -78,7 +78,7 @@ def test_a_scene_file_that_is_edited_keeps_the_quality_that_was_given(flight, mo
     assert (scene.markers[0].marker.size, scene.capture.quality.samples) == (0.2, 2)
 
 
-def test_what_is_no_run_is_said(flight, capsys):
+def test_paths_that_are_not_runs_are_reported(flight, capsys):
     (flight.parents[1] / "scene.toml").unlink()
     for folder, words in (
         (flight, "the scene of the flight"),
@@ -103,7 +103,7 @@ def trainer(tmp_path_factory):
     return made
 
 
-def test_a_checkpoint_holds_what_is_drawn(trainer):
+def test_a_checkpoint_holds_what_is_rendered(trainer):
     cloud, background = splats_of(trainer.checkpoint)
     assert background == BACKGROUND
     expected = trainer.cloud()

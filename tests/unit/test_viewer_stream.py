@@ -36,7 +36,7 @@ def at(x) -> Viewpoint:
     return replace(HERE, position=(x, 0.0, 0.0))
 
 
-def test_the_newest_viewpoint_then_one_exact_picture_then_nothing():
+def test_the_newest_viewpoint_then_one_exact_frame_then_nothing():
     stream, clock, rendered = looked_at()
     assert stream.step() is None  # no viewpoint yet
     for x in (1.0, 2.0, 3.0):
@@ -84,7 +84,7 @@ def test_the_scale_has_an_end():
     assert pace.step_scale == 1.0
 
 
-def test_a_picture_that_fails_is_told_and_the_stream_goes_on():
+def test_an_image_that_fails_is_reported_and_the_stream_continues():
     messages = []
 
     def refused(*_):
@@ -97,7 +97,7 @@ def test_a_picture_that_fails_is_told_and_the_stream_goes_on():
     assert stream.step() is not None
 
 
-def test_a_picture_that_is_too_large_for_the_memory_is_told():
+def test_a_frame_that_exceeds_the_memory_is_reported():
     messages: list[str] = []
 
     def fail(*_):
@@ -109,7 +109,7 @@ def test_a_picture_that_is_too_large_for_the_memory_is_told():
     assert messages == ["not enough memory for this image"]
 
 
-def test_a_picture_is_sent_while_the_next_is_drawn_and_before_the_exact_one():
+def test_a_frame_is_sent_while_the_next_is_rendered_and_before_the_exact_one():
     done, rendered, clock = [], [], Clock()
     next_is_drawn = threading.Event()
 
@@ -134,7 +134,7 @@ def test_a_picture_is_sent_while_the_next_is_drawn_and_before_the_exact_one():
     assert done == [0, 1, 2, "exact"]
 
 
-def test_what_goes_wrong_while_a_picture_is_sent_is_told():
+def test_errors_of_sending_a_frame_are_reported():
     messages = []
 
     def send():

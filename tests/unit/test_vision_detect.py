@@ -67,7 +67,7 @@ def test_qr_codes_are_read_and_their_corners_serve_a_pose(length, pixels, tilt, 
 
 
 @pytest.mark.parametrize("aside", [True, False])
-def test_a_steep_qr_code_is_read_by_stretching_the_picture(aside):
+def test_a_steep_qr_code_is_read_by_stretching_the_image(aside):
     camera = Camera.pinhole(640, 640, 2400, 2400, 320, 320)
     picture, corners, _ = seen(qr_bits("a" * 20), 350, tilt=80, quiet=4, camera=camera, aside=(0, 0))
     if aside:
@@ -96,7 +96,7 @@ def test_a_steep_tags_corners_are_looked_for_in_more_than_one_way():
     assert corner_error(tag.corners, corners) < 0.2
 
 
-def test_corners_that_do_not_settle_are_counted_from_the_edge_of_the_picture_too(monkeypatch):
+def test_corners_that_do_not_settle_are_counted_from_the_edge_of_the_image_too(monkeypatch):
     """OpenCV counts from the centre of the first pixel; nothing moves its corners here."""
     picture, corners, _ = seen(dictionary_bits("apriltag", "36h11", 5), 100, tilt=30, spin=8)
     monkeypatch.setattr("fidsplat.vision.detect.align", lambda *args, **more: None)
@@ -125,7 +125,7 @@ def test_one_square_is_given_once_and_in_the_family_named_first():
     assert [d.name for d in detect(picture, ["4x4_50", "4x4_100", "4x4_50"], qr=False)] == ["aruco:4x4_50:7"]
 
 
-def test_a_picture_with_several_codes():
+def test_an_image_with_several_codes():
     left, _, _ = seen(dictionary_bits("apriltag", "36h11", 300), 150)
     right, _, _ = seen(dictionary_bits("aruco", "4x4_50", 7), 150, tilt=30)
     below, _, _ = seen(qr_bits("two words"), 150, quiet=4)
@@ -187,7 +187,7 @@ def test_what_detect_cannot_use():
 
 
 @pytest.mark.parametrize("spin", [0.0, 90.0])
-def test_what_is_seen_face_to_face_has_a_pose(spin):
+def test_what_is_viewed_frontally_has_a_pose(spin):
     """Where OpenCV's IPPE divides by next to nothing: squares, and boards of many points."""
     points = np.stack(np.meshgrid([-0.12, -0.04, 0.04, 0.12], [-0.08, 0, 0.08]), -1).reshape(-1, 2)
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * SIZE / 2
@@ -222,7 +222,7 @@ def test_what_has_no_pose():
 
 
 @pytest.mark.parametrize("module", [3, 8, 30])
-def test_align_mends_corners_that_are_off_by_a_third_of_a_module(module):
+def test_align_corrects_corners_that_are_off_by_a_third_of_a_module(module):
     bits = dictionary_bits("apriltag", "36h11", 2)
     picture, corners, _ = seen(bits, 8 * module, tilt=15, spin=20)
     rough = corners + np.random.default_rng(module).uniform(-0.3, 0.3, (4, 2)) * module

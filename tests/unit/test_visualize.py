@@ -59,7 +59,7 @@ def test_labels_have_colours_of_their_own():
     assert len(set(colours[1])) == 1
 
 
-def test_an_outline_stands_on_its_corners_and_leaves_the_picture_alone():
+def test_an_outline_has_the_corners_and_keeps_the_image():
     image = np.zeros((60, 80, 3), np.uint8)
     drawn = draw_outlines(image, [(SQUARE, "")], thickness=1)
     assert not image.any()
@@ -69,7 +69,7 @@ def test_an_outline_stands_on_its_corners_and_leaves_the_picture_alone():
     assert drawn[10, 20].sum() > 400, "the first corner is marked"
 
 
-def test_captions_stand_below_their_outlines_and_not_over_each_other():
+def test_captions_are_below_their_outlines_and_not_over_each_other():
     image = np.zeros((200, 160, 3), np.uint8)
 
     def captions(*words):
@@ -101,7 +101,7 @@ def test_keys_say_what_the_colours_mean():
     assert ball[100, KEY_WIDTH // 2 + 30, 0] > ball[100, KEY_WIDTH // 2 - 30, 0], "red is to the right"
 
 
-def test_a_key_stands_beside_its_row():
+def test_a_key_is_next_to_its_row():
     rows = [[("a", np.full((30, 40, 3), 200, np.uint8))]] * 2
     strip = np.full((60, KEY_WIDTH, 3), 99, np.uint8)
     sheet = contact_sheet(rows, width=80, gap=4, key=lambda row, height: strip if row else None)
@@ -110,7 +110,7 @@ def test_a_key_stands_beside_its_row():
     assert not (sheet[:86, 88:] == 99).any()
 
 
-def test_a_sheet_holds_every_picture_under_its_title():
+def test_a_sheet_has_every_image_under_its_title():
     rows = [
         [(f"{i}{j}", np.full((30, 40, 3), 50 * i + 10 * j + 40, np.uint8)) for j in range(3)]
         for i in range(2)

@@ -48,7 +48,7 @@ def on_device(cloud, gradients=tuple(TYPES)):
     }
 
 
-def test_a_tape_goes_back_through_pictures_and_kernels(renderer, draw):
+def test_a_tape_differentiates_frames_and_kernels(renderer, draw):
     """All gradients are those of the backend by the same loss; a second pass adds to them."""
     cloud, capture = picture()
     arrays = on_device(cloud)

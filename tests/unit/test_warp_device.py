@@ -99,7 +99,7 @@ def test_an_effect_that_warp_lacks_is_an_error_that_names_both(renderer):
         renderer.backend.pipeline(features)
 
 
-def test_what_warp_lacks_stands_in_its_page():
+def test_what_warp_lacks_is_listed_in_its_page():
     page = (Path(__file__).parents[2] / "docs" / "backends.md").read_text("utf-8")
     for name in set(CATALOGUE) - known():
         assert f"`{name}`" in page, name
@@ -149,7 +149,7 @@ def test_what_is_done_to_a_shared_image_is_not_done_to_what_was_read(renderer):
     assert before.any()
 
 
-def test_a_frame_keeps_its_arrays_when_the_next_is_drawn(renderer):
+def test_a_frame_keeps_its_arrays_when_the_next_is_rendered(renderer):
     kept = renderer.render(CLOUD, CAMERA).device_array("rgb")
     before = kept.numpy().copy()
     renderer.render(random_splats(50, seed=2, depth=(1, 3)), CAMERA)
@@ -164,7 +164,7 @@ def test_other_backends_say_that_they_share_nothing(reference):
         reference.adopt(means=0, quats=0, scales=0, opacities=0, colors=0)
 
 
-def test_adopted_arrays_draw_what_the_cloud_draws(renderer):
+def test_adopted_arrays_render_what_the_cloud_renders(renderer):
     wanted = renderer.render(CLOUD, CAMERA)["rgb"]
     vectors = arrays_of(CLOUD, renderer.backend.device)
     rows = {
@@ -176,7 +176,7 @@ def test_adopted_arrays_draw_what_the_cloud_draws(renderer):
         assert np.array_equal(renderer.render(renderer.adopt(**arrays), CAMERA)["rgb"], wanted)
 
 
-def test_a_resident_cloud_tells_what_it_takes(renderer):
+def test_a_resident_cloud_reports_its_memory(renderer):
     words = 3 + 4 + 2 + 1 + 3 + 1  # means, quats, scales, opacities, colors, labels
     assert renderer.upload(CLOUD).memory_bytes == 4 * words * len(CLOUD)
     arrays = arrays_of(CLOUD, renderer.backend.device)
@@ -335,7 +335,7 @@ def test_warp_pipelines_share_kernels_that_mean_the_same():
 
 
 @pytest.mark.parametrize("device", ["warp:cpu", CUDA])
-def test_the_example_draws_each_step(device, monkeypatch, capsys):
+def test_the_example_renders_each_step(device, monkeypatch, capsys):
     example = Path(__file__).resolve().parents[2] / "examples" / "warp_loop.py"
     monkeypatch.setattr(sys, "argv", [str(example), "--device", device, "--steps", "11"])
     runpy.run_path(str(example), run_name="__main__")
@@ -344,7 +344,7 @@ def test_the_example_draws_each_step(device, monkeypatch, capsys):
     assert 0 < covered[0] != covered[1] > 0
 
 
-def test_a_memory_budget_draws_in_bands_with_the_same_bits():
+def test_a_memory_budget_renders_in_bands_bit_identically():
     cloud = random_splats(300, seed=5, depth=(0.5, 4.0), scale=(0.05, 1.0))
     view = fs.Camera.look_at(320, 240, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
     wanted = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)

@@ -151,7 +151,7 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     assert not np.array_equal(changed, toys["strongest"])
 
 
-def test_two_outputs_that_keep_a_field_of_one_name_are_told_apart(beside):
+def test_two_outputs_that_keep_a_field_of_one_name_are_distinguished(beside):
     text = "import warp as wp\nfrom . import Output\nOUTPUT = Output(state={'normal': wp.float32})\n"
     beside("output", "taken", text)
     output = runtime.kernels("output")
