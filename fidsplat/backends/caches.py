@@ -1,6 +1,6 @@
-"""Places for what drivers keep between runs (PoCL, pyopencl, Warp), where theirs cannot be written.
+"""Folders for the caches of drivers (PoCL, pyopencl, Warp), if their own cannot be written.
 
-PoCL without such a place shows no device, or refuses to compile, and pyopencl's caches fail.
+Without a cache folder PoCL lists no device or refuses to compile, and pyopencl's caches fail.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from pathlib import Path
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import user_cache, writable_folder
 
-LEAST_FREE = 2**25
-"""bytes, several times what the kernels of a picture take"""
+MIN_FREE = 2**25
+"""bytes, several times the size of a frame's kernels"""
 
 
 def pocl_folder() -> Path:
-    """Where PoCL keeps compiled kernels, as it looks for that place itself."""
+    """PoCL's folder of compiled kernels, found by PoCL's own rules."""
     if given := os.environ.get("POCL_CACHE_DIR"):
         return Path(given)
     home = os.environ.get("HOME")
@@ -32,13 +32,13 @@ def pocl_folder() -> Path:
 
 @cache
 def ensure_caches() -> None:
-    """Provide a folder for this process, named in the environment, for each cache that cannot be written, has
-    no room, or that other users can write. Warns. Called before a driver is first used.
+    """Set a temporary folder in the environment for each cache that cannot be written, has too little free
+    space, or can be written by other users. Warns. Called before a driver is first used.
     """
     if "HOME" not in os.environ and "XDG_CACHE_HOME" not in os.environ:  # PoCL would use a folder in /tmp
         os.environ.setdefault("POCL_CACHE_DIR", str(user_cache() / "pocl" / "kcache"))
     where = {"POCL_CACHE_DIR": pocl_folder(), "XDG_CACHE_HOME": user_cache()}
-    lacking = {name: why for name, folder in where.items() if (why := _lack(folder))}
+    lacking = {name: why for name, folder in where.items() if (why := _why_unusable(folder))}
     if "XDG_CACHE_HOME" not in os.environ and os.path.expanduser("~") == "~":
         lacking["XDG_CACHE_HOME"] = "this user has no home folder"
     if not lacking:
@@ -48,25 +48,25 @@ def ensure_caches() -> None:
     os.environ.update({name: str(place / name.lower()) for name in lacking})
     warnings.warn(
         f"kernels are compiled again in this run: {'; '.join(lacking.values())}; "
-        f"set {' and '.join(lacking)} to a folder of your own with room",
+        f"set {' and '.join(lacking)} to a folder of your own with free space",
         stacklevel=2,
     )
 
 
-def _lack(folder: Path) -> str:
-    """Why a folder cannot hold compiled kernels; empty if it can."""
+def _why_unusable(folder: Path) -> str:
+    """Why a folder cannot be used for compiled kernels; empty if it can."""
     try:
         free = shutil.disk_usage(writable_folder(folder)).free
         state = folder.stat()
     except (OSError, InputError) as error:
         return str(error).partition(";")[0]
-    if free < LEAST_FREE:
-        return f"{folder} has room for {free // 2**20} MB only"
+    if free < MIN_FREE:
+        return f"{folder} has only {free // 2**20} MB of free space"
     if hasattr(os, "geteuid") and state.st_uid != os.geteuid():
         return f"{folder} belongs to another user"
     return f"{folder} can be written by every user" if state.st_mode & stat.S_IWOTH else ""
 
 
 def _remove(place: Path, process: int) -> None:
-    if os.getpid() == process:  # not where a fork of it ends
+    if os.getpid() == process:  # not at the end of a fork
         shutil.rmtree(place, ignore_errors=True)

@@ -44,7 +44,7 @@ def remove_damaged(folder: Path, is_loaded: Callable[[str], bool], is_whole: Cal
     """Remove what differs from its checksum or is no regular file, and return the number of files removed.
 
     Args:
-        is_loaded: whether the driver loads files of a name; others are left alone.
+        is_loaded: whether the driver loads files of a name; others are not touched.
         is_whole: whether a file without a checksum is complete.
     """
     known, valid, removed = _read(folder), {}, 0

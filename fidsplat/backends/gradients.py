@@ -1,4 +1,4 @@
-"""What backends that have derivatives share: the checks of what they are given; reading what they give."""
+"""Shared by backends with derivatives: checks of gradients, and images with the frame that made them."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ class DifferentiableImages:
 
 
 def gradient_shape(name: str, view: View) -> tuple[int, ...]:
-    """The shape of an output's gradient: that of its image."""
+    """The shape of an output's gradient, equal to that of its image."""
     channels = IMAGES[name].channels
     return (view.height, view.width) if channels == 1 else (view.height, view.width, channels)
 
 
 def check_shape(name: str, given: tuple[int, ...], view: View) -> None:
-    """Raises InputError unless a gradient has its output's shape."""
+    """Raise InputError unless a gradient has its output's shape."""
     if tuple(given) != gradient_shape(name, view):
         raise InputError(
             f"the gradient of {name} must have the shape {gradient_shape(name, view)}, got {tuple(given)}"

@@ -1,6 +1,6 @@
 """The interface of a device: base classes with a default for what only some devices offer.
 
-`Backend.traits` says what a device offers. Nobody outside a backend asks for its name.
+`Backend.traits` says what a device offers. Code outside a backend never depends on its name.
 """
 
 from __future__ import annotations
@@ -499,7 +499,7 @@ class Backend(ABC):
         """
         raise DeviceError(self.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
 
-    def compile_ahead(self, features: FeatureSet) -> None:  # noqa: B027 (optional)
+    def compile_in_background(self, features: FeatureSet) -> None:  # noqa: B027 (optional)
         """Start to compile `differentiate` of these features in the background, where the device can.
         `differentiate` waits for it and raises its errors."""
 

@@ -1,4 +1,4 @@
-"""From a cloud and a capture to what a backend draws: the features to compile, and the picture's numbers."""
+"""Features to compile and uniforms of the view, from a cloud and a capture."""
 
 from __future__ import annotations
 
@@ -19,41 +19,41 @@ from fidsplat.util.errors import InputError
 
 
 class Origined(CloudTraits, Protocol):
-    """What decides the kernels, and where the zero of its means is."""
+    """Properties of a cloud that select kernels, and its origin."""
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) float64 metres."""
+        """(3,) float64 metres: world position of the means' zero."""
         ...
 
 
 _Prepared = tuple[FeatureSet, View]
 _prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[Origined, _Prepared]] = WeakKeyDictionary()
-"""of captures in which nothing moves: a motion's functions may answer otherwise the next time"""
+"""of captures in which nothing moves: a motion's functions may return other poses the next time"""
 
 
 def prepare(cloud: Origined, capture: Capture) -> _Prepared:
-    """What a capture of a cloud calls for, and its view; kept for a resident cloud that is drawn again.
+    """The features that a capture of a cloud requires, and its view; cached for resident clouds.
 
     Raises:
-        InputError: no camera, an output that nobody declares, effects that do not go together, a picture that
-            is too large, or a pose that is not rigid.
+        InputError: no camera, an unknown output, effects that exclude each other, a frame that is too large,
+            or a pose that is not rigid.
     """
     if isinstance(cloud, SplatCloud) or not capture.motion.is_still:
         view = view_of(capture, cloud.origin)
         return select(cloud, capture), view
-    held = _prepared.setdefault(capture, WeakKeyDictionary())
-    if cloud not in held:
+    cached = _prepared.setdefault(capture, WeakKeyDictionary())
+    if cloud not in cached:
         view = view_of(capture, cloud.origin)
-        held[cloud] = select(cloud, capture), view
-    return held[cloud]
+        cached[cloud] = select(cloud, capture), view
+    return cached[cloud]
 
 
 def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]:
-    """What the views of a batch call for, and those that are drawn.
+    """The features that the views of a batch require, and the views that are rendered.
 
     Raises:
-        InputError: as `prepare`; views that call for different effects.
+        InputError: as `prepare`; views with different effects.
     """
     rendered = views.active
     indices = np.array(rendered, np.uint32)
@@ -72,7 +72,7 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
             differing = ", ".join(sorted(other.names ^ features.names)) or "samples or precision"
             raise InputError(
                 f"the views of a batch must have the same effects, but views 0 and {number} differ in "
-                f"{differing}; draw them in batches of their own"
+                f"{differing}; render them in separate batches"
             )
     every = [own[number][1] for number in rendered]
     return features, ViewBatch.of(every or [own[0][1]], indices, len(views))
@@ -107,10 +107,9 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
 
 
 def _moved(view: View, motion: np.ndarray, origin: np.ndarray) -> View:
-    """The view that splats have which the motion (4, 4) of the world moves."""
+    """The view of splats that are moved by a motion (4, 4) of the world."""
     turn, move = motion[:3, :3], motion[:3, 3]
     rotation = view.rotation @ turn
-    # of the cloud's origin, before the camera is where it is
     translation = view.translation + rotated(view.rotation, rotated(turn, origin) + move - origin)
     eye = rotated(-rotation.T, translation)
     return replace(

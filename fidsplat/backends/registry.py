@@ -18,22 +18,22 @@ FAMILIES = {
     "warp": "fidsplat.backends.warp",
     "reference": "fidsplat.backends.reference",
 }
-"""family: its module; another family is one more entry; from outside, of one process"""
+"""modules of the families; a further entry adds a family in this process"""
 
 FIRST = "auto"
-"""the device that stands for the first family of ORDER that has a usable device"""
+"""the best device of the first family in `ORDER` that has a usable one"""
 ORDER = ("opencl", "warp")
 
 _STARTED_BY: dict[str, int] = {}
-"""family: the process that was the first here to ask its driver for something"""
+"""family: the process in which its driver was first used"""
 
 
 def open_backend(name: str) -> Backend:
     """Open a device by name: `auto`, a family (`opencl`, `warp`, `reference`) or `family:selector`.
 
     Raises:
-        UnknownDeviceError: no such family, or nothing of the family answers to the selector.
-        DeviceError: the device is there and cannot be used, or a fork has made it unusable here.
+        UnknownDeviceError: no such family, or no device of the family matches the selector.
+        DeviceError: the device exists but cannot be used, or a fork has made it unusable here.
     """
     family, _, selector = str(name).strip().partition(":")
     family = family.lower()
@@ -59,7 +59,7 @@ def devices() -> list[DeviceInfo]:
 
 
 def _open_first() -> Backend:
-    """The best device of the first family of ORDER that has a usable one. Warns of those that have none."""
+    """The best device of the first family of ORDER that has a usable one. Warns of families without one."""
     reasons = []
     for family in ORDER:
         _prepare(family)
@@ -78,14 +78,14 @@ def _prepare(family: str, selector: str = "") -> None:
     """Check that a family's driver can be entered, and provide folders for its caches."""
     if family == "reference":
         return
-    if (family, selector.lower()) != ("warp", "cpu"):  # which has no driver
+    if (family, selector.lower()) != ("warp", "cpu"):  # it has no driver
         _check_driver(family)
     check_driver(family)
     ensure_caches()
 
 
 def _check_driver(family: str) -> None:
-    """Raises DeviceError where the driver would wait for threads that a fork left behind."""
+    """Raise DeviceError in a fork, where the driver would wait for threads of the parent."""
     started = _STARTED_BY.setdefault(family, os.getpid())
     if started != os.getpid():
         raise DeviceError(

@@ -20,7 +20,7 @@ FAR_EYE = 1e9
 """metres: distance of the eye of a parallel projection"""
 NO_CAMERA = "no camera: pass camera=fs.Camera... or give the scene a [camera] table"
 MAX_GRID = 32767
-"""Largest side of the sample grid: anchors and rows are kept in 16 bits."""
+"""Largest side of the sample grid: anchors and rows are stored in 16 bits."""
 _NO_SENSOR = Sensor()
 
 
@@ -34,7 +34,7 @@ def rotated(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 class View:
     """The uniforms of a frame, in float64.
 
-    The sample grid is the picture with `samples` x `samples` samples in each pixel.
+    The sample grid is the image with `samples` x `samples` samples in each pixel.
     """
 
     width: int
@@ -224,15 +224,15 @@ class View:
 
 @dataclass(frozen=True)
 class SubFrame:
-    """One sub-picture of a picture that is made of several poses."""
+    """One pose of a frame with a shutter."""
 
     view: View
-    """of its rows alone"""
+    """restricted to its rows"""
     top: int
-    """its first row of samples in the picture"""
+    """its first row of samples in the frame"""
     weight: float
-    """in the mean of its rows' sub-pictures"""
+    """in the mean of the sub-frames of its rows"""
     first: bool
     """whether it is the first of its rows"""
     middle: bool
-    """whether the outputs beside rgb and alpha show it: the sub-pose n // 2 of n"""
+    """whether outputs other than rgb and alpha show it: the sub-pose n // 2 of n"""

@@ -37,7 +37,7 @@ class Output:
 
     @property
     def as_array(self) -> bool:
-        """Whether files store the array in addition to a picture."""
+        """Whether files store the array in addition to a PNG image."""
         return self.display not in ("color", "normal")
 
 

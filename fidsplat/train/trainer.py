@@ -289,7 +289,7 @@ class Trainer:
             self._features = features
             upcoming = next_features(self.settings, iteration, plain, surface)
             if upcoming is not None:
-                self.renderer.backend.compile_ahead(upcoming)
+                self.renderer.backend.compile_in_background(upcoming)
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, prepared, waits)
         loss, by_rgb = self._model.loss(images, number)

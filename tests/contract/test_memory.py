@@ -201,8 +201,8 @@ def test_plans_hold_to_the_budget():
             for upload in (0, 52):
                 plan = plan_of(count, 80, upload, 2**27, "ordered", budget, budget // 4)
                 held = plan.capacity * (80 + 12 + 16) + plan.chunk * (80 + 12 + upload) + budget // 8 + 2**27
-                assert held == plan.held or not plan.chunk
-                assert plan.held <= budget, (count, budget, upload, plan)
+                assert held == plan.total or not plan.chunk
+                assert plan.total <= budget, (count, budget, upload, plan)
                 assert plan.capacity * 80 <= budget // 4
                 assert plan.chunk or (plan.capacity == count and not upload)
 

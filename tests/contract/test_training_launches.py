@@ -237,7 +237,7 @@ def test_upcoming_kernels_are_compiled_in_the_background(renderer, dataset, monk
     backend = renderer.backend
     differentiate = backend.differentiate
     monkeypatch.setattr(
-        backend, "compile_ahead", lambda features: begun.append((trainer.iteration + 1, features))
+        backend, "compile_in_background", lambda features: begun.append((trainer.iteration + 1, features))
     )
     trainer = Trainer(dataset, renderer, **{**STEADY, "sh_degree": 2, **losses})
     monkeypatch.setattr(
@@ -265,11 +265,11 @@ def test_background_compilation_returns_kernels_and_errors(renderer, dataset, mo
 
     monkeypatch.setattr(backend, "pipeline", seen)
     for _ in range(2):
-        backend.compile_ahead(features)
+        backend.compile_in_background(features)
     found = backend.differentiate(features)
     assert backend.differentiate(features) is found
     assert [thread is threading.main_thread() for thread in where] == [False, True, True]
-    backend.compile_ahead(features)  # it is there
+    backend.compile_in_background(features)  # it is there
     assert len(where) == 3
 
     monkeypatch.setattr(backend, "_gradients", {})
@@ -278,6 +278,6 @@ def test_background_compilation_returns_kernels_and_errors(renderer, dataset, mo
         raise fs.DeviceError("no compiler")
 
     monkeypatch.setattr(backend, "pipeline", failing)
-    backend.compile_ahead(features)
+    backend.compile_in_background(features)
     with pytest.raises(fs.DeviceError, match="no compiler"):
         backend.differentiate(features)

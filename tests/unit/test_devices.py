@@ -240,15 +240,15 @@ def test_the_loader_sees_the_runtime_that_pip_installed(monkeypatch, tmp_path):
     monkeypatch.delenv(vendors._VENDORS, raising=False)
     monkeypatch.setattr(vendors, "_SYSTEM", system)
     monkeypatch.setattr(vendors, "intel_library", lambda: library)
-    with vendors.intel_among_them():
+    with vendors.intel_registered():
         folder = Path(os.environ[vendors._VENDORS])
         assert {file.read_text().strip() for file in folder.iterdir()} == {"libcard.so", str(library)}
     assert vendors._VENDORS not in os.environ
     assert not folder.exists()
     monkeypatch.setenv(vendors._VENDORS, str(system))
-    with vendors.intel_among_them():
+    with vendors.intel_registered():
         assert os.environ[vendors._VENDORS] == str(system)
     monkeypatch.delenv(vendors._VENDORS)
     monkeypatch.setattr(vendors, "intel_library", lambda: None)
-    with vendors.intel_among_them():
+    with vendors.intel_registered():
         assert vendors._VENDORS not in os.environ

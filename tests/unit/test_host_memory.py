@@ -12,7 +12,7 @@ from fidsplat.scenes.random_clouds import random_splats
 
 @pytest.fixture
 def renderer(monkeypatch):
-    monkeypatch.setattr(host_memory, "_LEAST", 1)
+    monkeypatch.setattr(host_memory, "_MINIMUM", 1)
     renderer = fs.Renderer("opencl")
     memory = renderer.backend.host_memory
     monkeypatch.setattr(memory, "locks", True)  # as GPUs do
@@ -53,12 +53,12 @@ def test_images_of_about_the_same_size_take_the_same_memory(renderer):
         places.add(array.ctypes.data)
         del array
     assert len(places) == 1
-    assert memory._held < 1.25 * 4 * 100 * 102
+    assert memory._locked < 1.25 * 4 * 100 * 102
 
 
 def test_no_more_is_locked_than_allowed(renderer, monkeypatch):
     memory, shape = renderer.backend.host_memory, (10, 10)
-    monkeypatch.setattr(host_memory, "_MOST", 900)
+    monkeypatch.setattr(host_memory, "_MAXIMUM", 900)
     first = memory.empty(shape, np.float32)
     assert first.base is None  # the first of a size is in ordinary memory
     kept = [memory.empty(shape, np.float32) for _ in range(4)]
@@ -68,5 +68,5 @@ def test_no_more_is_locked_than_allowed(renderer, monkeypatch):
     assert memory.empty((9, 9), np.int32).base is None
     other = memory.empty((9, 9), np.int32)  # what lies idle makes room
     assert other.base is not None
-    assert memory._held <= 900
+    assert memory._locked <= 900
     assert math.prod(other.shape) == 81

@@ -113,4 +113,4 @@ def test_defaults_of_the_interface(toy):
     assert frame.wait().read_rows("rgb", 1, 2).shape == (4, 6, 3)
     batch = toy.render_batch(CLOUD, CAMERA, poses=[[0, 0, 0, 0, 0, 0, 1]] * 2, mask=[True, False])
     assert (batch["rgb"].shape, batch.stats["splats"]) == ((2, 4, 6, 3), 1)
-    toy.backend.compile_ahead(None)
+    toy.backend.compile_in_background(None)

@@ -309,7 +309,7 @@ def test_gpu_planes_are_tensors_on_the_same_device(library):
 
 @pytest.mark.skipif(not GPUS, reason="no CUDA device for Warp here")
 def test_arrays_of_another_device_are_refused():
-    with pytest.raises(fs.InputError, match="means lies on cpu, but this renderer draws on cuda"):
+    with pytest.raises(fs.InputError, match=r"means must be on cuda.*, the device of this renderer, got cpu"):
         fs.Renderer(GPUS[0]).adopt(**arrays_of(CLOUD, "cpu"))
 
 

@@ -160,10 +160,9 @@ class OpenCLChunkCache(ChunkCache):
         items = copies.rows * (1 if moves else words)
         if not items:
             return
-        kernel = self._kernels[f"gather_{name}" if moves else "gather"]
-        kernel.set_args(
-            self._arrays[name], copies.pieces, copies.poses if moves else np.uint32(words), target
-        )
+        kernel = self._kernels["gather_placed" if moves else "gather"]
+        poses = (copies.poses,) if moves else ()
+        kernel.set_args(self._arrays[name], copies.pieces, np.uint32(words), *poses, target)
         size = -(-items // 64) * 64, copies.count
         self._last = cl.enqueue_nd_range_kernel(self.workspace.queue, kernel, size, (64, 1))
 

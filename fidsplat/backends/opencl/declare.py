@@ -134,12 +134,13 @@ class Argument:
 
 
 def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
-    """Arguments from lines of words, and others among them as they are.
+    """Parse declarations of arguments; tuples of arguments are inserted as they are.
 
-    A line is a type, names that have it, and a remark behind `//`. Alone it declares numbers that the stage
-    gives (`int width height`); behind `in` buffers of the stage that the kernel reads (`in float raw  // 4
-    channels`), behind `out` those that it changes, behind `cloud` arrays with a row for each splat, behind
-    `array` those that the view has on the host and that are copied to the device for the picture.
+    A declaration is a type, the names of arguments of this type, and a note after `//`. Without another word
+    it declares numbers that the stage passes (`int width height`). A word before the type declares buffers:
+    `in` buffers of the stage that the kernel only reads (`in float raw  // 4 channels`), `out` buffers that
+    it writes, `cloud` arrays with a row for each splat, `array` arrays of the view, which are copied to the
+    device for the frame.
     """
     found: list[Argument] = []
     for one in declared:

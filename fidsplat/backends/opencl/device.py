@@ -11,8 +11,8 @@ import pyopencl as cl
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.interface import Backend, ChunkedScene, DeviceInfo, DeviceTraits, Rates
-from fidsplat.backends.opencl.ahead import Ahead
 from fidsplat.backends.opencl.assemble import Source, assemble
+from fidsplat.backends.opencl.background_compiler import BackgroundCompiler
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.images import OpenCLImages
@@ -24,7 +24,7 @@ from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
 from fidsplat.backends.opencl.training import OpenCLTraining
-from fidsplat.backends.opencl.vendors import intel_among_them
+from fidsplat.backends.opencl.vendors import intel_registered
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.effects import FeatureSet
@@ -103,7 +103,7 @@ class OpenCLBackend(Workspace, Backend):
         self.compiler_options = build_options(device)
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
-        self._ahead = Ahead()
+        self._background = BackgroundCompiler()
         self._own: tuple[DeviceShape, dict[FeatureSet, OpenCLPipeline]] = self.shape, {}
         """pipelines for the device's default shape by requested features; looked up before all others"""
 
@@ -160,16 +160,16 @@ class OpenCLBackend(Workspace, Backend):
     def differentiate(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLGradients:
         """The pipeline with derivatives; `shape` replaces the device's own build constants (tests)."""
         check_differentiable(features)
-        self._ahead.wait(features)
+        self._background.wait(features)
         pipeline = self.pipeline(features, shape)
         if pipeline not in self._gradients:
             self._gradients[pipeline] = OpenCLGradients(pipeline)
         return self._gradients[pipeline]
 
-    def compile_ahead(self, features: FeatureSet) -> None:
+    def compile_in_background(self, features: FeatureSet) -> None:
         """Start to compile `differentiate` in the background."""
         if self._own[1].get(features) not in self._gradients:
-            self._ahead.begin(features, lambda: self.differentiate(features).compile_step())
+            self._background.begin(features, lambda: self.differentiate(features).compile_step())
 
     def training(self) -> OpenCLTraining:
         """Compiled training kernels, without splats."""
@@ -212,7 +212,7 @@ class OpenCLBackend(Workspace, Backend):
 
 def _all_devices() -> Iterator[cl.Device]:
     try:
-        with intel_among_them():
+        with intel_registered():
             platforms = cl.get_platforms()
     except cl.Error:  # raised by the loader if there is no platform
         return

@@ -233,7 +233,7 @@ class OpenCLGradients(GradientPipeline):
         return found
 
     def compile_step(self) -> None:
-        """Compile the kernel of `step`, which is not needed for gradients alone."""
+        """Compile the kernel of `step`, which gradients do not need."""
         if self._step_commands is None:
             source = assemble_step(self._pipeline.features, self._pipeline.shape)
             self._step_commands = CommandList(Program(self._pipeline.workspace, source))

@@ -1,5 +1,8 @@
-"""Host memory for images of a GPU: page-locked, so that it is written at the full rate of the bus beside
-what is drawn, and used again for the next image of about its size: locking takes longer than writing."""
+"""Page-locked host memory for the images of a GPU.
+
+A copy to page-locked memory runs at the full rate of the bus while the GPU renders. Locking takes longer
+than copying, so memory is reused for the next image of about the same size.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,25 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-_LEAST = 1 << 18  # bytes; smaller images are copied as fast in any memory
-_MOST = 1 << 30
-"""bytes that are locked at once: of a caller who keeps more pictures, the rest is in other memory"""
+_MINIMUM = 1 << 18
+"""bytes from which memory is locked: smaller images are copied as fast to any memory"""
+_MAXIMUM = 1 << 30
+"""bytes that are locked at once; further images are in ordinary memory"""
 
 
 @dataclass(frozen=True, eq=False)
-class _Locked:
-    """Memory that stays mapped as long as it lives."""
+class _LockedBuffer:
+    """A buffer that stays mapped during its lifetime."""
 
     buffer: cl.Buffer
     mapped: np.ndarray
 
 
-class _Lent:
-    """What an array lies in; the memory goes back when no array and no view of one holds this any more."""
+class _ArrayMemory:
+    """The base object of an array in locked memory. The memory is reused when the array and all its views
+    have been released."""
 
-    def __init__(self, memory: _Locked, shape: tuple[int, ...], dtype: Any) -> None:
+    def __init__(self, memory: _LockedBuffer, shape: tuple[int, ...], dtype: Any) -> None:
         self._memory = memory
         self.__array_interface__ = {
             "data": (memory.mapped.ctypes.data, False),
@@ -44,56 +49,58 @@ class HostMemory:
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
         self.locks = not device.type & cl.device_type.CPU
-        """whether memory is locked: CPUs copy to any in the same time"""
-        self._asked: set[int] = set()
-        """rooms that were asked for before"""
-        self._spare: dict[int, list[_Locked]] = {}
-        self._held, self._lock = 0, threading.Lock()
+        """whether memory is locked: a CPU copies to any memory in the same time"""
+        self._requested: set[int] = set()
+        """capacities that were requested before"""
+        self._spare: dict[int, list[_LockedBuffer]] = {}
+        """unused buffers by their capacity"""
+        self._locked, self._lock = 0, threading.Lock()
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """An array, its contents undefined. The first of about its size is in ordinary memory: one picture
-        alone is not worth locking pages."""
+        """An array with undefined contents. The first of about its size is in ordinary memory: locking pages
+        for a single image takes longer than it saves."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
-        if not self.locks or size < _LEAST:
+        if not self.locks or size < _MINIMUM:
             return np.empty(shape, dtype)
-        room = _room(size)
+        capacity = _capacity(size)
         with self._lock:
-            memory = self._taken(room)
+            memory = self._acquire(capacity)
         if memory is None:
             return np.empty(shape, dtype)
-        lent = _Lent(memory, shape, dtype)
-        # arrays may die at any point of any thread: what they call takes no lock
-        weakref.finalize(lent, self._spare.setdefault(room, []).append, memory).atexit = False
-        return np.asarray(lent)
+        base = _ArrayMemory(memory, shape, dtype)
+        # arrays are released at any point of any thread: the finalizer takes no lock
+        weakref.finalize(base, self._spare.setdefault(capacity, []).append, memory).atexit = False
+        return np.asarray(base)
 
-    def _taken(self, room: int) -> _Locked | None:
-        if room not in self._asked:
-            self._asked.add(room)
+    def _acquire(self, capacity: int) -> _LockedBuffer | None:
+        """An unused or new buffer; None if there should be none."""
+        if capacity not in self._requested:
+            self._requested.add(capacity)
             return None
-        spare = self._spare.setdefault(room, [])
+        spare = self._spare.setdefault(capacity, [])
         if spare:
             return spare.pop()
-        if self._held + room > _MOST:
-            for other, memories in self._spare.items():
-                while memories:
-                    memories.pop()
-                    self._held -= other
-        if self._held + room > _MOST:
+        if self._locked + capacity > _MAXIMUM:
+            for other, buffers in self._spare.items():
+                while buffers:
+                    buffers.pop()
+                    self._locked -= other
+        if self._locked + capacity > _MAXIMUM:
             return None
         flags, queue = cl.mem_flags, cl.CommandQueue(self._context)
         access: Any = cl.map_flags.READ | cl.map_flags.WRITE
         try:
-            buffer = cl.Buffer(self._context, flags.READ_WRITE | flags.ALLOC_HOST_PTR, room)
-            mapped, _ = cl.enqueue_map_buffer(queue, buffer, access, 0, (room,), np.dtype(np.uint8))
+            buffer = cl.Buffer(self._context, flags.READ_WRITE | flags.ALLOC_HOST_PTR, capacity)
+            mapped, _ = cl.enqueue_map_buffer(queue, buffer, access, 0, (capacity,), np.dtype(np.uint8))
         except cl.Error:  # the system locks no more
             self.locks = False
             return None
-        self._held += room
-        return _Locked(buffer, mapped)
+        self._locked += capacity
+        return _LockedBuffer(buffer, mapped)
 
 
-def _room(size: int) -> int:
-    """Bytes that are locked for an array: a quarter more at most, so that pictures whose size goes up and
-    down, as a viewer's do while one looks around, lie in the same memory."""
+def _capacity(size: int) -> int:
+    """Bytes that are locked for an array: at most a quarter more, so that images of varying size, as in a
+    viewer, share buffers."""
     step = 1 << max(size.bit_length() - 3, 0)
     return -(-size // step) * step

@@ -108,7 +108,7 @@ class OpenCLImages(Images):
         return self._workspace.host_memory.empty(self._shape(name), self._outputs[name].dtype)
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray, index: int = 0) -> None:
-        """Copy pixel rows [first, end) alone. Raises DeviceError as `read`."""
+        """Copy only pixel rows [first, end). Raises DeviceError as `read`."""
         if first < end:
             self._copy(name, into[first:end], (index * len(into) + first) * into[:1].nbytes)
 

@@ -51,7 +51,7 @@ class MemoryPlan:
     """splats that are projected at once; 0: all, without packing the visible ones"""
     capacity: int
     """visible splats of one band that are stored, if in chunks"""
-    held: int
+    total: int
     """bytes in total, with the cloud; more only if there are more than `MIN_BIG` big splats"""
 
 
@@ -123,13 +123,13 @@ class MemoryPlanner:
         splat = self._source.records["Splat"].itemsize + KEYS + WINDOWS
         splat += SORTED if self._shape.lists == "ordered" else 0
         each = resident.capacity * splat + tables + 4 * self._channels * samples
-        free = min(self._device.memory_budget - plan.held + each, self._device.largest_buffer)
+        free = min(self._device.memory_budget - plan.total + each, self._device.largest_buffer)
         most = min(free, PART_BYTES.get(self._device.kind, OTHER_PART_BYTES)) // each
         most = max(1, min(most, _PART_SAMPLES // samples))
         # parts of equal size have buffers of equal size
         parts = -(-count // most)
         for first, end in pairwise(count * k // parts for k in range(parts + 1)):
-            yield Part(first, end, MemoryPlan(0, resident.count, plan.held + (end - first - 1) * each))
+            yield Part(first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * each))
 
     def _image_bytes(self, view: View) -> int:
         """Bytes of the output images of a view."""
@@ -175,8 +175,9 @@ def plan_of(
     capacity = min(capacity, largest // record_bytes, count)
     if capacity < min(_MINIMUM, count):
         raise DeviceError(
-            f"a memory budget of {bytes_words(budget)} is too small: the frame and the cloud alone take "
-            f"{bytes_words(fixed_bytes)}; raise memory_budget, or render a smaller frame or fewer outputs"
+            f"a memory budget of {bytes_words(budget)} is too small: the frame and the cloud take "
+            f"{bytes_words(fixed_bytes)} without lists; raise memory_budget, or render a smaller frame or "
+            "fewer outputs"
         )
-    held = fixed_bytes + pairs + chunk * (each + upload_bytes) + capacity * (each + SORTED)
-    return MemoryPlan(chunk, capacity, held)
+    total = fixed_bytes + pairs + chunk * (each + upload_bytes) + capacity * (each + SORTED)
+    return MemoryPlan(chunk, capacity, total)

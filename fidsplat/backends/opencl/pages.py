@@ -1,19 +1,19 @@
-"""Large pages of memory, where the system gives them."""
+"""Large pages of memory, on systems that have them."""
 
 import ctypes
 import mmap
 
 
 def large_pages(address: int, size: int) -> bool:
-    """Asks the system to put what lies there in large pages from its first use on.
+    """Advise the system to use large pages for a range of memory from its first use on.
 
     Args:
-        address, size: bytes; only whole pages of it are asked for.
+        address, size: in bytes; rounded inwards to complete pages.
 
     Returns:
-        Whether the system took the advice. Contents stay as they are in any case.
+        Whether the system accepted. Contents are unchanged in any case.
     """
-    advice = getattr(mmap, "MADV_HUGEPAGE", None)  # Linux alone
+    advice = getattr(mmap, "MADV_HUGEPAGE", None)  # only on Linux
     first = -(-address // mmap.PAGESIZE) * mmap.PAGESIZE
     end = (address + size) // mmap.PAGESIZE * mmap.PAGESIZE
     if advice is None or end <= first:

@@ -102,7 +102,7 @@ class OpenCLPipeline(Pipeline):
                 part = views.part(first, end)
                 pipeline = self._for_part(resident, plan, part)
                 kind = pipeline, "views", resident.capacity, plan
-                workspace.pool.make_way(kind, workspace.memory_budget - plan.held)
+                workspace.pool.make_way(kind, workspace.memory_budget - plan.total)
                 frame = DeviceFrame(workspace, pipeline._commands, pipeline.shape, resident, part, plan)
                 frame.bind_images(images)
                 render(frame)
@@ -151,7 +151,7 @@ class OpenCLPipeline(Pipeline):
                 return frame
             plan = self._planner.frame(resident, view)
             kind = self._buffer_kind(resident, view, plan)
-            workspace.pool.make_way(kind, workspace.memory_budget - plan.held, resident.capacity)
+            workspace.pool.make_way(kind, workspace.memory_budget - plan.total, resident.capacity)
             if plan.chunk or not tiling.pair_capacity(workspace):
                 return self.render_complete(resident, view)
             resident.cached_frames.pop(key, None)  # an interrupt leaves a part of a recording
@@ -175,7 +175,7 @@ class OpenCLPipeline(Pipeline):
         """The next frame of a kind; None if it exceeds the capacity, or the buffers of the last frame were
         released."""
         workspace, recorded, waits = self.workspace, cached.recorded, self.shape.lists == "ordered"
-        workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.held, resident.capacity)
+        workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.total, resident.capacity)
         if not waits and not tiling.pair_capacity(workspace):
             return None
         queue = workspace.switch_to(workspace.queue if waits else workspace.replay_queue)
@@ -224,7 +224,7 @@ class OpenCLPipeline(Pipeline):
     ) -> DeviceFrame:
         """A frame with the buffers that it requires."""
         # buffers of other kinds of frames are released; those of its own kind are part of the plan
-        free = self.workspace.memory_budget - plan.held
+        free = self.workspace.memory_budget - plan.total
         self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.capacity)
         frame = self._frame(resident, view, plan, self._commands)
         frame.lease_images(self.features.images)

@@ -1,5 +1,5 @@
-"""Looks into an open device: small kernels under the build options and the pragmas of the stages, single
-stages on made-up input, and buffers that are filled with rubbish first.
+"""Access to an open device for tests: small kernels with the build options and pragmas of the stages, single
+stages on artificial input, and buffers that are filled with NaN before their use.
 """
 
 from __future__ import annotations
@@ -98,15 +98,14 @@ kernel void probe(global const float *x, global int *unequal, global int *named,
 
 
 class OpenCLProbe(Probe):
-    """Small kernels under the build options and the pragmas of the stages, single stages on made-up input,
-    and buffers that are filled with rubbish first: `Probe` of fidsplat/backends/probing.py."""
+    """Access to an open OpenCL device for tests."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
 
     @property
     def fuses(self) -> bool:
-        """Whether the device fuses multiply-adds where it is asked to."""
+        """Whether the device fuses multiply-adds where requested."""
         return self._workspace.shape.fast_fma
 
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
@@ -151,13 +150,12 @@ class OpenCLProbe(Probe):
         return results
 
     def options(self) -> list[str]:
-        """What every program is compiled with."""
+        """Compiler options of every program."""
         return self._workspace.compiler_options
 
     def scan(self, pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-        """What the device makes of lengths of lists (n,) uint32: where each list starts (n + 1,) uint32,
-        and the sum of all in 64 bits.
-        """
+        """Prefix sums of list lengths (n,) uint32: the start of each list (n + 1,) uint32, and the total in
+        64 bits."""
         workspace, items = pipeline.workspace, (pipeline.shape.scan_items,)
         starts = buffer_of(workspace, np.empty(len(lengths) + 1, np.uint32))
         sums = buffer_of(workspace, np.zeros(8, np.uint32))

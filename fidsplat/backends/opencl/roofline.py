@@ -1,4 +1,4 @@
-"""Times the kernels of kernels/opencl/check/roofline.cl: what this device can do at best."""
+"""Times the kernels of kernels/opencl/check/roofline.cl: the peak rates of a device."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fidsplat.util.errors import DeviceError
 
 _CHAINS = 8  # as in roofline.cl
 _REPEATS = 7
-_SHORTEST = 8e-3  # seconds that a timed launch lasts at least
+_SHORTEST = 8e-3  # seconds: minimum duration of a timed launch
 _GROUP = 64
 
 
@@ -37,10 +37,10 @@ def measure_rates(workspace: Workspace) -> Rates:
 
 
 def _copy_rate(workspace: Workspace, kernel: cl.Kernel) -> float:
-    """Bytes per second, those read and those written together; buffers that no cache holds."""
-    wanted = 2**29 if workspace.info.kind == "gpu" else 2**27
+    """Bytes per second, read and written together; the buffers exceed every cache."""
+    size = 2**29 if workspace.info.kind == "gpu" else 2**27
     share = min(workspace.info.largest_allocation_bytes, workspace.info.memory_bytes) // 8
-    size = min(wanted, share) // (16 * _GROUP) * 16 * _GROUP
+    size = min(size, share) // (16 * _GROUP) * 16 * _GROUP
     source, target = (workspace.pool.fresh("copied", size) for _ in range(2))
     cl.enqueue_fill_buffer(workspace.queue, source, np.zeros(1, np.float32), 0, size)
     items = size // 16

@@ -1,5 +1,4 @@
-"""Build constants of a device: what its kind decides, what a picture's features change, and others that tests
-compare with them."""
+"""Build constants of the kernels for a device, their changes by a frame's features, and others for tests."""
 
 from __future__ import annotations
 
@@ -29,10 +28,10 @@ class DeviceShape:
     k_buffer_size: int
     """fragments of a pixel that are sorted by depth at once (k-buffer), at most 254, or 31 in `group`"""
     rows: int = 2
-    """pixels of a column that a work-item draws (`group`)"""
+    """pixels of a column that a work-item blends (`group`)"""
     tape: int = 1024
-    """splats that cover a tile whose fragments are kept on the way forward for the way back (`lanes`), 2 KiB
-    each for each core; lists of which more are drawn are walked twice"""
+    """capacity of the tape (`lanes`): splats of a tile whose fragments the forward pass stores for the
+    backward pass, 2 KiB each for each core; longer lists are evaluated twice"""
 
     @property
     def pair_bytes(self) -> int:
@@ -46,19 +45,19 @@ class DeviceShape:
 
 
 def cpu_shape(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> DeviceShape:
-    """For CPUs: a tile per work-item, in the widest vectors."""
+    """The shape for CPUs: a tile per work-item, in the widest vectors."""
     return DeviceShape("lanes", "ordered", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma, 32)
 
 
 def gpu_shape(scan_items: int = 1024, fast_fma: bool = True) -> DeviceShape:
-    """For GPUs: a work-group per tile of 16 x 16 pixels."""
+    """The shape for GPUs: a work-group per tile of 16 x 16 pixels."""
     return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma, 8)
 
 
 def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
-    """`shape` with the tiles and the schedule that these features ask for."""
+    """`shape` with the tiles and the schedule that these features require."""
     if "blend_double" in features.slots and shape.schedule == "lanes":
-        # doubles are drawn one by one
+        # float64 is not vectorised
         shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
     if not {"compose_pixel", "compose_coplanar"}.isdisjoint(features.slots):
         # the k-buffer takes the registers of a second pixel

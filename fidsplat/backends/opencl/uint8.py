@@ -1,4 +1,4 @@
-"""Images as 8 bits, made on the device (kernels/opencl/uint8.cl)."""
+"""Conversion of images to 8 bits on the device (kernels/opencl/uint8.cl)."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from fidsplat.backends.opencl.workspace import Workspace
 
 _GROUP = 64
 _KERNELS: WeakKeyDictionary[Workspace, tuple[cl.Kernel, int]] = WeakKeyDictionary()
-"""compiled when they are first called for, and values of a work-item"""
+"""kernel, compiled on first use, and values per work-item"""
 
 
 def read_uint8(
     workspace: Workspace, image: cl.Buffer, shape: tuple[int, ...], after: list[cl.Event]
 ) -> np.ndarray:
-    """An image of floats as an array of uint8 on the host; waits for the device. after: until it is drawn.
+    """An image of floats as an array of uint8 on the host; waits for the device. after: events to wait for.
 
     Raises:
         DeviceError: no memory, or the compiler refuses.
     """
     into, count = workspace.host_memory.empty(shape, np.uint8), math.prod(shape)
     queue, name = workspace.read_queue, "8 bits of an image"
-    with workspace.lock:  # arguments belong to one picture at a time
+    with workspace.lock:  # arguments belong to one image at a time
         kernel, values = _kernel(workspace)
         made = workspace.pool.lease(name, count)
         items = -(-count // (values * _GROUP)) * _GROUP

@@ -1,7 +1,7 @@
-"""Lets the OpenCL loader find Intel's runtime for CPUs where pip has installed it.
+"""Registration of Intel's OpenCL runtime for CPUs, installed by pip, with the OpenCL loader.
 
-The packages intel-opencl-rt and intel-cmplr-lib-rt bring the libraries, but no file in /etc/OpenCL/vendors
-that names them, and the loader would not find those that they need.
+The packages intel-opencl-rt and intel-cmplr-lib-rt contain the libraries, but no file in /etc/OpenCL/vendors
+that names them, and the loader does not find their dependencies.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from importlib import metadata
 from pathlib import Path
 
 _VENDORS = "OCL_ICD_VENDORS"
-"""the loader's variable: a folder to look into instead of /etc/OpenCL/vendors"""
+"""the loader's environment variable: a folder that replaces /etc/OpenCL/vendors"""
 _SYSTEM = Path("/etc/OpenCL/vendors")
 _NEEDED = ("libintlc.so.5", "libimf.so", "libirng.so", "libsvml.so")
 
 
 def intel_library() -> Path | None:
-    """Intel's runtime as pip has installed it; None where it is not, or lacks intel-cmplr-lib-rt."""
+    """Intel's runtime as installed by pip; None if it or intel-cmplr-lib-rt is missing."""
     try:
         files = metadata.files("intel-opencl-rt") or ()
     except metadata.PackageNotFoundError:
@@ -35,9 +35,9 @@ def intel_library() -> Path | None:
 
 
 @contextmanager
-def intel_among_them() -> Iterator[None]:
-    """Within it, the loader's first look for platforms finds that runtime beside those of the system. A
-    folder that the user has named is left alone."""
+def intel_registered() -> Iterator[None]:
+    """A context in which the loader finds this runtime in addition to those of the system when it first
+    lists platforms. A folder that the user has set is not replaced."""
     library = None if _VENDORS in os.environ else intel_library()
     if library is None:
         yield
@@ -46,7 +46,7 @@ def intel_among_them() -> Iterator[None]:
         for known in _SYSTEM.glob("*.icd"):
             shutil.copy(known, folder)
         (Path(folder) / "fidsplat-intel-cpu.icd").write_text(f"{library}\n", "utf-8")
-        with suppress(OSError):  # libraries for another system: the loader will pass over it
+        with suppress(OSError):  # libraries for another system: the loader skips them
             for name in _NEEDED:
                 ctypes.CDLL(str(library.parent / name), ctypes.RTLD_GLOBAL)
         os.environ[_VENDORS] = folder

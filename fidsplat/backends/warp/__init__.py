@@ -1,6 +1,6 @@
 """The Warp backend: every stage as NVIDIA Warp kernels (kernels/warp), on the CPU and on CUDA GPUs.
 
-Nothing here imports warp until a device is asked for.
+Warp is imported when a device is first requested.
 """
 
 from fidsplat.backends.warp.device import devices, open_device

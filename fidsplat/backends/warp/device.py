@@ -42,10 +42,12 @@ def open_device(selector: str = "") -> WarpBackend:
         UnknownDeviceError: nothing matches the selector.
     """
     found = runtime.load().get_devices()
-    wanted = selector.strip().lower()
-    matching = [d for d in found if wanted in (d.alias, d.alias.split(":")[0]) or wanted in d.name.lower()]
+    requested = selector.strip().lower()
+    matching = [
+        d for d in found if requested in (d.alias, d.alias.split(":")[0]) or requested in d.name.lower()
+    ]
     if not matching:
-        if wanted.split(":")[0] == "cuda" and not any(device.is_cuda for device in found):
+        if requested.split(":")[0] == "cuda" and not any(device.is_cuda for device in found):
             raise DeviceError(
                 "Warp sees no CUDA device here (no NVIDIA driver, or no GPU); use device='warp:cpu'"
             )
@@ -64,8 +66,8 @@ class WarpBackend(Workspace, Backend):
         super().__init__(device, self.info.name, self.info.memory_bytes // 10 * 9)
         self.shape = shape_for(device)
         # debug builds of Warp's CPU kernels share a pointer among threads, and crash (warp/native/tile.h)
-        alone = device.is_cuda or runtime.load().config.mode == "debug"
-        self._launches = LaunchCache(device, 1 if alone else self.info.compute_units)
+        single = device.is_cuda or runtime.load().config.mode == "debug"
+        self._launches = LaunchCache(device, 1 if single else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
         self._gradients: dict[tuple[FeatureSet, WarpShape], WarpGradients] = {}
 

@@ -24,7 +24,7 @@ class WarpProbe(Probe):
         self._workspace = workspace
 
     fuses = True
-    """Warp's devices fuse multiply-adds where they are asked to"""
+    """Warp's devices fuse multiply-adds where requested"""
 
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
         """a b - a b; a b + a; (a / 3) (b / 3) - (a / 3) (b / 3) in float64; a b - (a b), fused: each (n,),

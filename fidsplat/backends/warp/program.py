@@ -203,8 +203,8 @@ class GradientKernels:
             DeviceError: the compiler refuses.
         """
         features, needs, shape = program.features, program.needs, program.shape
-        drawn = {"rgb", *features.outputs}
-        self.losses = tuple(name for name in GRADIENT_OUTPUTS if name in drawn)
+        rendered = {"rgb", *features.outputs}
+        self.losses = tuple(name for name in GRADIENT_OUTPUTS if name in rendered)
         """outputs with derivatives"""
         self.sh_terms = (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0
         effects, outputs = needs.among(_SAMPLE), needs.blending

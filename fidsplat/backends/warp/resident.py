@@ -98,13 +98,13 @@ class Resident(ResidentData):
             arrays["labels"] = pool.fresh("labels", count, load().int32)
             arrays["labels"].zero_()
         for name, array in arrays.items():
-            wanted = count * max(terms, 1) if name == "colors" else count
-            if count and array.size != wanted:
-                raise InputError(f"{name} holds {array.size} elements, but {count} means need {wanted}")
+            expected = count * max(terms, 1) if name == "colors" else count
+            if count and array.size != expected:
+                raise InputError(f"{name} holds {array.size} elements, but {count} means need {expected}")
         sh_degree = int(np.sqrt(terms)) - 1 if terms else -1
-        held = cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
-        held.adopted = True
-        return held
+        resident = cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
+        resident.adopted = True
+        return resident
 
 
 def _dtype(name: str) -> Any:
@@ -173,13 +173,13 @@ def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
     if isinstance(value, np.ndarray):
         typed = value.astype(np.int32 if dtype is wp.int32 else np.float32, copy=False)
         if width > 1 and (typed.ndim < 2 or typed.shape[-1] != width):
-            wanted = "2 or 3" if name == "scales" else width
-            raise InputError(f"{name} has the shape {typed.shape}; its last axis must be {wanted}")
+            expected = "2 or 3" if name == "scales" else width
+            raise InputError(f"{name} has the shape {typed.shape}; its last axis must be {expected}")
         return _uploaded(name, typed, pool, dtype)
     array: Any = value if isinstance(value, wp.array) else wp.from_dlpack(value)
     if array.device != pool.device:
         raise InputError(
-            f"{name} lies on {array.device}, but this renderer draws on {pool.device}; move it there"
+            f"{name} must be on {pool.device}, the device of this renderer, got {array.device}; move it there"
         )
     if not array.is_contiguous:
         raise InputError(f"{name} is not contiguous; give a contiguous array")

@@ -16,7 +16,7 @@ from fidsplat.util.errors import DeviceError, bytes_words
 
 
 class ArrayPool:
-    """Scratch arrays by name, kept from frame to frame and replaced only when one is too small."""
+    """Scratch arrays by name, reused from frame to frame and replaced only when one is too small."""
 
     def __init__(self, device: Any) -> None:
         self.device = device
@@ -30,17 +30,17 @@ class ArrayPool:
         """caches of scratch arrays, whose `release_arrays` is called when one is replaced"""
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
-        """An array of at least `size` elements whose content is undefined."""
-        held = self._arrays.get((name, dtype))
-        if held is None or held.size < size:
-            if held is not None:
-                del self._arrays[name, dtype], held
+        """An array of at least `size` elements with undefined contents."""
+        array = self._arrays.get((name, dtype))
+        if array is None or array.size < size:
+            if array is not None:
+                del self._arrays[name, dtype], array
                 self._parts.pop((name, dtype), None)
                 self.state = object()
                 for holder in list(self.holders):
                     holder.release_arrays()
-            held = self._arrays[name, dtype] = self.fresh(name, size, dtype)
-        return held
+            array = self._arrays[name, dtype] = self.fresh(name, size, dtype)
+        return array
 
     def exact(self, name: str, size: int, dtype: Any) -> Any:
         """The first `size` elements of a scratch array."""
@@ -54,9 +54,9 @@ class ArrayPool:
         """A scratch array of the size of `values`, with these values of the host."""
         wp = load()
         given = wp.array(values, dtype=dtype, device="cpu")
-        held = self.exact(name, given.size, dtype)
-        wp.copy(held, given)
-        return held
+        array = self.exact(name, given.size, dtype)
+        wp.copy(array, given)
+        return array
 
     def host(self, name: str, size: int, dtype: Any) -> Any:
         """A page-locked array of the host."""

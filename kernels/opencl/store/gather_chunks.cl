@@ -17,40 +17,28 @@ kernel void gather(global const uint *source, global const uint4 *pieces, uint w
 #if INSTANCED
 #define NOT_PLACED 0xffffffffu
 
-// Bit-identical to `moved` (fidsplat/store/subset.py): sums have the same order. Words of a pose: rotation by rows, translation
-// of the origin of the means, quaternion.
+// A row of means (width 3) or quaternions (width 4). Bit-identical to `moved` (fidsplat/store/subset.py): sums have the same
+// order. Words of a pose: rotation by rows, translation of the origin of the means, quaternion.
 // Index space: (rows of the largest piece, pieces).
-kernel void gather_means(
-    global const float *source, global const uint4 *pieces, global const double *poses, global float *target) {
+kernel void gather_placed(
+    global const float *source, global const uint4 *pieces, uint width, global const double *poses, global float *target) {
     uint4 piece = pieces[get_global_id(1)];
     uint row = get_global_id(0);
     if (row >= piece.z) return;
-    global const float *from = source + (ulong)3 * (piece.x + row);
-    global float *to = target + (ulong)3 * (piece.y + row);
+    global const float *from = source + (ulong)width * (piece.x + row);
+    global float *to = target + (ulong)width * (piece.y + row);
     if (piece.w == NOT_PLACED) {
-        for (int i = 0; i < 3; i++) to[i] = from[i];
+        for (uint i = 0; i < width; i++) to[i] = from[i];
         return;
     }
     global const double *pose = poses + 16 * (ulong)piece.w;
-    double x = from[0], y = from[1], z = from[2];
-    for (int i = 0; i < 3; i++)
-        to[i] = (float)(pose[3 * i] * x + pose[3 * i + 1] * y + pose[3 * i + 2] * z + pose[9 + i]);
-}
-
-// Index space: that of gather_means.
-kernel void gather_quats(
-    global const float *source, global const uint4 *pieces, global const double *poses, global float *target) {
-    uint4 piece = pieces[get_global_id(1)];
-    uint row = get_global_id(0);
-    if (row >= piece.z) return;
-    global const float *from = source + (ulong)4 * (piece.x + row);
-    global float *to = target + (ulong)4 * (piece.y + row);
-    if (piece.w == NOT_PLACED) {
-        for (int i = 0; i < 4; i++) to[i] = from[i];
+    if (width == 3) {
+        double x = from[0], y = from[1], z = from[2];
+        for (int i = 0; i < 3; i++)
+            to[i] = (float)(pose[3 * i] * x + pose[3 * i + 1] * y + pose[3 * i + 2] * z + pose[9 + i]);
         return;
     }
-    global const double *rotation = poses + 16 * (ulong)piece.w + 12;
-    double p = rotation[0], q = rotation[1], r = rotation[2], s = rotation[3];
+    double p = pose[12], q = pose[13], r = pose[14], s = pose[15];
     double w = from[0], a = from[1], b = from[2], c = from[3];
     to[0] = (float)(p * w - q * a - r * b - s * c);
     to[1] = (float)(p * a + q * w + r * c - s * b);

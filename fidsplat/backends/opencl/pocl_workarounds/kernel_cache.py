@@ -2,9 +2,8 @@
 
 A bitcode file or a shared object that is cut off, empty or noise ends the process ("LLVM ERROR", SIGBUS,
 abort) or makes a program without kernels, in that run and in every later one. Such files are removed before
-PoCL is first asked for a program; PoCL then compiles them again. PoCL renames a file when it is complete;
-files that another process is writing are called tempfile_*, and are left alone: without them that process
-would end.
+PoCL first builds a program; PoCL then compiles them again. PoCL renames a file when it is complete. Files
+that another process is writing are called tempfile_* and are not removed: that process would end.
 """
 
 from __future__ import annotations

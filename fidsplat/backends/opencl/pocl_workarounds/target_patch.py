@@ -48,7 +48,7 @@ def needs_correction(device_version: str) -> bool:
 
 
 def why_not(device_address: int, device_version: str) -> str:
-    """Why the PoCL device whose record lies at this address may not or cannot be corrected; empty if it can.
+    """Why the PoCL device whose record is at this address may not or cannot be corrected; empty if it can.
     Changes nothing."""
     if os.environ.get(FORBID, "0") not in ("", "0"):
         return f"{FORBID} forbids to correct it"
@@ -61,9 +61,8 @@ def why_not(device_address: int, device_version: str) -> str:
 
 
 def correct_target(device_address: int, device_version: str) -> str:
-    """Give the PoCL device whose record lies at this address the processor name of its kernel library;
-    returns that name. Only where `why_not` has no objection: else nothing is changed, and the name is that of
-    LLVM."""
+    """Set the processor name of the PoCL device whose record is at this address to that of its kernel
+    library, and return it. If `why_not` has a reason, nothing is changed, and LLVM's name is returned."""
     if device_address not in _corrected:
         place = None if why_not(device_address, device_version) else _place(device_address, device_version)
         if place is None:

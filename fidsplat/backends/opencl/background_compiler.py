@@ -1,4 +1,4 @@
-"""Programs that are compiled while others run, in a thread of their own."""
+"""Compilation of programs in the background."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from fidsplat.backends.opencl.program import in_background
 from fidsplat.util.errors import FidsplatError
 
 
-class Ahead:
-    """What is compiled before it is needed, one after another.
+class BackgroundCompiler:
+    """Compiles programs one after another in threads; drivers compile without Python's lock.
 
-    Drivers compile without Python's lock. A thread ends with what it compiles: a program that ends meanwhile,
-    by Ctrl-C say, waits so long and no longer.
+    A thread ends after its program: a process that ends meanwhile, by Ctrl-C for example, waits for it.
     """
 
     def __init__(self) -> None:
         self._threads: dict[Hashable, threading.Thread] = {}
 
     def begin(self, key: Hashable, compile: Callable[[], object]) -> None:
-        """Compiles in the background. What fails there is compiled, and fails, where it is needed."""
+        """Start to compile. An error is ignored here: the program is compiled again when it is needed, which
+        raises the error."""
         if key in self._threads:
             return
-        # here, since what `build` does for the main thread is not for two at once
+        # not in the thread: `build` changes the filters of all threads
         warnings.filterwarnings("ignore", category=cl.CompilerWarning)
         before = list(self._threads.values())
 
@@ -42,7 +42,7 @@ class Ahead:
         thread.start()
 
     def wait(self, key: Hashable) -> None:
-        """Until what was begun is done."""
+        """Wait until the compilation of a key has ended, if it has begun."""
         thread = self._threads.get(key)
         if thread is not None and thread is not threading.current_thread():
             thread.join()
