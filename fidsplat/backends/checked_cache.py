@@ -41,7 +41,8 @@ def check_once(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callabl
 
 
 def remove_damaged(folder: Path, is_loaded: Callable[[str], bool], is_whole: Callable[[Path], bool]) -> int:
-    """Remove what differs from its checksum or is no regular file, and return the number of files removed.
+    """Remove files that differ from their checksum and entries that are not regular files; returns their
+    number.
 
     Args:
         is_loaded: whether the driver loads files of a name; others are not touched.
@@ -85,7 +86,7 @@ def _current(path: str, state: os.stat_result, entry: Entry | None) -> Entry | N
 
 
 def _loaded(folder: Path, is_loaded: Callable[[str], bool]) -> Iterator[os.DirEntry[str]]:
-    """What has the name of a loaded file, in a folder and those below it."""
+    """Files of a folder and its subfolders with a name that the driver loads."""
     waiting = [str(folder)]
     while waiting:
         with suppress(OSError), os.scandir(waiting.pop()) as entries:

@@ -1,4 +1,4 @@
-"""The interface of a device: base classes with a default for what only some devices offer.
+"""The interface of a device: base classes with defaults for optional capabilities.
 
 `Backend.traits` says what a device offers. Code outside a backend never depends on its name.
 """
@@ -28,7 +28,7 @@ class DeviceInfo:
     """Description of a device."""
 
     name: str
-    """What to pass as `device=` to get this one."""
+    """Value of `device=` that opens this device."""
     title: str
     platform: str
     version: str
@@ -42,7 +42,7 @@ class DeviceInfo:
     reason: str
     """Why it cannot be used; empty if it can. For a usable device, a remark (may be empty)."""
     always_float64: bool = False
-    """whether all is computed in float64: slow, and the reference for other devices"""
+    """whether it computes everything in float64: slow, and the reference for other devices"""
 
 
 @dataclass(frozen=True)

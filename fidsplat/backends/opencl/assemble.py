@@ -93,7 +93,7 @@ class Text:
 
 @dataclass
 class Source:
-    """Flat kernel sources with what the host must know of them."""
+    """Flat kernel sources with their declarations for the host."""
 
     programs: dict[str, Text]
     """by their names"""

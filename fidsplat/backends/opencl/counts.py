@@ -1,4 +1,4 @@
-"""Counts that the device takes of a frame: big splats, visible splats, pairs of splats and tiles."""
+"""Counts of a frame: big splats, visible splats, pairs of splats and tiles."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Counts:
 
 @dataclass(frozen=True)
 class Capacity:
-    """What the buffers of a frame hold that was submitted before the host knew its counts."""
+    """Buffer capacities of a frame that was submitted before the host knew its counts."""
 
     big: int
     pairs: int

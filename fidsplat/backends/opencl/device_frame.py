@@ -70,8 +70,7 @@ class FrameBuffers:
 
 @dataclass
 class Rendered:
-    """What a submitted frame leaves: its own buffers and events, without the cloud and scratch buffers that
-    `DeviceFrame` holds."""
+    """Buffers and events of a submitted frame, without the cloud and scratch buffers of `DeviceFrame`."""
 
     queue: cl.CommandQueue
     leased: list[tuple[str, cl.Buffer]]
@@ -128,7 +127,7 @@ class DeviceFrame:
         self.resident, self.plan = resident, plan
         self.batch, self.views = views, len(views)
         self.view = view = views.view
-        """the view, or what the views have in common"""
+        """the view, or the common properties of the views"""
         self.waits = replay_queue is None or shape.lists == "ordered"
         """whether the host waits for the counts"""
         self.pair_limit, self.pool = pair_limit, workspace.pool
@@ -189,7 +188,7 @@ class DeviceFrame:
 
     @property
     def capacity(self) -> Capacity:
-        """What the buffers hold."""
+        """Capacity of the buffers."""
         return Capacity(self.numbers["big_capacity"], self.pairs)
 
     def count_pairs(self) -> int | None:
@@ -303,7 +302,7 @@ class DeviceFrame:
             self.put(name, array)
 
     def rendered(self) -> Rendered:
-        """What the frame leaves."""
+        """Buffers and events of the frame."""
         stages = None if self.queue is self.workspace.replay_queue else self.stages
         return Rendered(self.queue, self.leased, self.stats, self.events, stages, self.uploads)
 

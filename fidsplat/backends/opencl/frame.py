@@ -47,7 +47,7 @@ def render_pose(frame: DeviceFrame) -> None:
 
 
 def allocate_samples(frame: DeviceFrame) -> None:
-    """Bind buffers for what the blend stage writes."""
+    """Bind the buffers that the blend stage writes."""
     for one in frame.samples:
         frame.take(one.name, 4 * frame.numbers["channel_stride"] * one.channels)
     if frame.source.takes("blend", "termination_depths"):

@@ -249,7 +249,7 @@ class OpenCLPipeline(Pipeline):
         cached[key] = CachedFrame(frame.plan, kind, raster)
 
     def _key(self, view: View) -> tuple[Any, ...]:
-        """What frames have in common that differ in numbers only."""
+        """Key of frames that differ in numbers only."""
         labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
         return self, view.width, view.height, view.raster, labels, budgets
 
@@ -279,7 +279,7 @@ class OpenCLPipeline(Pipeline):
         return self._listing("local") if few or resident.coherent else self
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
-        """Render one frame and return what the stages pass on.
+        """Render one frame and return the data between the stages.
 
         keys (n,) uint32; starts (tiles + 1,) uint32; lists (pairs,) uint32, of the last band; records (n,) of
         the record `Splat` (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,

@@ -33,8 +33,8 @@ _ZERO = np.zeros(1, np.uint32)
 
 
 class RecordedFrame:
-    """The command list of a frame, and what differs from view to view. It holds no splats: their cloud caches
-    it (`Resident.cached_frames`)."""
+    """The command list of a frame, and the arguments that differ from view to view. It references no cloud,
+    which caches it (`Resident.cached_frames`)."""
 
     def __init__(self, frame: DeviceFrame) -> None:
         self.workspace, self.commands, self.capacity = frame.workspace, frame.commands, frame.capacity

@@ -62,7 +62,7 @@ class Resident(ResidentData):
         self.cached_frames: dict[Hashable, Any] = {}
         """frames of the cloud that are replayed, by their kind"""
         self.immutable = True
-        """whether its arrays never change; a frame of others cannot be rendered again later"""
+        """whether its arrays never change; otherwise a frame cannot be rendered again later"""
         self.buffer_key: object = None
         """key under which clouds share buffers"""
         self.coherent = False

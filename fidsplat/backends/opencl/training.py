@@ -161,7 +161,7 @@ class OpenCLTraining(TrainingKernels):
                 cl.enqueue_fill_buffer(self._queue, self._bound[name], np.zeros(1, np.float32), 0, size)
 
     def _splats_changed(self) -> None:
-        """Forget what depends on the buffers of the splats."""
+        """Discard the command lists that depend on the buffers of the splats."""
         self._count, self._resident, self._version = self._shapes["means"][0], None, object()
         if math.prod(self._shapes["sh"]) >= 2**32:  # kernels count coefficients in 32 bits
             raise DeviceError(

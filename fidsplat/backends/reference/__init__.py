@@ -1,9 +1,8 @@
-"""What the other backends are compared with: NumPy in float64, every sample of the picture against every
-splat, no tiles, no boxes.
+"""Reference backend: NumPy in float64, each sample of the frame against each splat, without tiles.
 
-It starts from the same float32 inputs and takes the same decisions (docs/correctness.md). Beside the
-outputs it gives certificates: how much a pixel may differ because single precision may decide or round
-otherwise.
+It starts from the same float32 inputs as other backends and makes the same decisions (docs/correctness.md).
+In addition to the outputs it returns certificates: upper bounds of the difference that decisions and rounding
+in float32 cause in each pixel.
 """
 
 from fidsplat.backends.reference.backend import ReferenceBackend, devices, open_device

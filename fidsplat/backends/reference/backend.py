@@ -1,4 +1,4 @@
-"""The reference as a backend: it opens, uploads and draws as the others do."""
+"""The reference backend: device, cloud and pipeline."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from fidsplat.util import interrupts
 from fidsplat.util.errors import UnknownDeviceError
 
 _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once: half a megabyte each, which caches hold
-_TILE = 16  # samples along a side of those for which splats are chosen together
-_WIDEST = 128  # the same of samples that are far apart, at most
-_FEW = 16  # samples: tiles of fewer are made wider, as choosing takes longer than drawing more splats
+_TILE = 16  # samples along a side of a tile, for which splats are culled together
+_WIDEST = 128  # the same, at most, of samples that are far apart
+_FEW = 16  # samples: tiles with fewer are widened, since culling takes longer than more splats
 
 
 def devices() -> list[DeviceInfo]:
@@ -113,7 +113,7 @@ class ReferenceCloud(ResidentData):
 
 
 class ReferencePipeline(Pipeline):
-    """Draws whole pictures (`render`) or chosen pixels (`pixels`)."""
+    """Renders complete frames (`render`) or single pixels (`pixels`)."""
 
     def __init__(self, features: FeatureSet) -> None:
         self.features, self._progress = features, _Progress()
@@ -156,9 +156,8 @@ class ReferencePipeline(Pipeline):
         columns: np.ndarray,
         widest: int = _WIDEST,
     ) -> dict[str, np.ndarray]:
-        """Outputs at pixels (row, column), each (k,) or (k, 3) float64; `certificate` (k,) beside those asked
-        for. widest: samples along a side of those for which splats are chosen together, at most.
-        """
+        """Outputs at pixels (row, column), each (k,) or (k, 3) float64, and `certificate` (k,). widest:
+        maximum samples along a side of a tile, for which splats are culled together."""
         n = view.samples
         sub_rows, sub_columns = np.mgrid[0:n, 0:n]
         y = (np.asarray(rows)[:, None] * n + sub_rows.ravel() + 0.5).ravel()
@@ -172,18 +171,18 @@ class ReferencePipeline(Pipeline):
     def _samples(
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
-        """What blending leaves (k, ...) at grid positions x, y (k,)."""
+        """Sample buffers (k, ...) at grid positions x, y (k,)."""
         splats = Setup(resident.cloud, view, self.features)
         if len(x) * len(splats.order) <= _BLOCK:
             return composite(splats, view, self.features, x, y)
         places, starts = _by_tile(view, x, y, widest)
         parts = []
         for mine in np.split(places, starts):
-            seen = splats.subset(may_contribute(splats, view, x[mine], y[mine]))
-            step = max(1, _BLOCK // max(1, len(seen.order)))
+            near = splats.subset(may_contribute(splats, view, x[mine], y[mine]))
+            step = max(1, _BLOCK // max(1, len(near.order)))
             for k in range(0, len(mine), step):
                 block = mine[k : k + step]
-                parts.append(composite(seen, view, self.features, x[block], y[block]))
+                parts.append(composite(near, view, self.features, x[block], y[block]))
                 self._progress.add(len(block))
         back = np.argsort(places)
         return {name: np.concatenate([part[name] for part in parts])[back] for name in parts[0]}
@@ -194,14 +193,14 @@ class ReferencePipeline(Pipeline):
         """The samples of several sub-frames: the mean of colours, fog and transmittances, all else from
         the middle one; `certificate_middle` is that one's certificate."""
         out: dict[str, np.ndarray] = {}
-        seen_by = [
+        rows_of = [
             (y > sub_frame.top) & (y < sub_frame.top + sub_frame.view.height) for sub_frame in view.sub_frames
         ]
-        self._progress.total = sum(int(mine.sum()) for mine in seen_by)
-        for sub_frame, mine in zip(view.sub_frames, seen_by, strict=True):
-            seen = self._samples(resident, sub_frame.view, x[mine], y[mine] - sub_frame.top, widest)
-            seen["certificate_middle"] = seen["certificate"]
-            for name, values in seen.items():
+        self._progress.total = sum(int(mine.sum()) for mine in rows_of)
+        for sub_frame, mine in zip(view.sub_frames, rows_of, strict=True):
+            samples = self._samples(resident, sub_frame.view, x[mine], y[mine] - sub_frame.top, widest)
+            samples["certificate_middle"] = samples["certificate"]
+            for name, values in samples.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
                 if name in ("rgb", "t", "fogged", "certificate", "behind_bound"):
                     plane[mine] += sub_frame.weight * values
@@ -211,8 +210,8 @@ class ReferencePipeline(Pipeline):
 
 
 def _by_tile(view: View, x: np.ndarray, y: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
-    """The places of samples (k,) tile by tile, and where each tile but the first begins in them. Samples that
-    are far apart have wider tiles, up to `widest` along a side."""
+    """Indices of samples (k,) tile by tile, and the start of each tile but the first. Samples that are far
+    apart have wider tiles, up to `widest` along a side."""
     side = _TILE
     while True:
         tile = y // side * view.width + x // side

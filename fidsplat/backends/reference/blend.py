@@ -114,7 +114,7 @@ def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
 def transmittance(
     alpha: np.ndarray, stop: float, exclusive: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transmittance before each thing, which are contributes, and what is left at the end."""
+    """Transmittance in front of each fragment, whether it contributes, and the transmittance at the end."""
     after = np.cumprod(1 - alpha, axis=1)
     before = shifted(after)
     live = before > stop

@@ -1,7 +1,7 @@
 """3D Gaussians as disks with the same image (docs/primitives.md).
 
 `exact`: with W the map that makes the covariance the unit matrix, the disk through the centre p that is
-perpendicular to W p there. A ray's least squared distance is rho / (1 + rho / |W p|^2) of that disk's rho.
+perpendicular to W p there. A ray's minimum squared distance is rho / (1 + rho / |W p|^2) of that disk's rho.
 `ewa`: a disk that faces the camera, whose image has the covariance of 3DGS.
 """
 
@@ -36,9 +36,9 @@ class Axes:
     inverse_m2: np.ndarray
     """1 / |W p|^2; 0 of disks"""
     faint: np.ndarray
-    """what is added to the logarithm of the opacity"""
+    """term that is added to the logarithm of the opacity"""
     turned: np.ndarray
-    """by how much the normal may be off: a flat one's turns by a right angle within the square of its
+    """error bound of the normal: that of a flat ellipsoid turns by a right angle within the square of its
     flatness of edge-on"""
 
 
@@ -76,7 +76,7 @@ def _surface_normals(
     axes: np.ndarray, scales: np.ndarray, towards: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals (n, 3) of the surfaces of the largest values along rays, at the centres: along the inverse
-    covariance times the ray, as RaDe-GS and GOF have it. And by how much rounding may turn them."""
+    covariance times the ray, as in RaDe-GS and GOF; and the angle by which rounding may turn them."""
     shares = (scales.min(axis=1)[:, None] / scales) ** 2
     normal = np.einsum("nk,nkc->nc", np.einsum("nkc,nc->nk", axes, towards) * shares, axes)
     length = np.linalg.norm(normal, axis=1)
@@ -85,7 +85,7 @@ def _surface_normals(
 
 
 def ewa(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View, antialiased: bool) -> Axes:
-    """The same as 3DGS draws them. Those whose centre lies behind the near plane are of no use."""
+    """Axes of 3D Gaussians in the EWA projection of 3DGS; undefined for centres behind the near plane."""
     scaled = axes * scales[:, :, None]
     z = p[:, 2]
     ahead = np.ones_like(z) if view.parallel else np.where(z > 0, z, 1.0)

@@ -2,7 +2,7 @@
 
 A device evaluates the affine forms n_u, n_v, D of a pixel in float32, about the pixel nearest to the splat's
 centre. Interval arithmetic over their rounding gives for each fragment the lowest and the highest opacity
-that it may have: far apart where a decision lies on its threshold (a rim, the near plane, the
+that it may have: far apart where a decision is at its threshold (a rim, the near plane, the
 horizon) or where the splat is thinner than the rounding of its distance (needles, grazing disks). A pixel's
 certificate adds up what that can change in it, to first order.
 """
@@ -141,7 +141,7 @@ def _of_mirrored_depth(s: Setup, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -
 
 
 def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """What rounding may change (k, n) in forms (k, n) with factors (3, n)."""
+    """Rounding error bounds (k, n) of forms (k, n) with factors (3, n)."""
     total = np.abs(form)
     for away, term in zip(f.away, terms, strict=True):
         total = total + away * np.abs(term)
@@ -149,14 +149,15 @@ def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np
 
 
 def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """What may change (k,) in colour and alpha, per unit of colour; moved (k, m): in each thing itself."""
+    """Error bound (k,) of colour and alpha, per unit of colour. moved (k, m): error bound of each fragment's
+    own colour."""
     bound = (before * (span.high - span.low)).sum(1)
     t_low = span.front_low * (1 - span.high) * (1 - STOP)
     t_high = span.front_high * (1 - span.low) * (1 + STOP)
     may_stop = (span.high > 0) & (t_low <= view.stop) & (t_high >= view.stop)
     # an exclusive stop drops a fragment, an inclusive one only what follows
     lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.stop)
-    # where things change places, whether one is drawn at all is decided by what then lies in front of it
+    # if fragments change places, the fragments in front decide whether one is blended
     may_miss = (
         (span.high > 0)
         & (span.front_low * (1 - STOP) <= view.stop)
@@ -168,7 +169,7 @@ def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.nda
 
 
 def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
-    """What may change (k, 1) in the colour of a layer, per unit of light in front of it, whose n splats have
+    """Error bound (k, 1) of the colour of a layer, per unit of light in front of it, whose n splats have
     optical depths (k, n) between `thin` and `thick`.
     """
     lowest = thin.sum(1, keepdims=True)
@@ -180,8 +181,8 @@ def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
 
 
 def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The same (k, 1) of a layer of n boxes whose opacities lie between `low` and `high` (k, n): its colour
-    times its opacity is their sum, and where they cover more than all, their mean.
+    """Error bound (k, 1) of the colour of a layer of n boxes with opacities between `low` and `high` (k, n):
+    its colour times its opacity is their sum, or their mean if they cover more than all.
     """
     return np.where((high > 0).sum(1, keepdims=True) > 1, (high - low).sum(1, keepdims=True), 0.0)
 
@@ -189,7 +190,7 @@ def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 def of_layer_depth(
     z_low: np.ndarray, z_high: np.ndarray, share: np.ndarray, thin: np.ndarray, thick: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Between which depths (k, 1) the mean by optical depth of n fragments (k, n) may lie."""
+    """Interval of the mean (k, 1) of the depths of n fragments (k, n), weighted by optical depth."""
     may = thick > 0
     count = may.sum(1, keepdims=True)
     none = count == 0
@@ -201,16 +202,16 @@ def of_layer_depth(
     moved = spread * np.minimum(1.0, 2 * (thick - thin).sum(1, keepdims=True) / np.maximum(lowest, 1e-9))
     low = np.where(share > 0, share * z_low, 0.0).sum(1, keepdims=True) - moved
     high = np.where(share > 0, share * z_high, 0.0).sum(1, keepdims=True) + moved
-    drawn = share.any(1, keepdims=True)
-    low = np.where(drawn, np.maximum(low, nearest), nearest)
-    high = np.where(drawn, np.minimum(high, furthest), furthest)
+    blended = share.any(1, keepdims=True)
+    low = np.where(blended, np.maximum(low, nearest), nearest)
+    high = np.where(blended, np.minimum(high, furthest), furthest)
     # a running mean rounds at every fragment
     off = (2 + count) * 2.0**-24 * np.maximum(np.abs(nearest), np.abs(furthest))
     return low - off, high + off
 
 
 def first_column(mask: np.ndarray, start: int) -> np.ndarray:
-    """The first column (k,) where mask (k, m) is set, counted from `start`; start + m where none is."""
+    """The first column (k,) where mask (k, m) is set, counted from `start`; start + m if there is none."""
     k, m = mask.shape
     return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
 
@@ -273,11 +274,11 @@ def of_first(span: Span, light: float) -> np.ndarray:
 
 
 def of_count(span: Span, count: np.ndarray, bound: np.ndarray, stop: float) -> np.ndarray:
-    """By how much (k,) the number of splats blended may differ. count, bound (k, m): in each thing that is
-    composited."""
+    """Error bound (k,) of the number of blended splats. count, bound (k, m): number of splats of each
+    fragment or layer, and its error bound."""
     may, must = span.high > 0, span.low > 0
     off = np.where(may, bound + np.where(must, 0, count), 0)
-    # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
+    # from where the light may have reached the stop to where it must have, a fragment may be blended or not
     open_to = (span.front_high >= stop * (1 - STOP)) & (span.front_low * (1 - span.high) <= stop * (1 + STOP))
     return np.where(may & open_to & (stop > 0), count + bound, off).sum(1)
 

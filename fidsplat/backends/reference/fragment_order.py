@@ -80,7 +80,7 @@ def by_center(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 
 def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
     """Fragments, and one layer per coplanar group, by their own depths at each sample, ties in the splats'
-    order. Those that do not contribute are left out."""
+    order. Fragments that do not contribute are omitted."""
     planes = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
     plain = np.flatnonzero(planes < 0)
     members = [np.flatnonzero(planes == plane) for plane in np.unique(planes[planes >= 0])]
@@ -143,11 +143,11 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFra
     z_low, z_high = error_bounds.of_layer_depth(z_low, z_high, share, thin, thick)
     depth = np.where(total > 0, (share * z).sum(1, keepdims=True), (z_low + z_high) / 2)
     covered = (_coverage(each, boxes) for each in (alpha, low, high))
-    opacity, least, most = covered
+    opacity, low, high = covered
     return OrderedFragments(
         alpha=opacity,
         z=depth,
-        span=Span.of(least, most, z_low, z_high),
+        span=Span.of(low, high, z_low, z_high),
         colors=(share @ s.colors[splats])[:, None],
         normal=(share @ s.normal[splats])[:, None],
         labels=label,

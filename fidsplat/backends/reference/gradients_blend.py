@@ -21,7 +21,7 @@ from fidsplat.backends.view import View
 
 @dataclass
 class Decisions:
-    """What was decided at k samples for m splats; bool arrays (k, m) unless they say otherwise."""
+    """Decisions of the forward pass at k samples for m splats; bool arrays (k, m) unless stated."""
 
     order: np.ndarray
     """(m,) int: the cloud's splats, nearest first"""
@@ -64,7 +64,7 @@ def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
 
 @dataclass
 class Samples:
-    """What blending leaves at k samples; or the derivatives of a loss by each of these."""
+    """Sample buffers of k samples; or the derivatives of a loss by each of them."""
 
     rgb: np.ndarray
     """(k, 3)"""
@@ -121,7 +121,7 @@ class Blend:
 
     @property
     def samples(self) -> Samples:
-        """What blending leaves."""
+        """The sample buffers."""
         return Samples(
             self._weight @ self._rgb,
             self._before[:, -1],
@@ -133,7 +133,7 @@ class Blend:
         )
 
     def backward(self, by: Samples) -> Placed:
-        """Derivatives of a loss by what is placed, from those by the samples."""
+        """Derivatives of a loss by the placed splats, from those by the samples."""
         made, view = self._made, self._view
         facing = self._normal * self._towards
         by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
@@ -187,8 +187,8 @@ class Blend:
         return out
 
     def _by_opacity(self, by: Samples, facing: np.ndarray) -> np.ndarray:
-        """Derivatives (k, m) by the fragments' opacities: what their light is worth, less what is worth that
-        which they hide; from back to front, without a division by what is left of the light."""
+        """Derivatives (k, m) by the opacities of fragments: the value of their own light less that of the
+        light that they occlude; from back to front, without a division by the transmittance."""
         worth = by.rgb @ self._rgb.T + by.normal @ facing.T + by.depth[:, None] * self._z
         worth = worth + by.weight[:, None] + by.inverse[:, None] * self._inverse
         worth = worth + by.squares[:, None] * self._inverse**2

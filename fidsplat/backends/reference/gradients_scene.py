@@ -1,4 +1,4 @@
-"""Splats in the camera's frame and in its colours, as functions of what gradients are taken by; float64."""
+"""Splats in the camera's frame, as differentiable functions of the parameters; float64."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Parameters:
 
     @property
     def names(self) -> list[str]:
-        """Those that there are."""
+        """Names of the parameters of this cloud."""
         return [one.name for one in fields(self) if getattr(self, one.name) is not None]
 
 
@@ -95,7 +95,7 @@ def place(parameters: Parameters, view: View) -> Placed:
 
 
 def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: Placed) -> dict:
-    """Derivatives by the parameters, where their pose is 0, from those by what is placed."""
+    """Derivatives by the parameters, at a pose of 0, from those by the placed splats."""
     rotation = view.rotation
     by_color, by_ray = _rgb_backward(parameters, _eye(parameters, view), slopes.rgb)
     pairs = [(slopes.unit_a, placed.unit_a), (slopes.unit_b, placed.unit_b), (slopes.p, placed.p)]

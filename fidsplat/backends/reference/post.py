@@ -1,4 +1,4 @@
-"""What changes rgb on its way out: what is valid behind everything, and the steps of the sensor."""
+"""Steps on rgb after blending: background, and the steps of the sensor."""
 
 from __future__ import annotations
 
@@ -62,9 +62,8 @@ def _panorama_at(panorama: Panorama, rays: np.ndarray) -> tuple[np.ndarray, np.n
 def apply_sensor(
     light: np.ndarray, bound: np.ndarray, steps: tuple[str, ...], view: View, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values (k, 3) after the sensor's steps for light (k, 3) at pixels (column x, row y), and what may
-    change in
-    them (k,) where the light may be off by `bound` (k,): each step is followed from both ends.
+    """Values (k, 3) after the sensor's steps for light (k, 3) at pixels (column x, row y), and their error
+    bounds (k,) for light with the error bound `bound` (k,): each step is evaluated at both ends.
     """
     low, high = light - bound[:, None], light + bound[:, None]
     for step in steps:
@@ -102,7 +101,7 @@ def _step(name: str, value: np.ndarray, view: View, x: np.ndarray, y: np.ndarray
 
 
 def variates(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
-    """Variates (k, 3) of mean 0 and variance 1 of pixels and channels, bit for bit those of post/noise.cl."""
+    """Variates (k, 3) of mean 0 and variance 1 by pixel and channel, bit-identical to post/noise.cl."""
     columns = []
     for channel in range(3):
         words = [

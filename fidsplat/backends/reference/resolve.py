@@ -50,13 +50,13 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
                 np.where(covered, samples[key], 0.0) for key in ("depth", "depth_moved", "weight")
             )
             out[name] = _ratio((depth * along).sum(1), weight.sum(1), 0.0)
-            # light that moves from the nearest to the furthest fragment, in a mean over at least `least`
+            # light that moves from the nearest to the furthest fragment, in a mean of weight >= `minimum`
             spread = np.where(covered, samples["furthest"] * along, -math.inf).max(1)
             spread -= np.where(covered, samples["nearest"] * along, math.inf).min(1)
             moved = bound_covered * np.where(bound_covered > 0, np.maximum(spread, 0), 0)
             moved += (off * along).sum(1)
-            least = weight.sum(1) - bound_covered
-            out[f"certificate_{name}"] = _where_covered(_ratio(moved, least, math.inf), covered, unsure)
+            minimum = weight.sum(1) - bound_covered
+            out[f"certificate_{name}"] = _where_covered(_ratio(moved, minimum, math.inf), covered, unsure)
     for name, along in (("depth_median", "distance_median"), ("depth_first", "distance_first")):
         if name in features.names:
             place = _median if name == "depth_median" else _nearest

@@ -1,5 +1,4 @@
-"""What a frame takes of the memory budget: how many pairs it may list at once, and which views are rendered
-together."""
+"""The memory plan: how many pairs a frame lists at once, and which views are rendered together."""
 
 from __future__ import annotations
 

@@ -54,11 +54,11 @@ class WarpProbe(Probe):
         return results
 
     def options(self) -> list[str]:
-        """What every kernel is compiled with, switches that are on."""
+        """Compiler options of every kernel that are on."""
         return [name for name, value in kernels("common").STRICT.items() if value is True]
 
     def scan(self, pipeline: Any, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-        """Where lists of these lengths (n,) uint32 start, modulo 2^32, (n + 1,) uint32; and the sum of all in
+        """Prefix sums of list lengths (n,) uint32, modulo 2^32, (n + 1,) uint32; and the total in
         64 bits. All pipelines scan alike.
         """
         wp, device = load(), self._workspace.device
