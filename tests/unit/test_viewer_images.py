@@ -96,6 +96,21 @@ def test_a_moved_camera_shows_the_scene_from_there(viewer, client):
     assert shows(client, expected)
 
 
+@pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.8, 0.3, -0.5)])
+def test_a_browser_starts_with_the_image_of_the_scenes_camera(viewer, up, monkeypatch):
+    """The page looks from `position` at `look_at`, `up` is up in its window, and `fov` is its height."""
+    camera = fs.Camera.look_at(48, 36, 0.9, (0.3, -0.2, -1.1), (0.1, 0.05, 0.0), up)
+    axes = []
+    monkeypatch.setattr(viewer.server.scene, "set_up_direction", axes.append)
+    viewer._start_camera(fs.Scene(camera=camera))
+    start = viewer.server.initial_camera
+    np.testing.assert_allclose(axes, [-camera.world_to_camera[1, :3]])  # which drags of the mouse turn about
+    across = 2 * np.arctan(np.tan(start.fov / 2) * 48 / 36)
+    seen = fs.Camera.look_at(48, 36, across, start.position, start.look_at, start.up)
+    np.testing.assert_allclose(seen.world_to_camera, camera.world_to_camera, atol=1e-9)
+    np.testing.assert_allclose([seen.fx, seen.fy], [camera.fx, camera.fy], rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("slider", "value", "parts"),
     [
