@@ -55,6 +55,17 @@ def test_a_smooth_curve_has_no_kink():
     assert np.abs(jump).max() > 0.1
 
 
+@pytest.mark.parametrize("count", [2, 3, 4, 7])
+def test_a_smooth_curve_backwards_is_the_same_curve(count):
+    """So that its two ends follow the same rule: between two keyframes a screw motion."""
+    path = some(count, smooth=True)
+    back = fs.Trajectory(-path.times[::-1], path.poses[::-1], smooth=True)
+    for time in np.linspace(path.times[0], path.times[-1], 40):
+        np.testing.assert_allclose(path(time), back(-time), atol=1e-12)
+        if count == 2:
+            np.testing.assert_allclose(path(time), fs.Trajectory(path.times, path.poses)(time), atol=1e-12)
+
+
 def test_a_smooth_curve_follows_a_parabola():
     """Between inner keyframes, however uneven they are, and without a turn."""
     times = np.array([0.0, 0.2, 1.0, 1.1, 3.0])
