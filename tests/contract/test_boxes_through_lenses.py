@@ -8,7 +8,7 @@ import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
 from sampling import SAMPLES, alternate, in_turn
 from test_boxes import EXACT, boxes_of, cut
-from test_lens_pictures import CAMERAS
+from test_lens_frames import CAMERAS
 
 import fidsplat as fs
 from fidsplat.cameras.raster import raster_of
@@ -58,7 +58,7 @@ def test_boxes_much_larger_than_the_image(renderer, camera):
     assert_agrees(renderer, cloud.with_boxes(), camera, quality=EXACT)
 
 
-# those that test_layers of test_lens_pictures.py leaves out, each on another device
+# those that test_layers of test_lens_frames.py leaves out, each on another device
 @in_turn(1)
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, dict(reversed(SAMPLES.items()))))
 def test_boxes_and_gaussians_in_layers(renderer, camera, samples):
@@ -156,7 +156,7 @@ def test_light_is_that_of_the_image(renderer, camera, size):
     assert np.mean(areas) == pytest.approx(area, rel=0.03)
 
 
-# each on a device on which test_lens_pictures.py does not have that lens
+# each on a device on which test_lens_frames.py does not have that lens
 @in_turn(1)
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama"])
 def test_boxes_through_lenses_in_single_precision(renderer, name):

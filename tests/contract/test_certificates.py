@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from agreement import random_splats, reference_images
 from test_agreement import coplanar_cloud
-from test_lens_pictures import CAMERAS
+from test_lens_frames import CAMERAS
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS

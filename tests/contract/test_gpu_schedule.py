@@ -11,7 +11,7 @@ import pytest
 from agreement import random_splats, reference_images
 from optimisation import hardly
 from sampling import in_turn
-from test_lens_pictures import CAMERAS
+from test_lens_frames import CAMERAS
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
-from test_lens_pictures import CAMERAS, EVERY_TERM
+from test_lens_frames import CAMERAS, EVERY_TERM
 
 import fidsplat as fs
 from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_to_matrix, rigid_matrix

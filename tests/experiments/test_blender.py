@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from experiments.blender_shots import BOXES, SHOTS, blackman_harris, flat, ours, theirs
+from experiments.blender_images import BOXES, IMAGES, blackman_harris, flat, ours, theirs
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -16,7 +16,7 @@ from fidsplat.experiments.setup import CATEGORIES
 from fidsplat.vision.metrics import psnr
 
 
-@pytest.mark.parametrize("name", SHOTS)
+@pytest.mark.parametrize("name", IMAGES)
 def test_inside_the_cells_the_images_are_equal(name):
     inside = flat(name, 2)
     assert inside.mean() > 0.3

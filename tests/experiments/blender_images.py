@@ -1,6 +1,6 @@
 """Small pictures by Blender, and what the exact renderer makes of the same.
 
-    python tests/experiments/blender_shots.py [ENVIRONMENT]
+    python tests/experiments/blender_images.py [ENVIRONMENT]
 
 prints how well they agree, after drawing those in `data` that are missing with the environment of
 `fidsplat experiment blender --install`.
@@ -33,25 +33,25 @@ CAMERAS = {
     "side": Camera.look_at(WIDTH, HEIGHT, math.radians(40), (2.4, -1.7, -2.6), (0.1, 0.0, 0.0)),
 }
 # name: category, camera, view, pixel filter
-SHOTS = {
+IMAGES = {
     "tag-raw": ("apriltag", "side", "raw", "BOX"),
     "tag-standard": ("apriltag", "side", "standard", "BOX"),
     "code-raw": ("small", "front", "raw", "BOX"),
     "code-standard": ("small", "side", "standard", "BOX"),
     "tag-blackman-harris": ("apriltag", "side", "raw", "BLACKMAN_HARRIS"),
 }
-BOXES = tuple(name for name, shot in SHOTS.items() if shot[3] == "BOX")
+BOXES = tuple(name for name, shot in IMAGES.items() if shot[3] == "BOX")
 
 
 def grid_of(name: str) -> np.ndarray:
     """The modules that a shot shows."""
-    return plain_marker(CATEGORIES[SHOTS[name][0]].spec(0)).grid
+    return plain_marker(CATEGORIES[IMAGES[name][0]].spec(0)).grid
 
 
 def ours(name: str, finer: int = 1, border: int = 0) -> np.ndarray:
     """The exact picture of a shot with ``border`` more pixels around it, each divided into finer x finer:
     display values."""
-    _, camera, view, _ = SHOTS[name]
+    _, camera, view, _ = IMAGES[name]
     grid, camera = grid_of(name), finely(CAMERAS[camera], finer, border)
     module = EDGE / grid.shape[0]
     if view == "raw":
@@ -96,7 +96,7 @@ def blackman_harris(name: str, finer: int = 16) -> np.ndarray:
 
 def compare() -> None:
     """Print PSNR in dB of each shot, inside cells and at edges."""
-    for name in SHOTS:
+    for name in IMAGES:
         inside = flat(name, 2)
         pictures = {"": ours(name)}
         if name not in BOXES:
@@ -108,7 +108,7 @@ def compare() -> None:
 
 def draw(environment: Path) -> None:
     """Draw what is missing."""
-    for name, (_, camera, view, pixel_filter) in SHOTS.items():
+    for name, (_, camera, view, pixel_filter) in IMAGES.items():
         grid = grid_of(name)
         shot = blender.image_job(DATA / f"{name}.png", CAMERAS[camera])
         job = {"name": name, "grid": grid.tolist(), "module": EDGE / grid.shape[0], "images": [shot]}
