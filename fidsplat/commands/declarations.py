@@ -120,8 +120,11 @@ def describe_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     repeated = tyro.conf.UseAppendAction in info.markers
     options = []
     for field in dataclasses.fields(info.type):
-        kind = _described(field.name, hints[field.name], texts.get(field.name), repeated)
-        options.append(StructFieldSpec(field.name, kind, _default_of(field, info.default)))
+        text, default = texts.get(field.name), _default_of(field, info.default)
+        if default is True and text:  # the option is --no-NAME
+            text = f"do not {text}"
+        kind = _described(field.name, hints[field.name], text, repeated)
+        options.append(StructFieldSpec(field.name, kind, default))
     return StructConstructorSpec(info.type, tuple(options))
 
 

@@ -1,11 +1,11 @@
 """`fidsplat demo`."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from fidsplat.commands.declarations import option
-from fidsplat.commands.options import Device, Json, check_range
+from fidsplat.commands.options import Device, Json
 from fidsplat.commands.output import (
     console,
     delayed_progress,
@@ -14,6 +14,7 @@ from fidsplat.commands.output import (
     print_table,
     report,
 )
+from fidsplat.experiments.demo_views import DemoViewSettings
 
 if TYPE_CHECKING:
     from fidsplat.experiments.demo import DemoResult, Sighting
@@ -32,21 +33,16 @@ class DemoViews:
     """
 
     out: Annotated[str, option("DIR", "folder for the data set", "-o")] = "fidsplat-demo-views"
-    views: Annotated[int, option("N", "training images, 2 to 1000")] = 30
-    width: Annotated[int, option("PIXELS", "width of an image, 64 to 4096")] = 320
+    images: DemoViewSettings = field(default_factory=DemoViewSettings)
     device: Device = None
     json: Json = False
 
     def run(self) -> int:
         from fidsplat.experiments.demo_views import write_demo_views
 
-        check_range("--views", self.views, 2, 1000)
-        check_range("--width", self.width, 64, 4096, " pixels")
         with delayed_progress() as progress:
-            folder = write_demo_views(
-                self.out, self.views, width=self.width, device=self.device, progress=progress
-            )
-        return report(self.json, {"folder": str(folder)}, f"{self.views} training views in {folder}")
+            folder = write_demo_views(self.out, self.images, self.device, progress)
+        return report(self.json, {"folder": str(folder)}, f"{self.images.views} training views in {folder}")
 
 
 @dataclass

@@ -56,12 +56,6 @@ def check_request(outputs: tuple[str, ...] | None, quality: str | None) -> None:
     select(fs.SplatCloud.empty(), fs.Capture(outputs=outputs or "rgb", quality=fs.Quality.of(quality)))
 
 
-def check_range(option: str, value: float, low: float, high: float, unit: str = "") -> None:
-    """Raise InputError for a number outside [low, high]."""
-    if not low <= value <= high:
-        raise InputError(f"{option} must be {low:,} to {high:,}{unit}, got {value:g}")
-
-
 def check_workers(ray: str | None, workers: int | None) -> None:
     """Raise InputError for an impossible number of workers, before anything is read."""
     if workers is not None and (ray is None or workers < 1):

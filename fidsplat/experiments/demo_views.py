@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,8 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import write_png
-from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
+from fidsplat.util.arguments import whole_number
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.worlds.yard import FOV_X, demo_scene
 
@@ -25,24 +26,44 @@ _ARC = math.radians(50.0)
 """half angle of the arc"""
 
 
+@dataclass(frozen=True)
+class DemoViewSettings:
+    """Images of the data set.
+
+    Raises:
+        InputError: a number is out of its range.
+    """
+
+    views: int = 30
+    """number of training images, 2 to 1000"""
+    test: int = 6
+    """number of test images, 1 to 1000"""
+    width: int = 320
+    """width of an image in pixels, 64 to 4096; the aspect ratio is 16 : 9"""
+    seed: int = 0
+    """seed of the scene and its points"""
+
+    def __post_init__(self) -> None:
+        ranges = {"views": (2, 1000), "test": (1, 1000), "width": (64, 4096), "seed": (0, 2**32 - 1)}
+        for name, (lowest, highest) in ranges.items():
+            whole_number(f"--{name}", getattr(self, name), lowest, highest)
+
+
 def write_demo_views(
     folder: str | Path,
-    views: int = 30,
-    test: int = 6,
-    width: int = 320,
-    seed: int = 0,
+    settings: DemoViewSettings | None = None,
     device: str | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Path:
     """Render the demo scene from many poses and write the data set (`fidsplat.train.load_dataset`).
 
-    Args:
-        views: number of training images; test: number of test images, in the folder test.
-        width: width of an image in pixels; the aspect ratio is 16 : 9.
-
     Raises:
         InputError: the folder cannot be written; DeviceError: the device cannot be used.
     """
+    from fidsplat.render.renderer import Renderer
+
+    settings = settings or DemoViewSettings()
+    views, test, width, seed = settings.views, settings.test, settings.width, settings.seed
     folder = writable_folder(folder)
     scene, renderer = demo_scene(seed), Renderer(device)
     resident, done = renderer.upload(scene), 0

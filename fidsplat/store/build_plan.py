@@ -42,7 +42,7 @@ class BuildSettings:
     memory: Bytes = 2 * 2**30
     """approximate memory while building"""
     levels: bool = True
-    """whether to store levels of detail; without them every image is exact"""
+    """store levels of detail; without them every image is exact"""
     sh_degree: int | None = None
     """highest SH degree to store (default: that of the files)"""
     colors: str = "float32"
