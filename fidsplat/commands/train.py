@@ -92,7 +92,8 @@ class Train:
             trainer.run(progress_step, prompt=False)
         seconds = time.perf_counter() - begun
         trainer.save(file)
-        scores = trainer.evaluate()
+        with delayed_progress() as progress:
+            scores = trainer.evaluate(progress=progress)
         done = trainer.iteration - before
         facts = _facts(trainer, scores, seconds, done) | {"file": str(file), "checkpoint": str(checkpoint)}
         if self.report is not None:

@@ -21,6 +21,7 @@ from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import save_ply
+from fidsplat.formats.collect import Progress
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.train import densify, mcmc
@@ -204,13 +205,25 @@ class Trainer:
         title = self.renderer.device.title
         save_checkpoint(self.checkpoint, state, self.settings, self.dataset, title)
 
-    def evaluate(self, views: tuple[TrainingView, ...] | None = None) -> list[ViewScore]:
-        """Metrics of views, by default of the held-out views."""
+    def evaluate(
+        self, views: tuple[TrainingView, ...] | None = None, progress: Progress | None = None
+    ) -> list[ViewScore]:
+        """Metrics of views, by default of the held-out views.
+
+        Args:
+            progress: called with a description and the share of views done, 0 to 1.
+        """
+        progress = callback("progress", progress)
         views = self.dataset.held_out if views is None else views
         views = items("views", views, TrainingView, "a list of TrainingView")
         captures = [self._capture(view) for view in views]
         frames = self.renderer.render_views(self.cloud(), captures)
-        return [score_view(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
+        scores = []
+        for number, (view, frame) in enumerate(zip(views, frames, strict=True)):
+            scores.append(score_view(view, frame["rgb"]))
+            if progress is not None:
+                progress("held-out views", (number + 1) / len(views))
+        return scores
 
     def _advance(self, late: bool) -> None:
         """Run one iteration. late: its loss may be read after later iterations."""
