@@ -25,17 +25,17 @@ __all__ = [
 _TRUTHS: dict[bytes, dict[str, np.ndarray]] = {}
 
 
-def reference_images(picture, pixels=None):
+def reference_images(image, pixels=None):
     """Images of the reference, cached for all devices."""
-    key = hashlib.sha256(pickle.dumps((picture, pixels))).digest()
+    key = hashlib.sha256(pickle.dumps((image, pixels))).digest()
     if key not in _TRUTHS:
-        _TRUTHS[key] = render_reference(picture, pixels)
+        _TRUTHS[key] = render_reference(image, pixels)
     return _TRUTHS[key]
 
 
-def against_reference(renderer, picture):
+def against_reference(renderer, image):
     """Render a frame on a device and compare every output with the reference."""
-    return compare(render(renderer, picture), reference_images(picture), picture.outputs)
+    return compare(render(renderer, image), reference_images(image), image.outputs)
 
 
 def reference_pixels(cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0), pixels=None):
@@ -45,9 +45,9 @@ def reference_pixels(cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0)
 
 def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, background=(0.1, 0.2, 0.3)):
     """Render with a device and with the reference, and compare every output; returns the frame."""
-    picture = FrameSpec(cloud, camera, Quality.of(quality), tuple(outputs), background)
-    frame = renderer.render(cloud, camera, outputs, picture.quality, background=background)
-    truth = reference_images(picture)
+    image = FrameSpec(cloud, camera, Quality.of(quality), tuple(outputs), background)
+    frame = renderer.render(cloud, camera, outputs, image.quality, background=background)
+    truth = reference_images(image)
     assert all(frame[name].shape == truth[name].shape for name in outputs)
     differences = compare(frame, truth, outputs)
     assert all(difference.agrees for difference in differences), differences

@@ -161,29 +161,29 @@ def combination(names: Iterable[str]) -> Combination:
         cloud = switch.cloud(cloud) if switch.cloud else cloud
         for name, into in merged.items():
             into.update(getattr(switch, name))
-    asked = merged["arguments"]
+    requested = merged["arguments"]
     capture = fs.Capture(
         camera,
         ("rgb", *(switch.output for switch in chosen if switch.output)),
         fs.Quality().with_(**merged["quality"]),
-        asked.get("background", (0.1, 0.2, 0.3)),
-        fs.Motion(turning if merged["shutter"] else None, asked.get("groups", {})),
+        requested.get("background", (0.1, 0.2, 0.3)),
+        fs.Motion(turning if merged["shutter"] else None, requested.get("groups", {})),
         fs.Shutter(**merged["shutter"]),
         fs.Sensor(**merged["sensor"]),
-        asked.get("fog"),
+        requested.get("fog"),
     )
     return Combination(cloud, capture)
 
 
 def assert_drawn(renderer: fs.Renderer, names: Iterable[str]) -> None:
     """It builds, it draws, and all its images are the reference's within tolerance and certificate."""
-    asked = combination(names)
-    frame = renderer.render(asked.cloud, asked.capture)
-    view = view_of(asked.capture, asked.cloud.origin)
+    requested = combination(names)
+    frame = renderer.render(requested.cloud, requested.capture)
+    view = view_of(requested.capture, requested.cloud.origin)
     reference = ReferenceBackend()
     truth = (
-        reference.pipeline(asked.features("alpha"))
-        .render_view(reference.upload(asked.cloud), view)
+        reference.pipeline(requested.features("alpha"))
+        .render_view(reference.upload(requested.cloud), view)
         .arrays_of(0)
     )
     differences = compare(frame, truth, frame.outputs)

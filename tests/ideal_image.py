@@ -47,9 +47,9 @@ def draw(bits, size, placed, camera, quiet=1, samples=4, ground=0.5) -> tuple[np
     inside = (row >= 0) & (column >= 0) & (row < printed.shape[0]) & (column < printed.shape[1])
     values = np.full(points.shape[1], float(ground))
     values[inside] = 1.0 - printed[row[inside].astype(int), column[inside].astype(int)]
-    picture = np.full((camera.height, camera.width), float(ground))
-    picture[y0:y1, x0:x1] = values.reshape(y1 - y0, samples, x1 - x0, samples).mean((1, 3))
-    return picture, _project(matrix, unit * half)
+    image = np.full((camera.height, camera.width), float(ground))
+    image[y0:y1, x0:x1] = values.reshape(y1 - y0, samples, x1 - x0, samples).mean((1, 3))
+    return image, _project(matrix, unit * half)
 
 
 def _project(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -57,9 +57,9 @@ def _project(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     return seen[:, :2] / seen[:, 2:]
 
 
-def photographed(picture: np.ndarray, seed: int = 0, noise: float = 2.0) -> np.ndarray:
+def photographed(image: np.ndarray, seed: int = 0, noise: float = 2.0) -> np.ndarray:
     """uint8 with less than full contrast and sensor noise of ``noise`` grey levels."""
-    levels = 20 + 200 * picture + np.random.default_rng(seed).normal(0, noise, picture.shape)
+    levels = 20 + 200 * image + np.random.default_rng(seed).normal(0, noise, image.shape)
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
 
 

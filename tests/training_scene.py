@@ -39,7 +39,7 @@ def scene(views=4, held_out=1, size=(24, 18), count=16, renderer=None):
         for a in np.linspace(-1, 1, views + held_out)
     ]
     renderer = renderer or fs.Renderer("reference")
-    drawn = [
+    rendered = [
         TrainingView(
             f"{i}.png", camera, to_uint8(renderer.render(cloud, camera, background=BACKGROUND)["rgb"])
         )
@@ -47,7 +47,7 @@ def scene(views=4, held_out=1, size=(24, 18), count=16, renderer=None):
     ]
     points = cloud.world_means() + random.normal(0, 0.02, (count, 3))
     grey = np.full((count, 3), 128, np.uint8)
-    return Dataset("tiny", tuple(drawn[held_out:]), tuple(drawn[:held_out]), points, grey, BACKGROUND)
+    return Dataset("tiny", tuple(rendered[held_out:]), tuple(rendered[:held_out]), points, grey, BACKGROUND)
 
 
 def run_and_resumed(whole, renderer, settings, steps, folder):

@@ -78,8 +78,8 @@ OF_GRADIENTS = (("lowpass_screen", "ray_depth"), ("depth", "distortion", "normal
 
 def blending_back(*effects):
     """Backward pass of blending, with the device's tile size."""
-    drawn = ((*effects, *OF_GRADIENTS[0]), OF_GRADIENTS[1])
-    return made("blend_backward.make_blend_backward", *drawn, GRADIENTS, True, 256).kernel
+    rendered = ((*effects, *OF_GRADIENTS[0]), OF_GRADIENTS[1])
+    return made("blend_backward.make_blend_backward", *rendered, GRADIENTS, True, 256).kernel
 
 
 def projecting_back(terms):

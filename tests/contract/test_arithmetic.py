@@ -89,10 +89,10 @@ def test_faint_fragments_stay_faint(renderer):
 @in_turn(1)
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_both_schedules_are_bit_identical(renderer, cloud):
-    picture = FrameSpec(cloud, CAMERA, FAST, ALL_OUTPUTS)
+    image = FrameSpec(cloud, CAMERA, FAST, ALL_OUTPUTS)
     own, other = (
-        trace(renderer, picture),
-        trace(renderer, picture, renderer.backend.shapes("schedule")["groups"]),
+        trace(renderer, image),
+        trace(renderer, image, renderer.backend.shapes("schedule")["groups"]),
     )
     assert differing(own, other, ALL_OUTPUTS) == 0
 

@@ -185,8 +185,8 @@ def test_what_moves_already_may_go_on_in_addition_to_poses(renderer, cloud):
         shutter=fs.Shutter(exposure_time=0.1, sub_poses=2),
     )  # fmt: skip
     batch = renderer.render_batch(cloud, capture, poses=POSES, mask=np.array([True, False, True]))
-    wanted = [renderer.render(cloud, capture.with_(camera=camera_at(POSES[k]))) for k in (0, 2)]
-    assert_same(batch, [wanted[0], None, wanted[1]])
+    expected = [renderer.render(cloud, capture.with_(camera=camera_at(POSES[k]))) for k in (0, 2)]
+    assert_same(batch, [expected[0], None, expected[1]])
 
 
 def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):

@@ -51,8 +51,8 @@ def turning(time):
     return pose
 
 
-def assert_agrees(renderer, **picture):
-    differences = against_reference(renderer, FrameSpec(**{"cloud": CLOUD, **picture}))
+def assert_agrees(renderer, **image):
+    differences = against_reference(renderer, FrameSpec(**{"cloud": CLOUD, **image}))
     assert all(difference.agrees for difference in differences), differences
 
 
@@ -127,8 +127,8 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
     ("camera", "behind", "samples"), alternate(CAMERAS, {"sky": SKY, "panorama": PANORAMA}, SAMPLES)
 )
 def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
-    picture = {"camera": camera, "background": behind, "quality": fs.Quality(samples=samples)}
-    assert_agrees(renderer, outputs=(*ALL_OUTPUTS, "normal_world"), **picture)
+    image = {"camera": camera, "background": behind, "quality": fs.Quality(samples=samples)}
+    assert_agrees(renderer, outputs=(*ALL_OUTPUTS, "normal_world"), **image)
 
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")

@@ -173,11 +173,11 @@ def test_random_hard_scenes(renderer, seeds):
     """The fuzzer's splats with a third scale; 1000 scenes have 100,000. `pytest -s` shows the figures."""
     worst, splats, pixels, risky = {}, 0, 0, 0.0
     for seed in seeds:
-        picture = thick_scene_of(seed)
-        found = against_reference(renderer, picture)
+        image = thick_scene_of(seed)
+        found = against_reference(renderer, image)
         assert all(one.finite and one.excess <= 0 for one in found), (seed, found)
         worst = {one.output: max(one.uncertified, worst.get(one.output, 0)) for one in found}
-        size = picture.camera.width * picture.camera.height
-        splats, pixels, risky = splats + len(picture.cloud), pixels + size, risky + found[0].risky * size
+        size = image.camera.width * image.camera.height
+        splats, pixels, risky = splats + len(image.cloud), pixels + size, risky + found[0].risky * size
     print(f"{splats} splats, {pixels} pixels, {risky:.0f} with large certificates, beyond them {worst}")
     assert risky <= RARE * pixels

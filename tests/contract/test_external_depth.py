@@ -63,8 +63,8 @@ def differences(pipeline, resident, cloud, capture):
 @in_turn()
 @pytest.mark.parametrize("case", CASES)
 def test_every_output_is_the_references(renderer, case):
-    cloud, asked = CASES[case]
-    capture = fs.Capture(**{"camera": CAMERA, "outputs": OUTPUTS, "external_depth": a_surface()} | asked)
+    cloud, requested = CASES[case]
+    capture = fs.Capture(**{"camera": CAMERA, "outputs": OUTPUTS, "external_depth": a_surface()} | requested)
     resident = renderer.upload(cloud).data
     pipeline = renderer.backend.pipeline(prepare(resident, capture)[0])
     wrong = [one for one in differences(pipeline, resident, cloud, capture) if not one.agrees]
@@ -77,8 +77,8 @@ def test_every_output_is_the_references(renderer, case):
 
 
 def test_both_schedules_agree(renderer):
-    cloud, asked = CASES["planes, fog, 2 x 2 samples"]
-    capture = fs.Capture(CAMERA, OUTPUTS, external_depth=a_surface()).with_(**asked)
+    cloud, requested = CASES["planes, fog, 2 x 2 samples"]
+    capture = fs.Capture(CAMERA, OUTPUTS, external_depth=a_surface()).with_(**requested)
     resident = renderer.upload(cloud).data
     for shape in renderer.backend.shapes("schedule").values():
         pipeline = renderer.backend.pipeline(prepare(resident, capture)[0], shape)
@@ -138,8 +138,8 @@ def test_our_depth_is_an_external_depth_image(renderer):
         colors=boxes.colors[rows], labels=boxes.labels[rows],
     ).with_boxes() for rows in ([1], [0, 2]))  # fmt: skip
     quality = "standard,opacity_ceiling=1"
-    drawn = renderer.render(first, fs.Capture(CAMERA, OUTPUTS, quality))
-    surface = fs.ExternalDepth(drawn["rgb"], drawn["depth"], np.maximum(drawn["label"], 0))
+    rendered = renderer.render(first, fs.Capture(CAMERA, OUTPUTS, quality))
+    surface = fs.ExternalDepth(rendered["rgb"], rendered["depth"], np.maximum(rendered["label"], 0))
     both = renderer.render(rest, fs.Capture(CAMERA, OUTPUTS, quality, external_depth=surface))
     whole = renderer.render(boxes, fs.Capture(CAMERA, OUTPUTS, quality))
     inside = np.abs(whole["rgb"] - np.rint(whole["rgb"])).max(-1) < 1e-6  # edges cover parts of pixels

@@ -64,16 +64,16 @@ PICTURES = {
 @in_turn()
 @pytest.mark.parametrize("name", PICTURES)
 def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
-    picture = PICTURES[name]()
-    backend, cloud = renderer.backend, picture.cloud
-    features, view = prepare(cloud, picture.capture)
+    image = PICTURES[name]()
+    backend, cloud = renderer.backend, image.cloud
+    features, view = prepare(cloud, image.capture)
     images = backend.pipeline(features, backend.shapes("schedule")["groups"]).render_view(
         backend.upload(cloud), view
     )
-    drawn = {output: images.read(output, 0) for output in picture.outputs}
-    differences = compare(drawn, reference_images(picture), picture.outputs)
+    rendered = {output: images.read(output, 0) for output in image.outputs}
+    differences = compare(rendered, reference_images(image), image.outputs)
     assert all(difference.agrees for difference in differences), differences
-    assert drawn["rgb"].std() > 0.05
+    assert rendered["rgb"].std() > 0.05
 
 
 def test_warp_reads_no_ray_outside_the_image():
@@ -104,7 +104,7 @@ def draw_with_guarded_rays():
         return wp.array(ptr=guard - length, dtype=dtype, shape=(size,), device="cpu")
 
     backend.pool.fresh = before_a_guard
-    picture = PICTURES["distortion"]()
-    features, view = prepare(picture.cloud, picture.capture)
+    image = PICTURES["distortion"]()
+    features, view = prepare(image.cloud, image.capture)
     pipeline = backend.pipeline(features, backend.shapes("schedule")["groups"])
-    pipeline.render_view(backend.upload(picture.cloud), view).read("rgb", 0)
+    pipeline.render_view(backend.upload(image.cloud), view).read("rgb", 0)

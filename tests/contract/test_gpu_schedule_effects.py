@@ -50,22 +50,22 @@ PICTURES = {
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_it_agrees_with_the_reference(renderer, name):
-    asked = PICTURES[name]()
+    requested = PICTURES[name]()
     backend, reference = renderer.backend, ReferenceBackend()
-    features, view = prepare(asked.cloud, asked.capture)
+    features, view = prepare(requested.cloud, requested.capture)
     groups = backend.shapes("schedule")["groups"]
-    images = backend.pipeline(features, groups).render_view(backend.upload(asked.cloud), view)
-    drawn = {output: images.read(output, 0) for output in asked.capture.outputs}
+    images = backend.pipeline(features, groups).render_view(backend.upload(requested.cloud), view)
+    rendered = {output: images.read(output, 0) for output in requested.capture.outputs}
     truth = (
-        reference.pipeline(asked.features("alpha"))
-        .render_view(reference.upload(asked.cloud), view)
+        reference.pipeline(requested.features("alpha"))
+        .render_view(reference.upload(requested.cloud), view)
         .arrays_of(0)
     )
-    differences = compare(drawn, truth, asked.capture.outputs)
+    differences = compare(rendered, truth, requested.capture.outputs)
     # of so few pixels a single one that is hard is too large a share
     wrong = [one for one in differences if not (one.finite and one.excess <= 0)]
     assert not wrong, wrong
-    assert drawn["rgb"].std() > 0.02
+    assert rendered["rgb"].std() > 0.02
 
 
 def test_nothing_is_left_out():

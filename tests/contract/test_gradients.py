@@ -192,8 +192,8 @@ def test_a_cloud_outlives_what_is_under_way(renderer, backend):
     """A processor reads the host's arrays: they go when nobody reads them any more."""
     if renderer.device.kind != "cpu" or not renderer.device.name.startswith("opencl"):
         pytest.skip("reads no arrays of the host, or does not work beside it")
-    told, (cloud, capture) = [], random_picture(6)
-    weakref.finalize(cloud.quats, told.append, "gone")
+    reported, (cloud, capture) = [], random_picture(6)
+    weakref.finalize(cloud.quats, reported.append, "gone")
     features, view = prepare(cloud, capture)
     gradients, resident = backend.differentiate(features), backend.upload(cloud)
     images = gradients.forward(resident, view)
@@ -203,12 +203,12 @@ def test_a_cloud_outlives_what_is_under_way(renderer, backend):
     gradients.backward(images, random_loss(features, view))
 
     def go_on():
-        told.append("read")
+        reported.append("read")
         held.set_status(cl.command_execution_status.COMPLETE)
 
     threading.Timer(0.2, go_on).start()
     del cloud, resident, images
-    assert told == ["read", "gone"]
+    assert reported == ["read", "gone"]
 
 
 def test_outputs_without_a_gradient_given_have_one_of_zero(backend):

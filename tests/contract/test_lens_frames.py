@@ -199,7 +199,7 @@ def test_outside_the_lens_is_background(renderer):
 
 @pytest.mark.parametrize("name", ["fold", "fisheye 200"])
 def test_outside_of_a_lens_there_is_no_distance_and_no_gradient(renderer, name):
-    picture = FrameSpec(
+    image = FrameSpec(
         random_splats(60, 3, depth=(1.0, 4.0)),
         CAMERAS[name],
         fs.Quality(samples=2),
@@ -207,16 +207,16 @@ def test_outside_of_a_lens_there_is_no_distance_and_no_gradient(renderer, name):
         fs.Gradient((0.2, 0.4, 0.9), (0.9, 0.2, 0.1)),
     )
     frame = renderer.render(
-        picture.cloud, picture.camera, picture.outputs, picture.quality, background=picture.background
+        image.cloud, image.camera, image.outputs, image.quality, background=image.background
     )
-    rays = View.of(fs.Capture(picture.camera, quality=picture.quality), np.zeros(3)).raster.rays[..., 0]
-    seen = (~np.isnan(rays)).reshape(picture.camera.height, 2, picture.camera.width, 2).sum((1, 3))
+    rays = View.of(fs.Capture(image.camera, quality=image.quality), np.zeros(3)).raster.rays[..., 0]
+    seen = (~np.isnan(rays)).reshape(image.camera.height, 2, image.camera.width, 2).sum((1, 3))
     unseen = seen == 0
     assert unseen.any()
     assert ((seen > 0) & (seen < 4)).any()
-    for name in picture.outputs:
+    for name in image.outputs:
         assert (frame[name][unseen] == 0).all(), name
-    assert all(difference.agrees for difference in against_reference(renderer, picture))
+    assert all(difference.agrees for difference in against_reference(renderer, image))
 
 
 def test_a_splat_next_to_the_camera_that_is_viewed_edge_on_leaves_its_dot(renderer):

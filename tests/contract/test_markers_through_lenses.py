@@ -50,12 +50,12 @@ def eight_bits(rgb):
     return np.clip(np.round(np.asarray(rgb) * 255), 0, 255).astype(np.uint8)
 
 
-def pictures(renderer, placed, camera, **effects):
+def images(renderer, placed, camera, **effects):
     """What the splats show, and what the ideal plane does under the same effects."""
     scene = fs.Scene([], camera, [placed], background=GREY, quality=DENSE)
-    drawn = renderer.render(scene, **effects)["rgb"]
+    rendered = renderer.render(scene, **effects)["rgb"]
     ideal = ideal_image(scene.markers[0], camera, DENSE.samples, GREY, **effects)
-    return eight_bits(drawn), eight_bits(ideal)
+    return eight_bits(rendered), eight_bits(ideal)
 
 
 def corners_in(image):
@@ -71,7 +71,7 @@ def assert_found(renderer, name, turn, **effects):
     placed = tag_at(position, turn)
     flat = pinhole_towards(camera, position, 360, 360, math.radians(40))
     errors = []
-    for image in pictures(renderer, placed, camera, **effects):
+    for image in images(renderer, placed, camera, **effects):
         corners = corners_in(undistort(image, camera, flat))
         assert corners is not None
         pose = np.linalg.inv(flat.world_to_camera) @ marker_pose(corners, SIZE, flat)
@@ -121,7 +121,7 @@ def test_parallel_rays_show_where_a_tag_is_across_them_and_its_rotation(renderer
         effects = {"motion": motion, "shutter": fs.Shutter(exposure_time=0.01, sub_poses=4)}
         effects["sensor"] = fs.Sensor(full_well=3000, read_noise=10, seed=2)
     errors = []
-    for image in pictures(renderer, placed, camera, **effects):
+    for image in images(renderer, placed, camera, **effects):
         corners = corners_in(image)
         assert corners is not None
         across = (corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
@@ -148,7 +148,7 @@ def test_a_blurred_tag_is_found_wherever_the_ideal_plane_is(renderer, modules):
     motion = fs.Motion(None, {1: lambda time: pose_of((0.8 * time, 0.0, 0.0), (1, 0, 0, 0))})
     shutter = fs.Shutter(exposure_time=exposure, sub_poses=8)
     errors = []
-    for image in pictures(renderer, placed, camera, motion=motion, shutter=shutter):
+    for image in images(renderer, placed, camera, motion=motion, shutter=shutter):
         corners = corners_in(image)
         pose = None if corners is None else marker_pose(corners, SIZE, camera)
         errors.append(math.inf if pose is None else pose_error(pose, placed.pose)[0])
@@ -179,7 +179,7 @@ def test_a_rolling_shutter_shows_the_tag_at_its_rows_time(renderer):
 
     readout, errors = 0.03, []
     shutter = fs.Shutter(readout=readout, rows_per_band=4)
-    for image in pictures(renderer, placed, camera, motion=fs.Motion(turning), shutter=shutter):
+    for image in images(renderer, placed, camera, motion=fs.Motion(turning), shutter=shutter):
         corners = corners_in(image)
         assert corners is not None
         then = turning(readout * (corners[:, 1].mean() / camera.height - 0.5))

@@ -81,8 +81,8 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
     budget = stats["pairs"] - 1
     bands = []
 
-    def noted(*asked):
-        bands.extend(split_by_cost(*asked))
+    def noted(*requested):
+        bands.extend(split_by_cost(*requested))
         return bands
 
     monkeypatch.setattr(opencl.backend, "pair_budget", budget)
@@ -101,11 +101,11 @@ def test_nothing_is_written_beyond_the_capacity_of_lists(opencl, monkeypatch, ma
     that touch few tiles, and of big ones, whose pairs are written elsewhere, as those of many views are."""
     own, some = machine(opencl), random_splats(300, seed=4, scale=scale)
 
-    def drawn():
+    def rendered():
         return own.render(some, CAMERA) if views == 1 else own.render_batch(some, [CAMERA] * views)
 
-    wanted = drawn()
-    pairs, pool, queue = wanted.stats["pairs"], own.backend.pool, own.backend.queue
+    expected = rendered()
+    pairs, pool, queue = expected.stats["pairs"], own.backend.pool, own.backend.queue
     words = {"lists": pairs}
     if machine is as_on_a_gpu:
         words, capacity, bands = {"pairs": 200, "lists": 100}, tiling.pair_capacity, tiling.unsorted_bands
@@ -128,8 +128,8 @@ def test_nothing_is_written_beyond_the_capacity_of_lists(opencl, monkeypatch, ma
     for name in words:
         buffer = pool.scratch(name, max(pool.size(name), 4 * pairs + 64))
         cl.enqueue_fill_buffer(queue, buffer, np.uint32([UNTOUCHED]), 0, buffer.size)
-    frame = drawn()
-    assert np.array_equal(frame["rgb"], wanted["rgb"])
+    frame = rendered()
+    assert np.array_equal(frame["rgb"], expected["rgb"])
     if machine is own_device:
         look()
     assert seen == [True] * len(words)
@@ -162,14 +162,14 @@ def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, stre
 def test_many_big_splats_in_chunks(opencl):
     """More splats that touch many tiles than the first guess has room for."""
     crowd = random_splats(26000, seed=2, depth=(-19.0, 9.0), scale=(0.5, 3.0))
-    wanted = opencl.render(crowd, CAMERA, ("rgb", "depth"))
+    expected = opencl.render(crowd, CAMERA, ("rgb", "depth"))
     own = small(opencl, 3.2)
     resident = own.upload(crowd)
     resident.data._shared, resident.data.streamed = False, True
     frame = own.render(resident, CAMERA, ("rgb", "depth"))
     assert "packed splats" in own.backend.pool._buffers
-    assert frame.stats == wanted.stats
-    assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+    assert frame.stats == expected.stats
+    assert all(np.array_equal(frame[name], expected[name]) for name in frame)
 
 
 @pytest.mark.parametrize(("budget", "words"), [(2**20, "1 MiB"), (200_000, "195 KiB")])
@@ -244,11 +244,11 @@ def test_a_pool_keeps_to_the_budget_whatever_was_rendered_before(opencl, machine
     for count, outputs in ((35000, ("rgb",)), (200000, ALL_OUTPUTS), (50000, ("rgb",)), (200000, ("rgb",))):
         crowd = random_splats(count, seed=6, scale=(1e-4, 1e-2))
         resident = own.upload(crowd)
-        wanted = opencl.render(crowd, CAMERA, outputs)
+        expected = opencl.render(crowd, CAMERA, outputs)
         frame = own.render(resident, CAMERA, outputs)
         if count != 50000:  # of which a processor has room for all, a GPU not
             assert ("packed splats" in own.backend.pool._buffers) == (count > 50000), "it was drawn in chunks"
-        assert all(np.array_equal(frame[name], wanted[name]) for name in outputs)
+        assert all(np.array_equal(frame[name], expected[name]) for name in outputs)
         assert own.backend.pool.memory_bytes + resident.memory_bytes <= budget, count
 
 

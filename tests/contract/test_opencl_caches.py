@@ -25,12 +25,12 @@ def test_a_part_of_a_batch_on_the_device_keeps_its_images(opencl):
     own, some = own_device(opencl), random_splats(100, seed=7)
     poses = np.tile([0, 0, 0, 1, 0, 0, 0.0], (2, 1))
     first = own.render_batch(some, CAMERA, poses=poses).wait()
-    wanted = first["rgb"][1]
+    expected = first["rgb"][1]
     view = first.device_array("rgb")[1]
     del first
     others = [own.render_batch(some, CAMERA, poses=poses + k * np.eye(7)[2]).wait() for k in (1, 2, 3)]
-    assert not np.array_equal(others[0]["rgb"][1], wanted)
-    assert np.array_equal(view.get(), wanted)
+    assert not np.array_equal(others[0]["rgb"][1], expected)
+    assert np.array_equal(view.get(), expected)
     held = weakref.ref(others[-1]._images)
     del others
     assert held() is None, "nor is a batch kept for ever"
@@ -105,6 +105,6 @@ def test_times_of_a_frame_are_taken_once(opencl):
     resident = machine.upload(random_splats(20, seed=1))
     frame = [machine.render(resident, CAMERA) for _ in range(3)][-1]
     assert frame.timings == frame.timings
-    pictures = machine.backend.frames
+    images = machine.backend.frames
     assert frame.timings
-    assert machine.backend.frames == pictures
+    assert machine.backend.frames == images

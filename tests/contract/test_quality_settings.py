@@ -78,8 +78,8 @@ def test_a_device_refuses_by_name_what_it_does_not_do(renderer):
     if renderer.device.name.startswith("opencl") and renderer.device.float64:
         renderer.render(AROUND, CAMERA, quality=DOUBLE)
         return
-    wanted = "blend_precision" if renderer.device.name.startswith("opencl") else "blend_double"
-    with pytest.raises(fs.DeviceError, match=wanted):
+    expected = "blend_precision" if renderer.device.name.startswith("opencl") else "blend_double"
+    with pytest.raises(fs.DeviceError, match=expected):
         renderer.render(AROUND, CAMERA, quality=DOUBLE)
 
 

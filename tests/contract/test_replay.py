@@ -22,12 +22,12 @@ def opencl(renderer):
 
 def test_kernels_see_new_buffers_at_old_addresses(opencl):
     """Arguments are kept from picture to picture, buffers are not: each cloud is drawn, not the last one."""
-    wanted = [random_splats(50, seed=seed) for seed in range(6)]
-    first = [opencl.render(cloud, CAMERA)["rgb"] for cloud in wanted]
+    expected = [random_splats(50, seed=seed) for seed in range(6)]
+    first = [opencl.render(cloud, CAMERA)["rgb"] for cloud in expected]
     for _ in range(3):
-        for cloud, picture in zip(wanted, first, strict=True):
-            assert np.array_equal(opencl.render(cloud, CAMERA)["rgb"], picture)
-    assert len({picture.tobytes() for picture in first}) == 6
+        for cloud, image in zip(expected, first, strict=True):
+            assert np.array_equal(opencl.render(cloud, CAMERA)["rgb"], image)
+    assert len({image.tobytes() for image in first}) == 6
 
 
 def test_a_frame_is_replayed_for_each_view(opencl):
@@ -53,9 +53,9 @@ def test_a_frame_is_replayed_for_each_view(opencl):
     kept = [machine.render(resident, capture) for _ in range(3) for capture in captures]
     assert [each.recorded is not None for each in resident.data.cached_frames.values()] == [True, True]
     for frame, capture in zip(kept, captures * 3, strict=True):
-        wanted = own.render(some, capture)
-        assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
-        assert frame.stats == wanted.stats
+        expected = own.render(some, capture)
+        assert all(np.array_equal(frame[name], expected[name]) for name in frame)
+        assert frame.stats == expected.stats
         assert set(frame.timings) == {"project", "sort", "bin", "blend"}  # which resolves
     assert kept[-1].wait() is kept[-1]
 
@@ -99,14 +99,14 @@ def test_threads_share_cached_launches(opencl):
         for width in (50, 60)
         for z in (-900, 0, 1)
     ]
-    wanted = [own.render(some, capture) for capture in captures]
+    expected = [own.render(some, capture) for capture in captures]
     resident = machine.upload(some)
 
     def draw(number):
         frames = [machine.render(resident, captures[(number + k) % 6]) for k in range(6)]
         return all(
-            np.array_equal(frame["rgb"], wanted[(number + k) % 6]["rgb"])
-            and frame.stats == wanted[(number + k) % 6].stats
+            np.array_equal(frame["rgb"], expected[(number + k) % 6]["rgb"])
+            and frame.stats == expected[(number + k) % 6].stats
             and len(frame.timings) == 4
             for k, frame in enumerate(frames)
         )
@@ -123,20 +123,23 @@ def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine
     capture = fs.Capture(fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)), ("rgb", "label"))
     poses = np.random.default_rng(0).normal(0, 0.05, (2, 7, 7))
     poses[..., 3] += 1
-    asked = {"poses": poses[0], "groups": {2: poses[1]}, "mask": np.arange(7) != 3}
+    requested = {"poses": poses[0], "groups": {2: poses[1]}, "mask": np.arange(7) != 3}
     resident = own.upload(some)
     for most in (1 << 31, 1 << 18):
         monkeypatch.setattr(memory_plan, "PART_BYTES", {})
         monkeypatch.setattr(memory_plan, "OTHER_PART_BYTES", most)
-        drawn = own.render_batch(resident, capture, **asked)
+        rendered = own.render_batch(resident, capture, **requested)
         alone = own.render(resident, capture)
         for number in (0, 1, 2, 4, 5, 6):
             one = {"poses": poses[0, [number]], "groups": {2: poses[1, [number]]}}
-            wanted = opencl.render(some, views_of([capture], **one).capture(0))
-            assert all(np.array_equal(drawn[name][number], wanted[name]) for name in drawn), (most, number)
-        assert (drawn["label"][3] == -1).all()
-        assert not drawn["rgb"][3].any()
-        assert np.array_equal(drawn.device_array("rgb").get(), drawn["rgb"])
+            expected = opencl.render(some, views_of([capture], **one).capture(0))
+            assert all(np.array_equal(rendered[name][number], expected[name]) for name in rendered), (
+                most,
+                number,
+            )
+        assert (rendered["label"][3] == -1).all()
+        assert not rendered["rgb"][3].any()
+        assert np.array_equal(rendered.device_array("rgb").get(), rendered["rgb"])
         assert np.array_equal(alone["rgb"], opencl.render(some, capture)["rgb"])
 
 

@@ -254,8 +254,8 @@ def test_rolling_shutters_of_a_tall_field_of_view_lose_no_splat(renderer, up):
         motion=fs.Motion(lambda time: np.eye(4) + 0.02 * time * np.eye(4, k=3)),
         shutter=fs.Shutter(readout=0.5, rows_per_band=8),
     )  # fmt: skip
-    wanted = fs.Renderer("reference").render(cloud, capture)
+    expected = fs.Renderer("reference").render(cloud, capture)
     frame = renderer.render(cloud, capture)
-    assert wanted["alpha"].max() > 0.2
+    assert expected["alpha"].max() > 0.2
     for output in ("rgb", "alpha"):
-        np.testing.assert_allclose(frame[output], wanted[output], atol=2e-4)
+        np.testing.assert_allclose(frame[output], expected[output], atol=2e-4)

@@ -71,7 +71,7 @@ def on_device(renderer, array):
     return pyopencl.array.to_device(renderer.backend.queue, np.ascontiguousarray(array, np.float32))
 
 
-def drawn(renderer, image):
+def rendered(renderer, image):
     """Images as a pipeline gives them."""
     array = on_device(renderer, image)
     return SimpleNamespace(device_buffer=lambda name: (array.data, array.shape), read=lambda name: image)
@@ -96,13 +96,13 @@ def test_loss(renderer, views, works, weight, lanes):
     for number in (0, 1, 0, 2):
         truth = views[number].image / 255.0
         image = (truth + random.normal(0, 0.2, truth.shape)).astype(np.float32)
-        value, slope = work.loss(drawn(renderer, image), number)
+        value, slope = work.loss(rendered(renderer, image), number)
         found = value()
         wanted, wanted_slope = image_loss(image.astype(np.float64), truth, views[number].mask, weight)
         assert found.value == pytest.approx(wanted.value, rel=1e-5)
         assert found.mse == pytest.approx(wanted.mse, rel=1e-5)
         np.testing.assert_allclose(slope.get(), wanted_slope, rtol=1e-3, atol=2e-7)
-        again, same = work.loss(drawn(renderer, image), number)
+        again, same = work.loss(rendered(renderer, image), number)
         assert (again(), same.get().tobytes()) == (found, slope.get().tobytes())
 
 
@@ -112,7 +112,7 @@ def test_the_loss_is_summed_piece_by_piece(renderer, views, works, monkeypatch):
     work, _ = works(lanes=1)  # on CPUs it is summed strip by strip
     truth = views[0].image / 255.0
     image = (truth + np.random.default_rng(2).normal(0, 0.2, truth.shape)).astype(np.float32)
-    found = work.loss(drawn(renderer, image), 0)[0]()
+    found = work.loss(rendered(renderer, image), 0)[0]()
     wanted, _ = image_loss(image.astype(np.float64), truth, views[0].mask, TrainSettings().dssim_weight)
     assert found.value == pytest.approx(wanted.value, rel=1e-5)
     assert found.mse == pytest.approx(wanted.mse, rel=1e-5)
@@ -122,11 +122,11 @@ def test_masked_values_that_are_not_finite_do_not_count(renderer, views, works):
     work, _ = works()
     image = np.full((18, 31, 3), 0.5, np.float32)
     image[~views[1].mask] = np.nan
-    value, slope = work.loss(drawn(renderer, image), 1)
+    value, slope = work.loss(rendered(renderer, image), 1)
     assert np.isfinite(value().value)
     assert not slope.get()[~views[1].mask].any()
     image[tuple(np.argwhere(views[1].mask)[0])] = np.nan
-    assert np.isnan(work.loss(drawn(renderer, image), 1)[0]().value)
+    assert np.isnan(work.loss(rendered(renderer, image), 1)[0]().value)
 
 
 def test_loss_of_normals(renderer, views, works):

@@ -119,11 +119,11 @@ def test_steps_are_the_same_if_they_are_reported_later(renderer, dataset):
     """At the end of a run all are told, in their order."""
     settings = {**QUICK, "iterations": 40}
     prompt, late, at_once = (Trainer(dataset, renderer, **settings) for _ in range(3))
-    told, ahead = [], []
+    reported, ahead = [], []
     prompt.run(lambda step: ahead.append(prompt.iteration - step.iteration))
-    late.run(told.append, prompt=False)
+    late.run(reported.append, prompt=False)
     steps = [at_once.step() for _ in range(40)]
-    assert told == steps
+    assert reported == steps
     assert set(ahead) == {0}
     assert splats_of(prompt) == splats_of(late) == splats_of(at_once)
 
@@ -185,15 +185,15 @@ def test_a_failed_densification_keeps_the_checkpoint(renderer, dataset, tmp_path
     file, pool = tmp_path / "run.training.npz", renderer.backend.pool
     whole = Trainer(dataset, renderer, **settings)
     whole.run()
-    trainer, fresh, asked = Trainer(dataset, renderer, checkpoint=file, **settings), pool.fresh, []
+    trainer, fresh, requested = Trainer(dataset, renderer, checkpoint=file, **settings), pool.fresh, []
     for _ in range(15):
         trainer.step()
     trainer.save_checkpoint()
     kept = file.read_bytes()
 
     def full(name, size):
-        asked.append(name)
-        if len(asked) == 4:
+        requested.append(name)
+        if len(requested) == 4:
             raise fs.DeviceError("no memory")
         return fresh(name, size)
 
@@ -233,7 +233,7 @@ def test_an_interrupt_keeps_pending_losses(renderer, dataset, monkeypatch):
 @pytest.mark.parametrize("losses", [{}, {"normal_from": 24, "distortion_from": 30, "distortion_weight": 1.0}])
 def test_upcoming_kernels_are_compiled_in_the_background(renderer, dataset, monkeypatch, losses):
     """Each set of kernels before the first iteration that draws by it, and all that are drawn by."""
-    begun, drawn = [], []
+    begun, rendered = [], []
     backend = renderer.backend
     differentiate = backend.differentiate
     monkeypatch.setattr(
@@ -241,11 +241,11 @@ def test_upcoming_kernels_are_compiled_in_the_background(renderer, dataset, monk
     )
     trainer = Trainer(dataset, renderer, **{**STEADY, "sh_degree": 2, **losses})
     monkeypatch.setattr(
-        trainer, "_differentiate", lambda features: drawn.append(features) or differentiate(features)
+        trainer, "_differentiate", lambda features: rendered.append(features) or differentiate(features)
     )
     trainer.run()
-    wanted = list(dict.fromkeys(drawn))
-    assert [features for _, features in begun] == wanted[1:]
+    expected = list(dict.fromkeys(rendered))
+    assert [features for _, features in begun] == expected[1:]
     changes = [1, 16, 25, 31] if losses else [1, 16]
     assert [iteration for iteration, _ in begun] == changes
 

@@ -25,7 +25,7 @@ KINDS = np.concatenate(
 """values at which a conversion may go wrong: no numbers, beyond both ends, on and beside every half"""
 
 
-def drawn(renderer, width, height):
+def rendered(renderer, width, height):
     camera = fs.Camera.look_at(width, height, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
     return renderer.render(CLOUD, camera, background=(-0.25, 0.5, 1.75))
 
@@ -42,7 +42,7 @@ def put(frame, values):
 
 @pytest.mark.parametrize("size", [(37, 23), (64, 32)], ids=str)
 def test_an_image_equals_the_hosts_bit_for_bit(renderer, size):
-    frame = drawn(renderer, *size)
+    frame = rendered(renderer, *size)
     assert frame._images.read_uint8("rgb") is not None
     on_device = frame.to_uint8()
     assert (on_device.shape, on_device.dtype) == ((*size[::-1], 3), np.uint8)
@@ -55,7 +55,7 @@ def test_an_image_equals_the_hosts_bit_for_bit(renderer, size):
 def test_every_kind_of_value(renderer, size):
     """Also in the last values, which fill no work-item."""
     for shift in (0, 7):
-        frame = drawn(renderer, *size)
+        frame = rendered(renderer, *size)
         values = np.resize(np.roll(KINDS, shift), (size[1], size[0], 3))
         put(frame, values)
         assert np.array_equal(frame.to_uint8(), to_uint8(values))
@@ -65,7 +65,7 @@ def test_every_kind_of_value_by_a_gpus_work_items(renderer):
     """On whatever device this is; they take four values each, not sixteen."""
     if not renderer.device.name.startswith("opencl"):
         pytest.skip("the OpenCL backend")
-    frame = drawn(fs.Renderer(renderer.device.name), 37, 23)
+    frame = rendered(fs.Renderer(renderer.device.name), 37, 23)
     frame.wait()._images._workspace.shape = gpu_shape()
     values = np.resize(KINDS, (23, 37, 3))
     put(frame, values)
@@ -74,7 +74,7 @@ def test_every_kind_of_value_by_a_gpus_work_items(renderer):
 
 def test_frames_are_read_concurrently(renderer):
     """Each keeps its own, though the device's buffer is used again."""
-    frames = [drawn(renderer, 37, 23), drawn(renderer, 23, 37)]
+    frames = [rendered(renderer, 37, 23), rendered(renderer, 23, 37)]
     read = [frame.to_uint8() for frame in (*frames, *frames)]
     for frame, first, again in zip(frames, read[:2], read[2:], strict=True):
         assert np.array_equal(first, again)
@@ -82,10 +82,10 @@ def test_frames_are_read_concurrently(renderer):
 
 
 def test_the_reference_and_cached_frames_convert_on_the_host(reference):
-    frame = drawn(reference, 9, 7)
-    wanted = to_uint8(frame["rgb"])
-    assert np.array_equal(frame.to_uint8(), wanted)
-    assert np.array_equal(pickle.loads(pickle.dumps(frame)).to_uint8(), wanted)
+    frame = rendered(reference, 9, 7)
+    expected = to_uint8(frame["rgb"])
+    assert np.array_equal(frame.to_uint8(), expected)
+    assert np.array_equal(pickle.loads(pickle.dumps(frame)).to_uint8(), expected)
 
 
 def test_a_frame_without_rgb_says_so(reference):

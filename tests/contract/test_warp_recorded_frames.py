@@ -70,17 +70,17 @@ def test_frames_equal_those_that_wait(renderer, ahead, case):
         drawn.extend((frame["rgb"], frame.stats) for frame in frames)
 
     assert pictures(ahead, draw) == len(cameras) + AGAIN.get(case, 0)
-    for (rgb, stats), wanted in zip(drawn, waiting(renderer, cameras), strict=True):
-        assert np.array_equal(rgb, wanted["rgb"])
-        assert stats == wanted.stats
-    assert wanted.stats["pairs"] > 2000 or case == "less and less"
+    for (rgb, stats), expected in zip(drawn, waiting(renderer, cameras), strict=True):
+        assert np.array_equal(rgb, expected["rgb"])
+        assert stats == expected.stats
+    assert expected.stats["pairs"] > 2000 or case == "less and less"
 
 
 def test_a_batch_of_views_waits_for_the_first_only(renderer, ahead):
     cameras, resident = [FAR, *[CAPTURE.camera] * 2, ELSEWHERE], renderer.upload(CLOUD)
     batch = renderer.render_batch(resident, [CAPTURE.with_(camera=camera) for camera in cameras])
-    for number, wanted in enumerate(waiting(renderer, cameras)):
-        assert np.array_equal(batch["rgb"][number], wanted["rgb"]), number
+    for number, expected in enumerate(waiting(renderer, cameras)):
+        assert np.array_equal(batch["rgb"][number], expected["rgb"]), number
 
 
 def test_adopted_arrays_are_waited_for(renderer, ahead):
@@ -138,9 +138,9 @@ def replayed(ahead, monkeypatch):
 
 
 def assert_drawn(renderer, frames, cameras):
-    for frame, wanted in zip(frames, waiting(renderer, cameras), strict=True):
-        assert np.array_equal(frame["rgb"], wanted["rgb"])
-        assert frame.stats == wanted.stats
+    for frame, expected in zip(frames, waiting(renderer, cameras), strict=True):
+        assert np.array_equal(frame["rgb"], expected["rgb"])
+        assert frame.stats == expected.stats
 
 
 def test_equal_frames_are_replayed(renderer, replayed):
@@ -189,12 +189,12 @@ def test_what_moves_is_replayed(renderer, replayed):
     assert len(replayed) == 2
     renderer.backend.asynchronous = False
     for frame, place in zip(frames, places, strict=True):
-        wanted = renderer.render(cloud, capture(place))
-        assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+        expected = renderer.render(cloud, capture(place))
+        assert all(np.array_equal(frame[name], expected[name]) for name in frame)
     aside = capture(0.1).with_(camera=fs.Camera.look_at(61, 43, 1.1, (0.4, 0.0, 0.0), (0.0, 0.0, 3.0)))
     batch = renderer.render_batch(cloud, [capture(0.1), aside])
-    wanted = renderer.render(cloud, aside)
-    assert all(np.array_equal(batch[name][1], wanted[name]) for name in batch)
+    expected = renderer.render(cloud, aside)
+    assert all(np.array_equal(batch[name][1], expected[name]) for name in batch)
 
 
 def budget(renderer, pairs):
@@ -230,19 +230,19 @@ def test_a_frame_between_replays_leaves_its_view_to_none(renderer, replayed, mon
 def test_a_replay_that_fails_half_filled_is_not_launched_again(renderer, replayed, monkeypatch):
     """The view that it was to show is drawn again."""
     resident, there = renderer.upload(CLOUD), CAPTURE.with_(camera=ELSEWHERE)
-    wanted = renderer.render(resident, there)["rgb"]
+    expected = renderer.render(resident, there)["rgb"]
     for _ in range(4):
         renderer.render(resident, CAPTURE)["rgb"]
     assert replayed
 
-    def refused(picture):
+    def refused(image):
         raise RuntimeError("no copy")
 
     with monkeypatch.context() as failing:
         failing.setattr(DeviceFrame, "_fill_views", refused)
         with pytest.raises(fs.DeviceError, match="no copy"):
             renderer.render(resident, there)
-    assert np.array_equal(renderer.render(resident, there)["rgb"], wanted)
+    assert np.array_equal(renderer.render(resident, there)["rgb"], expected)
 
 
 def test_a_graph_keeps_no_splats(renderer, replayed):
@@ -282,8 +282,8 @@ def test_parts_of_a_batch_are_replayed(renderer, replayed, monkeypatch):
     captures, resident = [CAPTURE.with_(camera=camera) for camera in CROSSING], renderer.upload(CLOUD)
     batch = renderer.render_batch(resident, captures)
     assert [len(stack) for stack in replayed] == [2, 2, 2]
-    for drawn, wanted in zip(batch["rgb"], waiting(renderer, CROSSING), strict=True):
-        assert np.array_equal(drawn, wanted["rgb"])
+    for drawn, expected in zip(batch["rgb"], waiting(renderer, CROSSING), strict=True):
+        assert np.array_equal(drawn, expected["rgb"])
     assert batch.stats["pairs"] == sum(each.stats["pairs"] for each in waiting(renderer, CROSSING))
 
 
@@ -299,9 +299,9 @@ def test_views_together_in_blocks_of_threads(renderer):
         banded = pipeline.render(resident, views).read("rgb")
     finally:
         backend.pair_budget = before
-    for k, wanted in enumerate(waiting(renderer, CROSSING[:3])):
-        assert np.array_equal(whole[k], wanted["rgb"])
-        assert np.array_equal(banded[k], wanted["rgb"])
+    for k, expected in enumerate(waiting(renderer, CROSSING[:3])):
+        assert np.array_equal(whole[k], expected["rgb"])
+        assert np.array_equal(banded[k], expected["rgb"])
 
 
 def test_a_device_that_captures_nothing_renders_nevertheless(renderer, replayed, monkeypatch):

@@ -69,11 +69,11 @@ def finely(camera: Camera, finer: int, border: int) -> Camera:
 
 def flat(name: str, room: int) -> np.ndarray:
     """(h, w) bool: pixels whose neighbours up to ``room`` away show one value."""
-    picture = ours(name)
-    same = np.ones(picture.shape, bool)
+    image = ours(name)
+    same = np.ones(image.shape, bool)
     for dy in range(-room, room + 1):
         for dx in range(-room, room + 1):
-            same &= np.abs(np.roll(picture, (dy, dx), (0, 1)) - picture) < 1e-9
+            same &= np.abs(np.roll(image, (dy, dx), (0, 1)) - image) < 1e-9
     same[:room], same[-room:], same[:, :room], same[:, -room:] = (False,) * 4
     return same
 
@@ -101,8 +101,8 @@ def compare() -> None:
         pictures = {"": ours(name)}
         if name not in BOXES:
             pictures[", our picture under that filter"] = blackman_harris(name)
-        for what, picture in pictures.items():
-            ratios = [psnr(picture[where], theirs(name)[where]) for where in (inside, ~inside)]
+        for what, image in pictures.items():
+            ratios = [psnr(image[where], theirs(name)[where]) for where in (inside, ~inside)]
             print(f"{name}{what}: {ratios[0]:.1f} inside cells, {ratios[1]:.1f} at edges")
 
 

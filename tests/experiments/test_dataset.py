@@ -71,24 +71,24 @@ def test_images_show_what_the_cameras_see(scene):
         (scene, "view-04.png", training_cameras(5)[4]),
         (scene / "test", "test-19.png", novel_cameras(CATEGORIES["small"], 3)[19]),
     ):
-        picture = read_image(folder / "images" / name)
-        assert np.array_equal(picture[:, :, 0], to_uint8(exact_view(spec, camera, False)))
+        image = read_image(folder / "images" / name)
+        assert np.array_equal(image[:, :, 0], to_uint8(exact_view(spec, camera, False)))
     assert len(list((scene / "images").glob("*.png"))) == 5
     assert len(list((scene / "test" / "images").glob("*.png"))) == 20
 
 
 def test_a_scene_that_is_whole_stays_and_another_truth_renders_it_again(scene):
     part = {"category": "small", "index": 3, "views": 5}
-    picture = scene / "images" / "view-00.png"
-    before = picture.stat().st_mtime_ns
+    image = scene / "images" / "view-00.png"
+    before = image.stat().st_mtime_ns
     write_scene(part, scene.parent, 0, "exact", Path("nowhere"))
-    assert picture.stat().st_mtime_ns == before
+    assert image.stat().st_mtime_ns == before
     note = json.loads((scene / "marker.json").read_text())
     assert note["spec"] == CATEGORIES["small"].spec(3)
     assert note["module_m"] * 33 == pytest.approx(2.0)
     (scene / "marker.json").unlink()  # as an interrupt leaves it
     write_scene(part, scene.parent, 0, "exact", Path("nowhere"))
-    assert picture.stat().st_mtime_ns > before
+    assert image.stat().st_mtime_ns > before
 
 
 def test_blenders_images_become_the_scenes(tmp_path):

@@ -108,10 +108,10 @@ def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
     camera = protocol.camera(35.0)
     ideal = markers.prepare(IDEAL, "small-0", spec, module)(camera)
     for name in method_names()[1:]:
-        picture = markers.prepare(name, "small-0", spec, module)(camera)
-        assert picture.shape == ideal.shape
-        match = psnr(picture, ideal)
-        shifted = max(psnr(np.roll(picture, step, axis), ideal) for step in (-1, 1) for axis in (0, 1))
+        image = markers.prepare(name, "small-0", spec, module)(camera)
+        assert image.shape == ideal.shape
+        match = psnr(image, ideal)
+        shifted = max(psnr(np.roll(image, step, axis), ideal) for step in (-1, 1) for axis in (0, 1))
         assert match > shifted + 3
 
 
@@ -163,14 +163,14 @@ def test_views_of_the_ideal_texture(pool, tmp_path):
 
 def test_images_are_rendered_once_for_all_truths(pool, tmp_path):
     """And what is kept is the right marker's, method's and truth's."""
-    drawn = []
+    rendered = []
 
     class Counting(MarkerRenderer):
         def prepare(self, method, name, spec, module):
             draw = super().prepare(method, name, spec, module)
 
             def counted(camera):
-                drawn.append(name)
+                rendered.append(name)
                 return draw(camera)
 
             return counted
@@ -181,7 +181,7 @@ def test_images_are_rendered_once_for_all_truths(pool, tmp_path):
             point = part_of(IDEAL, truth) | {"index": index, "flip": False}
             alone = views.measure_views(point, CEILING, 0, tmp_path, pool)
             assert views.measure_views(point, Counting(None), 0, tmp_path, pool, cache=cache) == alone
-    assert drawn == ["small-0", "small-0", "small-1", "small-1"]
+    assert rendered == ["small-0", "small-0", "small-1", "small-1"]
 
 
 @in_turn()

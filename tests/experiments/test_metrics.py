@@ -100,9 +100,9 @@ def test_lpips_is_that_of_its_definition(tmp_path):
     random = np.random.default_rng(3)
     one, other = random.uniform(size=(67, 71)), random.uniform(size=(67, 71))
 
-    def features(picture: np.ndarray) -> list[np.ndarray]:
+    def features(image: np.ndarray) -> list[np.ndarray]:
         shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-        x = ((2 * picture - 1)[None] - shift[:, None, None]) / scale[:, None, None]
+        x = ((2 * image - 1)[None] - shift[:, None, None]) / scale[:, None, None]
         found = []
         for k, (stride, padding) in enumerate(((4, 2), (1, 2), (1, 1), (1, 1), (1, 1)), 1):
             x = pooled(x) if k in (2, 3) else x

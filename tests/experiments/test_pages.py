@@ -29,10 +29,8 @@ def test_a_page_is_what_its_tables_give(tmp_path, name, write):
 def test_data_of_pages_are_small():
     tables = [file for name in FOLDERS for file in (FOLDERS[name] / name).glob("*.csv")]
     assert 0 < sum(file.stat().st_size for file in tables) < 300_000
-    pictures = [
-        f for name in FOLDERS for f in (FOLDERS[name] / name).iterdir() if f.suffix in (".svg", ".png")
-    ]
-    assert max(file.stat().st_size for file in pictures) < 150_000
+    images = [f for name in FOLDERS for f in (FOLDERS[name] / name).iterdir() if f.suffix in (".svg", ".png")]
+    assert max(file.stat().st_size for file in images) < 150_000
 
 
 def test_a_legend_is_not_wider_than_its_chart(tmp_path):

@@ -48,13 +48,13 @@ def clipped_mean(camera: fs.Camera, row: int, column: int) -> float:
 @pytest.mark.parametrize("view", VIEWS)
 def test_every_pixel_is_the_mean_over_its_square(view):
     camera = VIEWS[view]
-    picture = plane_image(GRID, MODULE, camera, **VALUES)
-    assert picture.shape == (47, 61)
+    image = plane_image(GRID, MODULE, camera, **VALUES)
+    assert image.shape == (47, 61)
     random = np.random.default_rng(1)
     places = set(zip(random.integers(0, 47, 60).tolist(), random.integers(0, 61, 60).tolist(), strict=True))
-    edges = np.argwhere(np.abs(np.diff(picture, axis=1)) > 0.05)[::37]
+    edges = np.argwhere(np.abs(np.diff(image, axis=1)) > 0.05)[::37]
     for row, column in places | {tuple(place) for place in edges.tolist()}:
-        assert picture[row, column] == pytest.approx(clipped_mean(camera, row, column), abs=1e-9)
+        assert image[row, column] == pytest.approx(clipped_mean(camera, row, column), abs=1e-9)
 
 
 def test_it_is_what_rays_through_ever_more_points_tend_to():
@@ -77,10 +77,10 @@ def test_it_is_what_rays_through_ever_more_points_tend_to():
 def test_modules_that_fill_pixels_keep_their_values():
     grid = np.array([[1, 0], [0, 1]], np.uint8)
     camera = fs.Camera.pinhole(6, 6, 2.0, 2.0, 3.0, 3.0, _away(1.0))
-    picture = plane_image(grid, 1.0, camera)
-    assert np.array_equal(picture[1:5, 1:5], np.kron(1.0 - grid, np.ones((2, 2))))
-    assert np.all(picture[[0, -1]] == 0.5)
-    assert np.all(picture[:, [0, -1]] == 0.5)
+    image = plane_image(grid, 1.0, camera)
+    assert np.array_equal(image[1:5, 1:5], np.kron(1.0 - grid, np.ones((2, 2))))
+    assert np.all(image[[0, -1]] == 0.5)
+    assert np.all(image[:, [0, -1]] == 0.5)
 
 
 def test_a_plane_out_of_the_image_and_one_without_contrast():
@@ -104,7 +104,7 @@ def test_what_is_viewed_from_behind_is_mirrored():
 
 def test_means_do_not_depend_on_how_the_image_is_cut():
     whole = VIEWS["tilted"]
-    picture = plane_image(GRID, MODULE, whole, **VALUES)
+    image = plane_image(GRID, MODULE, whole, **VALUES)
     part = fs.Camera.pinhole(
         20,
         15,
@@ -115,8 +115,8 @@ def test_means_do_not_depend_on_how_the_image_is_cut():
         whole.world_to_camera,
         position=whole.position,
     )
-    assert plane_image(GRID, MODULE, part, **VALUES) == pytest.approx(picture[11:26, 17:37], abs=1e-12)
-    assert math.isclose(picture.max(), VALUES["light"], abs_tol=1e-12)
+    assert plane_image(GRID, MODULE, part, **VALUES) == pytest.approx(image[11:26, 17:37], abs=1e-12)
+    assert math.isclose(image.max(), VALUES["light"], abs_tol=1e-12)
 
 
 def test_display_values_are_straight_where_they_are_dark():

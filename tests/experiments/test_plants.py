@@ -133,13 +133,13 @@ def test_images_become_a_data_set_and_the_trained_splats_a_plant(tmp_path, monke
     (tmp_path / "worker.py").write_text(FAKE)
     monkeypatch.setattr(plants, "WORKER", tmp_path / "worker.py")
     monkeypatch.setattr(blender, "environment_python", lambda environment: Path(sys.executable))
-    asked = {}
+    requested = {}
 
     class Quick:
         """Trains nothing, and makes one splat too faint to stay."""
 
         def __init__(self, dataset, renderer, settings, checkpoint, start):
-            asked.update(dataset=dataset, settings=settings, start=start)
+            requested.update(dataset=dataset, settings=settings, start=start)
 
         def run(self, progress):
             progress(SimpleNamespace(psnr=30.0, iteration=5))
@@ -148,28 +148,30 @@ def test_images_become_a_data_set_and_the_trained_splats_a_plant(tmp_path, monke
             return [SimpleNamespace(psnr=psnr) for psnr in (30.0, 34.0)]
 
         def cloud(self):
-            start, faint = asked["start"], asked["start"].opacities.copy()
+            start, faint = requested["start"], requested["start"].opacities.copy()
             faint[0] = 0.01
             sh = (start.colors[:, None] - 0.5) / 0.28209479
             return fs.SplatCloud(start.means, start.quats, start.scales, faint, sh=sh)
 
     monkeypatch.setattr(plants, "Trainer", Quick)
-    told = []
-    wanted = PlantSettings(("lettuce",), 1, views=3, test=2, splats=200, iterations=5)
+    reported = []
+    expected = PlantSettings(("lettuce",), 1, views=3, test=2, splats=200, iterations=5)
     out = tmp_path / "out"
-    made = list(write_plants(wanted, out, tmp_path, "reference", lambda words, share: told.append(share)))
+    made = list(
+        write_plants(expected, out, tmp_path, "reference", lambda words, share: reported.append(share))
+    )
     assert made == [(out / "lettuce-0.ply", 32.0)]
-    data = asked["dataset"]
+    data = requested["dataset"]
     assert (len(data.views), len(data.held_out), len(data.points)) == (3, 2, 200)
     assert data.background == plants.BACKGROUND
     np.testing.assert_array_equal(data.views[0].image[150, 75], (0, 200, 0))
     np.testing.assert_array_equal(data.views[0].image[0, 0], np.rint(255 * np.array(plants.BACKGROUND)))
-    assert (asked["settings"].iterations, asked["settings"].sh_degree) == (5, 0)
+    assert (requested["settings"].iterations, requested["settings"].sh_degree) == (5, 0)
     (plant,) = load_plants(out)["lettuce"]
     assert len(plant) == 199
-    np.testing.assert_allclose(plant.colors, asked["start"].colors[1:], atol=1e-6)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    np.testing.assert_allclose(plant.colors, requested["start"].colors[1:], atol=1e-6)
+    assert reported == sorted(reported)
+    assert reported[-1] == 1.0
 
 
 def test_blender_renders_a_plant(tmp_path):
@@ -177,9 +179,9 @@ def test_blender_renders_a_plant(tmp_path):
     python = blender.environment_python(blender.default_environment())
     if not python.is_file():
         pytest.skip("Blender is not here; fidsplat experiment blender --install")
-    wanted = PlantSettings(("lettuce",), 1, views=2, test=1, samples=4)
+    expected = PlantSettings(("lettuce",), 1, views=2, test=1, samples=4)
     plants._render(
-        wanted, wanted.mesh("lettuce", 0), tmp_path / "lettuce-0", python, lambda words, share: None
+        expected, expected.mesh("lettuce", 0), tmp_path / "lettuce-0", python, lambda words, share: None
     )
     picture = read_rgba(tmp_path / "lettuce-0/images/view-000.png").astype(int)
     assert picture[0, 0, 3] == 0

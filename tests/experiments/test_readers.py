@@ -21,9 +21,9 @@ def ideal(category: str, tilt: float, protocol: str = "fixed-module") -> tuple[n
     spec = CATEGORIES[category].spec(1)
     made, setting = plain_marker(spec), PROTOCOLS[protocol]
     module, camera = setting.module(made.grid.shape[0]), setting.camera(tilt)
-    picture = plane_image(made.grid, module, camera, background=BACKGROUND)
+    image = plane_image(made.grid, module, camera, background=BACKGROUND)
     corners = camera.project(made.corners / made.module * module)
-    return to_uint8(picture), Target(made.kind, made.family or "", made.id, made.payload, corners)
+    return to_uint8(image), Target(made.kind, made.family or "", made.id, made.payload, corners)
 
 
 def test_the_extra_detector_is_among_those_tested():
@@ -34,16 +34,16 @@ def test_the_extra_detector_is_among_those_tested():
 
 @pytest.mark.parametrize(("kind", "name"), ALL)
 def test_each_reads_the_ideal_texture_in_front_and_nothing_in_grey(kind, name):
-    picture, target = ideal("apriltag" if kind == "apriltag" else "small", 10.0)
-    assert attempt(name, picture, target) == Attempt(True, True)
-    assert attempt(name, np.full_like(picture, 128), target) == Attempt(False, False)
+    image, target = ideal("apriltag" if kind == "apriltag" else "small", 10.0)
+    assert attempt(name, image, target) == Attempt(True, True)
+    assert attempt(name, np.full_like(image, 128), target) == Attempt(False, False)
 
 
 @pytest.mark.parametrize(("kind", "name"), ALL)
 def test_another_code_in_its_place_is_found_at_most_and_not_read(kind, name):
-    picture, target = ideal("apriltag" if kind == "apriltag" else "small", 10.0)
+    image, target = ideal("apriltag" if kind == "apriltag" else "small", 10.0)
     other = replace(target, id=99) if kind == "apriltag" else replace(target, payload="another")
-    result = attempt(name, picture, other)
+    result = attempt(name, image, other)
     assert not result.read
     # the AprilTag library tells nothing of what it does not read as this tag
     assert result.found == (name != "pupil")
@@ -51,35 +51,35 @@ def test_another_code_in_its_place_is_found_at_most_and_not_read(kind, name):
 
 @pytest.mark.parametrize("name", ["aruco", "cv2", "zxing"])
 def test_a_quadrilateral_elsewhere_is_not_the_code(name):
-    picture, target = ideal("apriltag" if name == "aruco" else "small", 10.0)
+    image, target = ideal("apriltag" if name == "aruco" else "small", 10.0)
     wrong = replace(target, id=99, payload="another", corners=target.corners + 300.0)
-    assert attempt(name, picture, wrong) == Attempt(False, False)
+    assert attempt(name, image, wrong) == Attempt(False, False)
 
 
 @pytest.mark.parametrize("category", ["small", "large"])
 def test_a_tilted_code_is_read_once_it_is_made_taller(category):
-    picture, target = ideal(category, 80.0)
-    assert not attempt("zxing", picture, target).read
-    assert attempt("zxing-tall", picture, target) == Attempt(True, True)
+    image, target = ideal(category, 80.0)
+    assert not attempt("zxing", image, target).read
+    assert attempt("zxing-tall", image, target) == Attempt(True, True)
 
 
 def test_places_that_were_found_are_those_of_the_untouched_image():
     """The rows are cut out and stretched; the outline must come back to where the code is."""
-    picture, target = ideal("medium", 75.0)
-    assert not attempt("zxing", picture, target).read
+    image, target = ideal("medium", 75.0)
+    assert not attempt("zxing", image, target).read
     moved = replace(target, payload="another")  # so that only the place counts
-    assert attempt("zxing-tall", picture, moved) == Attempt(True, False)
+    assert attempt("zxing-tall", image, moved) == Attempt(True, False)
     assert not attempt(
-        "zxing-tall", picture, replace(moved, corners=moved.corners + np.array([0.0, 120.0]))
+        "zxing-tall", image, replace(moved, corners=moved.corners + np.array([0.0, 120.0]))
     ).found
 
 
 def test_a_code_that_is_only_read_enlarged_is_found_where_it_is():
     """Modules of less than two pixels: read in a picture twice as large."""
-    picture, target = ideal("small", 10.0)
-    height, width = picture.shape
+    image, target = ideal("small", 10.0)
+    height, width = image.shape
     for pixels in range(width, 20, -4):
-        shrunk = cv2.resize(picture, (pixels, pixels * height // width), interpolation=cv2.INTER_AREA)
+        shrunk = cv2.resize(image, (pixels, pixels * height // width), interpolation=cv2.INTER_AREA)
         same = replace(target, corners=target.corners * (pixels / width))
         other = replace(same, payload="another")  # so that only the place counts
         if attempt("zxing-tall", shrunk, same).read and not attempt("zxing", shrunk, other).found:
@@ -111,6 +111,6 @@ def test_overlap_of_quadrilaterals():
 
 
 def test_an_unknown_detector_is_an_error():
-    picture, target = ideal("small", 0.0)
+    image, target = ideal("small", 0.0)
     with pytest.raises(fs.InputError, match="unknown detector 'aruco' for qr; known: cv2, zxing, zxing-tall"):
-        attempt("aruco", picture, target)
+        attempt("aruco", image, target)

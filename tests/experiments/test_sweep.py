@@ -32,11 +32,11 @@ def sweep(file, measure=lambda key: {}, points=POINTS, overwrite=False, **change
 
 def test_a_run_that_was_stopped_continues(tmp_path):
     file = tmp_path / "deep" / "counts.jsonl"
-    asked = []
+    requested = []
 
     def measure(key):
-        asked.append(key["index"])
-        if len(asked) == 3:
+        requested.append(key["index"])
+        if len(requested) == 3:
             raise KeyboardInterrupt
         return {"value": key["index"] ** 2}
 
@@ -49,7 +49,7 @@ def test_a_run_that_was_stopped_continues(tmp_path):
     again = sweep(file, measure)
     assert again.left == POINTS[2:]
     assert [record.key["index"] for record in again.run()] == [2, 3, 4]
-    assert asked == [0, 1, 2, 2, 3, 4]
+    assert requested == [0, 1, 2, 2, 3, 4]
     records = read_records(file)
     assert [record.key for record in records] == POINTS
     assert [record.result["value"] for record in records] == [0, 1, 4, 9, 16]

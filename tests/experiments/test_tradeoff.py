@@ -43,7 +43,7 @@ def faint_rim() -> TradeScene:
     return TradeScene("rim", cloud, camera(64, 48, 60.0))
 
 
-def drawn(renderer: fs.Renderer, scene: TradeScene, quality: fs.Quality) -> np.ndarray:
+def rendered(renderer: fs.Renderer, scene: TradeScene, quality: fs.Quality) -> np.ndarray:
     return renderer.render(scene.cloud, scene.camera, quality=quality, background=scene.background)["rgb"]
 
 
@@ -55,9 +55,9 @@ def test_every_setting_changes_one_option_of_the_base():
             if point.setting in vars(BASE):
                 # the exclusive stop knows no layers; markers are also drawn without a low-pass
                 beside = {"order"} if point.value == "exclusive" else {"lowpass", "samples"}
-                wanted = beside if point.setting == "marker" or "order" in beside else set()
+                expected = beside if point.setting == "marker" or "order" in beside else set()
                 assert turned, point
-                assert turned <= {point.setting, *wanted}, point
+                assert turned <= {point.setting, *expected}, point
             elif point.setting == ABLATION and point.value != "exact":
                 assert point.value.split()[0] in turned
 
@@ -106,15 +106,15 @@ def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(session):
     )
     assert len(one) > 5000
     assert np.linalg.norm(one.origin) > 1e6
-    picture = session.render("hard", EXACT)["rgb"]
-    assert picture.shape == (camera_.height, camera_.width, 3)
+    image = session.render("hard", EXACT)["rgb"]
+    assert image.shape == (camera_.height, camera_.width, 3)
     for number, name in enumerate(CELLS):
-        assert picture[cell_window(number)].max() > 0.1, name
+        assert image[cell_window(number)].max() > 0.1, name
     # it hurts what it is to hurt: the haze is lost below 1/255, dropped layers let the lamp through
-    off = np.abs(session.render("hard", BASE)["rgb"] - picture)
+    off = np.abs(session.render("hard", BASE)["rgb"] - image)
     assert off[cell_window(CELLS.index("haze"))].max() > 0.1
     dropped = session.render("hard", BASE.with_(stop_rule="exclusive", order="centre"))["rgb"]
-    assert np.abs(dropped - picture)[cell_window(CELLS.index("opaque"))].max() > 0.5
+    assert np.abs(dropped - image)[cell_window(CELLS.index("opaque"))].max() > 0.5
 
 
 def test_3d_gaussians_are_compared_with_the_gaussians_themselves(monkeypatch):
@@ -139,12 +139,12 @@ def test_the_linear_image_is_wrong_off_the_axis_and_near():
 def test_errors_are_those_of_the_cut_off():
     renderer, scene = fs.Renderer("opencl"), faint_rim()
     cut = fs.Quality(alpha_cutoff=0.1)
-    exact = np.asarray(drawn(renderer, scene, EXACT), np.float64)
-    result = compare.compare_image(drawn(renderer, scene, cut), exact, scene, cut)
+    exact = np.asarray(rendered(renderer, scene, EXACT), np.float64)
+    result = compare.compare_image(rendered(renderer, scene, cut), exact, scene, cut)
     # just outside the radius alpha is just below the cut-off
     assert 0.09 < result["maximum"] < 0.1
     assert result["p999"] <= result["maximum"]
-    assert result["rmse"] == pytest.approx(np.sqrt(((drawn(renderer, scene, cut) - exact) ** 2).mean()))
+    assert result["rmse"] == pytest.approx(np.sqrt(((rendered(renderer, scene, cut) - exact) ** 2).mean()))
     assert result["psnr"] == pytest.approx(-20 * np.log10(result["rmse"]))
     # no pixel's decision hangs on rounding, so certificates take nothing away
     assert result["maximum_sure"] == pytest.approx(result["maximum"], abs=1e-4)
@@ -168,7 +168,7 @@ def test_a_certified_flip_is_not_an_error():
     off[24, 32] = 0.3
     assert certificate[24, 32] < 1e-3
     assert compare.beyond_certificates(off, scene, quality) == pytest.approx(0.3, abs=1e-3)
-    assert drawn(renderer, scene, quality)[24, 32].max() > 0.9
+    assert rendered(renderer, scene, quality)[24, 32].max() > 0.9
 
 
 def test_many_splats_have_no_certificates(monkeypatch):

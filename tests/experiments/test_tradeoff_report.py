@@ -113,7 +113,7 @@ def write(folder, records: list[Record]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "wanted"),
+    ("setting", "expected"),
     [
         (("alpha_cutoff", "1/1024"), "slower, more accurate"),
         (("alpha_cutoff", "4/255"), "faster, less accurate"),
@@ -124,9 +124,9 @@ def write(folder, records: list[Record]) -> None:
         (("arithmetic", "fast"), "more accurate"),
     ],
 )
-def test_a_verdict_follows_from_time_and_error(setting, wanted):
+def test_a_verdict_follows_from_time_and_error(setting, expected):
     found = device(plain_records("hard"))
-    assert found.verdict(found.at("hard", *setting), found.at("hard", "base", "base")) == wanted
+    assert found.verdict(found.at("hard", *setting), found.at("hard", "base", "base")) == expected
 
 
 def test_times_within_the_noise_of_the_base_do_not_differ():
@@ -166,12 +166,12 @@ def test_the_cheapest_invisible_error_is_the_cheapest_on_all_scenes():
 
 
 def test_on_a_gpu_what_delays_both_frames_makes_nothing_cheaper():
-    for kind, wanted in (("cpu", 1.125), ("gpu", 1.25)):
+    for kind, expected in (("cpu", 1.125), ("gpu", 1.25)):
         records = plain_records("hard", kind=kind)
         slow = next(each for each in records if each.key["value"] == "1/1024")
         slow.result.update(base_ms=20.0, ratio=1.125)
         found = device(records)
-        assert found.cost(found.at("hard", "alpha_cutoff", "1/1024")) == pytest.approx(wanted)
+        assert found.cost(found.at("hard", "alpha_cutoff", "1/1024")) == pytest.approx(expected)
 
 
 def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
@@ -359,11 +359,11 @@ def test_the_price_of_order_is_pixel_over_centre_where_both_were_rendered():
         turned = [Point("order", name, BASE.with_(order=name)) for name in ratios]
         return [record(scene, one, result(ratios[one.value], 0.1 * ratios[one.value])) for one in turned]
 
-    drawn = device([*plain_records("hard"), *records("hard", pixel=3.0, centre=2.0), *marker_records()])
-    (row,) = report.orders_table([drawn]).to_dict("records")
+    rendered = device([*plain_records("hard"), *records("hard", pixel=3.0, centre=2.0), *marker_records()])
+    (row,) = report.orders_table([rendered]).to_dict("records")
     assert row == {
         "`pixel` relative to `centre`": "hard",
-        f"time, {drawn.kind}": "+50 %",
+        f"time, {rendered.kind}": "+50 %",
         "largest error, `pixel`": "0.3",
         "largest error, `centre`": "0.2",
     }

@@ -103,11 +103,11 @@ def test_rendered_fragments_are_counted_exactly(renderer):
         return overdraw(renderer, renderer.upload(cloud), CAMERA, fs.Quality(**quality))
 
     one = facing([2.0], 0.5)
-    drawn = count(one)
-    assert drawn.shape == (48, 64)
-    assert drawn.dtype == np.int32
+    rendered = count(one)
+    assert rendered.shape == (48, 64)
+    assert rendered.dtype == np.int32
     alpha = renderer.render(one, CAMERA, outputs=("alpha",))["alpha"]
-    np.testing.assert_array_equal(drawn, (alpha > 0).astype(np.int32))
+    np.testing.assert_array_equal(rendered, (alpha > 0).astype(np.int32))
     np.testing.assert_array_equal(count(facing([2.0, 2.5, 3.0], 0.1)), 3 * count(facing([2.0], 0.1)))
     # nothing is drawn behind what lets no light through, here 1 - 0.9 a layer
     stack = count(facing([2.0, 2.1, 2.2, 2.3, 2.4], 0.9), transmittance_stop=0.05)
@@ -115,8 +115,8 @@ def test_rendered_fragments_are_counted_exactly(renderer):
     assert stack.max() == 5  # towards the rim every layer lets light through
     # a layer is made of as many fragments as lie in it
     printed = facing([2.0, 2.0, 2.0], 0.5).with_coplanar_groups(0)
-    np.testing.assert_array_equal(count(printed), 3 * drawn)
-    assert count(one, samples=2).sum() == pytest.approx(4 * drawn.sum(), rel=0.02)
+    np.testing.assert_array_equal(count(printed), 3 * rendered)
+    assert count(one, samples=2).sum() == pytest.approx(4 * rendered.sum(), rel=0.02)
 
 
 def test_fragments_are_counted_through_the_lens(renderer):
@@ -236,10 +236,10 @@ def test_what_a_device_cannot_render_is_reported_and_the_rest_is_rendered(capsys
     monkeypatch.setattr(fs.Renderer, "upload", refuse_empty)
     monkeypatch.setitem(BENCH_SCENES, "other", BenchScene("empty", lambda: (fs.SplatCloud.empty(), CAMERA)))
     assert bench("--scenes", "other", "small", "--json", "-") == 1
-    failed, drawn = json.loads(capsys.readouterr().out)["results"]
+    failed, rendered = json.loads(capsys.readouterr().out)["results"]
     assert failed["error"] == "no memory for this"
     assert tuple(failed) == KEYS
-    assert drawn["repeats"] == 3
+    assert rendered["repeats"] == 3
     assert bench("--scenes", "other", "small") == 1
     assert "other on opencl" in capsys.readouterr().out
 
@@ -283,12 +283,12 @@ def test_the_tag_is_in_the_middle_of_its_image():
 
 def test_the_wall_fills_the_image_with_200_codes(monkeypatch):
     plain = fs.marker("qr-v1-L:a", size=0.1, quiet_zone=0)  # made at once, and no larger than a dense one
-    asked = []
-    monkeypatch.setattr(catalogue, "marker", lambda spec, size: asked.append((spec, size)) or plain)
+    requested = []
+    monkeypatch.setattr(catalogue, "marker", lambda spec, size: requested.append((spec, size)) or plain)
     cloud, camera = catalogue.qr_wall()
     assert len(cloud) == 200 * len(plain.cloud)
-    assert len(asked) == len(set(asked)) == 10
-    assert all(spec.startswith("qr-v22-L:") and len(spec) == 1009 and size == 0.1 for spec, size in asked)
+    assert len(requested) == len(set(requested)) == 10
+    assert all(spec.startswith("qr-v22-L:") and len(spec) == 1009 and size == 0.1 for spec, size in requested)
     shown = camera.project(cloud.means + cloud.origin)
     assert shown.min() > 0
     assert np.all(shown.max(0) < (1920, 1080))
@@ -315,8 +315,8 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
         pose = np.eye(4)
         pose[0, 3] = -0.1 * k
         camera = fs.Camera.pinhole(64, 48, CAMERA.fx, CAMERA.fy, 32, 24, pose)
-        drawn = renderer.render(cloud, camera, quality=catalogue.TIMED)["rgb"]
-        assert result["mean_rgb"] == pytest.approx(float(drawn.mean(dtype=np.float64)), rel=1e-5)
+        rendered = renderer.render(cloud, camera, quality=catalogue.TIMED)["rgb"]
+        assert result["mean_rgb"] == pytest.approx(float(rendered.mean(dtype=np.float64)), rel=1e-5)
     assert bench(*words) == 0
     out = capsys.readouterr().out
     assert "own.toml: 200 splats, 64 x 48" in out
@@ -335,9 +335,9 @@ def test_the_plot_has_a_bar_for_each_scene_and_device(tmp_path):
     file = tmp_path / "times.svg"
     words = ("--device", "reference", "--device", "opencl:pocl")
     assert bench("--scenes", "small", "other", *words, "--plot", file) == 0
-    drawn = xml.dom.minidom.parse(str(file)).toxml()
+    rendered = xml.dom.minidom.parse(str(file)).toxml()
     for words in ("small", "other", "opencl:pocl", "reference", "ms per frame"):
-        assert f"<!-- {words}" in drawn, words
+        assert f"<!-- {words}" in rendered, words
 
 
 @pytest.mark.parametrize(

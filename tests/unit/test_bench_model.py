@@ -87,8 +87,8 @@ def test_series_cover_what_they_promise():
     assert (over_splats[0].count, over_splats[-1].count) == (10_000, 20_000_000)
     covered = [point.count * point.median_scale**2 for point in over_splats]
     assert covered == pytest.approx([covered[0]] * len(covered))
-    for point, wanted in zip(over_pixels, (0.25e6, 0.5e6, 1e6, 2e6, 4e6, 8e6), strict=True):
-        assert point.x == point.width * point.height == pytest.approx(wanted, rel=0.02)
+    for point, expected in zip(over_pixels, (0.25e6, 0.5e6, 1e6, 2e6, 4e6, 8e6), strict=True):
+        assert point.x == point.width * point.height == pytest.approx(expected, rel=0.02)
         assert point.width * 9 == point.height * 16
     for row in series.values():
         assert [point.x for point in row] == sorted({point.x for point in row})

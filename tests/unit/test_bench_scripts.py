@@ -138,9 +138,9 @@ def test_each_kind_of_figures_becomes_its_table(files):
 
 def test_a_table_replaces_the_text_between_its_marks():
     page = "before\n<!-- begin rates -->\nold\n<!-- end rates -->\nafter\n"
-    wanted = "before\n<!-- begin rates -->\nnew\n<!-- end rates -->\nafter\n"
-    assert tables.insert(page, "rates", "new") == wanted
-    assert tables.insert(wanted, "rates", "new") == wanted
+    expected = "before\n<!-- begin rates -->\nnew\n<!-- end rates -->\nafter\n"
+    assert tables.insert(page, "rates", "new") == expected
+    assert tables.insert(expected, "rates", "new") == expected
     assert tables.insert(page, "stages", "new") == page
 
 

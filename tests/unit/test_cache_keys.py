@@ -34,9 +34,9 @@ def key_of_quality(monkeypatch, renderer, **changes):
 
     monkeypatch.setattr(quality_within, "_cached", stop)
     given = {"error": 1e-2, "ms": None, "scene": CLOUD, "capture": fs.Capture(CAMERA), "device": renderer}
-    with pytest.raises(Asked) as asked:
+    with pytest.raises(Asked) as requested:
         quality_within.choose(**given | changes)
-    return asked.value.args[0]
+    return requested.value.args[0]
 
 
 def changed_arrays(cloud):
@@ -55,7 +55,7 @@ def test_measured_qualities_have_a_key_of_every_ingredient(renderer, monkeypatch
     assert first == key_of_quality(monkeypatch, renderer)
     capture = fs.Capture(CAMERA)
     keys = {"": first}
-    for name, asked in {
+    for name, requested in {
         "error": {"error": 1.1e-2},
         "ms": {"ms": 5.0},
         "error alone": {"error": None, "ms": 5.0},
@@ -70,7 +70,7 @@ def test_measured_qualities_have_a_key_of_every_ingredient(renderer, monkeypatch
         "quality": {"capture": capture.with_(quality="lowpass=none")},
         **{name: {"scene": cloud} for name, cloud in changed_arrays(CLOUD)},
     }.items():
-        keys[name] = key_of_quality(monkeypatch, renderer, **asked)
+        keys[name] = key_of_quality(monkeypatch, renderer, **requested)
     for name in FACTS:
         with monkeypatch.context() as patch:
             patch.setattr(renderer.backend, "info", replace(renderer.device, **{name: "another"}))

@@ -64,11 +64,11 @@ def test_devices_of_one_name_are_numbered(monkeypatch):
     monkeypatch.setattr(device, "_all_devices", lambda: iter(found))
     monkeypatch.setattr(device, "_why_unusable", lambda one: "" if one.available else "broken")
     monkeypatch.setattr(device, "OpenCLBackend", lambda one: one.name)
-    wanted = {"pocl": "a", "nvidia": "b", "pocl-2": "c", "nvidia-2": "d", "NVIDIA-3 ": "e"}
+    expected = {"pocl": "a", "nvidia": "b", "pocl-2": "c", "nvidia-2": "d", "NVIDIA-3 ": "e"}
     assert list(device._named_devices()) == [
         *("opencl:pocl", "opencl:nvidia", "opencl:pocl-2", "opencl:nvidia-2", "opencl:nvidia-3")
     ]
-    assert {name: device.open_device(name) for name in wanted} == wanted
+    assert {name: device.open_device(name) for name in expected} == expected
     assert [device._name_of(each) for each in found] == list(device._named_devices())
     with pytest.raises(UnknownDeviceError, match="opencl:nvidia-3: e"):
         device.open_device("nvidia-4")

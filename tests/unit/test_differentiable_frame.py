@@ -167,23 +167,23 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     back = bridge._Rendered.backward(context, None, None, Tensor(by_depth))
 
     frame = renderer.render_differentiable(fs.SplatCloud(**given), offset_camera(CAMERA, pose), OUTPUTS)
-    wanted = frame.backward({"depth": by_depth})
-    wanted["pose"] = offset_gradient(wanted["pose"], pose)
-    assert np.abs(wanted["pose"]).min() > 0
+    expected = frame.backward({"depth": by_depth})
+    expected["pose"] = offset_gradient(expected["pose"], pose)
+    assert np.abs(expected["pose"]).min() > 0
     for name, image in images.items():
         np.testing.assert_array_equal(image.numpy(), frame[name])
     assert [each is None for each in back] == [True, True, False, True, *[False] * 3, True, True, False]
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors"), (9, "pose")):
-        np.testing.assert_array_equal(back[place].numpy(), wanted[name])
+        np.testing.assert_array_equal(back[place].numpy(), expected[name])
     tensors["scales"] = Tensor(given["scales"] * [[1], [0], [1], [1], [1], [1]])  # one that cannot be drawn
     with pytest.warns(UserWarning, match="1 of 6 splats left out"):
         bridge.draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
     kept = {name: array[[0, 2, 3, 4, 5]] for name, array in given.items()}
     frame = renderer.render_differentiable(fs.SplatCloud(**kept), offset_camera(CAMERA, pose), OUTPUTS)
-    wanted = frame.backward({"rgb": ONES})
+    expected = frame.backward({"rgb": ONES})
     back = bridge._Rendered.backward(bridge._Rendered.context, Tensor(ONES), None, None)
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors")):
-        np.testing.assert_array_equal(np.delete(back[place].numpy(), 1, 0), wanted[name])
+        np.testing.assert_array_equal(np.delete(back[place].numpy(), 1, 0), expected[name])
         assert not back[place].numpy()[1].any()
     with pytest.raises(fs.InputError, match="pose must be 6 numbers"):
         bridge.draw(renderer, fs.Capture(CAMERA), **(tensors | {"pose": Tensor(np.zeros(7))}))
@@ -206,17 +206,17 @@ def test_tensors_have_the_gradients_of_the_backend(degree):
     background, pose = given.pop("background"), given.pop("pose")
     capture = fs.Capture(offset_camera(CAMERA, pose), OUTPUTS, background=tuple(background))
     frame = renderer.render_differentiable(fs.SplatCloud(**given), capture)
-    wanted = frame.backward(weights)
-    wanted["pose"] = offset_gradient(wanted["pose"], pose)
+    expected = frame.backward(weights)
+    expected["pose"] = offset_gradient(expected["pose"], pose)
     if degree == 0:
         shade = 0.28209479177387814 * given["sh"][:, 0] + 0.5
-        wanted["sh"] = 0.28209479177387814 * (wanted.pop("colors") * (shade > 0))[:, None]
+        expected["sh"] = 0.28209479177387814 * (expected.pop("colors") * (shade > 0))[:, None]
     length = np.linalg.norm(given["quats"], axis=1, keepdims=True)
-    wanted["quats"] = wanted["quats"] / length  # a cloud's are unit
+    expected["quats"] = expected["quats"] / length  # a cloud's are unit
     for name, image in images.items():
         np.testing.assert_allclose(image.detach().numpy(), frame[name], rtol=1e-5, atol=1e-6)
     for name, tensor in tensors.items():
-        np.testing.assert_allclose(tensor.grad.numpy(), wanted[name], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(tensor.grad.numpy(), expected[name], rtol=1e-4, atol=1e-5)
 
 
 def test_tensors_are_fitted_to_an_image():

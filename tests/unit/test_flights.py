@@ -70,8 +70,8 @@ def test_each_image_has_its_pose(here):
     for k, x in enumerate((0.0, 0.15, 0.3)):
         camera = fs.Camera.look_at(33, 24, np.radians(60), (x, 0, -1), (x, 0, 0))
         frame = renderer.render(scene, camera, outputs=("rgb", "depth"))
-        drawn = read_image(f"out/rgb/{k:06d}.png") / 255
-        assert np.abs(drawn - np.clip(frame["rgb"], 0, 1)).max() < 0.6 / 255
+        rendered = read_image(f"out/rgb/{k:06d}.png") / 255
+        assert np.abs(rendered - np.clip(frame["rgb"], 0, 1)).max() < 0.6 / 255
         np.testing.assert_allclose(np.load(f"out/depth/{k:06d}.npy"), frame["depth"], atol=1e-6)
     assert len(list((here / "out" / "depth").iterdir())) == 9
     poses = fs.load_trajectory("out/trajectory.tum")

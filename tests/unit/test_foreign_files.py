@@ -32,8 +32,8 @@ def assert_placed(cloud, turn, move, scale, atol=2e-6):
     three = np.column_stack([cloud.scales, cloud.thickness])
     found = ours * (three**2)[:, None, :] @ ours.swapaxes(1, 2)
     theirs = turn @ quaternion_to_matrix(QUATS)
-    wanted = theirs * ((scale * SCALES) ** 2)[:, None, :] @ theirs.swapaxes(1, 2)
-    np.testing.assert_allclose(found, wanted, atol=atol)
+    expected = theirs * ((scale * SCALES) ** 2)[:, None, :] @ theirs.swapaxes(1, 2)
+    np.testing.assert_allclose(found, expected, atol=atol)
     np.testing.assert_allclose(cloud.opacities, OPACITIES, atol=1e-6)
     np.testing.assert_allclose(cloud.sh[:, 0], COLORS, atol=1e-6)
 
@@ -134,8 +134,8 @@ def test_encodings_of_images_in_a_bag_of_rosbags(tmp_path, encoding, order):
         connection = bag.add_connection("/eye", message.__msgtype__, typestore=store)
         bag.write(connection, 10, store.serialize_cdr(message, message.__msgtype__))
     (found,) = log_images(tmp_path / "bag")
-    wanted = PIXELS[..., [0, 0, 0]] if encoding == "mono8" else PIXELS[..., :3]
-    np.testing.assert_array_equal(found.image, wanted)
+    expected = PIXELS[..., [0, 0, 0]] if encoding == "mono8" else PIXELS[..., :3]
+    np.testing.assert_array_equal(found.image, expected)
     assert (found.frame, found.stamp) == ("eye", 3_000_000_007)
 
 

@@ -20,7 +20,7 @@ def sog(path, **changes):
     book = np.linspace(-4, 4, 256)
     red = lambda rows: np.array(rows, np.uint8).reshape(2, 2, -1)  # noqa: E731
     nothing = [0, 0, 0, 255]
-    pictures = {
+    images = {
         "l.webp": red([[0, 0, 255, 255], [255, 0, 0, 255], nothing, nothing]),
         "u.webp": red([[128, 0, 255, 255], [255, 128, 0, 255], nothing, nothing]),
         "s.webp": red([[64, 96, 128, 255], [0, 0, 0, 255], nothing, nothing]),
@@ -29,7 +29,7 @@ def sog(path, **changes):
         "n.webp": red([[65, 0, 0, 255], [1, 0, 0, 255], nothing, nothing]),
         "p.webp": np.arange(2 * 192 * 4, dtype=np.uint32).reshape(2, 192, 4).astype(np.uint8),
     }
-    pictures["p.webp"][:, :, 3] = 255
+    images["p.webp"][:, :, 3] = 255
     meta = {
         "version": 2, "count": 2,
         "means": {"mins": [-1, -2, 0], "maxs": [1, 2, 3], "files": ["l.webp", "u.webp"]},
@@ -39,17 +39,17 @@ def sog(path, **changes):
         "shN": {"count": 66, "bands": 1, "codebook": book.tolist(), "files": ["p.webp", "n.webp"]},
     }  # fmt: skip
     for name, values in changes.items():
-        (pictures if name.endswith("webp") else meta)[name] = values
+        (images if name.endswith("webp") else meta)[name] = values
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("meta.json", json.dumps(meta))
-        for name, image in pictures.items():
+        for name, image in images.items():
             data = image
             if isinstance(image, np.ndarray):
                 bgra = cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA)
                 data = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
             if data is not None:
                 archive.writestr(name, data)
-    return book, pictures["p.webp"]
+    return book, images["p.webp"]
 
 
 def test_a_sog_file_by_hand(tmp_path):

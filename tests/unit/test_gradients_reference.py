@@ -78,11 +78,11 @@ def weights_of(images, seed=0):
 def test_frozen_images_are_the_references(name):
     cloud, features, view = pictured(name)
     backend = ReferenceBackend()
-    drawn = backend.pipeline(features).render_view(backend.upload(cloud), view)
+    rendered = backend.pipeline(features).render_view(backend.upload(cloud), view)
     frozen = FrozenFrame(cloud, view, features)
     images = frozen.images(frozen.parameters)
     for output in OUTPUTS:
-        assert np.allclose(images[output], drawn.read_float64(output, 0), rtol=1e-9, atol=1e-9), output
+        assert np.allclose(images[output], rendered.read_float64(output, 0), rtol=1e-9, atol=1e-9), output
     assert images["alpha"].max() > 0.1
 
 

@@ -66,27 +66,27 @@ def test_a_frame_becomes_a_tensor(monkeypatch):
     """Without a copy by DLPack if the backend shares arrays; else a writable copy."""
     torch = SimpleNamespace(from_dlpack=lambda array: ("dlpack", array), from_numpy=lambda a: ("numpy", a))
     monkeypatch.setitem(sys.modules, "torch", torch)
-    drawn = frame("rgb", "label")
-    kind, array = drawn.to_torch("label")
+    rendered = frame("rgb", "label")
+    kind, array = rendered.to_torch("label")
     assert kind == "numpy"
     assert array.flags.writeable
-    np.testing.assert_array_equal(array, drawn["label"])
+    np.testing.assert_array_equal(array, rendered["label"])
     assert fs.Frame(Shared({"rgb": "rgb there"}), fs.Capture(outputs="rgb")).to_torch() == (
         "dlpack",
         "rgb there",
     )
     with pytest.raises(fs.InputError, match="no 'depth'"):
-        drawn.to_torch("depth")
+        rendered.to_torch("depth")
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(fs.InputError, match="torch, which is not installed; pip install torch"):
-        drawn.to_torch()
+        rendered.to_torch()
 
 
 def test_torch_itself_takes_a_frame():
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    drawn = frame("rgb")
-    assert torch.equal(drawn.to_torch(), torch.tensor(drawn["rgb"]))
-    assert torch.equal(torch.from_dlpack(drawn), torch.tensor(drawn["rgb"]))
+    rendered = frame("rgb")
+    assert torch.equal(rendered.to_torch(), torch.tensor(rendered["rgb"]))
+    assert torch.equal(torch.from_dlpack(rendered), torch.tensor(rendered["rgb"]))
 
 
 def test_a_frame_of_one_output_goes_through_dlpack():
@@ -103,11 +103,13 @@ def test_a_frame_of_one_output_goes_through_dlpack():
 
 def test_pil_and_opencv_take_a_frame():
     """As docs/rendering.md says."""
-    drawn = frame("rgb")
+    rendered = frame("rgb")
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
-    np.testing.assert_array_equal(np.asarray(image.fromarray(to_uint8(drawn["rgb"]))), to_uint8(drawn["rgb"]))
-    bgr = cv2.cvtColor(to_uint8(drawn["rgb"]), cv2.COLOR_RGB2BGR)
-    np.testing.assert_array_equal(bgr[:, :, ::-1], to_uint8(drawn["rgb"]))
+    np.testing.assert_array_equal(
+        np.asarray(image.fromarray(to_uint8(rendered["rgb"]))), to_uint8(rendered["rgb"])
+    )
+    bgr = cv2.cvtColor(to_uint8(rendered["rgb"]), cv2.COLOR_RGB2BGR)
+    np.testing.assert_array_equal(bgr[:, :, ::-1], to_uint8(rendered["rgb"]))
 
 
 def test_clouds_and_scenes_say_what_they_hold():

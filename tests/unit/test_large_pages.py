@@ -24,14 +24,14 @@ def test_advice_leaves_contents_as_they_are():
 
 def test_large_buffers_are_the_devices_own(monkeypatch):
     """Memory of the host's would be gone with the Python object, though a kernel still writes there."""
-    asked = []
-    monkeypatch.setattr(buffers, "large_pages", lambda address, size: asked.append((address, size)))
+    requested = []
+    monkeypatch.setattr(buffers, "large_pages", lambda address, size: requested.append((address, size)))
     pool = fs.Renderer("opencl:cpu").backend.pool
     small, large = pool.fresh("small", 1 << 12), pool.fresh("large", (1 << 22) + 20)
     for buffer in (small, large):
         assert not buffer.flags & cl.mem_flags.USE_HOST_PTR
-    assert [size for _, size in asked] == [large.size]
-    assert all(address > 0 for address, _ in asked)
+    assert [size for _, size in requested] == [large.size]
+    assert all(address > 0 for address, _ in requested)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts pages by /proc/self/smaps")

@@ -215,8 +215,8 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
     monkeypatch.setattr(
         Drive, "images", lambda self, variant, run, renderer: (grey for _ in self.image_indices(run))
     )
-    asked = Drive(1, 1)
-    pictures = list(write_log(asked, "exact", None, str(tmp_path / "run.mcap"), False))
+    requested = Drive(1, 1)
+    images = list(write_log(requested, "exact", None, str(tmp_path / "run.mcap"), False))
     with (tmp_path / "run.mcap").open("rb") as stream:
         counts = reader.make_reader(stream).get_summary().statistics.channel_message_counts
         stream.seek(0)
@@ -228,17 +228,17 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
         turned = next(made.iter_decoded_messages(topics=["/imu"]))[-1]
     assert turned.linear_acceleration_covariance[0] == -1  # no accelerometer
     assert (
-        counts["/eye/image_raw/compressed"] == counts["/tf"] == counts["/eye/detections"] == len(pictures) > 3
+        counts["/eye/image_raw/compressed"] == counts["/tf"] == counts["/eye/detections"] == len(images) > 3
     )
-    assert counts["/odom"] == counts["/imu"] > 50 * len(pictures)
+    assert counts["/odom"] == counts["/imu"] > 50 * len(images)
     with pytest.raises(fs.InputError, match=r"must have images, e.g. exact, got"):
-        list(write_log(asked, "odometry", None, str(tmp_path / "other.mcap"), False))
+        list(write_log(requested, "odometry", None, str(tmp_path / "other.mcap"), False))
 
 
 def test_with_ideal_corners_it_knows_its_way():
     """The filter alone: every tag that the camera could see, with corners where they are."""
-    asked = Drive(1, 3)
-    house = asked.house
+    requested = Drive(1, 3)
+    house = requested.house
     moved = drive(
         house.mjcf(BODY), np.array([[-0.5, -0.75], [2.0, -0.75]]), errors=Errors(0.03, gyro_bias=0.01, seed=3)
     )
@@ -246,27 +246,27 @@ def test_with_ideal_corners_it_knows_its_way():
     from fidsplat.vision.visible import visible
 
     sightings = []
-    for k in asked.image_indices(moved):
-        camera = camera_at(asked.camera, moved.poses[k])
+    for k in requested.image_indices(moved):
+        camera = camera_at(requested.camera, moved.poses[k])
         tags = [p for p in house.markers if p.marker.kind == "apriltag" and visible(p, camera).share > 0.99]
         near = [p for p in tags if np.linalg.norm(p.pose[:3, 3] - camera.position) < 1.5]
         sightings.append(
             [Detection("apriltag", "36h11", p.marker.id, None, camera.project(p.corners)) for p in near]
         )
-    _, blind = asked.localise(moved, None, asked.camera)
-    _, seeing = asked.localise(moved, sightings, asked.camera, 0.05)
+    _, blind = requested.localise(moved, None, requested.camera)
+    _, seeing = requested.localise(moved, sightings, requested.camera, 0.05)
     assert seeing["tags"] > 5
     assert seeing["refused"] == 0
     assert seeing["ate_m"] < 0.01 < blind["ate_m"]
-    _, near = asked.localise(moved, sightings, asked.camera, 0.05, reach=1.0)
+    _, near = requested.localise(moved, sightings, requested.camera, 0.05, reach=1.0)
     assert 0 < near["tags"] < seeing["tags"]
     aside = np.array([0.6, 0.8])
     off = [[replace(tag, corners=tag.corners + aside) for tag in tags] for tags in sightings]
-    bins = asked.corner_errors(moved, off, asked.camera)
+    bins = requested.corner_errors(moved, off, requested.camera)
     assert [each["tags"] > 0 for each in bins] == [True, True, False, False]
     assert [each["median_px"] for each in bins] == pytest.approx([1.0, 1.0, None, None])
     assert sum(each["tags"] for each in bins) == sum(map(len, sightings))
-    back = asked.corner_errors(moved, asked.ideal_corners(moved, off), asked.camera)
+    back = requested.corner_errors(moved, requested.ideal_corners(moved, off), requested.camera)
     assert [each["median_px"] for each in back] == pytest.approx([0.0, 0.0, None, None])
 
 

@@ -32,8 +32,8 @@ def test_charuco_boards(columns, rows, family):
     assert made.bits.shape == (rows * square, columns * square)
     dictionary = predefined("aruco", family)
     board = cv2.aruco.CharucoBoard((columns, rows), square, square - 2, dictionary)
-    drawn = board.generateImage(made.bits.shape[::-1], marginSize=0, borderBits=1)
-    assert np.array_equal(made.bits, drawn < 128)
+    rendered = board.generateImage(made.bits.shape[::-1], marginSize=0, borderBits=1)
+    assert np.array_equal(made.bits, rendered < 128)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(printed(made))
     assert sorted(ids.ravel().tolist()) == list(range((columns - 1) * (rows - 1)))
     expected = board.getChessboardCorners()[ids.ravel(), :2]
@@ -43,8 +43,8 @@ def test_charuco_boards(columns, rows, family):
 def test_grid_boards():
     made = marker("gridboard:5x3:4x4_50")
     board = cv2.aruco.GridBoard((5, 3), 6, 2, predefined("aruco", "4x4_50"))
-    drawn = board.generateImage(made.bits.shape[::-1], marginSize=0, borderBits=1)
-    assert np.array_equal(made.bits, drawn < 128)
+    rendered = board.generateImage(made.bits.shape[::-1], marginSize=0, borderBits=1)
+    assert np.array_equal(made.bits, rendered < 128)
     found, ids, _ = cv2.aruco.ArucoDetector(board.getDictionary()).detectMarkers(printed(made))
     at, image = board.matchImagePoints(found, ids)
     assert len(at) == 4 * 15

@@ -178,10 +178,10 @@ def grown_by_definition(grid: np.ndarray, box: list[int], growth: float) -> list
     lengths = (box[2] - box[0], box[3] - box[1])
     cells, grown = list(box), [float(edge) for edge in box]
     for axis in (1, 0) if lengths[1] > lengths[0] else (0, 1):
-        wanted = growth * max(1.0, LONG * lengths[axis])
+        expected = growth * max(1.0, LONG * lengths[axis])
         for side, way in ((axis, -1), (axis + 2, 1)):
             free = 0
-            while free < wanted:
+            while free < expected:
                 x0, y0, x1, y1 = cells
                 at = cells[side] + min(way, 0)  # the cells beyond this side
                 if not 0 <= at < grid.shape[1 - axis]:
@@ -191,7 +191,7 @@ def grown_by_definition(grid: np.ndarray, box: list[int], growth: float) -> list
                     break
                 cells[side] += way
                 free += 1
-            grown[side] += way * min(wanted, free)
+            grown[side] += way * min(expected, free)
     return grown
 
 

@@ -24,12 +24,12 @@ def svg(folder, body: str, view: str = "0 0 40 20"):
     return file
 
 
-def drawn(folder, body: str, modules: int = 40, view: str = "0 0 40 20", **options):
+def rendered(folder, body: str, modules: int = 40, view: str = "0 0 40 20", **options):
     return marker(f"svg-{modules}:{svg(folder, body, view)}", **options)
 
 
 def test_shapes_are_painted_one_over_the_other(tmp_path):
-    made = drawn(
+    made = rendered(
         tmp_path,
         '<rect x="2" y="3" width="10" height="8" fill="#ff0000"/>'
         '<g fill="blue" transform="translate(20 2)"><rect width="5" height="4"/><g transform="scale(2)">'
@@ -47,7 +47,7 @@ def test_shapes_are_painted_one_over_the_other(tmp_path):
 
 
 def test_rectangles_of_whole_modules_are_as_few_as_can_be(tmp_path):
-    made = drawn(tmp_path, '<path d="M10 5h20v10h-20z" fill="red"/>', quiet_zone=2)
+    made = rendered(tmp_path, '<path d="M10 5h20v10h-20z" fill="red"/>', quiet_zone=2)
     assert (made.regions, made.angles, made.boxes.dtype) == (None, None, np.int64)
     assert len(made.boxes) == 5
 
@@ -60,7 +60,7 @@ CURVED = (
 
 def test_rectangles_cover_exactly_the_drawing(tmp_path):
     """Circles, obtuse and acute corners, a sliver thinner than a module, of either colour at an edge."""
-    made = drawn(tmp_path, CURVED, quiet_zone=2)
+    made = rendered(tmp_path, CURVED, quiet_zone=2)
     rectangles = np.array(shapely.polygons(rotated(made.boxes, made.boxes, made.angles)))
     assert made.palette.tolist()[0] == [1, 1, 1]
     assert len(made.regions) == len(made.palette) == 5
@@ -79,7 +79,7 @@ def test_rectangles_cover_exactly_the_drawing(tmp_path):
 
 
 def test_gaussians_stay_within_their_colour(tmp_path):
-    made = drawn(tmp_path, CURVED)
+    made = rendered(tmp_path, CURVED)
     fitted = made.gaussians
     x, y = (fitted.means[:, :2] / made.module + np.array(made.grid.shape[::-1]) / 2).T.astype(np.float64)
     for value, region in enumerate(made.regions):
@@ -116,9 +116,9 @@ def test_fill_rules():
 
 @pytest.mark.parametrize("body", ["", '<circle r="0"/>', '<rect x="50" width="9" height="9"/>'])
 def test_a_sheet_on_which_nothing_is_visible(tmp_path, body):
-    assert len(drawn(tmp_path, body).boxes) == 1
+    assert len(rendered(tmp_path, body).boxes) == 1
     hidden = '<circle cx="9" cy="9" r="5" fill="red"/><rect width="40" height="20" fill="blue"/>'
-    assert len(drawn(tmp_path, hidden).boxes) == 1
+    assert len(rendered(tmp_path, hidden).boxes) == 1
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_circles():
 )
 def test_unsupported_drawings_are_refused(tmp_path, body, says):
     with pytest.raises(fs.InputError) as error:
-        drawn(tmp_path, body)
+        rendered(tmp_path, body)
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -242,7 +242,7 @@ def test_files_that_are_no_drawings(tmp_path):
 
 
 def test_a_drawing_in_a_scene_file_is_next_to_it(tmp_path):
-    made = drawn(tmp_path, '<rect width="20" height="20" fill="red"/>')
+    made = rendered(tmp_path, '<rect width="20" height="20" fill="red"/>')
     fs.Scene(markers=[PlacedMarker(made)]).save(tmp_path / "scene.toml")
     assert 'spec = "svg-40:sign.svg"' in (tmp_path / "scene.toml").read_text()
     again = fs.Scene.load(tmp_path / "scene.toml").markers[0].marker
@@ -251,13 +251,13 @@ def test_a_drawing_in_a_scene_file_is_next_to_it(tmp_path):
 
 def test_shapes_that_touch_the_sheet_leave_no_lines(tmp_path):
     """The first shape is outside of the sheet and shares an edge with it."""
-    made = drawn(tmp_path, '<rect x="-5" width="5" height="9" fill="red"/><circle cx="9" cy="9" r="5"/>')
+    made = rendered(tmp_path, '<rect x="-5" width="5" height="9" fill="red"/><circle cx="9" cy="9" r="5"/>')
     assert set(map(tuple, made.cloud.colors[:, :3])) == {(0, 0, 0), (1, 1, 1)}
 
 
 def test_what_a_style_sheet_says(tmp_path):
     """Of equals the later; attributes, tags, classes, ids, an element's own: each over those before."""
-    made = drawn(
+    made = rendered(
         tmp_path,
         "<style>/* as it comes */ .a, .b { fill: #ff0000; } rect { fill: lime } .c.b { fill: navy }"
         " #it { visibility: hidden } .d { fill-rule: evenodd }</style>"
@@ -283,7 +283,7 @@ def test_colours_have_the_names_of_css():
 
 
 def test_invisible_shapes_are_not_rendered(tmp_path):
-    made = drawn(
+    made = rendered(
         tmp_path,
         '<g visibility="hidden"><rect width="5" height="5"/><rect x="9" width="5" height="5" '
         'visibility="visible"/></g><rect y="9" width="5" height="5" fill="transparent"/>'
@@ -295,35 +295,35 @@ def test_invisible_shapes_are_not_rendered(tmp_path):
 
 
 def test_round_corners(tmp_path):
-    made = drawn(tmp_path, '<rect x="1px" y="2" width="30" height="16" rx="4" fill="red"/>')
+    made = rendered(tmp_path, '<rect x="1px" y="2" width="30" height="16" rx="4" fill="red"/>')
     assert made.regions[1].area == pytest.approx(30 * 16 - (4 - np.pi) * 16, rel=1e-3)
-    made = drawn(tmp_path, '<rect width="30" height="16" rx="99" ry="99" fill="red"/>')
+    made = rendered(tmp_path, '<rect width="30" height="16" rx="99" ry="99" fill="red"/>')
     assert made.regions[1].area == pytest.approx(np.pi * 15 * 8, rel=1e-3)
-    made = drawn(tmp_path, '<path d="M10 0h10v10h-10z" transform="skewX(45)" fill="red"/>')
+    made = rendered(tmp_path, '<path d="M10 0h10v10h-10z" transform="skewX(45)" fill="red"/>')
     assert made.regions[1].bounds == pytest.approx((10, 0, 30, 10))
 
 
 def test_curves_that_touch_make_no_heaps_of_gaussians(tmp_path):
     """Between them lie slivers of paper ten thousand times as long as wide."""
     body = '<rect width="40" height="20" rx="6" fill="red"/>'
-    made = drawn(tmp_path, body)
+    made = rendered(tmp_path, body)
     thin = (made.boxes[:, 2:] - made.boxes[:, :2]).min(1) < 1 / 64
     assert thin.sum() > 20
     assert len(made.gaussians) < 20_000
-    assert np.array_equal(drawn(tmp_path, body, mixture="fitted").cloud.means, made.gaussians.means)
+    assert np.array_equal(rendered(tmp_path, body, mixture="fitted").cloud.means, made.gaussians.means)
 
 
 def test_scribbles_are_refused(tmp_path):
     places = " ".join(f"{7919 * i % 400 / 10} {104729 * i % 200 / 10}" for i in range(300))
     with pytest.raises(fs.InputError, match="must cross in at most 5000 places; simplify the drawing"):
-        drawn(tmp_path, f'<path d="M{places}z"/>')
+        rendered(tmp_path, f'<path d="M{places}z"/>')
 
 
 def test_one_outline_many_times_over_is_refused_soon(tmp_path):
     """Without crossings, but each piece of it has all others near."""
     begun = time.process_time()
     with pytest.raises(fs.InputError, match=r"at most 5,000,000 pairs of pieces near each other; simplify"):
-        drawn(tmp_path, 3000 * '<rect width="9" height="9"/>')
+        rendered(tmp_path, 3000 * '<rect width="9" height="9"/>')
     assert time.process_time() - begun < 10
 
 
@@ -349,4 +349,4 @@ def test_heaps_of_shapes_are_refused(tmp_path):
     with pytest.raises(
         fs.InputError, match="a drawing must have at most 50000 pairs of overlapping shapes; simplify it"
     ):
-        drawn(tmp_path, 400 * '<rect width="9" height="9"/>')
+        rendered(tmp_path, 400 * '<rect width="9" height="9"/>')

@@ -262,8 +262,8 @@ def test_splat_files_move_by_themselves(tmp_path, splats):
     (tmp_path / "there.toml").write_text(there)
     expected = fs.Renderer("reference").render(fs.Scene.load(tmp_path / "there.toml"))["rgb"]
     for scene in (splats, fs.Scene.load(tmp_path / "b.toml")):
-        drawn = fs.Renderer("reference").render(scene)["rgb"]
-        np.testing.assert_allclose(drawn, expected, atol=1e-4)
+        rendered = fs.Renderer("reference").render(scene)["rgb"]
+        np.testing.assert_allclose(rendered, expected, atol=1e-4)
         assert scene.cloud().labels[20:].tolist() == [3] * 30 + [1] * (len(scene.cloud()) - 50)
         assert [label for label, _ in scene.motion.groups_at(0.5)] == [3]
 

@@ -145,8 +145,8 @@ def test_frames_precede_a_failure_of_the_captures(store, two):
             made.extend(frames)  # keeps those that came
         assert len(made) == count
         for x, frame in enumerate(made):
-            wanted = alone.render(store.cloud(), look(at=(0.1 * x, 0, 0)))["rgb"]
-            assert np.array_equal(frame["rgb"], wanted)
+            expected = alone.render(store.cloud(), look(at=(0.1 * x, 0, 0)))["rgb"]
+            assert np.array_equal(frame["rgb"], expected)
     frames, made = two.render_views(store, [look(), look(), fs.Capture(), look()]), []
     with pytest.raises(fs.InputError, match="no camera"):
         made.extend(frames)
@@ -173,5 +173,5 @@ def test_a_scene_is_rendered_by_its_own_camera(count):
     tag = fs.scenes.PlacedMarker(fs.marker("aruco:4x4_50:7", size=0.4))
     scene = fs.Scene([], fs.Camera.look_at(24, 16, 1.0, (0.1, 0, -1), (0, 0, 0)), [tag])
     several = fs.SeveralDevices(["reference"] * count)
-    wanted = fs.Renderer("reference").render(scene)["rgb"]
-    np.testing.assert_array_equal(several.render(scene, outputs=("rgb",))["rgb"], wanted)
+    expected = fs.Renderer("reference").render(scene)["rgb"]
+    np.testing.assert_array_equal(several.render(scene, outputs=("rgb",))["rgb"], expected)

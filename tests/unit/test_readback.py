@@ -239,9 +239,9 @@ def test_markers_that_face_away_or_lie_outside_are_not_missed(tmp_path, monkeypa
 
 
 def test_images_that_cannot_be_read_back():
-    scene, picture = fs.Scene(markers=[outlined()[0]]), np.zeros((240, 320, 3), np.uint8)
+    scene, image = fs.Scene(markers=[outlined()[0]]), np.zeros((240, 320, 3), np.uint8)
     with pytest.raises(fs.InputError, match="the scene must have a camera, got none; give camera="):
-        read_back(picture, scene)
+        read_back(image, scene)
     wide = fs.Camera.look_at(321, 240, 1.0, (0, 0, -1), (0, 0, 0))
     with pytest.raises(fs.InputError, match=r"must have the camera's size, 321 x \d+ pixels, got 320 x 240"):
-        read_back(picture, scene, wide)
+        read_back(image, scene, wide)

@@ -63,7 +63,9 @@ def test_pixels_that_are_far_apart_are_those_of_the_whole_image(monkeypatch):
     """Splats are chosen for many of them together."""
     monkeypatch.setattr(backend, "_BLOCK", 1000)
     chosen, choose = [], backend.may_contribute
-    monkeypatch.setattr(backend, "may_contribute", lambda *asked: chosen.append(choose(*asked)) or chosen[-1])
+    monkeypatch.setattr(
+        backend, "may_contribute", lambda *requested: chosen.append(choose(*requested)) or chosen[-1]
+    )
     camera = fs.Camera.look_at(200, 150, 1.0, (0, 0, -2), (0, 0, 0))
     picture = FrameSpec(random_splats(100, 3, depth=(-0.5, 1.0)), camera, outputs=("rgb", "depth"))
     whole = reference_images(picture)

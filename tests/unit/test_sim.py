@@ -78,19 +78,17 @@ def test_an_environment_is_bit_identical_in_any_batch(scene):
 
 def test_a_marker_is_read_where_its_body_is_by_a_fixed_camera_and_by_one_that_moves(rig):
     poses = some_poses(2)
-    pictures = rig.render(poses)
+    images = rig.render(poses)
     for camera in ("fixed", "mounted"):
         for i in range(2):
             there = matrix_of(poses["box"][i]) @ rigid_matrix((0.05, 0, 0))
-            np.testing.assert_allclose(pictures.placed(i)[0].pose, there, atol=1e-12)
-            (reading,) = read_back(pictures.of(camera).frame(i), rig.scene).readings
+            np.testing.assert_allclose(images.placed(i)[0].pose, there, atol=1e-12)
+            (reading,) = read_back(images.of(camera).frame(i), rig.scene).readings
             np.testing.assert_allclose(reading.placed.pose, there, atol=1e-12)
             assert reading.position_error < 0.01, (camera, i)
             assert reading.corner_error < 0.1
     robot = matrix_of(poses["robot"][1]) @ np.linalg.inv(rigid_matrix((0.1, 0, 0.2)))
-    np.testing.assert_allclose(
-        pictures.camera("mounted", 1).world_to_camera, np.linalg.inv(robot), atol=1e-12
-    )
+    np.testing.assert_allclose(images.camera("mounted", 1).world_to_camera, np.linalg.inv(robot), atol=1e-12)
 
 
 def test_cameras_off_the_origin_have_the_images_of_a_scene_put_together_by_hand(scene, renderer):
@@ -112,18 +110,18 @@ def test_cameras_off_the_origin_have_the_images_of_a_scene_put_together_by_hand(
     own = Rig(made, {1: "box"}, cameras, renderer=renderer, outputs=("rgb", "depth"))
     poses = {"box": np.stack([a_pose() for _ in range(2)])}
     poses["robot"] = np.stack([compose(pose_of(base), a_pose(0.1, 0.05)) for _ in range(2)])
-    pictures = own.render(poses)
+    images = own.render(poses)
     for i in range(2):
         (tag,) = scene.markers
         placed = PlacedMarker(tag.marker, matrix_of(poses["box"][i]) @ tag.pose)
         eyes = {"fixed": base, "mounted": matrix_of(poses["robot"][i]) @ mount}
         for name, eye in eyes.items():
             alone = fs.Scene([cloud], seen_from(eye), [placed])
-            wanted = renderer.render(alone, outputs=("rgb", "depth"))
-            assert (wanted["rgb"] > 0).any(axis=2).mean() > 0.05
-            frame = pictures.of(name).frame(i)
+            expected = renderer.render(alone, outputs=("rgb", "depth"))
+            assert (expected["rgb"] > 0).any(axis=2).mean() > 0.05
+            frame = images.of(name).frame(i)
             for output, off in (("rgb", 1e-5), ("depth", 1e-4)):
-                wrong = np.abs(frame[output] - wanted[output]) > off
+                wrong = np.abs(frame[output] - expected[output]) > off
                 assert wrong.mean() < 2e-3, (name, i, output)  # float32 poses at thresholds
 
 
@@ -136,8 +134,8 @@ def test_arrays_in_the_rigs_order_say_the_same_as_names(rig):
 
 def test_a_camera_that_is_given_a_pose_has_it_on_any_body(rig):
     poses = some_poses(1)
-    pictures = rig.render(poses, {"mounted": [[0, 0, 0, 1, 0, 0, 0]]})
-    assert pictures["rgb"][0, 1].tobytes() == pictures["rgb"][0, 0].tobytes()
+    images = rig.render(poses, {"mounted": [[0, 0, 0, 1, 0, 0, 0]]})
+    assert images["rgb"][0, 1].tobytes() == images["rgb"][0, 0].tobytes()
 
 
 def test_bodies_at_rest_where_the_scene_has_their_splats(scene, renderer):
@@ -177,10 +175,10 @@ def test_each_environment_has_its_own_external_depth_image(scene):
 
 def test_masked_environments_are_not_rendered(rig):
     poses = some_poses(2)
-    pictures = rig.render(poses, mask=np.array([False, True]))
-    assert not pictures["rgb"][0].any()
-    assert (pictures["label"][0] == -1).all()
-    assert (pictures["label"][1] == 1).any()
+    images = rig.render(poses, mask=np.array([False, True]))
+    assert not images["rgb"][0].any()
+    assert (images["label"][0] == -1).all()
+    assert (images["label"][1] == 1).any()
 
 
 def test_noise_is_another_in_every_environment_and_step(scene, renderer):
@@ -202,10 +200,10 @@ def test_cameras_of_different_sizes_are_taken_one_by_one(scene, renderer):
         "a": fs.Camera.pinhole(*SIZE, 150, 150, 80, 60),
         "b": fs.Camera.pinhole(64, 48, 60, 60, 32, 24),
     }
-    pictures = Rig(scene, {1: "box"}, cameras, renderer=renderer).render({"box": [[0, 0, 1.5, 1, 0, 0, 0]]})
-    assert pictures.of("b")["label"].shape == (1, 48, 64)
+    images = Rig(scene, {1: "box"}, cameras, renderer=renderer).render({"box": [[0, 0, 1.5, 1, 0, 0, 0]]})
+    assert images.of("b")["label"].shape == (1, 48, 64)
     with pytest.raises(fs.InputError, match=r"one size, got several; .*images.of\('a'\)"):
-        _ = pictures["rgb"]
+        _ = images["rgb"]
 
 
 GOOD = np.array([[0, 0, 1.5, 1, 0, 0, 0.0]])

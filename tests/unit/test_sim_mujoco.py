@@ -74,7 +74,7 @@ def moved(model, seed):
 def test_a_tag_is_read_where_mujoco_says_it_is(model, rig):
     """The axes of bodies and cameras, by pictures: the truth is computed from MuJoCo's own matrices."""
     states = [moved(model, seed) for seed in (0, 1)]
-    pictures = rig.render(states)
+    images = rig.render(states)
     assert tuple(rig.cameras) == ("above", "front", "lens", "plain")
     for camera in ("front", "lens", "plain"):
         for i, data in enumerate(states):
@@ -84,7 +84,7 @@ def test_a_tag_is_read_where_mujoco_says_it_is(model, rig):
             eye[:3, :3] = data.camera(camera).xmat.reshape(3, 3) @ np.diag([1.0, -1.0, -1.0])
             eye[:3, 3] = data.camera(camera).xpos
             truth = np.linalg.inv(eye) @ box @ FACE
-            (reading,) = read_back(pictures.of(camera).frame(i), rig.scene).readings
+            (reading,) = read_back(images.of(camera).frame(i), rig.scene).readings
             np.testing.assert_allclose(reading.truth, truth, atol=1e-9)
             assert np.linalg.norm(reading.pose[:3, 3] - truth[:3, 3]) < 0.01, (camera, i)
 
@@ -97,9 +97,9 @@ def test_intrinsics_are_those_that_mujoco_renders_with(model, name):
     data = moved(model, 3)
     fixed = mujoco.MjvCamera()
     fixed.type, fixed.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(name).id
-    drawn = mujoco.MjvScene(model, maxgeom=10)
-    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, fixed, mujoco.mjtCatBit.mjCAT_ALL, drawn)
-    gl, ours = drawn.camera[0], camera_of(model, name).camera
+    rendered = mujoco.MjvScene(model, maxgeom=10)
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, fixed, mujoco.mjtCatBit.mjCAT_ALL, rendered)
+    gl, ours = rendered.camera[0], camera_of(model, name).camera
     half = gl.frustum_width or (gl.frustum_top - gl.frustum_bottom) / 2 * ours.width / ours.height
     left, right = gl.frustum_center - half, gl.frustum_center + half
     reach = 1.0 if gl.orthographic else gl.frustum_near
@@ -127,11 +127,11 @@ def test_what_a_camera_of_the_model_says_of_itself(model):
 
 
 def test_outputs_of_the_model_are_what_is_rendered(model, rig):
-    pictures = rig.render(moved(model, 0))
-    depth = pictures.of("front")["depth"]
+    images = rig.render(moved(model, 0))
+    depth = images.of("front")["depth"]
     assert depth.shape == (1, 240, 320)
     assert 1.2 < np.median(depth[depth > 0]) < 2.2
-    assert tuple(pictures.of("plain")) == ("rgb",)
+    assert tuple(images.of("plain")) == ("rgb",)
 
 
 @pytest.mark.parametrize(
@@ -251,8 +251,8 @@ def test_the_ten_lines_of_the_pages_render_a_tag_that_is_read():
     )
     assert readme == page
     exec(readme, names)
-    pictures = names["images"]
-    (reading,) = read_back(pictures.of("eye").frame(0), names["rig"].scene).readings
+    images = names["images"]
+    (reading,) = read_back(images.of("eye").frame(0), names["rig"].scene).readings
     assert reading.position_error < 0.003  # 0.2 % of 1.4 m
 
 

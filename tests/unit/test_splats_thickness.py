@@ -60,8 +60,8 @@ def test_a_moved_and_scaled_cloud_has_moved_and_scaled_ellipsoids():
     cloud = cloud_of()
     matrix = rigid_matrix((1, 2, 3), (1, 2, 3, 4), 2.5)
     moved = cloud.transformed(matrix)
-    wanted = matrix[:3, :3] @ covariances(cloud) @ matrix[:3, :3].T
-    np.testing.assert_allclose(covariances(moved), wanted, rtol=1e-5, atol=1e-6)
+    expected = matrix[:3, :3] @ covariances(cloud) @ matrix[:3, :3].T
+    np.testing.assert_allclose(covariances(moved), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_bounds_hold_the_thickness():

@@ -342,14 +342,14 @@ def test_a_time_bound_allows_levels_of_detail(store, renderer, monkeypatch, tmp_
         return Choice(own, errors[base.detail_error], 1.0, 1.0, "measured", "here", candidate.settings)
 
     monkeypatch.setattr(sys.modules["fidsplat.accuracy.quality_within"], "_search", found)
-    asked = {"scene": store, "capture": camera_at(1500.0), "device": renderer}
-    asked["capture"] = fs.Capture(asked["capture"], quality="lowpass=pixel")
+    requested = {"scene": store, "capture": camera_at(1500.0), "device": renderer}
+    requested["capture"] = fs.Capture(requested["capture"], quality="lowpass=pixel")
     for _ in range(2):  # the second is kept
-        assert fs.quality_within(ms=1.0, **asked).detail_error == 4 / 255
+        assert fs.quality_within(ms=1.0, **requested).detail_error == 4 / 255
     assert tried == [0.0, 1 / 255, 4 / 255]
     errors[1 / 255] = errors[4 / 255] = errors[16 / 255] = errors[0.5] = None
     with pytest.raises(fs.InputError, match="in 1 ms"):
-        fs.quality_within(ms=2.0, **asked)
+        fs.quality_within(ms=2.0, **requested)
 
 
 def test_a_cloud_in_memory_is_exact(renderer):

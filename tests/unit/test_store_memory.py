@@ -60,12 +60,12 @@ def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     resident = renderer.upload(store)
     renderer.render(resident, look())
-    cache, pool, asked = resident.data._cache, renderer.backend.pool, []
+    cache, pool, requested = resident.data._cache, renderer.backend.pool, []
     fresh = pool.fresh
 
     def full(name, size):
-        asked.append(name)
-        if len(asked) == 2:
+        requested.append(name)
+        if len(requested) == 2:
             raise fs.DeviceError("no memory")
         return fresh(name, size)
 
@@ -75,7 +75,7 @@ def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
         return found
 
     before = dict(cache._arrays)
-    wanted = {name: contents_of(name) for name in before}
+    expected = {name: contents_of(name) for name in before}
     held = cl.UserEvent(renderer.backend.context)
     cl.enqueue_barrier(cache._queue, wait_for=[held])
     threading.Timer(0.2, held.set_status, [cl.command_execution_status.COMPLETE]).start()
@@ -84,7 +84,7 @@ def test_cache_content_survives_a_failed_growth(stores, monkeypatch):
         with pytest.raises(fs.DeviceError, match="no memory"):
             cache._grow(2 * cache._size)
     assert sum(buffer is not before[name] for name, buffer in cache._arrays.items()) == 1
-    assert all(np.array_equal(contents_of(name), array) for name, array in wanted.items())
+    assert all(np.array_equal(contents_of(name), array) for name, array in expected.items())
 
 
 def test_a_cache_smaller_than_a_view(stores, monkeypatch):
@@ -116,11 +116,11 @@ def facing_the_wall(x=0.0):
 
 
 def test_views_that_do_not_fit_are_rendered_in_bands(stores, monkeypatch):
-    store, drawn, most = stores["wall"], [], 5500
+    store, rendered, most = stores["wall"], [], 5500
     cloud, plain, limited = store.cloud(), fs.Renderer("opencl"), fs.Renderer("opencl")
 
     def fits(self, resident, view):
-        drawn.append(resident.count)
+        rendered.append(resident.count)
         return resident.count < most
 
     monkeypatch.setattr(OpenCLPipeline, "fits", fits)
@@ -135,25 +135,25 @@ def test_views_that_do_not_fit_are_rendered_in_bands(stores, monkeypatch):
     )
     widened = fs.Capture(facing_the_wall(), outputs=outputs, quality="lowpass=pixel,alpha_cutoff=1e-8")
     for capture in (fs.Capture(facing_the_wall(), outputs=outputs), sampled, by_pixel, widened, moved):
-        drawn.clear()
+        rendered.clear()
         ours, whole = limited.render(resident, capture), plain.render(cloud, capture)
         for output in capture.outputs:
             assert np.array_equal(ours[output], whole[output]), output
-        assert sum(count < most for count in drawn) >= 2
+        assert sum(count < most for count in rendered) >= 2
         assert ours.stats["visible"] >= whole.stats["visible"]
         assert set(ours.timings) == set(whole.timings)
     # the next view begins with the bands of the previous one
-    drawn.clear()
+    rendered.clear()
     limited.render(resident, moved)
-    assert max(drawn) < most
+    assert max(rendered) < most
     # a band of a frame is split too
     frame = limited.render_band((5, 80), resident, moved)
     assert np.array_equal(frame["rgb"][5:80], plain.render(cloud, moved)["rgb"][5:80])
     # splitting does not help where all rows need all splats
-    drawn.clear()
+    rendered.clear()
     fisheye, most = fs.Capture(replace(facing_the_wall(), lens=fs.Fisheye())), 1
     assert np.array_equal(limited.render(resident, fisheye)["rgb"], plain.render(cloud, fisheye)["rgb"])
-    assert len(drawn) == 1
+    assert len(rendered) == 1
 
 
 def test_a_memory_budget_makes_bands(stores):

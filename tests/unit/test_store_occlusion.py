@@ -51,7 +51,7 @@ def town(tmp_path_factory):
 @pytest.fixture
 def culling(monkeypatch):
     """Occlusion culling of every view; returns the splats of each first pass, and of the view."""
-    drawn, counts = occlusion_culling.OcclusionCulling.render, []
+    rendered, counts = occlusion_culling.OcclusionCulling.render, []
     monkeypatch.setattr(occlusion_culling, "MIN_SPLATS", 0)
     monkeypatch.setattr(occlusion_culling, "_INITIAL_SPLATS", 3000)
     monkeypatch.setattr(occlusion_culling, "_PROBE_SHARE", 1)
@@ -59,7 +59,7 @@ def culling(monkeypatch):
     monkeypatch.setattr(subchunks, "ROWS", 24)
 
     def noted(self, whole, *given):
-        made = drawn(self, whole, *given)
+        made = rendered(self, whole, *given)
         counts.append((whole.count if made is None else made[0][0].count, whole.count))
         return made
 

@@ -171,8 +171,8 @@ def test_walls_next_to_the_camera_under_the_low_pass_pixel(tmp_path, lens):
         half = generator.uniform(-math.pi, math.pi) if number % 2 else generator.normal(0, 0.01)
         turn = (math.cos(half), 0.0, math.sin(half), 0.0)
         camera = look(turn=turn, at=at, lens=lens) if lens else look(turn=turn, at=at)
-        ours, wanted = (renderer.render(each, camera, quality=quality) for each in (resident, whole))
-        assert np.array_equal(ours["rgb"], wanted["rgb"])
+        ours, expected = (renderer.render(each, camera, quality=quality) for each in (resident, whole))
+        assert np.array_equal(ours["rgb"], expected["rgb"])
         read.append(ours.stats["splats"])
     assert (min(read) < 0.6 * count) or isinstance(lens, fs.BrownConrady)
 
@@ -223,19 +223,19 @@ def test_stores_are_bit_identical_on_a_device(stores, tmp_path):
 
 
 def test_a_failed_prefetch_is_ignored(stores, reference, monkeypatch):
-    tried, told = [], []
+    tried, reported = [], []
 
     def prefetch(self, selection):
         tried.append(selection)
         raise fs.DeviceError("no memory")
 
     monkeypatch.setattr(ChunkedSplats, "prefetch", prefetch)
-    monkeypatch.setattr(threading, "excepthook", told.append)
+    monkeypatch.setattr(threading, "excepthook", reported.append)
     cameras = [look(), look(turn=TURNED)]
     frames = list(reference.render_views(stores["disks"], cameras))
     assert len(frames) == 2
     assert tried
-    assert not told
+    assert not reported
 
 
 def test_stores_with_splats_in_memory_are_bit_identical(stores):

@@ -59,14 +59,14 @@ def test_the_baseline_of_other_iterations_is_not_mixed_in(tmp_path):
     from fidsplat.experiments.trained import BaselineSettings, baseline_sweeps
 
     renderer = fs.Renderer("reference")
-    wanted = BaselineSettings(tmp_path, category=("small",), markers=1, views=(3,), iterations=5)
-    with baseline_sweeps(wanted, renderer) as (trainings, *_):
-        trainings.results.append(wanted.points[0], {"psnr": 30.0})
+    expected = BaselineSettings(tmp_path, category=("small",), markers=1, views=(3,), iterations=5)
+    with baseline_sweeps(expected, renderer) as (trainings, *_):
+        trainings.results.append(expected.points[0], {"psnr": 30.0})
     with pytest.raises(fs.InputError, match=r"holds trainings of 5 iterations, not 7; .* --overwrite"):
-        baseline_sweeps(replace(wanted, iterations=7), renderer).__enter__()
-    with baseline_sweeps(wanted, renderer) as (trainings, *_):
+        baseline_sweeps(replace(expected, iterations=7), renderer).__enter__()
+    with baseline_sweeps(expected, renderer) as (trainings, *_):
         assert trainings.left == []
-    with baseline_sweeps(replace(wanted, iterations=7, overwrite=True), renderer) as (trainings, *_):
+    with baseline_sweeps(replace(expected, iterations=7, overwrite=True), renderer) as (trainings, *_):
         assert len(trainings.left) == 1
 
 
@@ -75,11 +75,11 @@ def test_the_baseline_begins_with_one_marker_of_each_category(tmp_path):
     from fidsplat.experiments.setup import CATEGORIES
     from fidsplat.experiments.trained import BaselineSettings
 
-    wanted = BaselineSettings(tmp_path, markers=2, seeds=3)
-    assert len(wanted.points) == 5 * 2 * 4 * 3
-    first = wanted.points[:20]
+    expected = BaselineSettings(tmp_path, markers=2, seeds=3)
+    assert len(expected.points) == 5 * 2 * 4 * 3
+    first = expected.points[:20]
     assert {(p["category"], p["views"]) for p in first} == {(c, n) for c in CATEGORIES for n in (3, 5, 9, 17)}
     assert {(p["index"], p["seed"]) for p in first} == {(0, 0)}
-    shares = [replace(wanted, shard=f"{i}/7").points for i in range(1, 8)]
-    assert sorted(map(str, wanted.points)) == sorted(str(p) for share in shares for p in share)
-    assert replace(wanted, shard="2/7").file("views").name == "views-2-of-7.jsonl"
+    shares = [replace(expected, shard=f"{i}/7").points for i in range(1, 8)]
+    assert sorted(map(str, expected.points)) == sorted(str(p) for share in shares for p in share)
+    assert replace(expected, shard="2/7").file("views").name == "views-2-of-7.jsonl"

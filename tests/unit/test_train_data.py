@@ -41,9 +41,9 @@ def transforms(made, folder, **more):
     return folder
 
 
-def same_views(found, wanted):
-    assert [view.name.removeprefix("./") for view in found] == [view.name for view in wanted]
-    for a, b in zip(found, wanted, strict=True):
+def same_views(found, expected):
+    assert [view.name.removeprefix("./") for view in found] == [view.name for view in expected]
+    for a, b in zip(found, expected, strict=True):
         np.testing.assert_array_equal(a.image, b.image)
         np.testing.assert_allclose(a.camera.world_to_camera, b.camera.world_to_camera, atol=1e-12)
         assert (a.camera.fx, a.camera.cx) == (b.camera.fx, b.camera.cx)
@@ -92,9 +92,9 @@ def test_colmaps_keypoints_are_skipped(folder):
     assert_same(load_colmap(model), before)
 
 
-def assert_same(model, wanted):
-    assert model.names == wanted.names
-    for one, other in zip(model.cameras, wanted.cameras, strict=True):
+def assert_same(model, expected):
+    assert model.names == expected.names
+    for one, other in zip(model.cameras, expected.cameras, strict=True):
         np.testing.assert_array_equal(one.world_to_camera, other.world_to_camera)
 
 
@@ -241,8 +241,8 @@ def test_views_that_nerfstudio_holds_out(made, tmp_path):
     ):
         folder = transforms(made, tmp_path / str(number), **lists)
         found = load_dataset(folder, random_points=9)
-        for views, wanted in ((found.views, trained), (found.held_out, held_out)):
-            assert [view.name for view in views] == [f"./{name}.png" for name in wanted]
+        for views, expected in ((found.views, trained), (found.held_out, held_out)):
+            assert [view.name for view in views] == [f"./{name}.png" for name in expected]
     for wrong, said in (
         ({"test_filenames": "2.png"}, "test_filenames must be a list"),
         ({"val_filenames": ["no.png"]}, "val_filenames must be file_paths of frames, got no.png"),

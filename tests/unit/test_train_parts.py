@@ -14,7 +14,7 @@ from fidsplat.train.parameters import Splats, TrainingError, logit, sigmoid
 from fidsplat.train.random_numbers import Purpose, normal, permutation, philox, uniform
 
 
-def pictures(seed=0, size=(9, 12)):
+def images(seed=0, size=(9, 12)):
     random = np.random.default_rng(seed)
     return random.uniform(-0.1, 1.1, (2, *size, 3))
 
@@ -32,7 +32,7 @@ def splats_of(count, seed=0, degree=1):
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("masked", [False, True])
 def test_the_gradient_of_the_loss_is_that_of_central_differences(weight, masked):
-    image, truth = pictures()
+    image, truth = images()
     mask = np.random.default_rng(1).uniform(size=image.shape[:2]) < 0.6 if masked else None
     _, gradient = image_loss(image, truth, mask, weight)
     random = np.random.default_rng(2)
@@ -91,7 +91,7 @@ def test_a_plane_has_the_normals_of_its_depths():
 
 def test_the_loss_is_what_its_definition_says():
     """SSIM written out pixel by pixel: a window of 11 that sees zeros beyond the picture."""
-    image, truth = pictures(size=(5, 7))
+    image, truth = images(size=(5, 7))
     weights = np.outer(window(), window())
     similar = []
     for c in range(3):
@@ -114,7 +114,7 @@ def test_the_loss_is_what_its_definition_says():
 
 
 def test_a_value_that_is_not_finite_is_detected_unless_it_is_masked():
-    image, truth = pictures()
+    image, truth = images()
     image[3, 4, 1] = np.nan
     assert np.isnan(image_loss(image, truth, None, 0.2)[0].value)
     mask = np.ones(image.shape[:2], bool)
@@ -136,8 +136,8 @@ def test_adam_takes_the_step_that_is_written_out():
         rates = np.full(value.shape, rate[name])
         if name == "sh":
             rates[:, 1:] /= 20
-        wanted = value - rates * (m / (1 - 0.9**7)) / (np.sqrt(v / (1 - 0.999**7)) + 1e-15)
-        np.testing.assert_allclose(splats.values[name], wanted, rtol=2e-5, atol=2e-6)
+        expected = value - rates * (m / (1 - 0.9**7)) / (np.sqrt(v / (1 - 0.999**7)) + 1e-15)
+        np.testing.assert_allclose(splats.values[name], expected, rtol=2e-5, atol=2e-6)
         np.testing.assert_allclose(splats.first[name], m, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(splats.second[name], v, rtol=1e-5)
 

@@ -143,8 +143,8 @@ def test_what_a_file_of_each_format_says(tmp_path):
     frame = said["frames"][0]
     assert (frame["file_path"], frame["time"]) == ("images/x.png", 1.5)
     # OpenGL: the camera looks along its own -z, so the third column is backwards, the second up
-    wanted = [[0, 0, -1, 1], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]]
-    np.testing.assert_allclose(frame["transform_matrix"], wanted, atol=1e-15)
+    expected = [[0, 0, -1, 1], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(frame["transform_matrix"], expected, atol=1e-15)
 
 
 def test_colmap_reads_what_is_written(tmp_path):

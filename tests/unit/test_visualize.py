@@ -61,20 +61,22 @@ def test_labels_have_colours_of_their_own():
 
 def test_an_outline_has_the_corners_and_keeps_the_image():
     image = np.zeros((60, 80, 3), np.uint8)
-    drawn = draw_outlines(image, [(SQUARE, "")], thickness=1)
+    rendered = draw_outlines(image, [(SQUARE, "")], thickness=1)
     assert not image.any()
-    assert drawn[25, 20].any()
-    assert drawn[25, 60].any()
-    assert not drawn[25, 40].any()
-    assert drawn[10, 20].sum() > 400, "the first corner is marked"
+    assert rendered[25, 20].any()
+    assert rendered[25, 60].any()
+    assert not rendered[25, 40].any()
+    assert rendered[10, 20].sum() > 400, "the first corner is marked"
 
 
 def test_captions_are_below_their_outlines_and_not_over_each_other():
     image = np.zeros((200, 160, 3), np.uint8)
 
     def captions(*words):
-        drawn = draw_outlines(image, [(SQUARE, word) for word in words], size=0.5)
-        return (drawn.min(axis=2) == 255).any(axis=1)[42:]  # rows with white in them; outlines are not white
+        rendered = draw_outlines(image, [(SQUARE, word) for word in words], size=0.5)
+        return (rendered.min(axis=2) == 255).any(axis=1)[
+            42:
+        ]  # rows with white in them; outlines are not white
 
     one, two = captions("näme"), captions("näme", "näme")
     assert one.any()

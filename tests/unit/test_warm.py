@@ -15,14 +15,14 @@ from fidsplat.worlds.yard import demo_scene
 
 
 def test_recipes_are_what_scenes_call_for():
-    wanted = warming.recipes()
-    assert len(set(wanted)) == len(wanted)
-    assert len({recipe.text for recipe in wanted}) == len(wanted)
+    expected = warming.recipes()
+    assert len(set(expected)) == len(expected)
+    assert len({recipe.text for recipe in expected}) == len(expected)
     called_for = {
         select(warming._cloud(recipe, 5), fs.Capture(outputs=recipe.outputs, quality=recipe.quality))
-        for recipe in wanted
+        for recipe in expected
     }
-    assert len(called_for) == len(wanted)
+    assert len(called_for) == len(expected)
     tag, demo = fs.marker("apriltag:36h11:5").cloud, demo_scene()
     assert select(tag, fs.Capture()) in called_for
     assert select(demo.cloud(), demo.capture) in called_for
@@ -42,9 +42,9 @@ def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
 
     features = select(cloud, fs.Capture(outputs=recipe.outputs, quality=recipe.quality))
     # a device without float64 has these in float32
-    wanted = replace(features, setup_precision="")
+    expected = replace(features, setup_precision="")
     compiled = [replace(key[0], setup_precision="") for key in renderer.backend._pipelines]
-    assert wanted in compiled
+    assert expected in compiled
 
 
 def test_the_command(capsys, monkeypatch):
@@ -60,8 +60,8 @@ def test_the_command(capsys, monkeypatch):
 
 
 def test_an_interrupt_says_what_is_ready(capsys, monkeypatch):
-    def stopped(renderer, wanted):
-        yield wanted[0], 0.1
+    def stopped(renderer, expected):
+        yield expected[0], 0.1
         raise KeyboardInterrupt
 
     monkeypatch.setattr(warming, "warm", stopped)

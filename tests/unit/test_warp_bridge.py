@@ -16,9 +16,9 @@ TYPES = {"means": "vec3", "quats": "vec4", "scales": "vec2", "opacities": "float
 
 
 @wp.kernel
-def squared(image: wp.array3d(dtype=float), wanted: wp.array3d(dtype=float), loss: wp.array(dtype=float)):
+def squared(image: wp.array3d(dtype=float), expected: wp.array3d(dtype=float), loss: wp.array(dtype=float)):
     i, j, k = wp.tid()
-    off = image[i, j, k] - wanted[i, j, k]
+    off = image[i, j, k] - expected[i, j, k]
     wp.atomic_add(loss, 0, off * off)
 
 
@@ -52,12 +52,12 @@ def test_a_tape_differentiates_frames_and_kernels(renderer, draw):
     """All gradients are those of the backend by the same loss; a second pass adds to them."""
     cloud, capture = picture()
     arrays = on_device(cloud)
-    wanted = wp.zeros((43, 61, 3), dtype=float, device="cpu")
+    expected = wp.zeros((43, 61, 3), dtype=float, device="cpu")
     loss = wp.zeros(1, dtype=float, device="cpu", requires_grad=True)
     tape = wp.Tape()
     with tape:
         images = draw(tape, renderer, capture, **arrays)
-        wp.launch(squared, (43, 61, 3), [images["rgb"], wanted, loss], device="cpu")
+        wp.launch(squared, (43, 61, 3), [images["rgb"], expected, loss], device="cpu")
     tape.backward(loss)
     rgb = images["rgb"].numpy()
     assert np.array_equal(rgb, renderer.render(cloud, capture)["rgb"])

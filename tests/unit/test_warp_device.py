@@ -165,7 +165,7 @@ def test_other_backends_say_that_they_share_nothing(reference):
 
 
 def test_adopted_arrays_render_what_the_cloud_renders(renderer):
-    wanted = renderer.render(CLOUD, CAMERA)["rgb"]
+    expected = renderer.render(CLOUD, CAMERA)["rgb"]
     vectors = arrays_of(CLOUD, renderer.backend.device)
     rows = {
         name: wp.array(getattr(CLOUD, name), dtype=wp.float32, device=renderer.backend.device)
@@ -173,7 +173,7 @@ def test_adopted_arrays_render_what_the_cloud_renders(renderer):
     }
     plain = {name: getattr(CLOUD, name) for name in vectors}
     for arrays in (vectors, rows, plain):
-        assert np.array_equal(renderer.render(renderer.adopt(**arrays), CAMERA)["rgb"], wanted)
+        assert np.array_equal(renderer.render(renderer.adopt(**arrays), CAMERA)["rgb"], expected)
 
 
 def test_a_resident_cloud_reports_its_memory(renderer):
@@ -189,11 +189,11 @@ def test_adopted_labels_harmonics_and_origins(renderer):
     cloud = random_splats(100, seed=3, depth=(1, 4), scale=(0.02, 0.4), sh_degree=2)
     names = ("means", "quats", "scales", "opacities", "sh", "labels")
     resident = renderer.adopt(**{name: getattr(cloud, name) for name in names})
-    frame, wanted = (renderer.render(what, CAMERA, ("rgb", "label")) for what in (resident, cloud))
-    assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+    frame, expected = (renderer.render(what, CAMERA, ("rgb", "label")) for what in (resident, cloud))
+    assert all(np.array_equal(frame[name], expected[name]) for name in frame)
     moved = renderer.adopt(**{name: getattr(cloud, name) for name in names}, origin=(1e6, 0, 0))
     view = fs.Camera.look_at(64, 48, 1.0, (1e6, 0.0, -0.1), (1e6, 0.0, 3.0))
-    assert np.allclose(renderer.render(moved, view)["rgb"], wanted["rgb"], atol=1e-5)
+    assert np.allclose(renderer.render(moved, view)["rgb"], expected["rgb"], atol=1e-5)
 
 
 def test_adopted_splats_with_three_scales(renderer):
@@ -202,13 +202,13 @@ def test_adopted_splats_with_three_scales(renderer):
     third = np.where(np.arange(len(CLOUD)) % 3 == 0, 0, CLOUD.scales[:, :1].T * 0.5)
     scales = np.column_stack([CLOUD.scales, third[0]])
     thick = fs.SplatCloud(CLOUD.means, CLOUD.quats, scales, CLOUD.opacities, colors=CLOUD.colors)
-    wanted = renderer.render(thick, CAMERA)["rgb"]
+    expected = renderer.render(thick, CAMERA)["rgb"]
     vectors = arrays_of(CLOUD, device) | {"scales": wp.array(scales, dtype=wp.vec3, device=device)}
     rows = vectors | {"scales": wp.array(scales, dtype=wp.float32, device=device)}
     plain = {name: getattr(CLOUD, name) for name in vectors} | {"scales": scales}
     for arrays in (vectors, rows, plain):
         resident = renderer.adopt(**arrays)
-        assert np.array_equal(renderer.render(resident, CAMERA)["rgb"], wanted)
+        assert np.array_equal(renderer.render(resident, CAMERA)["rgb"], expected)
         words = 3 + 4 + 3 + 1 + 3 + 1
         assert resident.memory_bytes == 4 * words * len(CLOUD)
 
@@ -221,7 +221,7 @@ def test_adopted_splats_with_three_scales(renderer):
     left = fs.SplatCloud(*(array[keep] for array in rest), colors=CLOUD.colors[keep])
     after = renderer.render(resident, CAMERA)["rgb"]
     assert np.array_equal(after, renderer.render(left, CAMERA)["rgb"])
-    assert not np.array_equal(after, wanted)
+    assert not np.array_equal(after, expected)
 
 
 def test_moving_an_adopted_array_moves_the_splats(renderer):
@@ -230,9 +230,9 @@ def test_moving_an_adopted_array_moves_the_splats(renderer):
     before = renderer.render(resident, CAMERA)["rgb"].copy()
     moved = CLOUD.means + np.float32([0.2, 0, 0])
     arrays["means"].assign(wp.array(moved, dtype=wp.vec3, device="cpu"))
-    wanted = fs.SplatCloud(moved, CLOUD.quats, CLOUD.scales, CLOUD.opacities, colors=CLOUD.colors)
+    expected = fs.SplatCloud(moved, CLOUD.quats, CLOUD.scales, CLOUD.opacities, colors=CLOUD.colors)
     after = renderer.render(resident, CAMERA)["rgb"]
-    assert np.array_equal(after, renderer.render(wanted, CAMERA)["rgb"])
+    assert np.array_equal(after, renderer.render(expected, CAMERA)["rgb"])
     assert not np.array_equal(after, before)
 
 
@@ -244,10 +244,10 @@ def test_adopted_values_that_are_not_finite_leave_no_trace(renderer, name, value
     arrays = {each: getattr(CLOUD, each).copy() for each in names}
     without = {each: array[keep] for each, array in arrays.items()}
     arrays[name][7] = value
-    frame, wanted = (
+    frame, expected = (
         renderer.render(renderer.adopt(**a), CAMERA, ("rgb", "alpha")) for a in (arrays, without)
     )
-    assert all(np.array_equal(frame[plane], wanted[plane]) for plane in frame)
+    assert all(np.array_equal(frame[plane], expected[plane]) for plane in frame)
 
 
 @pytest.mark.parametrize(
@@ -347,12 +347,12 @@ def test_the_example_renders_each_step(device, monkeypatch, capsys):
 def test_a_memory_budget_renders_in_bands_bit_identically():
     cloud = random_splats(300, seed=5, depth=(0.5, 4.0), scale=(0.05, 1.0))
     view = fs.Camera.look_at(320, 240, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
-    wanted = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)
+    expected = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)
     own = fs.Renderer("warp:cpu", memory_budget=6_894_400)
     frame = own.render(cloud, view, ALL_OUTPUTS)
     assert own.backend.pool._arrays["tile_totals", wp.int32].size == 300, "it was drawn in bands"
-    assert frame.stats == wanted.stats
-    assert all(np.array_equal(frame[name], wanted[name]) for name in ALL_OUTPUTS)
+    assert frame.stats == expected.stats
+    assert all(np.array_equal(frame[name], expected[name]) for name in ALL_OUTPUTS)
     with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small .* raise memory_budget"):
         fs.Renderer("warp:cpu", memory_budget=2**20).render(cloud, view, ALL_OUTPUTS)
 
@@ -364,11 +364,11 @@ def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
     end[0, 3] = 0.5
     poses = fs.Trajectory([-1.0, 1.0], np.stack([start, end]))
     exposed = {"motion": fs.Motion(poses), "shutter": fs.Shutter(exposure_time=0.3, sub_poses=2)}
-    wanted = fs.Renderer("warp:cpu").render(cloud, view, ("rgb", "depth"), **exposed)
+    expected = fs.Renderer("warp:cpu").render(cloud, view, ("rgb", "depth"), **exposed)
     own = fs.Renderer("warp:cpu", memory_budget=6_170_000)
     frame = own.render(cloud, view, ("rgb", "depth"), **exposed)
     assert own.backend.pool._arrays["tile_totals", wp.int32].size == 300, "it was drawn in bands"
-    assert all(np.array_equal(frame[name], wanted[name]) for name in ("rgb", "depth"))
+    assert all(np.array_equal(frame[name], expected[name]) for name in ("rgb", "depth"))
     small = fs.Renderer("warp:cpu", memory_budget=5_500_000)
     small.render(cloud, view, ("rgb", "depth"))
     with pytest.raises(fs.DeviceError, match=r"too small .* raise memory_budget"):

@@ -95,7 +95,7 @@ def beside(tmp_path, monkeypatch):
     return put
 
 
-def drawn(outputs, posts):
+def rendered(outputs, posts):
     """rgb and these outputs."""
     backend = fs.Renderer("warp:cpu").backend
     cloud = two_splats()
@@ -125,7 +125,7 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     beside("output", "strongest", STRONGEST)
     beside("post", "negative", NEGATIVE)
     assert not backend.unsupported(features)
-    plain, toys = drawn((), ()), drawn(("strongest",), ("negative",))
+    plain, toys = rendered((), ()), rendered(("strongest",), ("negative",))
     assert np.array_equal(toys["rgb"], np.float32(1) - plain["rgb"])
     # the nearer splat lets three quarters through, of which the other takes up to a half
     assert np.array_equal(toys["strongest"], plain["rgb"][..., :2].max(-1))
@@ -146,7 +146,7 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     del sys.modules[f"{runtime.kernels('output').__name__}.strongest"]
     for stage in ("pixel", "blend", "resolve"):
         make_anew(stage, monkeypatch)
-    changed = drawn(("strongest",), ())["strongest"]
+    changed = rendered(("strongest",), ())["strongest"]
     assert np.array_equal(changed, plain["rgb"][..., :2].sum(-1))
     assert not np.array_equal(changed, toys["strongest"])
 
