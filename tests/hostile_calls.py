@@ -133,6 +133,23 @@ def _robot_log(folder: Path) -> Call:
 CALLS: dict[str, Callable[[Path], Call]] = {
     "SplatCloud.reach": lambda _: (CLOUD.reach, {"sigmas": 3.0}, None),
     "Camera.project of several": lambda _: (fs.Camera.equirectangular(24, 12).project, {"points": MEANS}, None),
+    "Fisheye.image": lambda _: (fs.Fisheye(0.1).image, {"points": MEANS}, None),
+    "Fisheye.rays": lambda _: (fs.Fisheye(0.1).rays, {"image": MEANS[:, :2]}, None),
+    "BrownConrady.derivative": lambda _: (fs.BrownConrady(0.1).derivative, {"points": MEANS}, None),
+    "Motion.sampled": lambda _: (fs.Motion(PATH).sampled, {"times": [0.0, 1.0]}, None),
+    "TrainSettings.adam_steps": lambda _: (SETTINGS.adam_steps, {"iteration": 3}, None),
+    "TrainSettings.densifies_after": lambda _: (SETTINGS.densifies_after, {"iteration": 3}, None),
+    "TrainSettings.surface_weights_at": lambda _: (SETTINGS.surface_weights_at, {"iteration": 3}, None),
+    "DifferentiableFrame.backward": lambda _: (
+        RENDERER.render_differentiable(CLOUD, CAMERA).backward,
+        {"gradients": {"rgb": np.ones((16, 24, 3), np.float32)}, "on_device": False},
+        None,
+    ),
+    "DifferentiableFrame.backward of": lambda _: (
+        lambda rgb: RENDERER.render_differentiable(CLOUD, CAMERA).backward({"rgb": rgb}),
+        {"rgb": np.ones((16, 24, 3), np.float32)},
+        None,
+    ),
     "BrownConrady.opencv": lambda _: (fs.BrownConrady.opencv, {"coefficients": (0.1, 0, 0, 0)}, None),
     "focal_length": lambda _: (fs.cameras.focal_length, {"width": 24, "fov_x": 1.0}, None),
     "look_at_matrix": lambda _: (fs.cameras.look_at_matrix, {"position": (0, 0, -1), "target": (0, 0, 0), "up": (0, -1, 0)}, None),

@@ -1,6 +1,6 @@
 """Test interrupts and full disks: no complete file may be lost, and the next run must be bit-identical.
 
-    python tools/interrupt.py trials.jsonl [--commands demo,render,...] [--most 20] [--jobs 1] [--seed 0]
+    python tools/interrupt.py trials.jsonl [--commands demo,...] [--most 20] [--each 5] [--jobs 1] [--seed 0]
 
 Each command runs twice undisturbed: content that agrees is its expected result (values of figures and logs,
 lines of texts), and the rest (times, durations) must only parse. Each trial starts the command in an empty
@@ -33,7 +33,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from fidsplat.formats import save_ply
+from fidsplat.cameras import Camera, Trajectory
+from fidsplat.formats import save_ply, save_trajectory
+from fidsplat.images.files import write_png
 from fidsplat.scenes.random_clouds import random_splats
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGKILL")
@@ -80,9 +82,23 @@ COMMANDS = {
     "convert": Command("convert ../splats.ply splats.spz --overwrite", 60, 4),
     "fly": Command("fly ../scene.toml --trajectory ../flight.tum --rate 5 -o run.mcap", 60, 4),
     "bag": Command("fly ../scene.toml --trajectory ../flight.tum --rate 5 --log bag", 12, 0),
+    "store": Command("store build ../splats.ply -o city.fss --chunk 256", 60, 4),
+    "train": Command("train ../views -o out.ply --iterations 150 --random-points 200", 60, 2),
     "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 51, 1),
 }
 Facts = dict[Any, Any]
+
+
+def _write_views(folder: Path) -> None:
+    """A training data set of noise."""
+    folder.mkdir()
+    names, noise = [f"{number}.png" for number in range(4)], np.random.default_rng(0)
+    for name in names:
+        write_png(folder / name, noise.integers(0, 255, (48, 64, 3)).astype(np.uint8))
+    camera = Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
+    poses = np.stack([np.eye(4)] * 4)
+    poses[:, 0, 3] = np.linspace(-0.3, 0.3, 4)
+    save_trajectory(Trajectory(range(4), poses), folder / "transforms.json", camera, names)
 
 
 def files_below(folder: Path) -> dict[str, Path]:
@@ -142,6 +158,7 @@ class Trial:
         (work / "scene.toml").write_text(SCENE)
         (work / "flight.tum").write_text(FLIGHT)
         save_ply(random_splats(20_000, 0), work / "splats.ply")
+        _write_views(work / "views")
         found = []
         for name in ("first", "second"):
             start = time.monotonic()
@@ -291,9 +308,12 @@ def main() -> int:
     parser.add_argument("file", type=Path, help="the trials, a line each")
     parser.add_argument("--commands", default=",".join(COMMANDS), help=f"of {', '.join(COMMANDS)}")
     parser.add_argument("--most", type=int, default=10**6, help="trials in this run (default: all)")
+    parser.add_argument("--each", type=int, default=10**6, help="trials of each command (default: all)")
     parser.add_argument("--jobs", type=int, default=1, help="trials of a command that run at once")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
+    # background jobs of a shell ignore it, and their children would
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     names = given.commands.split(",")
     if unknown := set(names) - set(COMMANDS):
         parser.error(f"unknown commands {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
@@ -301,7 +321,8 @@ def main() -> int:
     for name in names:
         there = {row["trial"] for row in done if row["command"] == name}
         left = [(part, *plan) for part, plan in planned(name, given.seed).items() if part not in there]
-        left = [part for part in left if part[1] != DISK or os.geteuid() == 0][: given.most]
+        left = [part for part in left if part[1] != DISK or os.geteuid() == 0]
+        left = left[: min(given.most, given.each - len(there))]
         given.most -= len(left)
         if not left:
             continue

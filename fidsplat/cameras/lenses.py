@@ -109,6 +109,7 @@ class BrownConrady:
 
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2) of points (n, 3); NaN behind the camera and beyond the fold."""
+        points = _rows("points", points, 3)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
             a, b = self._distorted(x, y)[:2]
@@ -117,6 +118,7 @@ class BrownConrady:
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
         """Jacobian of the image coordinates by X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
+        points = _rows("points", points, 3)
         z = points[:, 2]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = points[:, 0] / z, points[:, 1] / z
@@ -126,6 +128,7 @@ class BrownConrady:
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Directions (n, 3) = (X / Z, Y / Z, 1) of image coordinates (n, 2); NaN outside the field of
         view."""
+        image = _rows("image", image, 2)
         a, b = image.T
         distance = np.hypot(a, b)
         x, y = _scaled(a, b, distance, self._undistorted(distance))
@@ -204,6 +207,7 @@ class Fisheye:
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
         """Jacobian of the image coordinates by X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
+        points = _rows("points", points, 3)
         x, y, z = points.T
         across = np.hypot(x, y)
         angle = np.arctan2(across, z)
@@ -217,6 +221,7 @@ class Fisheye:
 
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2) of points (n, 3); NaN outside the field of view."""
+        points = _rows("points", points, 3)
         across = np.hypot(points[:, 0], points[:, 1])
         angle = np.arctan2(across, points[:, 2])
         visible = np.asarray(angle <= self.limit) & np.asarray((across > 0) | (points[:, 2] > 0))
@@ -225,6 +230,7 @@ class Fisheye:
 
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) of image coordinates (n, 2); NaN outside the field of view."""
+        image = _rows("image", image, 2)
         a, b = image.T
         distance = np.hypot(a, b)
         angles = np.linspace(0, self.limit, _STEPS)
@@ -258,6 +264,7 @@ class Equirectangular:
 
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2), radians, of points (n, 3); NaN for the camera's centre."""
+        points = _rows("points", points, 3)
         x, y, z = points.T
         image = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], 1)
         return np.where(np.any(points != 0, axis=1)[:, None], image, np.nan)
@@ -265,6 +272,7 @@ class Equirectangular:
     def derivative(self, points: np.ndarray) -> np.ndarray:
         """Jacobian (n, 2, 3) of the image coordinates by X, Y, Z, at points (n, 3). At a pole, where the
         longitude jumps, it is the Jacobian of a point 1e-6 rad away towards z."""
+        points = _rows("points", points, 3)
         x, y, z = points.T
         far = np.linalg.norm(points, axis=1)
         polar = np.hypot(x, z) < 1e-6 * far
@@ -277,6 +285,7 @@ class Equirectangular:
 
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) of image coordinates (n, 2); NaN beyond the sphere."""
+        image = _rows("image", image, 2)
         a, b = image.T
         visible = (np.abs(a) <= math.pi) & (np.abs(b) <= math.pi / 2)
         rays = np.stack([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)], 1)
@@ -294,16 +303,27 @@ class Orthographic:
 
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2), metres, of points (n, 3); NaN behind the camera."""
+        points = _rows("points", points, 3)
         return np.where(points[:, 2:] > 0, points[:, :2], np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
         """Jacobian (n, 2, 3) of the image coordinates by X, Y, Z, at points (n, 3)."""
+        points = _rows("points", points, 3)
         return np.tile(np.eye(2, 3), (len(points), 1, 1))
 
 
 RayLens: TypeAlias = BrownConrady | Fisheye | Equirectangular
 """lenses whose rays start at one point"""
 Lens: TypeAlias = RayLens | Orthographic
+
+
+def _rows(name: str, value: np.ndarray, width: int) -> np.ndarray:
+    """An array (n, width) of real numbers; not copied if it is one."""
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+        value = real_array(name, value)
+    if value.ndim != 2 or value.shape[1] != width:
+        raise InputError(f"{name} must have the shape (n, {width}), got {value.shape}")
+    return value
 
 
 def _check(lens) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from fidsplat.cameras.pinhole import Camera
 from fidsplat.splats.rotations import check_similarity
-from fidsplat.util.arguments import as_float, instance, number, own_scalars, whole_number
+from fidsplat.util.arguments import as_float, instance, invalid, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError
 
 MAX_SUB_POSES = 1024
@@ -113,7 +113,10 @@ class Motion:
 
     def sampled(self, times: Iterable[float]) -> Motion:
         """A motion restricted to the poses at these times; it pickles even if made of functions."""
-        moments = [float(time) for time in times]
+        try:
+            moments = [number("a time", time, "a finite number of seconds") for time in times]
+        except TypeError:
+            raise invalid("times", "numbers of seconds", times) from None
         groups = {label: _PoseTable({t: pose(t) for t in moments}) for label, pose in self.groups.items()}
         camera = self.camera and _PoseTable({t: self.camera(t) for t in moments})
         return Motion(camera, groups)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import LARGEST, PickledByFields, own_scalars
+from fidsplat.util.arguments import LARGEST, PickledByFields, as_float, invalid, own_scalars
 from fidsplat.util.errors import InputError
 
 MAX_PANORAMA = 16384
@@ -175,9 +175,9 @@ def background_of(value: Any) -> Background:
 def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
     """Validated tuple of three finite floats; errors name it."""
     try:
-        x, y, z = map(float, value)
+        x, y, z = map(as_float, value)
     except (TypeError, ValueError):
         x = y = z = math.nan
     if not (abs(x) <= LARGEST and abs(y) <= LARGEST and abs(z) <= LARGEST):
-        raise InputError(f"{name} must be three finite numbers, at most {LARGEST:g}, got {value!r}")
+        raise invalid(name, f"three finite numbers, at most {LARGEST:g}", value)
     return x, y, z

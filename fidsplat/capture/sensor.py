@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import as_float, own_scalars
+from fidsplat.util.arguments import as_float, invalid, own_scalars
 from fidsplat.util.errors import InputError
 
 RESPONSES = ("linear", "srgb")
@@ -133,7 +133,7 @@ def _is_number(value: Any) -> bool:
 
 def _numbers(name: str, values: Any, lowest: int, highest: int) -> tuple[float, ...]:
     try:
-        numbers = tuple(float(value) for value in values)
+        numbers = tuple(map(as_float, values))
     except (TypeError, ValueError):
         numbers = None
     if (
@@ -141,7 +141,5 @@ def _numbers(name: str, values: Any, lowest: int, highest: int) -> tuple[float, 
         or not lowest <= len(numbers) <= highest
         or not all(abs(number) <= LARGEST for number in numbers)
     ):
-        raise InputError(
-            f"sensor: {name} must be {lowest} to {highest} finite numbers up to {LARGEST:g}, got {values!r}"
-        )
+        raise invalid(f"sensor: {name}", f"{lowest} to {highest} finite numbers up to {LARGEST:g}", values)
     return numbers

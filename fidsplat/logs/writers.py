@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from fidsplat.logs.bags import bag_metadata
+from fidsplat.util.arguments import flag, text
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of, printable, writable_folder
 
@@ -38,8 +39,8 @@ _APRILTAG = {
 def typestore() -> Any:
     """Message types of ROS 2 Jazzy and apriltag_msgs."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in _APRILTAG.items():
-        store.register(get_types_from_msg(text, f"apriltag_msgs/msg/{name}"))
+    for name, definition in _APRILTAG.items():
+        store.register(get_types_from_msg(definition, f"apriltag_msgs/msg/{name}"))
     return store
 
 
@@ -74,7 +75,8 @@ def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool, source: 
 
 def check_log(path: str | os.PathLike[str], overwrite: bool, source: str) -> bool:
     """Whether a complete log of the same source exists. Raises InputError if the log cannot be written."""
-    if not overwrite and source and _source_of(path_of(path)) == source:
+    flag("overwrite", overwrite)
+    if text("source", source) and not overwrite and _source_of(path_of(path)) == source:
         return True
     writable_folder(_target(path, overwrite).parent)
     return False
@@ -122,8 +124,8 @@ class _McapFile:
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
         if kind not in self._schemas:
-            text, _ = self._store.generate_msgdef(kind, ros_version=2)
-            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+            definition, _ = self._store.generate_msgdef(kind, ros_version=2)
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
         if topic not in self._channels:
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
         self._writer.add_message(self._channels[topic], time, data, time, self._count)

@@ -8,6 +8,7 @@ import numpy as np
 
 from fidsplat.markers import boards, images, qr, svg, tags
 from fidsplat.markers.spec import Kind, Spec
+from fidsplat.util.arguments import instance, invalid
 from fidsplat.util.errors import InputError
 
 _kinds = {kind.name: kind for module in (tags, qr, images, svg, boards) for kind in module.KINDS}
@@ -19,6 +20,8 @@ def register(kind: Kind) -> None:
     Raises:
         InputError: a name that exists or is invalid.
     """
+    if not isinstance(instance("kind", kind, Kind).name, str):
+        raise invalid("the name of a kind", "text", kind.name)
     if kind.name in _kinds:
         raise InputError(f"the name of a kind must be new, got {kind.name!r}; use another name")
     if not kind.name.isalnum() or kind.name != kind.name.lower():
@@ -63,7 +66,7 @@ def bits_of(spec: Spec) -> tuple[Spec, np.ndarray]:
 
 def with_file(text: str, change: Callable[[str], str]) -> str:
     """Replace the file in a spec, if it has one."""
-    head, colon, rest = text.partition(":")
+    head, colon, rest = instance("a marker spec", text, str).partition(":")
     kind = _named(head)
     return head + colon + change(rest) if rest and kind is not None and kind.is_file else text
 

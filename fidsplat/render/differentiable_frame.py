@@ -6,11 +6,14 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from fidsplat.backends.gradients import DifferentiableImages, on_host
 from fidsplat.backends.interface import GradientPipeline, Images
 from fidsplat.capture.capture import Capture
 from fidsplat.render.frame import Frame
 from fidsplat.util import interrupts
+from fidsplat.util.arguments import flag, instance, real_array
 
 
 class DifferentiableFrame(Frame):
@@ -57,6 +60,18 @@ class DifferentiableFrame(Frame):
             DeviceError: the device fails or lacks memory.
         """
         interrupts.check()
+        flag("on_device", on_device)
+        instance("gradients", gradients, Mapping, "arrays by the name of their output")
+        given = {name: _numeric(name, value) for name, value in gradients.items()}
         with self._lock:
-            found = self._pipeline.backward(self._forward, gradients)
+            found = self._pipeline.backward(self._forward, given)
             return found if on_device else {name: on_host(array) for name, array in found.items()}
+
+
+def _numeric(name: str, value: Any) -> Any:
+    """A gradient by an output as it is if it is an array of real numbers, else converted or refused."""
+    if value is None or (hasattr(value, "shape") and not isinstance(value, (np.ndarray, np.generic))):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+        return value
+    return real_array(f"the gradient of {name}", value)

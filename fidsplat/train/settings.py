@@ -179,17 +179,20 @@ class TrainSettings:
 
     def surface_weights_at(self, iteration: int) -> tuple[float, float]:
         """Weights of normal consistency and depth distortion at an iteration."""
+        iteration = whole_number("iteration", iteration, 0, 2**63 - 1)
         normal = self.normal_weight if iteration > self.normal_from else 0.0
         return normal, self.distortion_weight if iteration > self.distortion_from else 0.0
 
     def densifies_after(self, iteration: int) -> bool:
         """Whether densification follows an iteration."""
+        iteration = whole_number("iteration", iteration, 0, 2**63 - 1)
         until = self.relocate_until if self.strategy == "mcmc" else self.densify_until
         return self.densify_from < iteration < until and iteration % self.densify_every == 0
 
     def adam_steps(self, iteration: int) -> int:
         """Number of Adam steps up to an iteration. The default strategy has none at iterations that
         densification follows."""
+        iteration = whole_number("iteration", iteration, 0, 2**63 - 1)
         if self.strategy == "mcmc":
             return iteration
         last, every = min(iteration, self.densify_until - 1), self.densify_every

@@ -447,18 +447,18 @@ def test_points_whose_colors_are_no_bytes(tmp_path, color):
 # --- Python
 
 
-ODD = (object(), np.zeros((0, 3)), 10**400, "\ud800", float("nan"))
+ODD = (object(), [10**400] * 3, np.zeros((0, 3)), 10**400, "\ud800", float("nan"))
 
 
 @pytest.mark.parametrize("name", sorted(CALLS))
 def test_every_argument_is_validated(name, tmp_path, monkeypatch):
-    """Each argument of a public function in turn takes two values that nobody expects: it does its work, or
+    """Each argument of a public function in turn takes three values that nobody expects: it does its work, or
     refuses them with an error of ours."""
     monkeypatch.chdir(tmp_path)
     ground(tmp_path)
     monkeypatch.setattr(warnings, "showwarning", lambda *_: None)
     for number, key in enumerate(CALLS[name](tmp_path)[1]):
-        for odd in (ODD[0], ODD[1 + number % 4]):
+        for odd in (*ODD[:2], ODD[2 + number % 4]):
             function, good, use = CALLS[name](tmp_path)
             with contextlib.suppress(fs.FidsplatError):
                 made = function(**good | {key: odd})
