@@ -40,7 +40,7 @@ _PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "DIR"}
 """placeholders of values in help, by type; settings have no paths but folders"""
 _PLACEHOLDER = re.compile(r"[A-Z]+([.|,][A-Za-z0-9.]*)*")
 """placeholders in docstrings: `FILE.mp4: text`"""
-_Description = type(tyro.conf.arg())
+_Description: Any = type(tyro.conf.arg())
 
 
 def option(metavar: str, text: str | None = None, short: str | None = None):
@@ -131,7 +131,7 @@ def describe_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
 def _described(name: str, kind: Any, text: str | None, repeated: bool) -> Any:
     """The type of a field, with tyro's description of its option."""
     base, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
-    given = next((mark for mark in marks if isinstance(mark, _Description)), None)
+    given: Any = next((mark for mark in marks if isinstance(mark, _Description)), None)
     kinds = (kind, base, *get_args(base))
     if Bytes in kinds:
         parse = partial(parse_bytes, "--" + name.replace("_", "-"))

@@ -58,10 +58,10 @@ def write_city(
     camera, motion = flight(city)
     error = IMAGE_ERROR if store.detail_errors else 0.0
     scene = Scene(
-        markers=[
+        markers=tuple(
             PlacedMarker(marker(f"aruco:4x4_1000:{number}", size=0.8), pose)
             for number, pose in enumerate(city.marker_poses(settings.markers))
-        ],
+        ),
         stores=(store,),
         camera=camera,
         camera_motion=motion,

@@ -32,6 +32,11 @@ class FrameBatch(Mapping):
         self.outputs = views.captures[0].outputs
         """Names of the images, in the requested order."""
 
+    def __repr__(self) -> str:
+        camera = self._views.captures[0].camera
+        size = "" if camera is None else f", {camera.width} x {camera.height}"
+        return f"FrameBatch({self.views} views, {', '.join(self.outputs)}{size})"
+
     @property
     def views(self) -> int:
         """Number of views, including masked ones."""

@@ -68,6 +68,9 @@ class SeveralDevices:
         """ends of the bands as fractions of the frame's height"""
         self._pool = ThreadPoolExecutor(len(names), "fidsplat-device")
 
+    def __repr__(self) -> str:
+        return f"SeveralDevices({', '.join(renderer.device.name for renderer in self.renderers)})"
+
     def upload(self, scene: Scene | SplatCloud | Store) -> list[ResidentCloud]:
         """Copy a scene to all devices, for `render`."""
         return list(self._pool.map(lambda renderer: renderer.upload(scene), self.renderers))

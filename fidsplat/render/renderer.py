@@ -77,6 +77,9 @@ class Renderer:
                 )
             self.backend.limit_memory(memory_budget)
 
+    def __repr__(self) -> str:
+        return f"Renderer({self.device.name!r}, {self.device.title})"
+
     def __reduce__(self):
         raise InputError(
             "a Renderer holds a device and cannot be pickled or copied; open one where it is used, e.g. "

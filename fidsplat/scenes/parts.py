@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import check_similarity
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
-from fidsplat.util.arguments import PickledByFields
+from fidsplat.util.arguments import PickledByFields, invalid
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -198,11 +198,19 @@ class _MarkerMotion:
         return np.asarray(pose, np.float64) @ np.linalg.inv(self.start)
 
 
-def _all_of(values: Iterable, kind: type, name: str) -> tuple:
+T = TypeVar("T")
+
+
+def _all_of(values: Iterable, kind: type[T], name: str) -> tuple[T, ...]:
+    """The items of a list of one class. Raises InputError."""
+    if isinstance(values, kind):
+        raise invalid(name, f"a list of {kind.__name__}", values, "put it into a list")
     try:
         found = tuple(values)
     except TypeError:
-        found = (None,)
-    if not all(isinstance(value, kind) for value in found):
-        raise InputError(f"{name} must be a list of {kind.__name__}")
+        raise invalid(name, f"a list of {kind.__name__}", values) from None
+    for value in found:
+        if not isinstance(value, kind):
+            hint = "PlacedMarker(marker) places a marker" if kind is PlacedMarker else ""
+            raise invalid(name, f"a list of {kind.__name__}", value, hint)
     return found

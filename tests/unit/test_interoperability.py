@@ -130,3 +130,12 @@ def test_clouds_and_scenes_say_what_they_hold():
     assert scene.summary()["camera"] == "24 x 16, pinhole, at (0, 0, -1)"
     assert "qr:&lt;b&gt;" in scene._repr_html_()
     assert "<b>Scene</b>" in scene._repr_html_()
+
+
+def test_renderers_and_batches_name_what_they_hold():
+    renderer = fs.Renderer("reference")
+    assert repr(renderer) == f"Renderer('reference', {renderer.device.title})"
+    camera = fs.Camera.look_at(4, 3, 1.0, (0, 0, -1), (0, 0, 0))
+    batch = renderer.render_batch(fs.SplatCloud.empty(), 2 * [fs.Capture(camera, ("rgb", "depth"))])
+    assert repr(batch) == "FrameBatch(2 views, rgb, depth, 4 x 3)"
+    assert repr(fs.SeveralDevices(["reference"])) == "SeveralDevices(reference)"

@@ -356,9 +356,13 @@ def test_a_folder_that_cannot_be_written(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"clouds": [1]}, "clouds must be a list of SplatCloud"),
-        ({"clouds": cloud_of()}, "clouds must be a list of SplatCloud"),
-        ({"markers": [fake_marker("qr:x")]}, "markers must be a list of PlacedMarker"),
+        ({"clouds": [1]}, "clouds must be a list of SplatCloud, got 1"),
+        ({"clouds": 1}, "clouds must be a list of SplatCloud, got 1"),
+        (
+            {"clouds": cloud_of()},
+            r"a list of SplatCloud, got SplatCloud\(.*; put it into a list",
+        ),
+        ({"markers": [fake_marker("qr:x")]}, r"PlacedMarker, got .*; PlacedMarker\(marker\) places a marker"),
         ({"camera": "front"}, "camera must be a Camera"),
         ({"background": (0, 0)}, "background must be three"),
         ({"background": (0, 0, math.nan)}, "background must be three"),
