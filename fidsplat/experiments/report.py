@@ -231,8 +231,8 @@ def _trained(rows: Frame, viewed: Frame | None, scans: Frame | None) -> dict:
                 }
             )
     shown, markers = pd.DataFrame(table), ""
-    if shown["markers"].nunique() == 1:
-        markers = f", {shown['markers'][0]} of each"
+    if len(numbers := set(shown["markers"])) == 1:
+        markers = f", {numbers.pop()} of each"
         shown = shown.drop(columns="markers")
     return {
         "rows": shown,

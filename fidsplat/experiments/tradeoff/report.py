@@ -217,12 +217,14 @@ def constants_table(devices: Sequence[DeviceResults]) -> Frame:
 def _compare(
     devices: Sequence[DeviceResults], scene: str, setting: tuple[str, str], base: tuple[str, str]
 ) -> tuple[dict[str, str], float | None]:
-    """Columns of the time of a setting relative to another on each device with both, and its largest error on
-    them; None without any."""
-    pairs = [(device, device.at(scene, *setting), device.at(scene, *base)) for device in devices]
-    pairs = [pair for pair in pairs if pair[1] is not None and pair[2] is not None]
-    times = {f"time, {device.kind}": percent(row["ratio"] / other["ratio"]) for device, row, other in pairs}
-    return times, max((row["maximum"] for _, row, _ in pairs), default=None)
+    """Columns of the time of a setting relative to another, and its largest error; None if not measured."""
+    times, errors = {}, []
+    for device in devices:
+        row, other = device.at(scene, *setting), device.at(scene, *base)
+        if row is not None and other is not None:
+            times[f"time, {device.kind}"] = percent(row["ratio"] / other["ratio"])
+            errors.append(row["maximum"])
+    return times, max(errors, default=None)
 
 
 def _verdict(device: DeviceResults, constant: Constant) -> str:
