@@ -1,6 +1,6 @@
 """Measure how pixels jump when splats change order, and what the order by pixel costs (docs/correctness.md).
 
-    python benchmarks/order.py [--device opencl] [--scene FILE] [--repeats 15]
+    python benchmarks/order.py [--device opencl] [--scene FILE] [--repeats 15] [--rows NAME ...] [--cpu-time]
         [-o docs/images/order-jump.png] [--json FILE] [--times-only | --jumps-only]
 
 Jumps: the largest change of a pixel while a camera rotates in steps of 1e-4 degrees, with splats ordered by
@@ -13,14 +13,18 @@ are its jumps and how far ours exceed them in the same or an adjacent step, sinc
 past a pixel one step earlier.
 
 Times: frames of the standard scenes, of a default marker in front of the wall and of the intersecting splats
-(30 degrees, 1280 x 720), and of --scene. Both orders are timed interleaved with resident splats, at the
-standard cut-off and at 1/255; reported are the median and quartiles of the ratio.
+(30 degrees, 1280 x 720), of --scene, and of --scene with a marker behind a fisheye lens (640 x 480). All
+orders are timed interleaved with resident splats, at the standard cut-off and at 1/255; reported are the
+medians and, for `pixel` and `auto`, the median and quartiles of the ratio to `centre`. Without coplanar
+groups `auto` is `centre`. --cpu-time: processor time of the process in place of wall-clock time, for CPUs
+that others use too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +42,7 @@ from fidsplat.selftest.order import STEP, camera_path, largest_jump, wall
 from fidsplat.util.timing import frame_timer, quartiles, ratios, time_interleaved
 
 ORDERS = ("centre", "pixel")
+TIMED_ORDERS = ("centre", "auto", "pixel")
 SIZE = {"width": 240, "height": 192}
 STEPS = 10
 REFERENCE_PIXELS = 16
@@ -45,6 +50,7 @@ REFERENCE_PIXELS = 16
 CUTOFFS = {"standard": 1e-5, "1/255": 1 / 255}
 TIMED = ("r100k_720p", "r1m_1080p")
 INTERSECTING = "1000 splats that intersect"
+WITH_MARKER = "captured with AprilTag, fisheye"
 
 
 def marker(spec: str) -> fs.SplatCloud:
@@ -125,8 +131,22 @@ def jumps(renderer: fs.Renderer, capture: fs.SplatCloud | None, panels: dict) ->
     return rows
 
 
-def times(renderer: fs.Renderer, capture: fs.SplatCloud | None, repeats: int) -> list[dict]:
-    """A row for each scene and cut-off."""
+def with_marker(capture: fs.SplatCloud) -> tuple[fs.SplatCloud, fs.Camera]:
+    """A captured scene with a marker next to it, behind a fisheye lens."""
+    low, high = extent(capture)
+    middle, height = (low + high) / 2, high[1] - low[1]
+    camera = views(capture)["front"]
+    rotation = camera.world_to_camera[:3, :3]
+    tag = fs.marker("apriltag:36h11:5", size=0.2 * height).cloud
+    beside = np.eye(4)
+    beside[:3, :3] = rotation.T
+    beside[:3, 3] = middle + rotation.T @ [0.35 * height, 0.0, -0.1 * height]
+    lens = fs.Camera.fisheye(640, 480, math.radians(120), camera.world_to_camera)
+    return fs.SplatCloud.concatenate([capture, tag.transformed(beside)]), lens
+
+
+def timed_scenes(capture: fs.SplatCloud | None) -> dict[str, tuple[fs.SplatCloud, fs.Camera]]:
+    """Cloud and camera of each row of the times."""
     scenes = {name: load_scene(name) for name in TIMED}
     before_wall = fs.SplatCloud.concatenate([fs.marker("apriltag:36h11:5", size=1.0).cloud, wall()])
     for name, cloud in (
@@ -135,23 +155,40 @@ def times(renderer: fs.Renderer, capture: fs.SplatCloud | None, repeats: int) ->
     ):
         scenes[name] = cloud, next(camera_path(cloud, "auto", 0, 30.0, 1280, 720)).camera
     if capture is not None:
-        scenes["captured"] = capture, views(capture)["front"]
+        scenes |= {"captured": (capture, views(capture)["front"]), WITH_MARKER: with_marker(capture)}
+    return scenes
+
+
+def times(
+    renderer: fs.Renderer,
+    scenes: dict[str, tuple[fs.SplatCloud, fs.Camera]],
+    repeats: int,
+    clock: Callable[[], float],
+) -> list[dict]:
+    """A row for each scene and cut-off."""
     rows = []
     for name, (cloud, camera) in track(scenes.items(), "times", console=PROGRESS):
         resident = renderer.upload(cloud)
+        orders = TIMED_ORDERS if cloud.has_coplanar_groups else ORDERS
         for label, cutoff in CUTOFFS.items():
-            centre, pixel = timers = [
-                frame_timer(
+            timers = {
+                order: frame_timer(
                     renderer,
                     resident,
                     fs.Capture(camera, quality=fs.Quality(alpha_cutoff=cutoff, order=order)),
+                    clock=clock,
                 )
-                for order in ORDERS
-            ]
-            time_interleaved(timers, repeats)
-            low, middle, high = quartiles(ratios(pixel, centre))
-            ms = dict(zip(ORDERS, (centre.median, pixel.median), strict=True))
-            rows.append({"scene": name, "cutoff": label, "ms": ms, "ratio": middle, "quartiles": [low, high]})
+                for order in orders
+            }
+            time_interleaved(list(timers.values()), repeats)
+            row = {
+                "scene": name,
+                "cutoff": label,
+                "ms": {order: timer.median for order, timer in timers.items()},
+                "stages": {order: timer.part_medians for order, timer in timers.items()},
+                "ratio": {order: quartiles(ratios(timers[order], timers["centre"])) for order in orders[1:]},
+            }
+            rows.append(row)
     return rows
 
 
@@ -181,6 +218,8 @@ def main() -> None:
     parser = options(__doc__, repeats=15)
     parser.add_argument("--scene", metavar="FILE", help="a captured scene, y down, as in docs/experiments.md")
     parser.add_argument("-o", "--out", type=Path, help="PNG file for the comparison image")
+    parser.add_argument("--rows", nargs="+", metavar="NAME", help="beginnings of the names of scenes to time")
+    parser.add_argument("--cpu-time", action="store_true", help="measure processor time")
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--times-only", action="store_true", help="skip the jumps and the image")
     part.add_argument("--jumps-only", action="store_true", help="skip the times")
@@ -191,7 +230,11 @@ def main() -> None:
     figures = {**facts(renderer), "jumps": [] if arguments.times_only else jumps(renderer, capture, panels)}
     if arguments.out is not None and panels:
         write_png(arguments.out, comparison(panels))
-    figures["times"] = [] if arguments.jumps_only else times(renderer, capture, arguments.repeats)
+    scenes = {} if arguments.jumps_only else timed_scenes(capture)
+    if arguments.rows:
+        scenes = {name: scene for name, scene in scenes.items() if name.startswith(tuple(arguments.rows))}
+    clock = time.process_time if arguments.cpu_time else time.perf_counter
+    figures["times"] = times(renderer, scenes, arguments.repeats, clock)
     if keep(figures, arguments.json):
         return
     title = f"Largest jump of a pixel on {renderer.device.title}"
@@ -206,13 +249,15 @@ def main() -> None:
         show(title, ("scene", "splats", *names), cells)
     rows = []
     for row in figures["times"]:
-        low, high = row["quartiles"]
-        times_of = (f"{row['ms'][order]:.1f}" for order in ORDERS)
-        rows.append(
-            (row["scene"], row["cutoff"], *times_of, f"{row['ratio']:.2f}", f"{low:.2f} to {high:.2f}")
+        times_of = (f"{row['ms'][order]:.2f}" if order in row["ms"] else "-" for order in TIMED_ORDERS)
+        ratios_of = (
+            "{1:.2f} ({0:.2f} to {2:.2f})".format(*row["ratio"][order]) if order in row["ratio"] else "-"
+            for order in TIMED_ORDERS[1:]
         )
+        rows.append((row["scene"], row["cutoff"], *times_of, *ratios_of))
     if rows:
-        show("Milliseconds of a frame", ("scene", "cut-off", *ORDERS, "ratio", "quartiles"), rows)
+        heads = ("scene", "cut-off", *TIMED_ORDERS, *(f"{order} / centre" for order in TIMED_ORDERS[1:]))
+        show("Milliseconds of a frame; ratio (quartiles)", heads, rows)
 
 
 if __name__ == "__main__":

@@ -93,7 +93,14 @@ class Timer:
         return {name: float(np.median(times)) for name, times in self.parts.items()}
 
 
-def frame_timer(renderer, scene, camera, catch_errors: bool = False, **how) -> Timer:
+def frame_timer(
+    renderer,
+    scene,
+    camera,
+    catch_errors: bool = False,
+    clock: Callable[[], float] = time.perf_counter,
+    **how,
+) -> Timer:
     """A timer of frames of a resident scene, whose image stays on the device. A time ends when the device is
     done; its parts are the stages by the device's clock.
 
@@ -101,7 +108,7 @@ def frame_timer(renderer, scene, camera, catch_errors: bool = False, **how) -> T
         renderer, scene, camera, how: arguments of `renderer.render(scene, camera, **how)`.
     """
     render = lambda: renderer.render(scene, camera, **how).wait()  # noqa: E731
-    return Timer(render, catch_errors=catch_errors, parts=lambda frame: frame.timings)
+    return Timer(render, clock, catch_errors, parts=lambda frame: frame.timings)
 
 
 def time_interleaved(
