@@ -260,7 +260,7 @@ def _off(value: np.ndarray, left: np.ndarray, ideal: np.ndarray, sample: np.ndar
 
 
 def _layered(alpha, light, start, ideal, sample) -> tuple[float, np.ndarray]:
-    """Compositing of coplanar splats as one layer (kernels/opencl/slot/compose_coplanar.cl): error, gradient
+    """Compositing of coplanar splats as one layer (kernels/opencl/part/coplanar_layers.cl): error, gradient
     by alpha."""
     tau = -np.log1p(-alpha)
     n = np.diff(start, append=len(alpha))

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.probing import Probe
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
@@ -109,8 +108,8 @@ class Chunk:
     """the same for the same splats, wherever they are placed"""
     count: int
     load: Callable[[], Mapping[str, np.ndarray]]
-    """their arrays by the names of a cloud's, float32 or int32; `coplanar_groups` by the index of a
-    `PlaneTable`"""
+    """their arrays by the names of a cloud's, float32 or int32; `coplanar_groups` by dense
+    indices"""
     pose: np.ndarray | None = None
     """(16,) float64: placement, the rotation by rows, the position of the means' zero [m], and the
     quaternion; None: not moved"""
@@ -127,8 +126,6 @@ class ChunkedScene(ABC):
     has_coplanar_groups: bool
     footprint: str
     ellipsoids: str
-    group_table: PlaneTable | None
-    """coplanar groups of its splats"""
 
     @abstractmethod
     def distinct(self, applies_poses: bool) -> int:

@@ -117,10 +117,10 @@ class Quality:
     use `exact`."""
 
     order: str = "auto"
-    """Compositing order. `pixel`: by the depth of each fragment, where the ray meets the splat; coplanar
-    groups (markers) are one layer without an order. `centre`: by the depth of splat centres, as in other
-    renderers and in the training of captured scenes; large splats pop as the camera turns. `auto`: `pixel`
-    for scenes with coplanar groups, else `centre` (docs/correctness.md)."""
+    """Compositing order. `centre`: by the depth of splat centres, as in other renderers and in the training
+    of captured scenes; large splats pop as the camera turns. `pixel`: by the depth of each fragment, where
+    the ray meets the splat. `auto`: as `centre`, with coplanar groups (markers) placed by their depth at each
+    pixel. In `pixel` and `auto` a coplanar group is one layer without an order (docs/correctness.md)."""
 
     samples: int = 1
     """Samples per pixel side, 1 to 8, default 1: a pixel is the mean of n x n samples on a regular grid.

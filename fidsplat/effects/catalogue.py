@@ -67,6 +67,7 @@ _PLAIN = (
     *("camera_pinhole", "camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
     *("camera_orthographic", "color_rgb", "color_sh", "lowpass_none", "lowpass_pixel", "lowpass_screen"),
     *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_pixel", "compose_coplanar"),
+    "compose_coplanar_pixel",
     *("footprint_gaussian", "footprint_box", "footprint_mixed"),
     *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
     *("background_constant", "background_gradient", "background_panorama"),

@@ -141,13 +141,15 @@ def with_termination_depths(features: FeatureSet) -> FeatureSet:
 
 
 def _composing(cloud: CloudTraits, order: str, one_depth_each: bool) -> str:
-    """Select the compositing effect: by centre depth, or by fragment depth with or without coplanar groups.
+    """Select the compositing effect: by centre depth or by fragment depth, with or without layers of coplanar
+    groups, which are placed by their depth at each pixel in either order.
 
     If every fragment has the float32 depth of its splat's centre, both orders are equal and the k-buffer is
     not needed.
     """
     if cloud.has_coplanar_groups:
-        return "compose_ordered" if order == "centre" else "compose_coplanar"
+        ways = {"centre": "compose_ordered", "auto": "compose_coplanar", "pixel": "compose_coplanar_pixel"}
+        return ways[order]
     return "compose_pixel" if order == "pixel" and not one_depth_each else "compose_ordered"
 
 

@@ -171,14 +171,14 @@ def _tilted_planes(quality: Quality) -> FrameSpec:
     return FrameSpec(cloud, view, quality, ALL_OUTPUTS)
 
 
-def _three_tags() -> FrameSpec:
+def _three_tags(quality: Quality) -> FrameSpec:
     """Three intersecting tags, and ungrouped splats between them."""
     pose = np.eye(4)
     pose[:3, :3] = quaternion_to_matrix(rotation((1, 0.3, 0), -35))
     pose[2, 3] = 0.1
     others = random_splats(30, seed=13, depth=(-0.6, 0.6), scale=(0.02, 0.2), across=0.6)
     cloud = SplatCloud.concatenate([*crossing_tags(), others, tag(6, seed=2).transformed(pose)])
-    return FrameSpec(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
+    return FrameSpec(cloud, ON_TAGS, quality, ALL_OUTPUTS)
 
 
 def tag_before_wall(count: int) -> SplatCloud:
@@ -204,7 +204,7 @@ def _c1_order(renderer: Renderer) -> Iterator[Finding]:
     yield Finding(
         "jump of a tag in steps of 1e-4 deg", largest_jump(renderer, camera_path(cloud, "auto", 2))[0], SMOOTH
     )
-    tilted = next(camera_path(tag_before_wall(150), "auto", 0, 30))
+    tilted = next(camera_path(tag_before_wall(150), "pixel", 0, 30))
     for what, spec in (
         ("a tag's splats", next(camera_path(cloud, "auto", 0))),
         ("a tag's splats among others", tilted),
@@ -216,7 +216,7 @@ def _c1_order(renderer: Renderer) -> Iterator[Finding]:
 
 def _c1_layers(renderer: Renderer) -> Iterator[Finding]:
     for tilt in (0.0, 30.0, 60.0):
-        jump = largest_jump(renderer, camera_path(tag_before_wall(150), "auto", 2, tilt))[0]
+        jump = largest_jump(renderer, camera_path(tag_before_wall(150), "pixel", 2, tilt))[0]
         yield Finding(f"jump of a tag in front of a wall, {tilt:g} deg", jump, SMOOTH)
     # opacity just above and just below the cut-off
     with_it, without = (render(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
@@ -240,7 +240,7 @@ def c1(renderer: Renderer) -> Found:
         yield fronto_parallel(away)
     yield _tilted_planes(Quality())
     yield _tilted_planes(Quality(order="centre"))
-    yield _three_tags()
+    yield _three_tags(Quality())
     for side in SIDES:
         cloud = SplatCloud.concatenate(tag_and_large_splat(side))
         yield FrameSpec(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
@@ -333,10 +333,11 @@ def _pixel_specs() -> Iterator[FrameSpec]:
     yield FrameSpec(crossing(), camera(), by_pixel, ALL_OUTPUTS)
     yield FrameSpec(fan(), camera(), by_pixel, ALL_OUTPUTS)
     yield FrameSpec(crossing(60), Camera.fisheye(90, 70, math.radians(160)), by_pixel, ALL_OUTPUTS)
-    yield _tilted_planes(Quality())
-    yield FrameSpec(
-        SplatCloud.concatenate([fan(), tag().transformed(_tag_pose())]), camera(), outputs=ALL_OUTPUTS
-    )
+    yield _tilted_planes(by_pixel)
+    yield _three_tags(by_pixel)
+    through_fan = SplatCloud.concatenate([fan(), tag().transformed(_tag_pose())])
+    for quality in (by_pixel, Quality()):
+        yield FrameSpec(through_fan, camera(), quality, ALL_OUTPUTS)
 
 
 def _tag_pose() -> np.ndarray:

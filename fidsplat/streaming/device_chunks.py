@@ -7,7 +7,6 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from fidsplat.backends.coplanar_groups import PlaneTable
 from fidsplat.backends.interface import Chunk, ChunkedScene
 from fidsplat.store.chunked_splats import ChunkedSplats, Selection
 from fidsplat.store.partial_cloud import PartialCloud
@@ -55,15 +54,6 @@ class DeviceChunks(ChunkedScene):
             for store in self.scene.stores
         )
         return sum(each) + -(-len(self.scene.in_memory) // self.largest_chunk)
-
-    @property
-    def group_table(self) -> PlaneTable | None:
-        """Coplanar groups of all splats; their chunks are part of every frame."""
-        return self._group_table if self.has_coplanar_groups else None
-
-    @cached_property
-    def _group_table(self) -> PlaneTable:
-        return PlaneTable(self._pinned_part)
 
     @cached_property
     def _pinned_part(self) -> PartialCloud:

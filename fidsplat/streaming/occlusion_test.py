@@ -30,7 +30,7 @@ def minimum_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
     """(n,) metres: lower bound on the sort keys of the splats in each box."""
     extent = _extent(view, features)
     assert extent is not None  # `is_supported`
-    if "compose_ordered" in features.names:
+    if not {"compose_ordered", "compose_coplanar"}.isdisjoint(features.names):
         return CameraBoxes(view, *boxes(0.0)).nearest(view)
     return extent.nearest(view, CameraBoxes(view, *boxes(extent.depths)))
 

@@ -6,6 +6,11 @@ typedef struct {            // colour and outputs of a fragment or layer
 //@@ attributes
 } Attributes;
 
+typedef union {
+    Attributes attributes;
+    vfloat fields[sizeof(Attributes) / sizeof(vfloat)];
+} AttributeFields;
+
 //@@ compose_types
 typedef struct {
     vfloat t;               // transmittance in front of the next fragment
@@ -80,6 +85,8 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
     vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->ceiling);
 //@@ footprint_opacity
     const Attributes attributes = fragment_attributes(s, c, inverse_d);
+//@@ occlude
+//@@ layers
 //@@ compose
 }
 

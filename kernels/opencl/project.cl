@@ -168,5 +168,6 @@ kernel void project(
 //@@ list
     float key = (float)pz;
 //@@ key
+//@@ coplanar_key
     keys[at] = sortable(key);
 }

@@ -26,9 +26,9 @@ _NONE, _ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 def samples_each(effects: tuple[str, ...]) -> int:
     """Samples of a column per thread on a GPU: two, which share the reading of a record, unless each has its
-    own ray or k-buffer.
+    own ray, k-buffer or layers.
     """
-    return 2 if {"rays", "compose_pixel"}.isdisjoint(effects) else 1
+    return 2 if {"rays", "compose_pixel", "compose_coplanar"}.isdisjoint(effects) else 1
 
 
 @cache
@@ -64,7 +64,7 @@ def make_blend(
     Intersection, opacity_of = intersection.Intersection, intersection.opacity_of
     asking = bool(output.having(outputs, "fragment"))
     fragments, screen = output.functions(outputs, "fragment"), "lowpass_screen" in effects
-    bent, curved = "rays" in effects, cross_slopes is not None
+    bent, curved, layered = "rays" in effects, cross_slopes is not None, "compose_coplanar" in effects
 
     @wp.func
     def store(p: Pixel, at: int, samples: Samples):
@@ -79,6 +79,21 @@ def make_blend(
         if x >= view.width or y >= view.height:
             p.t = 0.0
         return p
+
+    @wp.func
+    def has_groups(
+        first: int,
+        end: int,
+        lists: wp.array(dtype=wp.int32),
+        coplanar_groups: wp.array(dtype=wp.int32),
+        view: View,
+    ) -> int:
+        """1 for a tile with splats of coplanar groups, which are the first of its list."""
+        exist = int(0)
+        if first < end:
+            if coplanar_groups[lists[first] % view.splats] >= 0:
+                exist = 1
+        return exist
 
     @wp.func
     def observe(pixel: Pixel, s: Splat, c: Intersection, x: float, y: float, view: View):
@@ -152,6 +167,9 @@ def make_blend(
         x0 = left + cell_x * CELL_W + own % CELL_W
         y0 = top + cell_y * CELL_H + own / CELL_W * each
         p = new_sample(x0, y0, rays, view)
+        end = starts[tile + 1]
+        if wp.static(layered):
+            p.layers.exist = has_groups(starts[tile], end, lists, coplanar_groups, view)
         open = unfinished(p, view)
         if wp.static(pair):
             q = new_sample(x0, y0 + 1, rays, view)
@@ -164,7 +182,6 @@ def make_blend(
             if p.t > 0.0:
                 slopes = rays.slopes[y0 * view.width + x0]
         records = pool()
-        end = starts[tile + 1]
         again = bool(True)
         while again:
             k = starts[tile]
@@ -246,12 +263,18 @@ def make_blend(
         view = views[number]
         x0 = tile_column * view.tile_w
         y0 = tile_row * view.tile_h
+        end = starts[tile + 1]
+        exist = int(0)
+        if wp.static(layered):
+            exist = has_groups(starts[tile], end, lists, coplanar_groups, view)
         for k in range(view.tile_w * view.tile_h):
-            state[state_first + k] = start(x0 + k % view.tile_w, y0 + k / view.tile_w, rays, view)
+            p = start(x0 + k % view.tile_w, y0 + k / view.tile_w, rays, view)
+            if wp.static(layered):
+                p.layers.exist = exist
+            state[state_first + k] = p
         x_end = wp.min(x0 + view.tile_w, view.width)
         y_end = wp.min(y0 + view.tile_h, view.height)
         alive = (x_end - x0) * (y_end - y0)
-        end = starts[tile + 1]
         again = bool(True)
         while again:
             k = starts[tile]

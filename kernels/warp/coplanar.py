@@ -1,8 +1,8 @@
 """Splats of one plane are one layer at a sample (docs/correctness.md): its colour and depth are means of its
 fragments by optical depth.
 
-They stand together in the lists, where the nearest point of the plane puts them; when another splat follows,
-the layer waits as one fragment among the others (k_buffer.py).
+They are the first splats of a tile's list, group after group. A pass over the list finds the nearest layer
+behind that of the previous pass, composites the fragments of other splats between the two, then the layer.
 """
 
 from types import SimpleNamespace
@@ -22,34 +22,47 @@ NEARER = wp.constant(wp.float32(-(2.0**-16)))
 
 
 def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """The struct Layer and its functions: accumulate, accumulate_box; nothing, depth."""
+    """The structs Layer and Layers, and their functions: accumulate, accumulate_box; start, select, close,
+    admits, passed.
+    """
     log = fast_log if "arithmetic_fast" in effects else wp.log
     accumulators = output.functions(outputs, "accumulate")
     # tau: optical depth; `mean`: weighted by optical depths; of boxes, by opacities
-    # place: of the first splat in the list; nearest: lower bound of the depths
     fields = {
-        "plane": wp.int32,
-        "place": wp.int32,
-        "nearest": wp.float32,
+        "group": wp.int32,
         "opacity": wp.float32,
         "tau": wp.float32,
         "mean": Attributes,
     }
     fields |= output.fields(outputs, "layer")
-    Layer = struct_of("Layer", "Fragments of one coplanar group at a sample; plane -1: none.", fields)
+    Layer = struct_of("Layer", "Fragments of one coplanar group at a sample; group -1: none.", fields)
+    # exist: whether the tile has groups; open: the layer that still accumulates; next: the nearest of this
+    # pass, at an infinite depth if there is none; after: depth and group of that of the previous pass
+    passing = {
+        "exist": wp.int32,
+        "open": Layer,
+        "next": Layer,
+        "next_z": wp.float32,
+        "after_z": wp.float32,
+        "after_group": wp.int32,
+    }
+    Layers = struct_of("Layers", "Layers of a sample.", passing)
 
     @wp.func
-    def empty_layer(plane: int, place: int, nearest: float):
-        """The layer of a plane before its first fragment, the splat at this place of the list."""
+    def empty_layer(group: int):
         layer = Layer()
-        layer.plane = plane
-        layer.place = place
-        layer.nearest = nearest
+        layer.group = group
         return layer
 
     @wp.func
-    def nothing():
-        return empty_layer(-1, 0, 0.0)
+    def start():
+        """State before the first pass, in a tile without groups."""
+        layers = Layers()
+        layers.open = empty_layer(-1)
+        layers.next_z = wp.inf
+        layers.after_z = -wp.inf
+        layers.after_group = -1
+        return layers
 
     @wp.func
     def depth(layer: Layer) -> float:
@@ -57,7 +70,43 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         front of ungrouped splats in its plane.
         """
         z = layer.mean.z
-        return wp.max(fma(wp.abs(z), NEARER, z), layer.nearest)
+        return fma(wp.abs(z), NEARER, z)
+
+    @wp.func
+    def close(layers: Layers):
+        """Complete the open layer, and keep it if it is the nearest of this pass."""
+        after = layers
+        if layers.open.tau > 0.0:
+            z = depth(layers.open)
+            follows = z > layers.after_z or (z == layers.after_z and layers.open.group > layers.after_group)
+            if follows and z < layers.next_z:
+                after.next = layers.open
+                after.next_z = z
+        after.open = empty_layer(-1)
+        return after
+
+    @wp.func
+    def select(layers: Layers, group: int):
+        """Open the layer of the group of the current splat, -1 for none."""
+        if group == layers.open.group:
+            return layers
+        after = close(layers)
+        after.open = empty_layer(group)
+        return after
+
+    @wp.func
+    def admits(layers: Layers, z: float) -> bool:
+        """Whether a fragment of a splat without group belongs to this pass."""
+        return z >= layers.after_z and z < layers.next_z
+
+    @wp.func
+    def passed(layers: Layers):
+        """State before the next pass; at an infinite depth if there is none."""
+        after = layers
+        after.after_z = layers.next_z
+        after.after_group = layers.next.group
+        after.next_z = wp.inf
+        return after
 
     @wp.func
     def accumulate(layer: Layer, attributes: Attributes, opacity: float):
@@ -90,10 +139,12 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         return after
 
     return SimpleNamespace(
-        Layer=Layer,
-        nothing=nothing,
-        empty_layer=empty_layer,
-        depth=depth,
+        Layers=Layers,
         accumulate=accumulate,
         accumulate_box=accumulate_box,
+        start=start,
+        select=select,
+        close=close,
+        admits=admits,
+        passed=passed,
     )

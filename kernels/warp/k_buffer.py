@@ -15,12 +15,10 @@ from .common import View, struct_of
 
 _EMPTY = wp.constant(-1)
 """list place of an empty entry"""
-_FIRST, _SECOND = wp.constant(-2), wp.constant(-3)
-"""list places of buffered layers"""
 
 
-def make_k_buffer_struct(layer: SimpleNamespace | None, size: int):
-    """The struct KBuffer of a sample, with two layers if `layer` is given."""
+def make_k_buffer_struct(size: int):
+    """The struct KBuffer of a sample."""
     fields = {
         # sorted by depth, empty entries first
         "z": wp.types.vector(size, wp.float32),
@@ -32,21 +30,15 @@ def make_k_buffer_struct(layer: SimpleNamespace | None, size: int):
         "until_z": wp.float32,
         "until": wp.int32,
     }
-    # the open layer, and buffered ones
-    fields |= dict.fromkeys(("open", "first", "second"), layer.Layer) if layer else {}
     return struct_of("KBuffer", "Buffered fragments of a sample.", fields)
 
 
-def make_k_buffer(
-    Pixel, composite, attributes_of, layer: SimpleNamespace | None, size: int
-) -> SimpleNamespace:
-    """start, of a Pixel with a `queue`; take, of a fragment; close, of the open layer; end, of the list.
+def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace:
+    """start, of a Pixel with a `k_buffer`; take, of a fragment; end, of the list.
 
     attributes_of (lines, index, z): attributes of a splat's fragment at that depth.
     """
-    layered = layer is not None
     last = size - 1
-    nothing, depth = (layer.nothing, layer.depth) if layer else (None, None)
 
     @wp.func
     def start(pixel: Pixel):
@@ -56,34 +48,7 @@ def make_k_buffer(
             p.k_buffer.place[k] = _EMPTY
         p.k_buffer.after_z = -wp.inf
         p.k_buffer.until_z = wp.inf
-        if wp.static(layered):
-            p.k_buffer.open = nothing()
-            p.k_buffer.first = nothing()
-            p.k_buffer.second = nothing()
         return p
-
-    @wp.func
-    def without(pixel: Pixel, place: int):
-        """Remove the layer of this place, if it is one."""
-        p = pixel
-        if wp.static(layered):
-            if place == _FIRST:
-                p.k_buffer.first = nothing()
-            if place == _SECOND:
-                p.k_buffer.second = nothing()
-        return p
-
-    @wp.func
-    def attributes_at(
-        p: Pixel, z: float, place: int, lines: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32)
-    ):
-        """Attributes of a buffered fragment or layer."""
-        if wp.static(layered):
-            if place == _FIRST:
-                return p.k_buffer.first.mean
-            if place == _SECOND:
-                return p.k_buffer.second.mean
-        return attributes_of(lines, lists[place], z)
 
     @wp.func
     def composite_at(
@@ -95,21 +60,11 @@ def make_k_buffer(
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """Composite a buffered fragment or layer."""
+        """Composite a buffered fragment."""
         p = pixel
         if place != _EMPTY:
-            p = without(composite(p, attributes_at(p, z, place, lines, lists), opacity, view), place)
+            p = composite(p, attributes_of(lines, lists[place], z), opacity, view)
         return p
-
-    @wp.func
-    def list_place(p: Pixel, place: int) -> int:
-        """List place, of a layer that of its first splat."""
-        if wp.static(layered):
-            if place == _FIRST:
-                return p.k_buffer.first.place
-            if place == _SECOND:
-                return p.k_buffer.second.place
-        return place
 
     @wp.func
     def drop_from(pixel: Pixel, z: float, place: int):
@@ -119,10 +74,8 @@ def make_k_buffer(
         p.k_buffer.until = place
         more = bool(True)
         while more:
-            at = int(p.k_buffer.place[last])
-            more = p.k_buffer.z[last] > z or (p.k_buffer.z[last] == z and list_place(p, at) >= place)
+            more = p.k_buffer.z[last] > z or (p.k_buffer.z[last] == z and p.k_buffer.place[last] >= place)
             if more:
-                p = without(p, at)
                 for k in range(wp.static(last)):
                     p.k_buffer.z[last - k] = p.k_buffer.z[last - k - 1]
                     p.k_buffer.opacity[last - k] = p.k_buffer.opacity[last - k - 1]
@@ -155,8 +108,8 @@ def make_k_buffer(
         p = pixel
         if p.k_buffer.z[0] > nearest and z > nearest:
             if p.k_buffer.z[last] <= z:
-                return without(drop_from(p, z, list_place(p, place)), place)
-            p = drop_from(p, p.k_buffer.z[last], list_place(p, p.k_buffer.place[last]))
+                return drop_from(p, z, place)
+            p = drop_from(p, p.k_buffer.z[last], int(p.k_buffer.place[last]))
         first_z, first_opacity = float(p.k_buffer.z[0]), float(p.k_buffer.opacity[0])
         first_place = int(p.k_buffer.place[0])
         if z < first_z:
@@ -211,53 +164,6 @@ def make_k_buffer(
         return p
 
     @wp.func
-    def full(p: Pixel) -> bool:
-        """Whether both layer entries are used."""
-        return p.k_buffer.first.plane >= 0 and p.k_buffer.second.plane >= 0
-
-    @wp.func
-    def drop_furthest(pixel: Pixel):
-        """Drop the further of the buffered layers, and all that is behind it."""
-        p = pixel
-        far_z, far = depth(p.k_buffer.first), int(p.k_buffer.first.place)
-        other_z, other = depth(p.k_buffer.second), int(p.k_buffer.second.place)
-        if other_z > far_z or (other_z == far_z and other > far):
-            far_z, far = other_z, other
-        return drop_from(p, far_z, far)
-
-    @wp.func
-    def close(
-        pixel: Pixel,
-        nearest: float,
-        lines: wp.array(dtype=wp.vec4),
-        lists: wp.array(dtype=wp.int32),
-        view: View,
-    ):
-        """Insert the open layer, which is complete."""
-        p = pixel
-        if p.k_buffer.open.plane < 0:
-            return p
-        z, opacity, place = depth(p.k_buffer.open), float(p.k_buffer.open.opacity), int(p.k_buffer.open.place)
-        if is_taken(p, z, place):
-            if full(p):
-                p = composite_until(p, wp.min(nearest, z), lines, lists, view)
-            if full(p) and z <= nearest:
-                p = composite(p, p.k_buffer.open.mean, opacity, view)
-            else:
-                if full(p):
-                    p = drop_furthest(p)
-                if is_taken(p, z, place):
-                    slot = int(_FIRST)
-                    if p.k_buffer.first.plane < 0:
-                        p.k_buffer.first = p.k_buffer.open
-                    else:
-                        p.k_buffer.second = p.k_buffer.open
-                        slot = _SECOND
-                    p = put(p, nearest, z, opacity, slot, lines, lists, view)
-        p.k_buffer.open = nothing()
-        return p
-
-    @wp.func
     def end(
         pixel: Pixel,
         lines: wp.array(dtype=wp.vec4),
@@ -265,14 +171,11 @@ def make_k_buffer(
         view: View,
     ):
         """After the last splat of the list: composite all entries, and start the next pass."""
-        p = pixel
-        if wp.static(layered):
-            p = close(p, float(wp.inf), lines, lists, view)
-        p = composite_until(p, float(wp.inf), lines, lists, view)
+        p = composite_until(pixel, float(wp.inf), lines, lists, view)
         p.k_buffer.after_z = p.k_buffer.until_z
         p.k_buffer.after = p.k_buffer.until
         p.k_buffer.until_z = wp.inf
         p.k_buffer.until = 0
         return p
 
-    return SimpleNamespace(start=start, take=take, close=close, end=end)
+    return SimpleNamespace(start=start, take=take, end=end)

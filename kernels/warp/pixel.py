@@ -1,7 +1,7 @@
 """State of a sample and compositing of its fragments. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
 alpha_j).
 
-Fragments may be buffered until no nearer one can follow (k_buffer.py), coplanar ones as a layer
+Fragments may be buffered until no nearer one can follow (k_buffer.py); coplanar ones are one layer
 (coplanar.py). An external depth image is an opaque surface: fragments at its depth or behind are invisible,
 and it is composited last. State of outputs is declared in their files (output/).
 """
@@ -55,11 +55,15 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         attributes | output.fields(outputs, "attributes"),
     )
     layer = make_layer(Attributes, effects, outputs) if layered else None
+    layers_start, select, close_layers, admits, passed = (
+        (layer.start, layer.select, layer.close, layer.admits, layer.passed) if layer else (None,) * 5
+    )
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     fields |= {"finished": wp.int32} if exclusive else {}
     fields |= {"opaque_z": wp.float32} if opaque else {}
     fields |= output.fields(outputs, "state")
-    fields |= {"k_buffer": make_k_buffer_struct(layer, k_buffer_size)} if k_buffered else {}
+    fields |= {"k_buffer": make_k_buffer_struct(k_buffer_size)} if k_buffered else {}
+    fields |= {"layers": layer.Layers} if layer else {}
     Pixel = struct_of("Pixel", "State of a sample.", fields)
 
     @wp.func
@@ -74,6 +78,8 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         p.t = 1.0
         if wp.static(k_buffered):
             p = k_buffer.start(p)
+        if wp.static(layered):
+            p.layers = layers_start()
         length = float(1.0)
         if wp.static(measured):
             length = length_of(x, y, rays, view)
@@ -93,6 +99,8 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             return p.t > view.stop and p.finished == 0
         elif wp.static(k_buffered):
             return p.t > view.stop and p.k_buffer.after_z < wp.inf
+        elif wp.static(layered):
+            return p.t > view.stop and p.layers.after_z < wp.inf
         else:
             return p.t > view.stop
 
@@ -145,9 +153,8 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             wp.static(layout.place("nearest")[1])
         ]
 
-    k_buffer = (
-        make_k_buffer(Pixel, composite, stored_attributes, layer, k_buffer_size) if k_buffered else None
-    )
+    k_buffer = make_k_buffer(Pixel, composite, stored_attributes, k_buffer_size) if k_buffered else None
+    end_k_buffer = k_buffer.end if k_buffer else None
 
     @wp.func
     def blend(
@@ -164,39 +171,55 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         index = lists[place]
         inverse_d = 1.0 / c.d
         opacity = opacity_of(s, c, inverse_d, view)
-        z, plane = float(0.0), int(-1)
+        z, group = float(0.0), int(-1)
         if wp.static(layered):
-            plane = coplanar_groups[index % view.splats]
+            if pixel.layers.exist != 0:
+                group = coplanar_groups[index % view.splats]
         if wp.static(has_depth):
-            z = depth_of(lines, index, s, c, inverse_d, plane >= 0)
+            z = depth_of(lines, index, s, c, inverse_d, group >= 0)
         if wp.static(opaque):
-            nearer = z
-            if wp.static(layered):
-                nearer = wp.max(z, nearest_of(lines, index))
-            if not (nearer < pixel.opaque_z):
+            if not (z < pixel.opaque_z):
                 return pixel
         color = wp.vec3(s.c[1], s.c[2], s.c[3])
+        p = pixel
         if wp.static(layered):
-            p = pixel
-            if not (opacity > 0.0):
-                return p  # of no optical depth: its mean would be 0 / 0
-            nearest = nearest_of(lines, index)
-            if plane != p.k_buffer.open.plane:
-                p = k_buffer.close(p, nearest, lines, lists, view)
-                p.k_buffer.open = layer.empty_layer(plane, place, nearest)
-            if plane < 0:
-                return k_buffer.take(p, nearest, z, opacity, place, lines, lists, view)
-            attributes = attributes_at(color, wp.max(z, nearest), lines, index)
-            if wp.static(boxes):
-                if is_box(s):
-                    p.k_buffer.open = layer.accumulate_box(p.k_buffer.open, attributes, opacity)
+            if p.layers.exist != 0:
+                if not (opacity > 0.0):
+                    return p  # of no optical depth: its mean would be 0 / 0
+                p.layers = select(p.layers, group)
+                if group >= 0:
+                    attributes = attributes_at(color, z, lines, index)
+                    if wp.static(boxes):
+                        if is_box(s):
+                            p.layers.open = layer.accumulate_box(p.layers.open, attributes, opacity)
+                            return p
+                    p.layers.open = layer.accumulate(p.layers.open, attributes, opacity)
                     return p
-            p.k_buffer.open = layer.accumulate(p.k_buffer.open, attributes, opacity)
-            return p
-        elif wp.static(k_buffered):
-            return k_buffer.take(pixel, nearest_of(lines, index), z, opacity, place, lines, lists, view)
+                if not admits(p.layers, z):
+                    return p
+        if wp.static(k_buffered):
+            return k_buffer.take(p, nearest_of(lines, index), z, opacity, place, lines, lists, view)
         else:
-            return composite(pixel, attributes_at(color, z, lines, index), opacity, view)
+            return composite(p, attributes_at(color, z, lines, index), opacity, view)
+
+    @wp.func
+    def end(pixel: Pixel, lines: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32), view: View):
+        """After the last splat of the list: composite what is left of this pass, and start the next one."""
+        p = pixel
+        dropped = bool(False)
+        if wp.static(k_buffered):
+            p = end_k_buffer(p, lines, lists, view)
+            dropped = p.k_buffer.after_z < wp.inf
+        if wp.static(layered):
+            p.layers = close_layers(p.layers)
+            if not dropped:
+                if p.layers.next_z < wp.inf:
+                    p = composite(p, p.layers.next.mean, p.layers.next.opacity, view)
+                    if wp.static(k_buffered):
+                        p.k_buffer.after_z = -wp.inf
+                p.layers = passed(p.layers)
+            p.layers.next_z = wp.inf
+        return p
 
     @wp.func
     def cover(pixel: Pixel, x: int, y: int, rays: Rays, view: View):
@@ -230,7 +253,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         start=start,
         unfinished=unfinished,
         blend=blend,
-        end=k_buffer.end if k_buffered else None,
+        end=end if k_buffered or layered else None,
         cover=cover if opaque else None,
         finish=finish,
     )

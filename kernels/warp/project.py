@@ -25,6 +25,8 @@ SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
 BLOCK = 128
 """threads of a block on a GPU"""
 LIMITS = (BLOCK, 5)  # so many blocks at once: at most 96 registers, of 116 that it would take
+GROUP_KEYS = wp.constant(wp.uint32(0x00800000))
+"""key of the first coplanar group, below those of all depths: groups are first in each list, one by one"""
 NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 
 
@@ -93,10 +95,6 @@ def make_project(
         opacities: wp.array(dtype=wp.float32),  # (n)
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
         coplanar_groups: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
-        group_keys: wp.array(
-            dtype=wp.float32
-        ),  # (views groups) depth at which a group's splats are sorted [m]
-        group_count: int,
         boxes: wp.array(dtype=wp.int32),  # (n) 1: a box, of a cloud that has boxes and others
         thickness: wp.array(dtype=wp.float32),  # (n) [m], of a cloud that has 3D Gaussians; 0: a disk
         lines: wp.array(dtype=wp.vec4),  # (views n lines_each) out: records of splats that are visible
@@ -296,9 +294,6 @@ def make_project(
         key = float(depth)
         if wp.static(k_buffered):
             key = float(middle) - float(depth_reach)  # as blending bounds depths
-            if wp.static(layers):
-                if coplanar_groups[i] >= 0:
-                    key = group_keys[number * group_count + coplanar_groups[i]]
             record[at_nearest] = key
         if wp.static(surfaced):
             if thick:
@@ -315,6 +310,9 @@ def make_project(
         corner = wp.uint64((number * view.tiles_y + top) * view.tiles_x + left)
         windows[at] = (corner << BITS) | wp.uint64(bits)
         keys[at] = sortable(key)
+        if wp.static(layers):
+            if coplanar_groups[i] >= 0:
+                keys[at] = GROUP_KEYS + wp.uint32(coplanar_groups[i])
         counts[at] = wp.int64(tiles)
         visible[at] = 1
 

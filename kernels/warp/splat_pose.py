@@ -60,16 +60,16 @@ def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
             # fragments below 1/255 of the splat's opacity are clamped to the range of the others, so that the
             # order does not depend on the cut-off
             found = reach * (range_radius / radius)
-            if wp.static(layers):
-                # the plane out to a radius beyond every cut-off and low-pass
-                if plane >= 0:
-                    found = reach * (plane_radius / radius)
             if wp.static(boxes_too):
                 if boxed:
                     found = reach
-                    if wp.static(layers):
-                        if plane >= 0:
-                            found = reach * plane_radius
+        if wp.static(layers):
+            # the plane out to a radius beyond every cut-off and low-pass
+            if plane >= 0:
+                found = reach * (plane_radius / radius)
+                if wp.static(boxes_too):
+                    if boxed:
+                        found = reach * plane_radius
         if depth < near:
             # fragments lie beyond `near`
             furthest = wp.max(near, depth + found)

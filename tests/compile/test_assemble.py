@@ -64,7 +64,7 @@ def test_base_text_names_no_other_effect():
         "arithmetic_fast",
     }
     of_quality = ("wide", "WIDE")
-    of_layers = ("coplanar_groups", "plane_keys", "layer", "Layer", "open_layer", "optical_depth")
+    of_layers = ("coplanar_groups", "layers", "Layer", "Layers", "pass_finish", "optical_depth")
     of_order = (*of_layers, "k_buffer", "KBuffer", "K_BUFFER_SIZE", "nearest")
     for name in (*absent, *FURTHER, "sh", "finished", *of_order, *of_quality):
         assert not re.search(rf"\b{name}(_|\b)", text), name
@@ -95,7 +95,7 @@ def test_an_output_adds_its_own_text_only(output):
 @pytest.mark.parametrize("outputs", [("rgb",), tuple(FURTHER)])
 def test_only_coplanar_groups_add_layers(outputs):
     """Sections of outputs for layers are absent too; layers add the fragment depth that they require."""
-    words = ("Layer", "layer_close", "layer_add", "plane_keys", "label_tau", "share")
+    words = ("Layer", "layer_close", "layer_add", "pass_finish", "label_tau", "share")
     plain = assemble(select(COLORS, fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
     layered = assemble(
         select(Traits(has_coplanar_groups=True), fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE

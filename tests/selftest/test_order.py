@@ -46,7 +46,7 @@ def test_a_tag_in_front_of_a_wall_does_not_jump(renderer):
     for tilt in (0.0, 30.0, 60.0):
         before, after = (
             largest_jump(renderer, camera_path(cloud, order, 2, tilt, 54, 45, WALL_STEP))[0]
-            for order in ("centre", "auto")
+            for order in ("centre", "pixel")
         )
         assert before > 0.15
         assert after < 10 * SMOOTH
@@ -223,3 +223,23 @@ def test_a_real_marker_does_not_jump(renderer):
     for tilt in (0.0, 40.0):
         assert largest_jump(renderer, camera_path(cloud, "auto", steps=3, tilt=tilt))[0] < SMOOTH
     assert largest_jump(renderer, camera_path(cloud, "centre", steps=3))[0] > 0.2
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+def test_a_marker_changes_no_pixel_that_it_does_not_cover(renderer, lens):
+    """By `auto` the other splats are bit-identical to those by centre without the marker."""
+    others, sheet = (
+        random_splats(150, 14, depth=(0.8, 4.0), scale=(0.1, 0.6)),
+        tag().transformed(order._tag_pose()),
+    )
+    view = clouds.camera(60, 45, 48.0) if lens == "pinhole" else Camera.fisheye(60, 45, 2.0)
+    both = fs.SplatCloud.concatenate([others, sheet])
+    together, alone, marker = (
+        renderer.render(cloud, view, ALL_OUTPUTS, background=(0.1, 0.2, 0.3))
+        for cloud in (both, others, sheet)
+    )
+    outside = marker["alpha"] == 0
+    assert 0.1 < outside.mean() < 0.95
+    for name in ("rgb", *ALL_OUTPUTS):
+        assert np.array_equal(together[name][outside], alone[name][outside]), name
+    assert np.abs(together["rgb"] - alone["rgb"])[~outside].max() > 0.1

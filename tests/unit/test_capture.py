@@ -119,6 +119,7 @@ GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
         (Traits(), {}, "compose_ordered", "compose_pixel"),
         (OF_PLANES, {}, "compose_coplanar", "compose_ordered"),
         (OF_PLANES, {"quality": ORDERED}, "compose_ordered", "compose_coplanar"),
+        (OF_PLANES, {"quality": BY_PIXEL}, "compose_coplanar_pixel", "compose_coplanar"),
         (Traits(), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
         (THICK, {"quality": BY_PIXEL}, "compose_ordered", "compose_pixel"),  # of one depth each
         (Traits(ellipsoids="some"), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),

@@ -186,11 +186,14 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files.append(LAYOUTS[f"k_buffer_{shape.schedule}"].file)
     elif shape.schedule == "lanes":
         files.append(LAYOUTS["tile_loop_lanes"].file)
-    if "termination_depths" in layouts:  # after the k-buffer, which may repeat the pass through a list
+    if not layouts.keys().isdisjoint({"compose_pixel", "coplanar_layers"}):
+        files.append(LAYOUTS[f"passes_{shape.schedule}"].file)
+        files.append(LAYOUTS["blocks_nearest" if shape.schedule == "lanes" else "tile_nearest"].file)
+    if "termination_depths" in layouts:  # after all passes through a list
         way = "_pixel" if "compose_pixel" in layouts else ""
         files += [LAYOUTS["termination_depth_pixel"].file] if way else []
         files.append(LAYOUTS[f"termination_depth{way}_{shape.schedule}"].file)
-    if "external_depth" in layouts:  # after the k-buffer is empty
+    if "external_depth" in layouts:  # after all passes
         files.append(LAYOUTS["external_depth_end"].file)
     stages = {
         "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),

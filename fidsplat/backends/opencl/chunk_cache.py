@@ -259,7 +259,7 @@ class GatheredChunks(ResidentData):
         self.capacity = _rounded_up(self.count)
         """splats for which frames have buffers; the next view, with about as many, reuses them"""
         self.origin, self.sh_degree, self.footprint = whole.origin, whole.sh_degree, whole.footprint
-        self.has_coplanar_groups, self.group_table = whole.has_coplanar_groups, whole.group_table
+        self.has_coplanar_groups = whole.has_coplanar_groups
         self.ellipsoids = whole.ellipsoids
         self.cached_frames: dict[Hashable, Any] = {}
         """frames that are replayed, by their kind"""

@@ -34,7 +34,6 @@ class FrameBuffers:
     """records `View` (groups + 1, v)"""
     moving: cl.Buffer
     """number and labels of the groups that move"""
-    plane_keys: cl.Buffer
     """sort keys of the coplanar groups (groups, v)"""
     splats: cl.Buffer
     """records `Splat` (v, n)"""
@@ -297,7 +296,7 @@ class DeviceFrame:
         """Copy the uniforms of the projection for the requested ones of rows of samples [row, end)."""
         if self.view.raster is not None:
             self.put_rays()
-        arrays = projection_arrays(self.batch, self.resident, self.source, row, end)
+        arrays = projection_arrays(self.batch, self.source, row, end)
         for name, array in arrays.items():
             self.put(name, array)
 

@@ -74,15 +74,8 @@ LAYOUTS: dict[str, Layout] = {
         parts=("ray_depth",),
         splat=(member("wide nearest", "minimum depth of the splat's fragments"),),
     ),
-    "compose_coplanar": Layout(
-        "slot/compose_coplanar.cl",
-        parts=("compose_pixel",),
-        splat=(member("int group", "coplanar group, -1: none"),),
-        project=takes(
-            "cloud int coplanar_groups  // (n) index of the splat's group; -1: none",
-            "in float plane_keys  // (groups, views) depth at which its splats are sorted in [m]",
-        ),
-    ),
+    "compose_coplanar": Layout(parts=("compose_ordered", "coplanar_layers")),
+    "compose_coplanar_pixel": Layout(parts=("compose_pixel", "coplanar_layers")),
     "footprint_gaussian": Layout(),
     "footprint_box": Layout("slot/footprint_box.cl", parts=("box_edges",)),
     "footprint_mixed": Layout(
@@ -196,6 +189,12 @@ LAYOUTS: dict[str, Layout] = {
         backward_file="part/ray_depth_backward.cl",
         moments=(member("float z_numerator z_center"),),
     ),
+    "coplanar_layers": Layout(
+        "part/coplanar_layers.cl",
+        parts=("ray_depth",),
+        splat=(member("int group", "coplanar group, -1: none"),),
+        project=takes("cloud int coplanar_groups  // (n) index of the splat's group; -1: none"),
+    ),
     # resolving samples to pixels
     "resolve_pixel": Layout("part/resolve_pixel.cl"),
     "resolve_fused": Layout("part/resolve_fused.cl"),
@@ -210,6 +209,12 @@ LAYOUTS: dict[str, Layout] = {
     # fragments sorted by depth at each pixel, by the schedule
     "k_buffer_lanes": Layout("part/k_buffer_lanes.cl"),
     "k_buffer_group": Layout("part/k_buffer_group.cl"),
+    # minimum depths of splats in blocks of pixels and in tiles, by the schedule
+    "blocks_nearest": Layout("part/blocks_nearest.cl"),
+    "tile_nearest": Layout("part/tile_nearest.cl"),
+    # several passes through a tile's list, by the schedule
+    "passes_lanes": Layout("part/passes_lanes.cl"),
+    "passes_group": Layout("part/passes_group.cl"),
     "external_depth_end": Layout("part/external_depth_end.cl"),
     "coverage": Layout("part/coverage.cl"),
     "ray": Layout(resolve=RAY_UNIFORMS),

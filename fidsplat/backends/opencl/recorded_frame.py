@@ -121,7 +121,7 @@ class RecordedFrame:
 
     def _learn(self, resident: Resident, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
         """Cache the uniforms of another view."""
-        own = projection_arrays(ViewBatch.single(view), resident, self._source, 0, self._rows)
+        own = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
         for name in self._source.view_arrays:
             own[name] = view.array(name)
         # an array that views share, a panorama say, is counted once

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.coplanar_groups import PlaneTable
+from fidsplat.backends.coplanar_groups import group_index
 from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.opencl.buffers import DeviceBuffer
 from fidsplat.backends.opencl.workspace import Workspace
@@ -39,7 +39,6 @@ class Resident(ResidentData):
         self.sh_degree = cloud.sh_degree
         self.has_coplanar_groups = cloud.coplanar_groups is not None
         self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
-        self.group_table = PlaneTable(cloud) if self.has_coplanar_groups else None
         self._arrays = {
             "means": cloud.means,
             "quats": cloud.quats,
@@ -47,8 +46,8 @@ class Resident(ResidentData):
             "opacities": cloud.opacities,
             "labels": cloud.labels,
         }
-        if self.group_table is not None:
-            self._arrays["coplanar_groups"] = self.group_table.index
+        if self.has_coplanar_groups:
+            self._arrays["coplanar_groups"] = group_index(cloud)
         if cloud.boxes is not None:
             self._arrays["boxes"] = cloud.boxes.astype(np.int32)
         if cloud.thickness is not None:

@@ -59,7 +59,7 @@ def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
     if "blend_double" in features.slots and shape.schedule == "lanes":
         # float64 is not vectorised
         shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
-    if not {"compose_pixel", "compose_coplanar"}.isdisjoint(features.slots):
+    if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.slots):
         # the k-buffer takes the registers of a second pixel
         shape = replace(shape, rows=1)
     return shape

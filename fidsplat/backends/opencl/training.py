@@ -56,7 +56,7 @@ Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
 class ResidentArrays(ResidentData):
     """Splats in training as a cloud to render: disks without labels and coplanar groups."""
 
-    has_coplanar_groups, footprint, ellipsoids, group_table = False, "gaussian", "none", None
+    has_coplanar_groups, footprint, ellipsoids = False, "gaussian", "none"
     streamed = immutable = coherent = False
 
     def __init__(

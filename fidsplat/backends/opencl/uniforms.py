@@ -9,7 +9,6 @@ import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import Source
-from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.view import View
 
 
@@ -34,9 +33,7 @@ def numbers_of(view: View, source: Source) -> dict[str, Any]:
     return numbers
 
 
-def projection_arrays(
-    views: ViewBatch, resident: Resident, source: Source, row: int, end: int
-) -> dict[str, np.ndarray]:
+def projection_arrays(views: ViewBatch, source: Source, row: int, end: int) -> dict[str, np.ndarray]:
     """Arrays of views that kernels of the projection read, for rows of samples [row, end), by the names of
     the arguments. They are read-only: `BufferPool.put` copies such an array once."""
     view = views.view
@@ -45,9 +42,6 @@ def projection_arrays(
     arrays = {"view": view_records(views, row, end, source.records["View"])}
     if view.groups:
         arrays["moving"] = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
-    if resident.group_table is not None:
-        # a copy, since it must own its memory to be recognised
-        arrays["plane_keys"] = resident.group_table.keys_of(views).T.copy()
     for array in arrays.values():
         array.flags.writeable = False
     return arrays

@@ -7,7 +7,7 @@ import numpy as np
 from fidsplat.backends.reference import error_bounds
 from fidsplat.backends.reference.coverage import MIN_ALPHA, median_of
 from fidsplat.backends.reference.external_depth import surface_at
-from fidsplat.backends.reference.fragment_order import by_center, by_depth
+from fidsplat.backends.reference.fragment_order import by_center, by_depth, by_layers
 from fidsplat.backends.reference.fragments import fragments_of, shifted
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import background_at
@@ -32,7 +32,8 @@ def composite(
     surface = None if view.external_depth is None else surface_at(view.external_depth, view, x, y)
     if surface is not None:
         span = surface.occlude(s, f, span)
-    ordered = by_depth(s, f, span) if s.by_depth else by_center(s, f, span)
+    sort = by_depth if s.by_depth else by_layers if s.coplanar_groups is not None else by_center
+    ordered = sort(s, f, span)
     before, live, final = transmittance(ordered.alpha, view.stop, s.exclusive)
     if surface is not None:
         ordered = surface.append_to(ordered)

@@ -59,9 +59,6 @@ def may_contribute(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.nda
             1 + sum(np.abs(_ends(at) - to).max(0) for at, to in ((x, s.anchor_x), (y, s.anchor_y)))
         )
         contributing |= np.maximum(np.hypot(across, down) / view.samples - off, 0) ** 2 <= r2 / 2
-    if s.coplanar_groups is not None:
-        planes, first = np.unique(s.coplanar_groups, return_index=True)
-        contributing[first[(planes >= 0) & np.isin(planes, s.coplanar_groups[contributing])]] = True
     return contributing
 
 

@@ -9,7 +9,7 @@ certificate adds up what that can change in it, to first order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -224,30 +224,78 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
 
     A swap of two neighbours changes a colour by at most the product of their opacities and the transmittance
     in front of them. Every possible order results from swaps of pairs whose depth intervals overlap. Exactly
-    equal depths are ordered by the indices of the splats, which rounding does not change.
+    equal depths have an order that rounding does not change.
     """
-    k, m = span.low.shape
-    may = span.high > 0
-    near = np.where(may, span.z_low - lift - _DEPTH * np.abs(span.z_low), np.inf)
-    far = np.where(may, span.z_high - lift + _DEPTH * np.abs(span.z_high), -np.inf)
-    exact = span.z_low == span.z_high
+    near, far = _sort_depths(span, lift)
+    may, exact = span.high > 0, span.z_low == span.z_high
     furthest = np.maximum.accumulate(far, axis=1)
     nearest = np.minimum.accumulate(near[:, ::-1], axis=1)[:, ::-1]
-    dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
-    light = np.cumsum(dimmed, axis=1) - dimmed
-    lowest = span.front_low.copy()
     pairs = []
-    for apart in range(1, m):
+    for apart in range(1, span.low.shape[1]):
         first, second = np.s_[:, :-apart], np.s_[:, apart:]
         if not (furthest[first] >= nearest[second]).any():
             break
         meet = may[first] & may[second] & (far[first] >= near[second])
         meet &= ~(exact[first] & exact[second] & (near[first] == near[second]))
         pairs.append((first, second, meet))
+    return _of_swaps(span, pairs)
+
+
+def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np.ndarray]:
+    """The same of fragments in the order of the splats' centres, place (k, m), that layers (place < 0) divide
+    by depth.
+
+    Two fragments may also swap where a layer may be between them or not.
+    """
+    near, far = _sort_depths(span, lift)
+    may, layered = span.high > 0, place < 0
+    bound, lowest, highest = np.zeros(len(may)), span.front_low.copy(), span.front_high.copy()
+    layers = layered.sum(1).max(initial=0)
+    # by column of a layer: whether it may exist, surely exists; its interval
+    columns = np.argsort(~layered, axis=1, kind="stable")[:, :layers]
+    own = [np.take_along_axis(each, columns, 1) for each in (may & layered, span.low > 0, near, far)]
+    unsure = np.zeros(len(may), bool)
+    for exists, surely, low, high in zip(*(each.T[:, :, None] for each in own), strict=True):
+        meets = may & (far >= low) & (near <= high)
+        unsure |= exists[:, 0] & (~surely[:, 0] | (meets.sum(1) > 1))  # it meets itself
+    rows = np.flatnonzero(unsure)
+    if len(rows) == 0:
+        return span, bound
+    near, far, may, layered, place = (each[rows] for each in (near, far, may, layered, place))
+    own = [each[rows].T[:, :, None] for each in own]
+    pairs = []
+    for apart in range(1, near.shape[1]):
+        first, second = np.s_[:, :-apart], np.s_[:, apart:]
+        between, divided = np.zeros(near[first].shape, bool), np.zeros(near[first].shape, bool)
+        for exists, surely, low, high in zip(*own, strict=True):
+            between |= exists & (far[first] >= low) & (near[second] <= high)
+            divided |= exists & surely & (far[first] < low) & (near[second] > high)
+        swapped = np.where(place[first] < place[second], between, ~divided)
+        meet = np.where(layered[first] | layered[second], far[first] >= near[second], swapped)
+        pairs.append((first, second, meet & may[first] & may[second]))
+    part = Span(*(getattr(span, field.name)[rows] for field in fields(Span)))
+    part, bound[rows] = _of_swaps(part, pairs)
+    lowest[rows], highest[rows] = part.front_low, part.front_high
+    return replace(span, front_low=lowest, front_high=highest), bound
+
+
+def _sort_depths(span: Span, lift: np.ndarray) -> _Pair:
+    """Nearest and furthest depths (k, m) at which rounding may sort fragments and layers."""
+    may = span.high > 0
+    near = np.where(may, span.z_low - lift - _DEPTH * np.abs(span.z_low), np.inf)
+    return near, np.where(may, span.z_high - lift + _DEPTH * np.abs(span.z_high), -np.inf)
+
+
+def _of_swaps(span: Span, pairs: list[tuple]) -> tuple[Span, np.ndarray]:
+    """Bounds over the orders in which the pairs (slices of columns, and where they meet) may be swapped."""
+    dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
+    light = np.cumsum(dimmed, axis=1) - dimmed
+    lowest = span.front_low.copy()
+    for first, second, meet in pairs:
         light[second] -= np.where(meet, dimmed[first], 0.0)
         lowest[first] *= np.where(meet, 1 - span.high[second], 1.0)
     highest = np.exp(light) if pairs else span.front_high
-    bound = np.zeros(k)
+    bound = np.zeros(len(light))
     for first, second, meet in pairs:
         front = np.minimum(highest[first], highest[second])
         bound += np.where(meet, front * span.high[first] * span.high[second], 0.0).sum(1)

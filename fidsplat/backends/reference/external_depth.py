@@ -34,11 +34,12 @@ class Surface:
         """Remove fragments at its depth or behind it. In the returned span a fragment that rounding may move
         to the other side has opacities down to 0."""
         z = self.z[:, None]
-        # depths of coplanar groups are no nearer than these
-        depth, low, high = (np.maximum(one, s.nearest) for one in (f.z, span.z_low, span.z_high))
-        f.alpha = np.where(depth < z, f.alpha, 0.0)
+        f.alpha = np.where(f.z < z, f.alpha, 0.0)
         return Span.of(
-            np.where(high < z, span.low, 0.0), np.where(low < z, span.high, 0.0), span.z_low, span.z_high
+            np.where(span.z_high < z, span.low, 0.0),
+            np.where(span.z_low < z, span.high, 0.0),
+            span.z_low,
+            span.z_high,
         )
 
     def append_to(self, ordered: OrderedFragments) -> OrderedFragments:

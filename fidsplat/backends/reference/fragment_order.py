@@ -79,23 +79,53 @@ def by_center(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 
 
 def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
-    """Fragments, and one layer per coplanar group, by their own depths at each sample, ties in the splats'
-    order. Fragments that do not contribute are omitted."""
-    planes = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
-    plain = np.flatnonzero(planes < 0)
-    members = [np.flatnonzero(planes == plane) for plane in np.unique(planes[planes >= 0])]
-    columns = _concatenated([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])
-    arrival = np.concatenate([plain, [splats[0] for splats in members]])
+    """Fragments, and one layer per coplanar group, by their own depths at each sample. Ties: layers first,
+    then in the splats' order. Fragments that do not contribute are omitted."""
+    columns, lift, arrival = _with_layers(s, f, span)
     may = columns.span.high > 0
-    # a coplanar layer is in front of other splats in its plane
-    lift = np.where(np.arange(columns.z.shape[1]) < len(plain), 0.0, COPLANAR_BIAS * np.abs(columns.z))
     depth = np.where(may, columns.z - lift, np.inf)
-    rank = np.lexsort((np.broadcast_to(arrival, depth.shape), depth, ~may), axis=1)
-    rank = rank[:, : may.sum(1).max(initial=0)]
-    ordered = columns.take(rank)
-    lift = np.take_along_axis(lift, rank, 1)
+    rank = _rank(may, arrival, depth)
+    ordered, lift = columns.take(rank), np.take_along_axis(lift, rank, 1)
     ordered.span, ordered.reordered = error_bounds.of_order(ordered.span, lift)
     return ordered
+
+
+def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
+    """Fragments in the order of the splats' centres, and layers of coplanar groups by depth at each sample:
+    fragments nearer than a layer are in front of it, the others behind. Those that do not contribute are left
+    out."""
+    columns, lift, arrival = _with_layers(s, f, span)
+    may, layered = columns.span.high > 0, arrival < 0
+    depth, exists = columns.z - lift, columns.alpha > 0
+    # number of layers in front of each fragment, and of each layer by its rank among layers
+    in_front = np.zeros(depth.shape, int)
+    for layer in np.flatnonzero(layered):
+        first = np.where(layered, arrival > arrival[layer], True)
+        nearer = (depth[:, [layer]] < depth) | ((depth[:, [layer]] == depth) & first)
+        in_front += 2 * (nearer & exists[:, [layer]])
+    rank = _rank(may, arrival, in_front + layered)
+    ordered, lift = columns.take(rank), np.take_along_axis(lift, rank, 1)
+    place = arrival[rank]
+    ordered.span, ordered.reordered = error_bounds.of_layers(ordered.span, lift, place)
+    return ordered
+
+
+def _with_layers(s: Setup, f: Fragments, span: Span) -> tuple[OrderedFragments, np.ndarray, np.ndarray]:
+    """Fragments (k, n) of splats without a group, then layers (k, p); by how much each counts as nearer; and
+    the order of ties (n + p,), negative for layers."""
+    groups = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
+    plain = np.flatnonzero(groups < 0)
+    members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
+    columns = _concatenated([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])
+    arrival = np.concatenate([plain, np.arange(len(members)) - len(members)])
+    # a coplanar layer is in front of other splats in its plane
+    return columns, np.where(arrival < 0, COPLANAR_BIAS * np.abs(columns.z), 0.0), arrival
+
+
+def _rank(may: np.ndarray, arrival: np.ndarray, key: np.ndarray) -> np.ndarray:
+    """Columns (k, m) of the fragments that may contribute, sorted by `key` (k, n), then by `arrival` (n,)."""
+    rank = np.lexsort((np.broadcast_to(arrival, key.shape), key, ~may), axis=1)
+    return rank[:, : may.sum(1).max(initial=0)]
 
 
 def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> OrderedFragments:
@@ -124,8 +154,7 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> Or
 
 def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFragments:
     """Layer (k, 1) of the splats (indices) of a coplanar group."""
-    alpha, nearest = f.alpha[:, splats], s.nearest[splats]
-    z, z_low, z_high = (np.maximum(z[:, splats], nearest) for z in (f.z, span.z_low, span.z_high))
+    alpha, z, z_low, z_high = (each[:, splats] for each in (f.alpha, f.z, span.z_low, span.z_high))
     low, high = span.low[:, splats], span.high[:, splats]
     boxes = bool(s.box[splats[0]])  # a plane has one footprint
     tau = alpha if boxes else optical_depth(alpha)

@@ -7,7 +7,7 @@ from copy import copy
 
 import numpy as np
 
-from fidsplat.backends.coplanar_groups import PlaneTable
+from fidsplat.backends.coplanar_groups import group_index
 from fidsplat.backends.reference import ellipsoids, optics
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
@@ -63,22 +63,15 @@ class Setup:
         within = np.where(box, box_reach, within)
         reach = np.where(box, box_reach, radius * reach)
         visible = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
-        self.by_depth = "compose_ordered" not in features.slots
+        self.by_depth = not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.slots)
         """whether fragments are composited by their own depth"""
-        planes, nearest = None, np.full(len(cloud), -np.inf)
-        if self.by_depth:
-            # depths are the same at every cut-off
-            radius = np.full(len(cloud), _RANGE_RADIUS)
-            if cloud.coplanar_groups is not None:
-                radius[cloud.coplanar_groups >= 0] = _PLANE_RADIUS
-            with np.errstate(divide="ignore", invalid="ignore"):
-                further = radius / np.sqrt(2 * half_r2)
-                further[box] = (
-                    1
-                    if cloud.coplanar_groups is None
-                    else np.where(cloud.coplanar_groups[box] >= 0, _PLANE_RADIUS, 1)
-                )
-                within = reach * further
+        layered = not {"compose_coplanar", "compose_coplanar_pixel"}.isdisjoint(features.slots)
+        groups = group_index(cloud) if layered else np.full(len(cloud), -1, np.int32)
+        # depths are the same at every cut-off
+        radius = np.where(groups >= 0, _PLANE_RADIUS, np.where(box, 1.0, _RANGE_RADIUS))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            further = reach * radius / np.where(box, 1.0, np.sqrt(2 * half_r2))
+        within = np.where((groups >= 0) | self.by_depth, further, within)
         z_low, z_high = depth - within, depth + within
         behind = depth < view.near  # fragments lie beyond `near`
         z_low, z_high = (
@@ -87,14 +80,10 @@ class Setup:
         )
         if self.by_depth:
             self.key = z_low.astype(np.float32)
-        if "compose_coplanar" in features.slots:
-            table = PlaneTable(cloud)
-            planes = table.index
-            nearest = np.where(planes < 0, nearest, np.append(table.keys(view), 0)[planes])
-            self.key = np.where(planes < 0, self.key, nearest.astype(np.float32))
+        self.key[groups >= 0] = -np.inf
         visible &= np.isfinite(shape.inverse_m2)  # else the camera is at its centre
         order = np.flatnonzero(visible)
-        order = order[np.argsort(self.key[order], kind="stable")]
+        order = order[np.lexsort((groups[order], self.key[order]))]
         self.order = order
 
         normal, self.turned = shape.normal[order], shape.turned[order]
@@ -134,12 +123,9 @@ class Setup:
         self.normal = shape.surface[order] * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
-        self.coplanar_groups = None if planes is None else planes[order]
-        self.coplanar = (
-            np.zeros(len(order), bool) if self.coplanar_groups is None else self.coplanar_groups >= 0
-        )
-        self.nearest = nearest[order]
-        """lower bound of depths in a coplanar group; -inf for splats without a group"""
+        self.coplanar_groups = groups[order] if layered else None
+        """dense index of the group whose layer a splat is part of, -1 for none, or None without layers"""
+        self.coplanar = groups[order] >= 0
 
     def subset(self, chosen: np.ndarray) -> Setup:
         """The chosen splats (n,) bool, in the same order."""
@@ -176,7 +162,6 @@ _OF_SPLATS = (
         "anchor_y",
         "colors",
         "normal",
-        "nearest",
         "coplanar",
     ),
 )

@@ -104,7 +104,6 @@ class DeviceFrame:
         self._fill_views()
         self.named["lens"] = lens_of(view, self.workspace)
         self.named["moving"] = moving_of(self.resident, stack, inputs)
-        self.named |= self._coplanar_groups()
         given = {"sloped": program.sloped, "opaque": program.opaque}
         self._rays = rays_of(view, self.workspace, inputs, **given)
         if program.backdrop:
@@ -185,8 +184,8 @@ class DeviceFrame:
         counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
         visible, offsets = self._exact("visible", n, wp.int32), self._exact("offsets", n, wp.int32)
         # not read if all splats are of one kind
-        cloud = {"boxes": visible, "thickness": self.resident.arrays["opacities"]} | self.resident.arrays
-        cloud |= {"coplanar_groups": self.named["coplanar_groups"], "group_keys": self.named["group_keys"]}
+        cloud = {"boxes": visible, "coplanar_groups": visible, "thickness": self.resident.arrays["opacities"]}
+        cloud |= self.resident.arrays
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
         wp.utils.array_scan(visible, offsets, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)
@@ -196,20 +195,6 @@ class DeviceFrame:
             return self.capacity.visible, self.capacity.pairs
         visible, pairs = self.launcher.read_back(totals, self.pool.host("totals", 2, wp.int64))
         return visible, pairs
-
-    def _coplanar_groups(self) -> dict[str, Any]:
-        """Coplanar group of each splat, and sort keys of the groups in these views."""
-        wp, table = self.wp, self.resident.group_table
-        if table is None or not self.program.layered:
-            none = self.pool.scratch("no groups", 1, wp.int32), self.pool.scratch("no keys", 1, wp.float32)
-            return {"coplanar_groups": none[0], "group_keys": none[1], "group_count": 0}
-        keys = table.keys_of(self.stack)
-        filled = self.inputs.filled("group keys", keys.ravel(), wp.float32)
-        return {
-            "coplanar_groups": self.resident.arrays["coplanar_groups"],
-            "group_keys": filled,
-            "group_count": keys.shape[1],
-        }
 
     def _sort(self, visible: int) -> None:
         """Sort visible splats by depth, ties by index."""

@@ -20,7 +20,7 @@ SLOTS = frozenset(
     | {"camera_brown_conrady", "camera_fisheye", "camera_equirectangular"}
     | {"lowpass_none", "lowpass_screen", "lowpass_pixel", "stop_inclusive", "stop_exclusive"}
     | {"ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"}
-    | {"compose_ordered", "compose_pixel", "compose_coplanar"}
+    | {"compose_ordered", "compose_pixel", "compose_coplanar", "compose_coplanar_pixel"}
     | {"footprint_gaussian", "footprint_box", "footprint_mixed"}
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure", "external_depth"}
@@ -76,9 +76,10 @@ class _Needs:
         # rays of other lenses have a length of 1
         if "camera_brown_conrady" in effects and measured:
             effects.add("rays_length")
-        if "compose_coplanar" in effects:
-            effects.add("compose_pixel")
-        if not effects.isdisjoint({"compose_pixel", "external_depth"}) or output.having(outputs, "depth"):
+        if "compose_coplanar_pixel" in effects:
+            effects |= {"compose_coplanar", "compose_pixel"}
+        with_depth = {"compose_pixel", "compose_coplanar", "external_depth"}
+        if not effects.isdisjoint(with_depth) or output.having(outputs, "depth"):
             effects.add("ray_depth")
         steps = tuple(name for name in features.posts if name in kernels("post").known())
         blending = output.having(outputs, "attributes", "state", "samples")
@@ -136,7 +137,6 @@ class Program:
     def _make_blend(self, needs: _Needs) -> None:
         buffers, blending = kernels("buffers"), needs.blending
         self.layout = kernels("records").Layout(needs.among(_RECORD), blending)
-        self.layered = "compose_coplanar" in needs.effects
         boxes = not needs.effects.isdisjoint(kernels("records").BOXES)
         self.sloped = boxes and "rays" in needs.effects
         """whether blending reads the derivatives of a lens's rays"""

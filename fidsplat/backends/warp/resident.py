@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.coplanar_groups import PlaneTable
+from fidsplat.backends.coplanar_groups import group_index
 from fidsplat.backends.interface import ResidentData
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, nbytes
@@ -25,18 +25,13 @@ class Resident(ResidentData):
         count: int,
         origin: np.ndarray,
         sh_degree: int,
-        group_table: PlaneTable | None = None,
         footprint: str = "gaussian",
         ellipsoids: str = "none",
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.memory_bytes = sum(map(nbytes, arrays.values()))
         """including adopted arrays"""
-        self.sh_degree, self.group_table, self.has_coplanar_groups = (
-            sh_degree,
-            group_table,
-            group_table is not None,
-        )
+        self.sh_degree, self.has_coplanar_groups = sh_degree, "coplanar_groups" in arrays
         self.footprint, self.ellipsoids = footprint, ellipsoids
         self.adopted = False
         """whether the caller may change the arrays"""
@@ -62,16 +57,15 @@ class Resident(ResidentData):
             "colors": colors,
             "labels": cloud.labels,
         }
-        table = None if cloud.coplanar_groups is None else PlaneTable(cloud)
-        if table is not None:
-            arrays["coplanar_groups"] = table.index
+        if cloud.coplanar_groups is not None:
+            arrays["coplanar_groups"] = group_index(cloud)
         if cloud.footprint == "mixed" and cloud.boxes is not None:
             arrays["boxes"] = cloud.boxes.astype(np.int32)
         if cloud.thickness is not None:
             arrays["thickness"] = cloud.thickness
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
         kinds = cloud.footprint, cloud.ellipsoids
-        return cls(device, len(cloud), cloud.origin, cloud.sh_degree, table, *kinds)
+        return cls(device, len(cloud), cloud.origin, cloud.sh_degree, *kinds)
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:

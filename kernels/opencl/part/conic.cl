@@ -26,6 +26,7 @@
         vint outside = VMASK(FMA(u, u, v * v) > conic_h * (1.0f + BLOCKS_SLACK) * (d * d)) | VMASK(d < 0.0f);
 //@@ blocks_disc
 //@@ blocks_nearest
+//@@ blocks_nearest_stored
         touched &= ~(VBITS(outside) << first);
     }
 //@ cells_functions

@@ -8,7 +8,6 @@
 typedef struct {                    // in memory: an index that is not constant moves a complete struct out of registers
     wide z[QUEUE_CAPACITY + 1], opacity[QUEUE_CAPACITY + 1];    // ring buffer, sorted by depth
     uint splat[QUEUE_CAPACITY + 1];
-//@@ k_buffer_queue_fields
 } Queue;
 typedef struct {
     wide z[IN_REGISTERS], opacity[IN_REGISTERS];
@@ -16,7 +15,6 @@ typedef struct {
     Queue *queue;
     uint head, count;               // of the queue
     bool bounded;                   // fragments outside of [from, until) are skipped
-//@@ k_buffer_fields
     wide from, until;               // depths; at `from`: splats from `from_splat` on, at `until`: those before
     uint from_splat, until_splat;   // `until_splat`
 } KBuffer;
@@ -31,7 +29,6 @@ static inline void k_buffer_clear(KBuffer *k_buffer) {
 static inline void k_buffer_start(KBuffer *k_buffer) {
     k_buffer_clear(k_buffer);
     k_buffer->head = k_buffer->count = 0;
-//@@ k_buffer_init
     k_buffer->bounded = false;
     k_buffer->from = -INFINITY;
     k_buffer->until = INFINITY;
@@ -40,7 +37,7 @@ static inline void k_buffer_start(KBuffer *k_buffer) {
 //@ group_start
     Queue queues[ROWS];
     for (int row = 0; row < ROWS; row++) pixels[row].k_buffer.queue = &queues[row];
-//@ unfinished
+//@ pass_unfinished
         & VMASK(pixel->k_buffer.from < INFINITY)
 //@ compose_functions
 // Order of two splats in the list.
@@ -51,7 +48,6 @@ static inline bool precedes(global const Splat *splats, uint splat, uint other) 
 
 static inline void k_buffer_composite(Pixel *pixel, wide z, wide opacity, uint splat, global const Splat *splats,
                                      const BlendConstants *constants) {
-//@@ k_buffer_composition
     const Splat s = splats[splat];
     const Crossing nowhere = {1.0f};
     Attributes attributes = fragment_attributes(&s, nowhere, 1.0f);
@@ -83,7 +79,6 @@ static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint spl
     Queue *queue = k_buffer->queue;
     if (k_buffer->count == QUEUE_CAPACITY) {
         uint dropped = k_buffer->splat[IN_REGISTERS - 1];
-//@@ k_buffer_eviction
         k_buffer->until = k_buffer->z[IN_REGISTERS - 1];
         k_buffer->until_splat = dropped;
         k_buffer->bounded = true;
@@ -119,7 +114,7 @@ static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint spl
 static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide opacity, uint splat, global const Splat *splats,
                                 const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
-    // a completed layer may be nearer than the next splat and than queued fragments
+    // the new fragment may be nearer than queued ones
     k_buffer_flush(pixel, fmin(nearest, z), splats, constants);
     bool first = z < k_buffer->z[0];
     wide first_z = first ? z : k_buffer->z[0], first_opacity = first ? opacity : k_buffer->opacity[0];
@@ -147,14 +142,9 @@ static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opac
         if (z > k_buffer->until || (z == k_buffer->until && !precedes(splats, place, k_buffer->until_splat))) return;
         if (z < k_buffer->from || (z == k_buffer->from && precedes(splats, place, k_buffer->from_splat))) return;
     }
-//@@ k_buffer_insertion
     k_buffer_push(pixel, nearest, z, opacity, splat, splats, constants);
 }
-
-//@@ coplanar_functions
-// After the last splat of the list: composites all remaining fragments. Returns true if dropped fragments require another pass.
-static inline int k_buffer_finish(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
-//@@ coplanar_finish
+//@ k_buffer_finish
     KBuffer *k_buffer = &pixel->k_buffer;
     k_buffer_flush(pixel, INFINITY, splats, constants);
 #pragma unroll
@@ -166,20 +156,9 @@ static inline int k_buffer_finish(Pixel *pixel, global const Splat *splats, cons
     k_buffer->from_splat = k_buffer->until_splat;
     k_buffer->until = INFINITY;
     k_buffer->bounded = true;        // if nothing was dropped here, another pass (for other pixels) includes no fragment
-    return pixel_unfinished(pixel, constants);
-}
+    repeats = VMASK(k_buffer->from < INFINITY);
+//@ layer_passed
+        if (ready) k_buffer->from = -INFINITY;
 //@ blend_arguments
-                                , splats, lists[batch + which], lists[batch + which], s.nearest
+                                , splats, lists[batch + which], lists[batch + which]
                                 , staged[k + 1 < listed ? places[cell][k + 1] : length - 1].splat.nearest
-//@ pass
-    local int repeat_pass;
-    do {
-//@ pass_end
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (item == 0) repeat_pass = 0;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (int row = 0; row < ROWS; row++)
-            if (px < width && py + row < height && k_buffer_finish(&pixels[row], splats, &constants)) repeat_pass = 1;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        // uniform: every work-item reads the same vote
-    } while (repeat_pass);

@@ -19,10 +19,6 @@
 #define LOOKAHEAD_FACTOR 4                   // splats evaluated per splat required, to amortise lookahead
 #define EMPTY_Z INFINITY            // depth of an empty lane of the queue
 #define NO_FRAGMENT (-INFINITY)            // depth of an empty lane of `farthest`
-typedef union {
-    Attributes attributes;
-    vfloat fields[sizeof(Attributes) / sizeof(vfloat)];
-} AttributeFields;
 typedef struct {                    // one fragment per lane
     vfloat z, opacity;
     vint place;                     // position of its splat in the list
@@ -89,11 +85,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
     }
 //@ blocks_parameters
                                    , int which, int *keys
-//@ blocks_nearest
-        vfloat min_depth = s->nearest;
-//@@ camera_blocks_nearest
-//@@ disc_blocks_nearest
-//@@ coplanar_blocks_nearest
+//@ blocks_nearest_stored
         VSTORE((in_order(VAS_INT(min_depth)) & -CHUNK) | which, keys + first);
 //@ tile_loop
     ulong deferred[DEFERRED_CAPACITY];         // (minimum depth in the tile, position), farthest first
@@ -109,9 +101,9 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
             for (; length < CHUNK && read < end; length++) places[length] = read++;
         else
             for (; length < CHUNK && deferred_count > 0; length++) places[length] = (uint)deferred[--deferred_count];
-//@@ chunk_end
         wide rest_nearest = read < end ? splats[lists[read]].nearest : INFINITY;
         if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, depth_of_key((uint)(deferred[deferred_count - 1] >> 32)));
+//@@ chunk_of_layers_sorted
         for (uint which = 0; which < length; which++) listed[which] = lists[places[which]];
         // per splat: its blocks, and its minimum depth in each block, whose last bits hold its index in the chunk
         int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
@@ -125,7 +117,9 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
             behind += s.z_center >= rest_nearest;
             const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
-            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, (int)which, keys[which]);
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter
+//@@ blocks_arguments
+                , (int)which, keys[which]);
         }
         // splats behind by their centre: test the minimum depth in this tile
         if (reads && (ordered || behind > DEFER_THRESHOLD)) {
@@ -277,11 +271,7 @@ static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloa
         k_buffer_flush(pixel, nearest, constants);
     }
 }
-
-//@@ coplanar_functions
-// After the last splat of the list: composites all remaining fragments. Returns the lanes that require another pass.
-static inline vint k_buffer_finish(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
-//@@ coplanar_finish
+//@ k_buffer_finish
     k_buffer_flush(pixel, INFINITY, constants);
     Entry *farthest = &pixel->k_buffer.farthest;
     composite(pixel, &farthest->data.attributes, farthest->opacity, VMASK(farthest->z > NO_FRAGMENT), constants);
@@ -290,27 +280,19 @@ static inline vint k_buffer_finish(Pixel *pixel, global const Splat *splats, con
     queue->from = queue->until;
     queue->from_place = queue->until_place;
     queue->until = INFINITY;
-    return VMASK(queue->from < INFINITY) & pixel_unfinished(pixel, constants);
-}
+    repeats = VMASK(queue->from < INFINITY);
+//@ layer_passed
+        queue->from = VSELECT(queue->from, (vfloat)-INFINITY, ready);
 //@ skip_fragment
             if (lookahead > next) {
                 vfloat z = fragment_attributes(&s, c, 1.0f / c.d).z;
-//@@ coplanar_lookahead
                 depths[lookahead - 1] = VSELECT(depths[lookahead], VMIN(z, depths[lookahead]), mask);
                 lookahead--;
                 continue;
             }
-            if (!VANY(mask)) {              // a splat without fragments here does not complete a layer either
+            if (!VANY(mask)) {
                 lookahead = ++next;
                 continue;
             }
 //@ blend_arguments
-                        , splats, listed[which], places[which]
-                        , VMIN(VAS_FLOAT(in_order((vint)sorted[next] & -CHUNK)), (vfloat)rest_nearest), next_nearest
-//@ pass
-    do {
-//@ pass_end
-        alive = 0;
-        for (int block = 0; block < BLOCKS; block++)
-            if ((on_picture >> block & 1u) && VANY(k_buffer_finish(&pixels[block], splats, &constants))) alive |= 1u << block;
-    } while (alive);
+                        , splats, listed[which], places[which], next_nearest

@@ -9,6 +9,7 @@
     real depth_center = pz, depth_reach = reach;
 //@@ disc_depth_reach
 //@@ depth_reach
+//@@ coplanar_depth_reach
     if (pz < near) {                // all fragments are beyond `near`
         real furthest = fmax(near, pz + depth_reach);
         depth_center = REAL(0.5) * (furthest + near);
@@ -28,6 +29,5 @@
 //@@ disc_attribute_depth
     attributes.z = VSELECT((vfloat)s->z_center,
                      VMIN(VMAX(depth, (vfloat)s->z_center - (vfloat)s->z_reach), (vfloat)s->z_center + (vfloat)s->z_reach), hit);
-//@@ coplanar_attribute_depth
 //@ layer_accumulate
     layer->mean.z = FMA(share, attributes->z - layer->mean.z, layer->mean.z);

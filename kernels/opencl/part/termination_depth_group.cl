@@ -2,4 +2,6 @@
 //@ group_start
     if (item == 0) termination_depths[tile] = UINT_MAX;
 //@ voted
-        if (!alive && item == 0 && batch > start) termination_depths[tile] = keys[lists[batch - 1]];
+        if (!alive && item == 0 && batch > start
+//@@ termination_known
+            ) termination_depths[tile] = keys[lists[batch - 1]];

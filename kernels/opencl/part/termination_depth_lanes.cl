@@ -5,4 +5,6 @@
 //@ tile_loop_chunk
         last_read = chunk + length - 1;
 //@ pass_end
-    termination_depths[tile] = !alive && last_read != UINT_MAX ? keys[lists[last_read]] : UINT_MAX;
+    termination_depths[tile] = !alive && last_read != UINT_MAX
+//@@ termination_known
+        ? keys[lists[last_read]] : UINT_MAX;

@@ -2,8 +2,9 @@
 //@ compose_types
 #define CHUNK 64
 //@ tile_loop
-    for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base; chunk < end && alive; chunk += CHUNK) {
-        const uint length = min(end - chunk, (uint)CHUNK);
+    for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base, length; chunk < end && alive; chunk += length) {
+        length = min(end - chunk, (uint)CHUNK);
+//@@ chunk_of_layers
 //@@ tile_loop_chunk
         int touched[CHUNK];                 // blocks of each splat
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
@@ -11,7 +12,9 @@
             PREFETCH(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]);
             PREFETCH((global const char *)(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]) + 64);
             const Splat s = splats[lists[chunk + which]];
-            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter);
+            touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter
+//@@ blocks_arguments
+            );
         }
         for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
             const int block = 31 - clz((int)(blocks & -blocks));

@@ -32,8 +32,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 
     uint base = starts[band_first], start = starts[tile] - base, end = starts[tile + 1] - base;
 //@@ pass
-    for (uint batch = start; batch < end; batch += STAGED) {
-        uint length = min(end - batch, (uint)STAGED);
+    for (uint batch = start, length; batch < end; batch += length) {
+        length = min(end - batch, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item == 0) alive = 0;
         // in vectors, so that neighbouring work-items read consecutive memory
@@ -42,11 +42,14 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             staged[which].words[part] = ((global const float4 *)(splats + lists[batch + which]))[part];
         }
         barrier(CLK_LOCAL_MEM_FENCE);
+//@@ staged
         for (int row = 0; row < ROWS; row++)
             if (px < width && py + row < height && pixel_unfinished(&pixels[row], &constants)) alive = 1;
         for (uint which = item; which < length; which += GROUP) {
             local const Splat *s = &staged[which].splat;
-            touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, (local uchar *)cells + which);
+            touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, (local uchar *)cells + which
+//@@ cells_arguments
+            );
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         // uniform: all work-items read the same vote, taken before this batch is blended

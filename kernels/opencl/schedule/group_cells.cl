@@ -22,11 +22,14 @@ typedef union {              // a staged record, as vectors for fewer reads
 
 // Cells of the tile at (left, top) that the splat overlaps: one byte of bits per row of cells, set from `first_row` to `last_row`.
 // Conservative; the test of each pixel decides.
-static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, local uchar *cells) {
+static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, local uchar *cells
+//@@ cells_parameters
+) {
     int first_row = max(s->y0 - top, 0) / CELL_H, last_row = (min(s->y1 - top, TILE_H) - 1) / CELL_H;
     float shift = (float)s->ax - (float)left;
 //@@ cells_start
     for (int cell_row = 0; cell_row < CELLS_Y; cell_row++) cells[cell_row * CELLS_STRIDE] = 0;
+//@@ cells_occluded
     for (int cell_row = first_row; cell_row <= last_row; cell_row++) {
         // columns with fragments in the cell's rows of samples
         float y0 = (float)(top + cell_row * CELL_H) - (float)s->ay, y1 = y0 + (float)(CELL_H - 1), low = -INFINITY, high = INFINITY;

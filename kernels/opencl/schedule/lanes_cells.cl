@@ -35,6 +35,7 @@ static inline uint touched_blocks(const Splat *s, int left, int top, wide half_r
 ) {
     uint touched = blocks_within(s->x0 - left, s->x1 - left, s->y0 - top, s->y1 - top);
     if (touched == 0) return 0;
+//@@ blocks_occluded
 //@@ blocks_touched
     return touched;
 }

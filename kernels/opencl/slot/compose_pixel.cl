@@ -13,7 +13,6 @@
 #endif
 //@ depth_reach
     depth_reach = BOX_HERE ? reach : reach * (RANGE_RADIUS / radius);
-//@@ coplanar_depth_reach
 //@ depth_nearest
     record.nearest = (wide)convert_float_rtn(record.z_center - record.z_reach);
 //@@ coplanar_nearest
@@ -24,7 +23,6 @@
 //@ start
     k_buffer_start(&pixel->k_buffer);
 //@ blend_parameters
-                               , global const Splat *splats, uint splat, uint place, vfloat this_nearest, vfloat next_nearest
+                               , global const Splat *splats, uint splat, uint place, vfloat next_nearest
 //@ compose
-//@@ compose_coplanar_group
     k_buffer_insert(pixel, next_nearest, attributes.z, opacity, &attributes, splat, place, mask, splats, constants);

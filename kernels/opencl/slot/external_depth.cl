@@ -17,6 +17,6 @@
         }
 //@ empty
                        && false         // the surface covers all pixels
-//@ compose
+//@ occlude
     mask &= VMASK(attributes.z < pixel->opaque_z);
     if (!VANY(mask)) return;

@@ -81,7 +81,7 @@ static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat invers
         depth = VSELECT(FMA(circle * (depth_d - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center), depth, on_plane);
     }
 //@ disc_blocks_nearest
-        if (HAS_DISC(s)) min_depth = fmin(min_depth, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->nearest));
+        if (HAS_DISC(s)) min_depth = fmin(min_depth, (vfloat)fmax((1.0f - BLOCKS_SLACK) * s->z_center, s->z_center - s->z_reach));
 //@ disc_depth_reach
 #ifndef BOX_HERE
 #define BOX_HERE false

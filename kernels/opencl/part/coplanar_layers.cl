@@ -1,0 +1,208 @@
+// Compositing with coplanar groups: splats of one group have no order, and form one layer per pixel. The layer is the limit of
+// cutting the splats into thin sheets and shuffling them, which is independent of order: optical depths
+// tau = -ln(1 - opacity) add up, and colour, outputs and depth are means weighted by tau. A marker then does not change when its
+// splats are reordered, or when camera rotation reorders the depths of their centres.
+//
+// Splats of groups are the first ones of a tile's list, group after group. A pass through the list finds at each pixel the nearest layer
+// (`next`) behind that of the previous pass (`from`), composites the fragments of other splats between the two, in centre order or by
+// fragment depth, then the layer. Where there was a layer another pass follows. Tiles without groups have none of this.
+//@ project
+    record.group = coplanar_groups[i];
+//@ functions
+#ifndef BOX_HERE
+#define BOX_HERE false
+#endif
+#define COPLANAR_RADIUS REAL(64.0)       // in standard deviations; for boxes in half sides
+//@ coplanar_depth_reach
+    // depth range of the plane out to a fixed radius, beyond the reach of every alpha cut-off and low-pass: then the order of
+    // layers does not depend on the cut-off, nor on boxes much smaller than a pixel
+    if (coplanar_groups[i] >= 0) depth_reach = reach * (BOX_HERE ? COPLANAR_RADIUS : COPLANAR_RADIUS / radius);
+//@ coplanar_nearest
+    if (coplanar_groups[i] >= 0) record.nearest = -0x1p126f;
+//@ coplanar_key
+    if (coplanar_groups[i] >= 0) key = as_float(0xFF7FFFFFu - (uint)coplanar_groups[i]);     // below all depths
+//@ blocks_parameters
+                                   , const float *until
+//@ blocks_arguments
+                , until
+//@ blocks_occluded
+    if (until)
+        for (int first = 0; first < BLOCKS; first += LANES)
+            touched &= ~(VBITS(VMASK((vfloat)(s->z_center - s->z_reach) >= VLOAD(until + first))) << first);
+//@ coplanar_blocks_nearest
+        if (s->group >= 0) min_depth = -0x1p126f;
+        if (until) outside |= VMASK(min_depth >= VLOAD(until + first));
+//@ coplanar_disc_depth
+        if (s->group >= 0) on_plane = -1;           // also in the low-pass disc
+//@ compose_types
+typedef struct {
+    int group;                  // -1: no layer
+    vfloat opacity;             // 1 - the product of transmittances, accumulated directly to stay exact for faint layers
+    vfloat optical_depth;       // sum over its fragments
+    Attributes mean;                  // of its fragments, weighted by optical depth
+//@@ layer_fields
+} Layer;
+
+typedef struct {
+    Layer open;                 // layer that still accumulates fragments
+    AttributeFields next;       // nearest layer of this pass; its depth is infinite if there is none
+    vfloat next_z, next_opacity;
+    vint next_group;
+    vfloat from;                // depth and group of the layer of the previous pass; infinite if there was none
+    vint from_group;
+} Layers;
+
+static inline Layer no_layer(void) {
+    Layer layer = {-1};         // all other fields 0
+    return layer;
+}
+//@ state
+    Layers *layers;             // 0 in a tile without groups
+//@ start
+    pixel->layers = 0;
+//@ lanes_start
+    Layers layers[BLOCKS];
+    if (!empty && splats[lists[starts[tile] - base]].group >= 0)
+        for (int block = 0; block < BLOCKS; block++) layers_start(&pixels[block], layers + block);
+    float layer_depths[BLOCKS + LANES] __attribute__((aligned(64)));   // of each block: behind them no fragment belongs to this pass
+    const float *until = 0;                                 // these depths, once all layers are complete
+//@ chunk_of_layers
+        // splats of groups have chunks of their own
+        if (pixels[0].layers) {
+            if (splats[lists[chunk]].group >= 0) until = 0;
+            else if (!until) until = blocks_until(pixels, &constants, layer_depths);
+            while (!until && splats[lists[chunk + length - 1]].group < 0) length--;
+        }
+//@ chunk_of_layers_sorted
+        if (pixels[0].layers) {
+            if (splats[lists[places[0]]].group >= 0) until = 0;
+            else if (!until) until = blocks_until(pixels, &constants, layer_depths);
+            if (!until) {
+                for (; splats[lists[places[length - 1]]].group < 0; length--) read--;
+                rest_nearest = INFINITY;        // not deferred
+            }
+        }
+//@ group_start
+    local uint layer_depth;
+    Layers layers[ROWS];
+    wide until = INFINITY;      // behind it no fragment belongs to this pass; infinite until all layers are complete
+    bool complete = false;
+//@ staged
+        // splats of groups have batches of their own; all work-items branch alike
+        if (staged[0].splat.group >= 0) {
+            if (!pixels[0].layers)
+                for (int row = 0; row < ROWS; row++) layers_start(&pixels[row], layers + row);
+            while (staged[length - 1].splat.group < 0) length--;
+            until = INFINITY;
+            complete = false;
+        } else if (pixels[0].layers && !complete) {
+            if (item == 0) layer_depth = 0;
+            barrier(CLK_LOCAL_MEM_FENCE);
+            for (int row = 0; row < ROWS; row++)
+                if (px < width && py + row < height)
+                    atomic_max(&layer_depth, sortable(convert_float_rtp(layers_until(&pixels[row], &constants))));
+            barrier(CLK_LOCAL_MEM_FENCE);
+            until = as_float((layer_depth & 0x80000000u) ? layer_depth & 0x7FFFFFFFu : ~layer_depth);
+            complete = true;
+        }
+//@ cells_parameters
+                                 , wide until
+//@ cells_arguments
+                          , until
+//@ cells_occluded
+    if (until < INFINITY) {
+//@@ tile_nearest
+        if (min_depth >= until) return;
+    }
+//@ termination_known
+            && !pixels[0].layers
+//@ pass_unfinished
+        & VMASK(!pixel->layers || pixel->layers->from < INFINITY)
+//@ compose_functions
+static inline void layers_start(Pixel *pixel, Layers *layers) {
+    const Layers none = {{-1}};     // all other fields 0
+    *layers = none;
+    pixel->layers = layers;
+    layers->next_z = INFINITY;
+    layers->from = -INFINITY;
+    layers->from_group = -1;
+}
+
+// Adds a fragment where `mask` is set.
+static inline void layer_add(Layer *layer, const Splat *s, const Attributes *attributes, vfloat opacity, vint mask) {
+    opacity = VSELECT((vfloat)0.0f, opacity, mask);
+    // clamped to the optical depth at which float32 transmittance is 0
+    vfloat tau = -LOG(fmax(1.0f - opacity, (vfloat)0x1p-24f));
+//@@ footprint_tau
+    layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);
+    layer->optical_depth += tau;
+//@@ footprint_layer
+    vfloat share = VSELECT((vfloat)0.0f, tau / layer->optical_depth, VMASK(tau > 0.0f));
+    layer->mean.r = FMA(share, attributes->r - layer->mean.r, layer->mean.r);
+    layer->mean.g = FMA(share, attributes->g - layer->mean.g, layer->mean.g);
+    layer->mean.b = FMA(share, attributes->b - layer->mean.b, layer->mean.b);
+//@@ layer_accumulate
+}
+
+// Completes the open layer: keeps it where it is the nearest one of this pass. It is nearer by slightly more than the rounding of
+// depths, so that it is in front of ungrouped splats in the same plane.
+static inline void layer_close(Layers *layers) {
+    if (layers->open.group < 0) return;
+    const AttributeFields own = {layers->open.mean};
+    const vfloat z = FMA(fabs(own.attributes.z), (vfloat)-0x1p-16f, own.attributes.z);
+    vint nearest = VMASK(layers->open.optical_depth > 0.0f) & VMASK(z < layers->next_z);
+    nearest &= VMASK(z > layers->from) | (VMASK(z == layers->from) & VMASK(layers->open.group > layers->from_group));
+    layers->next_z = VSELECT(layers->next_z, z, nearest);
+    layers->next_opacity = VSELECT(layers->next_opacity, layers->open.opacity, nearest);
+    layers->next_group = VSELECT(layers->next_group, (vint)layers->open.group, nearest);
+#if LANES == 1
+    if (nearest) layers->next = own;
+#else
+    for (uint field = 0; field < sizeof(Attributes) / sizeof(vfloat); field++)
+        layers->next.fields[field] = VSELECT(layers->next.fields[field], own.fields[field], nearest);
+#endif
+    layers->open = no_layer();
+}
+
+// Completes the layers: the depth behind which no fragment belongs to this pass.
+static inline vfloat layers_until(Pixel *pixel, const BlendConstants *constants) {
+    layer_close(pixel->layers);
+    const vint open = pixel_transmits(pixel, constants) & VMASK(pixel->layers->from < INFINITY);
+    return VSELECT((vfloat)-INFINITY, pixel->layers->next_z, open);
+}
+//@ blocks_functions
+// The largest one of each block.
+static inline const float *blocks_until(Pixel *pixels, const BlendConstants *constants, float *depths) {
+    for (int block = 0; block < BLOCKS; block++) {
+        const vfloat lanes = layers_until(&pixels[block], constants);
+        depths[block] = -INFINITY;
+        for (int lane = 0; lane < LANES; lane++) depths[block] = fmax(depths[block], ((const float *)&lanes)[lane]);
+    }
+    return depths;
+}
+//@ layers
+    if (pixel->layers) {
+        Layers *layers = pixel->layers;
+        if (s->group != layers->open.group) {
+            layer_close(layers);
+            layers->open.group = s->group;
+        }
+        if (s->group >= 0) {
+            layer_add(&layers->open, s, &attributes, opacity, mask);
+            return;
+        }
+        mask &= VMASK(attributes.z >= layers->from) & VMASK(attributes.z < layers->next_z);
+        if (!VANY(mask)) return;
+    }
+//@ layers_finish
+    if (pixel->layers) {
+        Layers *layers = pixel->layers;
+        layer_close(layers);
+        const vint passed = ~repeats, ready = passed & VMASK(layers->next_z < INFINITY);
+        composite(pixel, &layers->next.attributes, layers->next_opacity, ready, constants);
+        layers->from = VSELECT(layers->from, layers->next_z, passed);
+        layers->from_group = VSELECT(layers->from_group, layers->next_group, passed);
+        layers->next_z = INFINITY;
+        repeats |= ready;
+//@@ layer_passed
+    }
