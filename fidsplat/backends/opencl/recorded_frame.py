@@ -67,7 +67,7 @@ class RecordedFrame:
         if pool.state is not self.state:
             return False
         if view is not self._view:
-            _, arrays, numbers = self._views.get(id(view)) or self._learn(resident, view)
+            _, arrays, numbers = self._views.get(id(view)) or self._learn(view)
             self.commands.set(numbers)
             self._view, self._arrays = view, arrays
         for name, array in self._arrays.items():
@@ -119,7 +119,7 @@ class RecordedFrame:
         frame.events, frame.stages = events, self._stages.copy()
         frame.counted, frame.stats = events[self._counted - 1], rendered.stats
 
-    def _learn(self, resident: Resident, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
+    def _learn(self, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
         """Cache the uniforms of another view."""
         own = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
         for name in self._source.view_arrays:
