@@ -2,8 +2,8 @@
 
     python benchmarks/accuracy_page.py [DIR ...]
 
-DIR: folders with results or their tables; by default the tables of the page. Replaces the generated block of
-docs/accuracy.md, and writes docs/accuracy/report.md with the tables and charts of `fidsplat tradeoff report`.
+DIR: folders with results or their tables; by default devlog/accuracy. Replaces the generated block of
+docs/accuracy.md, and writes devlog/accuracy.md with the tables and charts of `fidsplat tradeoff report`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from fidsplat.experiments.pages import fill_template, write_page
 from fidsplat.experiments.tradeoff.report import report_content
 from fidsplat.util.files import atomic_write
 
-PAGE = Path(__file__).parents[1] / "docs" / "accuracy.md"
+TREE = Path(__file__).parents[1]
+PAGE, REPORT = TREE / "docs" / "accuracy.md", TREE / "devlog" / "accuracy.md"
 BEGIN, END = "<!-- begin generated -->\n", "<!-- end generated -->\n"
 
 
-def write_accuracy(folders: Sequence[Path], page: Path = PAGE) -> None:
-    """Write the block of a page, and the report in the folder of its name without .md."""
-    folder = page.with_suffix("")
+def write_accuracy(folders: Sequence[Path], page: Path = PAGE, report: Path = REPORT) -> None:
+    """Write the block of a page, and a report with its tables and charts in the folder of its name."""
+    folder = report.with_suffix("")
     context, _ = report_content(folders, folder)
-    write_page(folder / "report.md", folder, "accuracy.md.j2", context)
+    write_page(report, folder, "accuracy.md.j2", context)
     before, _, rest = page.read_text("utf-8").partition(BEGIN)
     after = rest.partition(END)[2]
     block = fill_template(page, folder, "accuracy_summary.md.j2", context | {"summary": True})
@@ -33,4 +34,4 @@ def write_accuracy(folders: Sequence[Path], page: Path = PAGE) -> None:
 
 
 if __name__ == "__main__":
-    write_accuracy([Path(name) for name in sys.argv[1:]] or [PAGE.with_suffix("")])
+    write_accuracy([Path(name) for name in sys.argv[1:]] or [REPORT.with_suffix("")])

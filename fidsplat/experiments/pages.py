@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,8 @@ def fill_template(page: Path, folder: Path, template: str, context: Mapping[str,
         finalize=_inserted,
     )
     environment.filters |= {"table": markdown_table, "number": number, "listed": listed}
-    prefix = "" if folder == page.parent else f"{folder.name}/"
+    prefix = os.path.relpath(folder, page.parent).replace(os.sep, "/") + "/"
+    prefix = "" if prefix == "./" else prefix
     return environment.get_template(template).render(**context, folder=prefix)
 
 

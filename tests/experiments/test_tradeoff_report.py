@@ -209,13 +209,16 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
     # a page with a generated block keeps the rest
     other = tmp_path / "docs" / "block.md"
     other.write_text("# Ours\n<!-- begin generated -->\nold\n<!-- end generated -->\nmore\n")
-    (tmp_path / "docs" / "block").mkdir()
-    write_accuracy([tmp_path / "cpu"], other)
+    (tmp_path / "devlog" / "block").mkdir(parents=True)
+    block = tmp_path / "devlog" / "block.md"
+    write_accuracy([tmp_path / "cpu"], other, block)
     kept = other.read_text()
     assert kept.startswith("# Ours\n<!-- begin generated -->\n- **A processor**")
     assert kept.endswith("<!-- end generated -->\nmore\n")
     assert "old" not in kept.split()
-    assert "## Method" in (tmp_path / "docs" / "block" / "report.md").read_text()
+    assert "](../devlog/block/cpu.svg)" in kept
+    assert "## Method" in block.read_text()
+    assert "](block/cpu.svg)" in block.read_text()
 
     # the page can be made again from its own tables, and these are small
     before = {file: file.read_bytes() for file in (tmp_path / "docs").rglob("*.*")}
