@@ -17,6 +17,8 @@ BLOCK = 256
 """default threads per block on a GPU"""
 _MIN_PIECE = 2048
 """minimum threads of a piece of a CPU launch, below which the call costs more than it saves"""
+_MIN_TILES = 4
+"""minimum tiles of a piece, for the same reason"""
 
 
 @cache
@@ -93,7 +95,7 @@ class Launcher:
         """Launch a CPU thread per tile; the kernel's first parameter is the first tile of a piece, its last
         the offset of the piece's `area` samples of state.
         """
-        pieces = min(self.pieces, end - first)
+        pieces = min(self.pieces, -(-(end - first) // _MIN_TILES))
         cuts = [first + (end - first) * k // pieces for k in range(pieces + 1)]
         args = _arguments(kernel, {**given, "state_first": 0}, 1)[:-1]
         spans = enumerate(pairwise(cuts))

@@ -9,6 +9,8 @@ from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary, WeakSet
 
+import numpy as np
+
 from fidsplat.backends.warp.runtime import load
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.capture.environment import Panorama
@@ -22,6 +24,8 @@ class ArrayPool:
         self.device = device
         self._arrays: dict[tuple[str, Any], Any] = {}
         self._parts: dict[tuple[str, Any], Any] = {}
+        self._memory: dict[tuple[str, Any], tuple[Any, np.ndarray]] = {}
+        """parts of scratch arrays on the CPU, and their memory as NumPy arrays"""
         self._hosts: dict[str, Any] = {}
         self._spare: dict[str, list[Any]] = {}
         self.state = object()
@@ -36,6 +40,7 @@ class ArrayPool:
             if array is not None:
                 del self._arrays[name, dtype], array
                 self._parts.pop((name, dtype), None)
+                self._memory.pop((name, dtype), None)
                 self.state = object()
                 for holder in list(self.holders):
                     holder.release_arrays()
@@ -50,12 +55,21 @@ class ArrayPool:
             part = self._parts[name, dtype] = whole[:size]
         return part
 
-    def filled(self, name: str, values: Any, dtype: Any) -> Any:
+    def filled(self, name: str, values: np.ndarray, dtype: Any) -> Any:
         """A scratch array of the size of `values`, with these values of the host."""
         wp = load()
-        given = wp.array(values, dtype=dtype, device="cpu")
-        array = self.exact(name, given.size, dtype)
-        wp.copy(array, given)
+        if self.device.is_cuda:
+            given = wp.array(values, dtype=dtype, device="cpu")
+            array = self.exact(name, given.size, dtype)
+            wp.copy(array, given)
+            return array
+        per_element = 1 if values.dtype.names else wp.types.type_size(dtype)
+        array = self.exact(name, values.size // per_element, dtype)
+        known, memory = self._memory.get((name, dtype), (None, None))
+        if known is not array:  # to make the NumPy array takes longer than to fill it
+            memory = array.numpy()
+            self._memory[name, dtype] = array, memory
+        memory[...] = values.reshape(memory.shape)
         return array
 
     def host(self, name: str, size: int, dtype: Any) -> Any:
