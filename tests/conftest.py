@@ -1,6 +1,9 @@
 """Every device that can be opened here, the reference excepted: contract tests run on each."""
 
+import math
+
 import pytest
+from rich.progress import Progress
 from sampling import take_turns
 
 import fidsplat as fs
@@ -32,3 +35,19 @@ def renderer(request):
 @pytest.fixture(scope="session")
 def reference():
     return fs.Renderer("reference")
+
+
+@pytest.fixture(autouse=True)
+def progress_within_its_total(monkeypatch):
+    """Progress bars of commands stay between nothing and all."""
+    outside, update = [], Progress.update
+
+    def checked(bar, task_id, **changes):
+        update(bar, task_id, **changes)
+        task = bar._tasks[task_id]
+        if not 0 <= task.completed <= (math.inf if task.total is None else task.total * (1 + 1e-9)):
+            outside.append((task.description, task.completed, task.total))
+
+    monkeypatch.setattr(Progress, "update", checked)
+    yield
+    assert not outside
