@@ -8,7 +8,8 @@
     python tools/mutate.py --equivalent KEY 'reason'          mark a survivor that changes no behaviour
 
 Each result is a line of mutations.jsonl (the last line of a key holds), and a sample that was stopped resumes
-there. The operators work on tokens, so they are the same for Python, Warp kernels and OpenCL C.
+there if the tree is the same. The operators work on tokens, so they are the same for Python, Warp kernels and
+OpenCL C.
 """
 
 from __future__ import annotations
@@ -211,16 +212,18 @@ def _is_python(mutation: Mutation) -> bool:
     return False
 
 
-def tests_for(mutation: Mutation) -> list[str]:
+def tests_for(mutation: Mutation, root: Path) -> list[str]:
     """Arguments of pytest: the test files most specific to the mutated place, the most specific first.
+
+    root: the tree whose tests run, which may be older than the working tree.
 
     Similarity of word counts, weighted by how few test files contain a word. The words near the mutation, in
     the file's name and in its public names count more; an import of the mutated module doubles it.
     """
-    path, source = mutation.path, (ROOT / mutation.path).read_text("utf-8")
+    path, source = mutation.path, (root / mutation.path).read_text("utf-8")
     warp = path.startswith(("kernels/warp/", "fidsplat/backends/warp/"))
     tests = {
-        file.relative_to(ROOT).as_posix(): file.read_text("utf-8") for file in ROOT.glob("tests/*/test_*.py")
+        file.relative_to(root).as_posix(): file.read_text("utf-8") for file in root.glob("tests/*/test_*.py")
     }
     names = path.removesuffix(".py").split("/")
     imported = re.compile(
@@ -276,15 +279,17 @@ class Tree:
         while True:
             file.write_text(mutation.applied(text), "utf-8")
             try:
-                status, test, output = self._pytest([*tests_for(mutation), *broken])
+                status, test, output = self._pytest([*tests_for(mutation, self._folder), *broken])
             finally:
                 file.write_text(text, "utf-8")
             if mutation.path.startswith("kernels/") and INVALID.search(output):
                 return "invalid", test, ""
             if status == LIMIT:
                 return "limit", test, f"{self._limit} s of CPU time"
-            if status == 0 or not test:
-                return "survived", "", f"pytest ended with {status}" if status else ""
+            if status in (0, 5):  # 5: no test is left
+                return "survived", "", ""
+            if not test:
+                raise RuntimeError(f"pytest ended with {status}:\n{output[-2000:]}")
             if self._passes.setdefault(test, self._alone(test)):
                 how = "fails" if status > 0 else "hangs" if status == -signal.SIGPROF else f"signal {-status}"
                 return "caught", test, how
