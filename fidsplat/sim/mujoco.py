@@ -12,9 +12,9 @@ from fidsplat.cameras import Camera, Orthographic
 from fidsplat.capture.environment import ExternalDepth
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
-from fidsplat.sim.poses import quaternions_of
 from fidsplat.sim.rig import Rig, RigCamera, RigImages
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
 from fidsplat.util.errors import InputError, unknown
 
 try:
@@ -90,9 +90,12 @@ class MujocoRig(Rig):
         if not many:
             raise InputError("data must have at least one MjData, got an empty list")
         parts = [_arrays_of(each, *self._counts) for each in many]
-        position, turn, at, axes = (np.concatenate([part[k] for part in parts]) for k in range(4))
-        bodies = np.concatenate([position, turn], -1)[:, self._body_ids]
-        cameras = np.concatenate([at, quaternions_of(axes, right=_OPENCV)], -1)[:, self._camera_ids]
+        position, rotation, at, axes = (np.concatenate([part[k] for part in parts]) for k in range(4))
+        bodies = np.concatenate([position, rotation], -1)[:, self._body_ids]
+        camera_rotation = quaternion_multiply(
+            matrices_to_quaternions(axes), np.broadcast_to(_OPENCV, (*axes.shape[:2], 4))
+        )
+        cameras = np.concatenate([at, camera_rotation], -1)[:, self._camera_ids]
         return bodies, cameras
 
     def render(  # type: ignore[override]

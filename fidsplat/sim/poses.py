@@ -80,27 +80,5 @@ def pose_of(matrix: np.ndarray) -> np.ndarray:
     return np.concatenate([matrix[:3, 3], matrix_to_quaternion(matrix[:3, :3])])
 
 
-def quaternions_of(rotations: np.ndarray, right: np.ndarray | None = None) -> np.ndarray:
-    """Unit quaternions (..., 4) of rotation matrices (..., 3, 3), multiplied from the right by `right` (4,).
-
-    The method is that of `matrix_to_quaternion`."""
-    entry = np.moveaxis(rotations, (-2, -1), (0, 1))
-    xx, yy, zz = entry[0, 0], entry[1, 1], entry[2, 2]
-    wx, wy, wz = entry[2, 1] - entry[1, 2], entry[0, 2] - entry[2, 0], entry[1, 0] - entry[0, 1]
-    xy, zx, yz = entry[0, 1] + entry[1, 0], entry[0, 2] + entry[2, 0], entry[1, 2] + entry[2, 1]
-    rows = [
-        [1 + xx + yy + zz, wx, wy, wz],
-        [wx, 1 + xx - yy - zz, xy, zx],
-        [wy, xy, 1 - xx + yy - zz, yz],
-        [wz, zx, yz, 1 - xx - yy + zz],
-    ]
-    outer = np.stack([np.stack(row, -1) for row in rows], -2)
-    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    row = np.take_along_axis(outer, largest[..., None, None], -2)[..., 0, :]
-    w, x, y, z = np.moveaxis(row, -1, 0)
-    unit = row / np.sqrt(w * w + x * x + y * y + z * z)[..., None]
-    return unit if right is None else quaternion_multiply(unit, np.broadcast_to(right, unit.shape))
-
-
 def _shown(array: np.ndarray, at: list[int]) -> str:
     return "(" + ", ".join(f"{number:g}" for number in array[tuple(at)].tolist()) + ")"

@@ -34,23 +34,38 @@ def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def matrix_to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion (4,) float64, w >= 0, of one rotation matrix (3, 3).
-
-    Normalises the row of 4 q q^T with the largest diagonal entry, whose norm is never small.
-    """
-    r = np.asarray(rotation, np.float64)
-    xx, yy, zz = r[0, 0], r[1, 1], r[2, 2]
-    outer = np.array(
-        [
-            [1 + xx + yy + zz, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], 1 + xx - yy - zz, r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 - xx + yy - zz, r[1, 2] + r[2, 1]],
-            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - xx - yy + zz],
-        ]
-    )
+    """Unit quaternion (4,) float64, w >= 0, of one rotation matrix (3, 3)."""
+    outer = _outer_product(np.asarray(rotation, np.float64))
     row = outer[np.argmax(np.diag(outer))]
     row = row / np.linalg.norm(row)
     return row if row[0] >= 0 else -row
+
+
+def matrices_to_quaternions(rotations: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4) float64 of rotation matrices (..., 3, 3); each is independent of the
+    others."""
+    outer = _outer_product(np.moveaxis(np.asarray(rotations, np.float64), (-2, -1), (0, 1)))
+    largest = np.argmax(outer[range(4), range(4)], axis=0)
+    rows = np.take_along_axis(outer, largest[None, None], 0)[0]
+    w, x, y, z = rows
+    return np.moveaxis(rows / np.sqrt(w * w + x * x + y * y + z * z), 0, -1)
+
+
+def _outer_product(r: np.ndarray) -> np.ndarray:
+    """4 q q^T (4, 4, ...) of rotation matrices (3, 3, ...). The row of its largest diagonal entry is a
+    multiple of q that is never small.
+    """
+    xx, yy, zz = r[0, 0], r[1, 1], r[2, 2]
+    wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, zx, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    return np.array(
+        [
+            [1 + xx + yy + zz, wx, wy, wz],
+            [wx, 1 + xx - yy - zz, xy, zx],
+            [wy, xy, 1 - xx + yy - zz, yz],
+            [wz, zx, yz, 1 - xx - yy + zz],
+        ]
+    )
 
 
 def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray, float, np.ndarray]:
@@ -68,7 +83,7 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{name} must have the last row (0, 0, 0, 1), got {tuple(m[3].tolist())}")
     linear = m[:3, :3]
-    with np.errstate(over="ignore"):  # an overflow is refused below
+    with np.errstate(over="ignore"):  # an overflow is rejected below
         scale = float(np.linalg.norm(linear)) / np.sqrt(3.0)
     if not scale > 0 or not np.isfinite(scale):
         raise InputError(f"{name} must be a rotation with a positive scale, but its scale is {scale:g}")
@@ -100,7 +115,7 @@ def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) 
     translation, rotation = real_array("position", position), real_array("quaternion", quaternion)
     if translation.shape != (3,) or not np.isfinite(translation).all():
         raise InputError(f"position must be three finite numbers, got {position!r}")
-    with np.errstate(over="ignore"):  # an overflow is refused below
+    with np.errstate(over="ignore"):  # an overflow is rejected below
         length = np.linalg.norm(rotation) if rotation.shape == (4,) else np.nan
     if not (0 < length < np.inf):
         raise InputError(

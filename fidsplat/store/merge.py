@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from fidsplat.splats.harmonics import C0
+from fidsplat.splats.rotations import matrices_to_quaternions
 from fidsplat.store.morton import BITS, Grid
 
 REDUCTION = 4
@@ -130,7 +131,7 @@ def _by_moments(
     rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
     opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
     copies = np.maximum(np.ceil(opacities / MAX_OPACITY), 1).astype(np.int64)
-    made = {"means": (base + middle).T, "quats": quaternions_of(rotations), "scales": sigma[:, :2]}
+    made = {"means": (base + middle).T, "quats": matrices_to_quaternions(rotations), "scales": sigma[:, :2]}
     made["opacities"] = opacities / copies
     for name in {"colors", "sh"} & set(splats):
         flat = splats[name].reshape(count, -1).T.astype(np.float64)
@@ -153,23 +154,3 @@ def _first_of_largest(weights: np.ndarray, starts: np.ndarray, lengths: np.ndarr
     largest = np.repeat(np.maximum.reduceat(weights, starts), lengths)
     places = np.where(weights == largest, np.arange(len(weights)), len(weights))
     return np.minimum.reduceat(places, starts)
-
-
-def quaternions_of(frames: np.ndarray) -> np.ndarray:
-    """(n, 4) float64 unit quaternions w x y z of rotations (n, 3, 3)."""
-    r = frames
-    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
-    a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
-    d, e, f = r[:, 1, 0] + r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 2, 1] + r[:, 1, 2]
-    rows = np.stack(
-        [
-            np.stack([1 + xx + yy + zz, a, b, c], 1),
-            np.stack([a, 1 + xx - yy - zz, d, e], 1),
-            np.stack([b, d, 1 - xx + yy - zz, f], 1),
-            np.stack([c, e, f, 1 - xx - yy + zz], 1),
-        ],
-        axis=1,
-    )
-    largest = np.argmax(np.diagonal(rows, axis1=1, axis2=2), axis=1)
-    chosen = rows[np.arange(len(rows)), largest]
-    return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.formats import load_ply
-from fidsplat.sim.poses import quaternions_of
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.rotations import matrices_to_quaternions
 from fidsplat.util.errors import InputError
 
 LEAF, STALK, TOMATO, CUCUMBER = (0.2, 0.46, 0.13), (0.38, 0.5, 0.2), (0.85, 0.13, 0.07), (0.16, 0.4, 0.1)
@@ -44,7 +44,11 @@ def disks(
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     frames = np.stack([first, np.cross(normal, first), normal], axis=2)
     return SplatCloud(
-        centers, quaternions_of(frames), sizes, np.full(len(centers), opacity), colors=np.clip(colors, 0, 1)
+        centers,
+        matrices_to_quaternions(frames),
+        sizes,
+        np.full(len(centers), opacity),
+        colors=np.clip(colors, 0, 1),
     )
 
 

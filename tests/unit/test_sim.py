@@ -6,8 +6,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.scenes import PlacedMarker
 from fidsplat.sim import Rig, RigCamera
-from fidsplat.sim.poses import compose, inverse, matrix_of, pose_of, quaternions_of
-from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.sim.poses import compose, inverse, matrix_of, pose_of
+from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision import read_back
 
 SIZE = 160, 120
@@ -53,15 +53,6 @@ def test_poses_compose_and_invert_as_matrices_do():
     np.testing.assert_allclose(matrix_of(compose(a, b)), matrix_of(a) @ matrix_of(b), atol=1e-15)
     np.testing.assert_allclose(matrix_of(inverse(a)), np.linalg.inv(matrix_of(a)), atol=1e-15)
     np.testing.assert_allclose(pose_of(matrix_of(a[0])), a[0], atol=1e-15)
-
-
-def test_quaternions_of_many_matrices_are_those_of_each():
-    q = RNG.normal(size=(50, 4))
-    turns = matrix_of(np.concatenate([np.zeros((50, 3)), q / np.linalg.norm(q, axis=1)[:, None]], 1))[
-        :, :3, :3
-    ]
-    for one, turn in zip(quaternions_of(turns), turns, strict=True):
-        assert np.abs(np.abs(one @ matrix_to_quaternion(turn)) - 1) < 1e-14
 
 
 def test_an_environment_is_bit_identical_in_any_batch(scene):

@@ -11,6 +11,7 @@ import fidsplat as fs
 from fidsplat.splats.cloud import sh_basis
 from fidsplat.splats.harmonics import rotation_of_coefficients
 from fidsplat.splats.rotations import (
+    matrices_to_quaternions,
     matrix_to_quaternion,
     quaternion_multiply,
     quaternion_to_matrix,
@@ -261,3 +262,13 @@ def test_rotating_coefficients_keeps_bands_apart_and_lengths(turn):
     dirs = np.random.default_rng(0).normal(size=(20, 3))
     dirs /= np.linalg.norm(dirs, axis=1, keepdims=True)
     np.testing.assert_allclose(sh_basis(3, dirs @ rotation.T) @ matrix, sh_basis(3, dirs), atol=1e-10)
+
+
+def test_quaternions_of_many_rotations_are_those_of_each():
+    quats = np.random.default_rng(0).normal(size=(4, 50, 4))
+    rotations = quaternion_to_matrix(quats)
+    found = matrices_to_quaternions(rotations)
+    np.testing.assert_allclose(quaternion_to_matrix(found), rotations, atol=1e-14)
+    for one, rotation in zip(found.reshape(-1, 4), rotations.reshape(-1, 3, 3), strict=True):
+        assert np.array_equal(matrices_to_quaternions(rotation), one)
+        assert np.abs(np.abs(one @ matrix_to_quaternion(rotation)) - 1) < 1e-14

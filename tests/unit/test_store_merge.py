@@ -6,7 +6,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.splats.harmonics import C0
 from fidsplat.splats.rotations import quaternion_to_matrix
-from fidsplat.store.merge import MAX_OPACITY, merged, quaternions_of
+from fidsplat.store.merge import MAX_OPACITY, merged
 from fidsplat.store.morton import Grid, grid_around
 
 
@@ -99,13 +99,6 @@ def test_bright_and_dark_splats_are_merged_separately():
         known = {float(value) for value in values.ravel()}
         assert {min(known, key=lambda k, v=v: abs(k - v)) for v in made[name].ravel()} == known
         assert np.abs(made[name].ravel()[:, None] - sorted(known)).min(axis=1).max() < 1e-6
-
-
-def test_quaternions_of_many_rotations():
-    quats = np.random.default_rng(0).normal(size=(200, 4))
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    again = quaternions_of(quaternion_to_matrix(quats))
-    assert np.abs((again * quats).sum(axis=1)) == pytest.approx(1)
 
 
 def test_codes_follow_the_bits_of_the_cells():
