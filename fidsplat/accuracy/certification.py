@@ -67,8 +67,9 @@ def certify(
     (times,) = measurement.times([quality])
     if ms is not None and times.late > ms:
         raise InputError(
-            f"an error that is certified to be at most {error:g} takes {times.late:.3g} ms a frame on "
-            f"{choice.device}, not {ms:g}; allow more of one of the two"
+            f"ms must be at least {times.late:.3g} on {choice.device} for a certified error of {error:g}, "
+            "got "
+            f"{ms:g}; allow more time or a larger error"
         )
     settings = {
         name: getattr(quality, name) for name, value in DEFAULTS.items() if getattr(quality, name) != value

@@ -213,7 +213,7 @@ def _search(search: CandidateSearch, error: float | None, ms: float | None) -> C
     found = search.fastest_within(error)
     if ms is not None and late_ms(found) > ms:
         raise InputError(
-            f"an error of {error:g} takes {late_ms(found):.3g} ms a frame on {search.device}, not "
+            f"ms must be at least {late_ms(found):.3g} on {search.device} for an error of {error:g}, got "
             f"{ms:g}; {_best_in(search, ms)}"
         )
     return found

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import as_float, invalid, own_scalars
+from fidsplat.util.arguments import as_float, invalid, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError
 
 RESPONSES = ("linear", "srgb")
@@ -50,36 +50,22 @@ class Sensor:
 
     def __post_init__(self) -> None:
         own_scalars(self)
-        if not (_is_number(self.full_well) and self.full_well >= 1):
-            raise InputError(
-                f"sensor: full_well must be a number of electrons, 1 or more, got {self.full_well!r}"
-            )
+        if not as_float(self.full_well) >= 1:
+            raise invalid("sensor: full_well", "a number of electrons, 1 or more", self.full_well)
         for name, highest in (("exposure", LARGEST), ("gain", LARGEST), ("read_noise", self.full_well)):
-            value = getattr(self, name)
-            if not (_is_number(value) and 0 <= value <= highest and value < math.inf):
-                raise InputError(
-                    f"sensor: {name} must be a number of at least 0, at most {highest:g}, got {value!r}"
-                )
+            number(f"sensor: {name}", getattr(self, name), f"a number from 0 to {highest:g}", 0, highest)
         if self.read_noise > 0 and math.isinf(self.full_well):
-            raise InputError(
-                f"sensor: full_well must be given with read_noise, got read_noise={self.read_noise!r} only"
-            )
-        if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and 0 <= self.seed < 2**32):
-            raise InputError(f"sensor: seed must be a whole number from 0 to 2^32 - 1, got {self.seed!r}")
-        if self.bits is not None and not (isinstance(self.bits, int) and self.bits in BITS):
-            raise InputError(f"sensor: bits must be 8, 16 or None, got {self.bits!r}")
+            raise InputError(f"sensor: full_well must be given with read_noise, got {self.read_noise!r} only")
+        whole_number("sensor: seed", self.seed, 0, 2**32 - 1)
+        if self.bits is not None and (not isinstance(self.bits, int) or self.bits not in BITS):
+            raise invalid("sensor: bits", "8, 16 or None", self.bits)
         object.__setattr__(self, "vignetting", _numbers("vignetting", self.vignetting, 0, 3))
         if isinstance(self.response, str):
             if self.response not in RESPONSES:
-                raise InputError(
-                    f"sensor: response must be {', '.join(RESPONSES)}, a gamma above 0, or a table, got "
-                    f"{self.response!r}"
-                )
-        elif _is_number(self.response):
-            if not GAMMAS[0] <= self.response <= GAMMAS[1]:  # type: ignore[operator]
-                raise InputError(
-                    f"sensor: a gamma must be from {GAMMAS[0]:g} to {GAMMAS[1]:g}, got {self.response!r}"
-                )
+                requirement = f"{', '.join(RESPONSES)}, a gamma above 0, or a table"
+                raise invalid("sensor: response", requirement, self.response)
+        elif not math.isnan(as_float(self.response)):
+            number("sensor: a gamma", self.response, "from {:g} to {:g}".format(*GAMMAS), *GAMMAS)
         else:
             object.__setattr__(self, "response", _numbers("response", self.response, 2, 65536))
 
@@ -127,10 +113,6 @@ class Sensor:
         return {name: value for name, value in pairs if value != getattr(default, name)}
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not math.isnan(as_float(value))
-
-
 def _numbers(name: str, values: Any, lowest: int, highest: int) -> tuple[float, ...]:
     try:
         numbers = tuple(map(as_float, values))
@@ -139,7 +121,7 @@ def _numbers(name: str, values: Any, lowest: int, highest: int) -> tuple[float, 
     if (
         numbers is None
         or not lowest <= len(numbers) <= highest
-        or not all(abs(number) <= LARGEST for number in numbers)
+        or not all(abs(value) <= LARGEST for value in numbers)
     ):
         raise invalid(f"sensor: {name}", f"{lowest} to {highest} finite numbers up to {LARGEST:g}", values)
     return numbers

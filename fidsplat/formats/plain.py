@@ -25,8 +25,8 @@ def refuse_boxes(cloud: SplatCloud, what: str) -> None:
     """Raise InputError for boxes, which no file format can store."""
     if cloud.boxes is not None:
         raise InputError(
-            f"{int(cloud.boxes.sum())} of {len(cloud)} splats are boxes, which {what} cannot hold; write the "
-            "marker's Gaussians instead (Marker.gaussians), or make it with mixture='fitted'"
+            f"splats in {what} must be Gaussians, got {int(cloud.boxes.sum())} boxes of {len(cloud)}; write "
+            "Marker.gaussians, or make the marker with mixture='fitted'"
         )
 
 

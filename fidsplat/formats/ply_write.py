@@ -5,6 +5,7 @@ import os
 import numpy as np
 
 from fidsplat.formats.collect import PADDED_LOG_SCALE
+from fidsplat.formats.plain import refuse_boxes
 from fidsplat.formats.ply import ORIGIN_COMMENT
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
@@ -31,15 +32,12 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
         raise InputError(f"cloud must be a SplatCloud, got a {type(cloud).__name__}")
     if not isinstance(native_2dgs, bool):
         raise InputError(f"native_2dgs must be True or False, got {native_2dgs!r}")
-    if cloud.boxes is not None:
-        raise InputError(
-            f"{int(cloud.boxes.sum())} of {len(cloud)} splats are boxes, which a PLY file cannot hold; write "
-            "the marker's Gaussians instead (Marker.gaussians), or make it with mixture='fitted'"
-        )
+    refuse_boxes(cloud, "a PLY file")
     if native_2dgs and cloud.thickness is not None:
         raise InputError(
-            f"{int((cloud.thickness > 0).sum())} of {len(cloud)} splats are 3D Gaussians, which two scales "
-            "cannot hold; write three, or the cloud's flattened()"
+            "splats must be disks for native_2dgs, got "
+            f"{int((cloud.thickness > 0).sum())} 3D Gaussians of {len(cloud)}; use native_2dgs=False, or "
+            "flatten them by cloud.flattened()"
         )
     rest = 0 if cloud.sh is None else 3 * (cloud.sh.shape[1] - 1)
     names = [

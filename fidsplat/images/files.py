@@ -37,9 +37,9 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
 
     Raises InputError when the file is missing, is not an image that OpenCV reads, or has other pixels.
     """
-    image = _decode(path, cv2.IMREAD_COLOR | (cv2.IMREAD_ANYDEPTH if deep else 0))
+    image = _read(path, cv2.IMREAD_COLOR | (cv2.IMREAD_ANYDEPTH if deep else 0))
     if image.dtype not in (np.uint8, np.uint16, np.float32):
-        raise InputError(f"{path} holds {image.dtype} pixels; give 8 or 16 bits, or floats of 32")
+        raise InputError(f"the pixels of {path} must be of 8 or 16 bits, or floats of 32, got {image.dtype}")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -49,15 +49,12 @@ def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
     The EXIF orientation is ignored; 16 bits are cut to 8.
     Raises InputError when the file is missing, or is not an image of 8 or 16 bits.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _read(path, cv2.IMREAD_UNCHANGED)
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path} holds {image.dtype} pixels; give 8 or 16 bits")
+        raise InputError(f"the pixels of {path} must be of 8 or 16 bits, got {image.dtype}")
     if image.dtype == np.uint16:
         image = (image >> 8).astype(np.uint8)
-    channels = 1 if image.ndim == 2 else image.shape[2]
-    if channels == 4:
-        return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
-    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA if channels == 1 else cv2.COLOR_BGR2RGBA)
+    return _to_rgba(image, path)
 
 
 def read_on_background(path: str | os.PathLike[str], background: Sequence[float]) -> np.ndarray:
@@ -129,15 +126,17 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
 
     Raises InputError when the file cannot be read or has colours or more grey levels.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _read(path, cv2.IMREAD_UNCHANGED)
     if image.size > MAX_BITS:
         raise InputError(
-            f"{path} has {image.shape[1]} x {image.shape[0]} pixels; a marker image has one for each module"
+            f"a marker image must have one pixel for each module, got {image.shape[1]} x {image.shape[0]} "
+            "pixels in "
+            f"{path}"
         )
     if image.ndim == 2:
         image = image[:, :, None]
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path} holds {image.dtype} pixels; a marker image must be a one-bit or 8-bit PNG")
+        raise InputError(f"a marker image must be a one-bit or 8-bit PNG, got {image.dtype} pixels in {path}")
     top = np.iinfo(image.dtype).max
     colours, alpha = image, None
     if image.shape[2] == 4:
@@ -146,11 +145,12 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
     grey = colours[:, :, 0]
     levels = np.unique(grey)
     if (colours != grey[:, :, None]).any():
-        raise InputError(f"{path} has colours; a marker image must be black and white: threshold it first")
+        raise InputError(f"a marker image must be black and white, got colours in {path}; threshold it first")
     if len(levels) > 2:
         raise InputError(
-            f"{path} has {len(levels)} grey levels; a marker image must have two, one pixel a module: "
-            "threshold it first and do not smooth it"
+            f"a marker image must have at most two grey levels, got {len(levels)} in {path}; use one pixel "
+            "for "
+            "each module, and threshold it without smoothing"
         )
     dark = levels[0] if len(levels) == 2 or levels[0] <= top // 2 else None
     return (grey == dark).astype(np.uint8) if dark is not None else np.zeros(grey.shape, np.uint8)
@@ -245,9 +245,9 @@ def encoded(image: np.ndarray, kind: str, quality: int = 95) -> bytes:
     return data.tobytes()
 
 
-def declared_pixels(data: bytes | np.ndarray) -> int:
+def declared_pixels(data: bytes) -> int:
     """Pixels of a PNG, WebP (RFC 9649), JPEG, BMP or TIFF image by its header; 0 for another file."""
-    head = bytes(data[:32])
+    head = data[:32]
     body = head[20:30]
     if head[:8] == b"\x89PNG\r\n\x1a\n":
         return int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big")
@@ -267,20 +267,20 @@ def declared_pixels(data: bytes | np.ndarray) -> int:
     return _tiff_pixels(data) if head[:4] in (b"II*\0", b"MM\0*") else 0
 
 
-def _jpeg_pixels(data: bytes | np.ndarray) -> int:
+def _jpeg_pixels(data: bytes) -> int:
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
-        kind, size = int(data[at + 1]), int.from_bytes(bytes(data[at + 2 : at + 4]), "big")
+        kind, size = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):  # a frame's header
-            height, width = (int.from_bytes(bytes(data[at + k : at + k + 2]), "big") for k in (5, 7))
+            height, width = (int.from_bytes(data[at + k : at + k + 2], "big") for k in (5, 7))
             return height * width
         at += 1 if kind == 0xFF else 2 + size
     return 0
 
 
-def _tiff_pixels(data: bytes | np.ndarray) -> int:
+def _tiff_pixels(data: bytes) -> int:
     def number(at: int, size: int) -> int:
-        return int.from_bytes(bytes(data[at : at + size]), "little" if data[0] == 0x49 else "big")
+        return int.from_bytes(data[at : at + size], "little" if data[0] == 0x49 else "big")
 
     first = number(4, 4)
     sides = {}
@@ -289,16 +289,16 @@ def _tiff_pixels(data: bytes | np.ndarray) -> int:
     return sides.get(256, 0) * sides.get(257, 0)
 
 
-def _check_size(data: bytes | np.ndarray, name: str | os.PathLike[str]) -> None:
+def _check_size(data: bytes, name: str | os.PathLike[str]) -> None:
     """Raise InputError for an image that declares more pixels than `input_limit` allows, or for a PNG with a
     chunk longer than the file, for which libpng would allocate memory."""
-    at, png = 8, bytes(data[:8]) == b"\x89PNG\r\n\x1a\n"
-    while png and at + 8 <= len(data) and bytes(data[at + 4 : at + 8]) != b"IEND":
-        length = int.from_bytes(bytes(data[at : at + 4]), "big")
+    at, png = 8, data[:8] == b"\x89PNG\r\n\x1a\n"
+    while png and at + 8 <= len(data) and data[at + 4 : at + 8] != b"IEND":
+        length = int.from_bytes(data[at : at + 4], "big")
         if length > len(data):
             raise InputError(
                 f"cannot read {name}: a PNG must have chunks within its {len(data):,} "
-                f"bytes, got one of {length:,}; give a whole PNG file"
+                f"bytes, got one of {length:,}; give a complete PNG file"
             )
         at += 12 + length
     pixels = declared_pixels(data)
@@ -308,10 +308,7 @@ def _check_size(data: bytes | np.ndarray, name: str | os.PathLike[str]) -> None:
 def decoded(content: bytes) -> np.ndarray:
     """Decode a file's content to (h, w, 3) uint8 RGB. Raises InputError for content that is not an image or
     exceeds `input_limit`."""
-    _check_size(content, "a compressed image")
-    image = None
-    with _silent_opencv(), contextlib.suppress(cv2.error):
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
+    image = _decode(content, "a compressed image", cv2.IMREAD_COLOR)
     if image is None:
         raise InputError("cannot decode a compressed image; it must be a JPEG or PNG")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
@@ -323,26 +320,34 @@ def rgba_pixels(data: bytes, name: str) -> np.ndarray:
     name: the file's name in errors. Raises InputError for content that is not an image of 8 bits or exceeds
     `input_limit`.
     """
-    _check_size(data, name)
-    image = None
-    with _silent_opencv(), contextlib.suppress(cv2.error):
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    image = _decode(data, name, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8:
         raise InputError(f"{name} cannot be read as an image of 8 bits")
-    kinds = {2: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
-    return cv2.cvtColor(image, kinds[2 if image.ndim == 2 else image.shape[2]])
+    return _to_rgba(image, name)
 
 
-def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
-    data = np.frombuffer(read_input(path), np.uint8)
-    _check_size(data, path)
-    image = None
-    # OpenCV raises when there are more pixels than its limit
-    with _silent_opencv(), contextlib.suppress(cv2.error):
-        image = cv2.imdecode(data, flags) if data.size else None
+def _to_rgba(image: np.ndarray, name: str | os.PathLike[str]) -> np.ndarray:
+    """Convert a decoded image, grey, BGR or BGRA, to RGBA."""
+    conversions = {1: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    if channels not in conversions:
+        raise InputError(f"{name} must have 1, 3 or 4 channels, got {channels}; convert it to RGB or RGBA")
+    return cv2.cvtColor(image, conversions[channels])
+
+
+def _read(path: str | os.PathLike[str], flags: int) -> np.ndarray:
+    image = _decode(read_input(path), path, flags)
     if image is None:
-        raise InputError(f"{path} is not an image that can be read; give a PNG, JPEG, BMP, TIFF or WebP file")
+        raise InputError(f"cannot read {path} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
     return image
+
+
+def _decode(data: bytes, name: str | os.PathLike[str], flags: int) -> np.ndarray | None:
+    """Decode an image; None if OpenCV cannot. Raises InputError for an image that is too large."""
+    _check_size(data, name)
+    with _silent_opencv(), contextlib.suppress(cv2.error):  # OpenCV raises above its own limit of pixels
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    return None
 
 
 @contextlib.contextmanager

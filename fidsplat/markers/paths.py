@@ -36,7 +36,7 @@ def polygon_rings(points: str) -> Rings:
     """Ring of a polygon's `points`. Raises ValueError for an odd number of coordinates."""
     numbers = [number(text) for _, text in _TOKEN.findall(points)]
     if len(numbers) % 2:
-        raise ValueError("an odd number of coordinates")
+        raise ValueError("coordinates must be pairs, got an odd number")
     return [np.array(numbers).reshape(-1, 2)] if len(numbers) >= 6 else []
 
 
@@ -112,7 +112,7 @@ def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
         in_flag = command in ("A", "a") and len(numbers) % 7 in (3, 4)
         found = (_FLAG if in_flag else _TOKEN).match(text, place)
         if found is None and place < len(text):
-            raise ValueError(f"{text[place : place + 10].split()[0]!r} in a path")
+            raise ValueError(f"a path must not have {text[place : place + 10].split()[0]!r}")
         letter, digits = ("Z", "") if found is None else found.groups(default="")
         place = len(text) + 1 if found is None else _skip(text, found.end())
         if not letter:
@@ -121,14 +121,14 @@ def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
         if command:
             size = _NUMBERS[command.upper()]
             if (len(numbers) % size if size else numbers) or (size and not numbers):
-                raise ValueError(f"{command} with {len(numbers)} numbers")
+                raise ValueError(f"{command} must not have {len(numbers)} numbers")
             if not size:
                 yield command, np.zeros(0)
             for i in range(0, len(numbers), size or 1):
                 yield command, np.array(numbers[i : i + size])
                 command = "L" if command == "M" else "l" if command == "m" else command
         elif numbers:
-            raise ValueError("numbers before a command")
+            raise ValueError("numbers of a path must follow a command")
         command, numbers = letter, []
 
 

@@ -180,7 +180,7 @@ def _shifted(shift: np.ndarray) -> FrameSpec:
 @case("B5", "far from the world origin", "camera and cloud at (5e5, 4.5e6, 300) m")
 def b5(renderer: Renderer) -> Found:
     yield _shifted(SHIFT)
-    # float64 means without an origin get one
+    # float64 means without an origin are made relative to one
     near = _shifted(np.zeros(3)).cloud
     means = near.world_means() + SHIFT
     cloud = SplatCloud(means, near.quats, near.scales, near.opacities, colors=near.colors, labels=near.labels)

@@ -260,7 +260,7 @@ def _keys_and_order(renderer: Renderer, spec: FrameSpec) -> tuple[int, int]:
         visible = np.flatnonzero(keys != CULLED)
         bits = keys[visible]
         decoded = np.where(bits & 0x80000000, bits & 0x7FFFFFFF, ~bits).view(np.float32)
-    else:  # the reference stores depths
+    else:  # the reference backend has depths instead of sort keys
         visible = np.sort(traced["order"])
         decoded = keys[visible]
     off = np.abs(decoded - depth[visible]) > 2 * np.spacing(np.abs(depth[visible]).astype(np.float32))

@@ -171,7 +171,7 @@ class Rig:
         for marker in self.scene.markers:
             name = self.labels.get(marker.label)
             if name is not None and name not in bodies:
-                raise invalid("bodies", f"poses of all bodies, {name!r} among them", sorted(bodies))
+                raise invalid("bodies", f"poses of all bodies, with {name!r}", sorted(bodies))
             if name is not None:
                 pose = compose(bodies[name], self._rest.get(name, IDENTITY))
                 marker = replace(marker, pose=matrix_of(pose) @ marker.pose)
@@ -234,7 +234,7 @@ class Rig:
 class RigImages(Mapping):
     """Images of a rig's cameras: a mapping from an output's name to (env, camera, h, w[, c]).
 
-    `of(camera)` gives one camera's, (env, h, w[, c]), also where cameras have different sizes.
+    `of(camera)` returns those of one camera, (env, h, w[, c]), also if cameras have different sizes.
     """
 
     def __init__(

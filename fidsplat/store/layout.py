@@ -169,7 +169,7 @@ def _check(header: Header) -> None:
     types = _TYPES | {"colors" if header.sh_degree < 0 else "sh": ("<f2", "<f4")}
     for name, kind in header.columns.items():
         if kind not in types.get(name, ()):
-            raise ValueError(f"the column {name} of the type {kind}")
+            raise ValueError(f"the column {name} must not have the type {kind}")
     # all but three columns are in every store
     if missing := types.keys() - {"labels", "coplanar_groups", "thickness"} - header.columns.keys():
         raise ValueError(f"no column {min(missing)}")

@@ -105,7 +105,7 @@ class Residency:
 
     def _data(self, selection: Selection, first_id: int = 0) -> ResidentData:
         if self._current is None or self._current[:2] != (selection, first_id):
-            self._current = None  # released first, so that both need not fit
+            self._current = None  # released before the upload, so that the device need not hold both
             self._current = selection, first_id, self._uploaded(selection, first_id)
         return self._current[-1]
 

@@ -103,8 +103,8 @@ def load_checkpoint(
         device: title of the device that renders from now on.
 
     Returns:
-        the progress of the run; and which device and sources made it, where they are others: "another device
-        (PoCL, not H100)".
+        the progress of the run, and descriptions of a different device or sources that made the checkpoint:
+        "another device (PoCL, not H100)".
 
     Raises InputError for a file that is damaged or of another run; the message names the difference.
     """

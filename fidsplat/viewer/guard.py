@@ -77,7 +77,7 @@ def guarded(make: Callable[[], Any], listens: str) -> Any:
     """
     from websockets.asyncio import server
 
-    policy()  # before anything listens
+    policy()  # fails before the server listens
     with _LOCK:
         serve, started = server.serve, []
 

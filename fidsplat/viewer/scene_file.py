@@ -74,7 +74,7 @@ class SceneFile:
                 f"{self.path} was edited by another program; it is loaded again, and nothing was written"
             )
         text = with_pose(self.text, number, pose, str(self.path), kind)
-        with atomic_write(self.path.resolve()) as stream:  # a link stays a link
+        with atomic_write(self.path.resolve()) as stream:  # preserves symbolic links
             stream.write(text.encode("utf-8"))
         self.text = self._last_read = text
 

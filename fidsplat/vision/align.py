@@ -123,8 +123,9 @@ class _Model:
 
     def __init__(self, bits: np.ndarray, shape: tuple[int, ...], module: float) -> None:
         self.shape = shape
-        # The pattern has as many samples that OpenCV's linear ramp between two of them is as wide as the step
-        # between the samples of a pixel: the model then moves continuously with an edge along the rows.
+        # OpenCV interpolates linearly between the k samples of a module. With this k the ramp at an edge is
+        # as wide as the distance between the samples of a pixel, so that the model changes continuously with
+        # the position of an edge along the rows.
         k = int(np.clip(np.ceil(_POINTS * module), 1, _LARGEST_MODULE))
         self.pattern = np.kron(1 - np.pad(bits, _QUIET), np.ones((k, k))).astype(np.float32)
         n = bits.shape[0]
@@ -163,7 +164,7 @@ class _Model:
 
 
 def _step(model: _Model, smooth: np.ndarray, homography: np.ndarray, blur: float, robust: bool):
-    """Gauss-Newton step (3, 3) X, which changes the homography to homography (I + X); None if it is
+    """Gauss-Newton step (3, 3) X, which changes the homography H to H (I + X); None if it is
     singular."""
     keep, (s, t) = model.inside(homography)
     if keep.size < 16:

@@ -30,11 +30,11 @@ size = 0.3
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"exposure": -1}, "exposure must be a number of at least 0"),
+        ({"exposure": -1}, r"sensor: exposure must be a number from 0 to 1e.15, got -1"),
         ({"gain": math.nan}, "gain must be .* got nan"),
         ({"full_well": 0.5}, "full_well must be a number of electrons, 1 or more"),
-        ({"full_well": 9, "read_noise": 10}, "read_noise must be .* at least 0, at most 9, got 10"),
-        ({"gain": 1e30}, r"gain must be a number of at least 0, at most"),
+        ({"full_well": 9, "read_noise": 10}, "sensor: read_noise must be a number from 0 to 9, got 10"),
+        ({"gain": 1e30}, r"sensor: gain must be a number from 0 to 1e.15, got 1e.30"),
         ({"read_noise": 3}, "full_well must be given with read_noise"),
         ({"seed": 1.5}, "seed must be a whole number"),
         ({"seed": 2**32}, "seed must be .* got 4294967296"),

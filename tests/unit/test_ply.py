@@ -278,7 +278,9 @@ def test_ellipsoids_and_disks_come_back_together(tmp_path):
 
 
 def test_two_scales_cannot_hold_an_ellipsoid(tmp_path):
-    with pytest.raises(fs.InputError, match=r"4 of 4 splats are 3D Gaussians.*flattened"):
+    with pytest.raises(
+        fs.InputError, match=r"splats must be disks for native_2dgs, got 4 3D Gaussians of 4; use"
+    ):
         fs.save_ply(thick_cloud(4), tmp_path / "a.ply", native_2dgs=True)
     fs.save_ply(thick_cloud(4).flattened(), tmp_path / "a.ply", native_2dgs=True)
     assert fs.load_ply(tmp_path / "a.ply").thickness is None

@@ -132,7 +132,7 @@ def test_a_choice_is_refined_until_certified(renderer):
     assert again.quality == choice.quality
     with pytest.raises(InputError, match=r"error must be at least .* to be certified"):
         certify(choice, 1e-9, None, scene, scene.capture, renderer)
-    with pytest.raises(InputError, match=r"takes .* ms a frame"):
+    with pytest.raises(InputError, match=r"ms must be at least .* for a certified error of 0.001, got"):
         certify(coarse(renderer), 1e-3, 1e-6, scene, scene.capture, renderer)
 
 
@@ -302,7 +302,9 @@ def test_the_most_accurate_in_time(renderer, scene, clock):
 def test_error_and_time_together(renderer, scene, clock):
     choice = within(renderer, scene, 1e-2, 100)
     assert choice.error <= 1e-2
-    with pytest.raises(InputError, match=r"an error of 0\.0001 takes \d+.*; the lowest error in that"):
+    with pytest.raises(
+        InputError, match=r"ms must be at least .* for an error of 0.0001, got .*; the lowest error in that"
+    ):
         within(renderer, scene, 1e-4, 25)
 
 
@@ -328,7 +330,9 @@ def test_nine_frames_of_ten_keep_a_time():
     assert known.most_accurate_in(10.0).error == 1e-4
     measured = import_module("fidsplat.accuracy.quality_within")._search
     assert measured(known, 1e-3, 10.0).error == 1e-4
-    with pytest.raises(InputError, match=r"takes 9 ms a frame on known, not 5; the lowest error .* 0\.01"):
+    with pytest.raises(
+        InputError, match=r"ms must be at least 9 on known .*, got 5; the lowest error .* 0\.01"
+    ):
         measured(known, 1e-3, 5.0)
 
 
