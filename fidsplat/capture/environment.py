@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import LARGEST, PickledByFields, as_float, invalid, own_scalars
+from fidsplat.util.arguments import LARGEST, PickledByFields, array_of, as_float, invalid, own_scalars
 from fidsplat.util.errors import InputError
 
 MAX_PANORAMA = 16384
@@ -72,14 +72,9 @@ class Panorama(PickledByFields):
     """its file"""
 
     def __post_init__(self) -> None:
-        try:
-            given: np.ndarray = np.asarray(self.image)
-        except ValueError:  # rows of different lengths
-            given = np.empty(0)
-        if given.ndim != 3 or given.shape[2] != 3 or given.dtype.kind not in "fiu":
-            raise InputError(
-                f"background: a panorama must be (h, w, 3) numbers, got {given.shape} {given.dtype}"
-            )
+        given = array_of("background: a panorama", self.image, "(h, w, 3) numbers", "fiu")
+        if given.ndim != 3 or given.shape[2] != 3:
+            raise InputError(f"background: a panorama must be (h, w, 3) numbers, got {given.shape}")
         if not 2 <= min(given.shape[:2]) <= max(given.shape[:2]) <= MAX_PANORAMA:
             height, width = given.shape[:2]
             raise InputError(
@@ -119,7 +114,10 @@ class ExternalDepth(PickledByFields):
     """(h, w) int32, or one for all"""
 
     def __post_init__(self) -> None:
-        rgb, depth = (_array_of(name, getattr(self, name)) for name in ("rgb", "depth"))
+        rgb, depth, label = (
+            array_of(f"{name} of external_depth", getattr(self, name), "an array of numbers", "fiu")
+            for name in ("rgb", "depth", "label")
+        )
         if depth.ndim != 2 or rgb.shape != (*depth.shape, 3):
             raise InputError(
                 f"rgb and depth of external_depth must have shapes (h, w, 3) and (h, w), got {rgb.shape} and "
@@ -128,7 +126,6 @@ class ExternalDepth(PickledByFields):
         whole = 255 if rgb.dtype == np.uint8 else 1
         if not np.isfinite(rgb).all() or (depth < 0).any():
             raise InputError("external_depth must have finite colours and depths of at least 0")
-        label = _array_of("label", self.label)
         if label.dtype.kind not in "iu" or label.shape not in ((), depth.shape):
             raise InputError(f"label of external_depth must be integers {depth.shape}, or one for all")
         here = np.isfinite(depth) & (depth > 0)
@@ -141,16 +138,6 @@ class ExternalDepth(PickledByFields):
             array = array.copy() if array is getattr(self, name) else array
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-
-
-def _array_of(name: str, value: Any) -> np.ndarray:
-    try:
-        array: np.ndarray = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, object)
-    if array.dtype.kind not in "fiu":
-        raise InputError(f"{name} of external_depth must be an array of numbers, got {value!r}")
-    return array
 
 
 Background = tuple[float, float, float] | Gradient | Panorama

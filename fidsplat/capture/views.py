@@ -11,7 +11,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Motion
 from fidsplat.capture.capture import Capture
 from fidsplat.splats.rotations import quaternion_to_matrix
-from fidsplat.util.arguments import LARGEST, real_array
+from fidsplat.util.arguments import LARGEST, array_of, real_array
 from fidsplat.util.errors import InputError
 
 
@@ -120,9 +120,11 @@ def views_of(captures: Iterable[Capture], poses: Any = None, groups: Any = None,
             raise InputError(f"keys of groups must be integer labels, got {label!r}")
     given = {int(label): pose_matrices(f"groups[{label}]", each) for label, each in (groups or {}).items()}
     if mask is not None:
-        mask = _mask(mask)
-    turned = None if poses is None else pose_matrices("poses", poses)
-    views = Views(tuple(captures), turned, given or None, mask)
+        mask = array_of("mask", mask, "(views,) bools", "b")
+        if mask.ndim != 1:
+            raise InputError(f"mask must be (views,) bools, got the shape {mask.shape}")
+    matrices = None if poses is None else pose_matrices("poses", poses)
+    views = Views(tuple(captures), matrices, given or None, mask)
     views.refuse_other_sizes()
     return views
 
@@ -153,16 +155,6 @@ def pose_matrices(name: str, poses: Any) -> np.ndarray:
     matrices[:, :3, 3] = given[:, :3]
     matrices[:, 3, 3] = 1
     return matrices
-
-
-def _mask(given: Any) -> np.ndarray:
-    try:
-        mask = np.asarray(given)
-    except ValueError:  # rows of different lengths
-        mask = np.empty(0, object)
-    if mask.dtype != bool or mask.ndim != 1:
-        raise InputError(f"mask must be (views,) bools, got shape {mask.shape} and type {mask.dtype}")
-    return mask
 
 
 def _constant(pose: np.ndarray):

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fidsplat.util.arguments import array_of
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, path_of, read_input, utf8_path
 from fidsplat.util.limits import check_expansion
@@ -158,13 +159,7 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
 
 def pixels_of(image: np.ndarray) -> np.ndarray:
     """Convert an image to an array. Raises InputError for anything but real numbers."""
-    try:
-        array = np.asarray(image)
-    except ValueError:  # rows that differ in length
-        array = np.empty(0, object)
-    if array.dtype.kind not in "fiub":
-        raise InputError(f"an image must have rows of real numbers, got {array.dtype}")
-    return array
+    return array_of("an image", image, "rows of real numbers")
 
 
 _BLOCK = 1 << 14

@@ -143,7 +143,6 @@ class Rig:
         count = _environments(given, views)
         poses = {name: self._mounted_pose(name, given, count) for name in self.cameras} | views
         names = None if outputs is None else output_names(outputs)
-        active = _mask_of(mask, count)
         external = {name: () for name in self.cameras} | self._external_of(external_depths, count)
         groups = {
             label: compose(given[name], self._rest[name]) if name in self._rest else given[name]
@@ -151,7 +150,7 @@ class Rig:
         }
         batches = {
             name: self._render_camera(
-                self._captures_of(name, names, external[name], count), poses[name], groups, active
+                self._captures_of(name, names, external[name], count), poses[name], groups, mask
             )
             for name in self.cameras
         }
@@ -225,7 +224,7 @@ class Rig:
         captures: list[Capture],
         poses: np.ndarray,
         groups: dict[int, np.ndarray],
-        mask: np.ndarray | None,
+        mask: Any,
     ) -> FrameBatch:
         taken = captures[0] if len(captures) == 1 else captures
         return self.renderer.render_batch(self._cloud, taken, poses=poses, groups=groups, mask=mask)
@@ -382,15 +381,3 @@ def _environments(bodies: Mapping[str, np.ndarray], cameras: Mapping[str, np.nda
                 f"the {name} must have poses of {count} environments like the {first}, got {other}"
             )
     return count
-
-
-def _mask_of(mask: Any, count: int) -> np.ndarray | None:
-    if mask is None:
-        return None
-    try:
-        array = np.asarray(mask)
-    except ValueError:  # rows that differ in length
-        array = np.empty(0, object)
-    if array.dtype != bool or array.shape != (count,):
-        raise invalid("mask", f"({count},) bool, one for each environment", mask)
-    return array

@@ -145,12 +145,17 @@ def own_scalars(data: Any) -> None:
             object.__setattr__(data, field.name, value.item())
 
 
-def real_array(what: str, value: Any, requirement: str = "an array of real numbers") -> np.ndarray:
-    """An array of real numbers, of any shape, as float64."""
+def array_of(what: str, value: Any, requirement: str, kinds: str = "fiub") -> np.ndarray:
+    """An array of any shape, without a copy if possible. kinds: allowed values of `dtype.kind`."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):  # for example rows of different lengths
-        array = np.empty(0, object)
-    if array.dtype.kind not in "fiub":
+        raise invalid(what, requirement, value) from None
+    if array.dtype.kind not in kinds:
         raise invalid(what, requirement, value)
-    return array.astype(np.float64)
+    return array
+
+
+def real_array(what: str, value: Any, requirement: str = "an array of real numbers") -> np.ndarray:
+    """An array of real numbers, of any shape, as float64."""
+    return array_of(what, value, requirement).astype(np.float64)
