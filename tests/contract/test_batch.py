@@ -206,10 +206,10 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"captures": []}, "captures is empty"),
+        ({"captures": []}, "at least one view, got an empty captures"),
         ({"captures": 5}, "captures is 5; it must be a list"),
         ({"captures": [CAMERA, "front"]}, "camera must be .* got 'front'"),
-        ({"captures": [CAMERA, fs.Camera.pinhole(51, 40, 9, 9, 9, 9)]}, "same size.* view 1 has 51 x 40"),
+        ({"captures": [CAMERA, fs.Camera.pinhole(51, 40, 9, 9, 9, 9)]}, "same size.* 51 x 40.* of view 1"),
         ({"captures": [CAMERA, fs.Capture(CAMERA, "alpha")]}, "same outputs"),
         (
             {"captures": [CAMERA, fs.Capture(CAMERA, sensor=fs.Sensor(gain=2.0))]},
@@ -217,7 +217,7 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
         ),
         ({"captures": CAMERAS, "poses": POSES[:2]}, "captures has 3, poses has 2"),
         ({"poses": POSES[:, :6]}, r"poses must have the shape \(views, 7\).* \(3, 6\)"),
-        ({"poses": np.zeros((0, 7))}, "poses is empty"),
+        ({"poses": np.zeros((0, 7))}, "at least one view, got an empty poses"),
         ({"poses": np.zeros((2, 7))}, r"poses\[0\] must be x y z, .* not all 0"),
         ({"poses": np.full((2, 7), np.nan)}, r"poses\[0\] must be x y z"),
         ({"groups": {9: POSES}}, "unknown label of splats '9'; known: 0, 1, 2"),

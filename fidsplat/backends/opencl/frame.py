@@ -30,12 +30,7 @@ def render(frame: DeviceFrame) -> None:
     """Submit all stages of a frame whose images are bound."""
     if frame.view.sub_frames:
         render_exposure(frame)
-    else:
-        render_pose(frame)
-
-
-def render_pose(frame: DeviceFrame) -> None:
-    """Submit all stages for one pose of the camera."""
+        return
     frame.discard_launches()
     allocate_samples(frame)
     if frame.plan.chunk:
@@ -179,7 +174,7 @@ def render_exposure(frame: DeviceFrame) -> None:
     for sub_frame in frame.view.sub_frames:
         part = frame.sub_frame(sub_frame.view)
         part.named |= surroundings
-        render_pose(part)
+        render(part)
         frame.events += part.events
         frame.stages += part.stages
         accumulate(frame, part, sub_frame)
