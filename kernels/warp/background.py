@@ -1,5 +1,5 @@
-"""What each sample sees behind everything, by the direction of its ray: a gradient, a panorama. (One colour
-is the same for all, and is left to resolving.)
+"""Background of each sample by the direction of its ray: a gradient or a panorama. A constant colour is added
+when samples are resolved.
 """
 
 from functools import cache

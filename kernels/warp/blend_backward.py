@@ -1,6 +1,7 @@
-"""Tiles taken back: each walks its list forward once more for the light in front of every CHUNK splats, then
-back, a chunk at a time, and leaves of each of its splats the sums over its samples in a slot of their own
-(fragment_backward.py has the formulae). No atomics: a sum has one order, and so the same bits on every run.
+"""Backward pass of blending. Each tile evaluates its list forward once more, for the transmittance in front
+of every CHUNK splats, then backward, a chunk at a time, and stores the sums over its samples for each of its
+splats at a place of their own (fragment_backward.py has the formulae). Without
+atomics a sum has one order, so results are bit-identical on every run.
 
 On a GPU a block of threads per tile, a sample per thread: fragments' sums are taken over a warp by shuffles,
 over the warps in shared memory. On a CPU a thread per tile that walks each splat's box within it.
@@ -81,7 +82,8 @@ _GATHER = """
 
 @cache
 def make_slots(screen: bool):
-    """The kernel that finds where each pair of a splat and a tile leaves its sums; screen: as make_bounds.
+    """The kernel that computes the place of the sums of each pair of a splat and a tile; screen: as
+    make_bounds.
 
     A splat has as many slots as it has tiles, in their order, after those of the splats before it.
     """
@@ -125,8 +127,8 @@ def make_slots(screen: bool):
 def make_blend_backward(
     effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...], on_gpu: bool, threads: int
 ) -> SimpleNamespace:
-    """kernel; By, Loss, Moments: structs of what it reads, keeps of a sample, and leaves. effects, outputs,
-    on_gpu, threads: as make_blend; losses: outputs with derivatives."""
+    """The kernel; By, Loss, Moments: structs of its inputs, of the state of a sample, and of its results.
+    effects, outputs, on_gpu, threads: as make_blend; losses: outputs with derivatives."""
     made = make_fragments(effects, outputs, losses)
     By, Samples, Loss, Moments = made.By, made.Samples, made.Loss, made.Moments
     read, box_of, loss_at = made.read, made.box_of, made.loss_at

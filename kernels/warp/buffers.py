@@ -1,5 +1,5 @@
-"""Sample buffers, which blending leaves for resolving, and output images, which resolving leaves for the
-user: structs of arrays with the fields that the outputs of a picture declare.
+"""Sample buffers, written by blending and read by resolving, and output images: structs of arrays with the
+fields that the outputs of a frame declare.
 """
 
 from functools import cache
@@ -16,7 +16,7 @@ def sample_fields(outputs: tuple[str, ...]) -> dict[str, type]:
 
 
 def light_of(outputs: tuple[str, ...]) -> frozenset[str]:
-    """Sample buffers whose mean is what several poses leave together."""
+    """Sample buffers that are averaged over the poses of a shutter."""
     return frozenset({"color"} | output.fields(output.having(outputs, "light"), "samples").keys())
 
 

@@ -1,5 +1,5 @@
-"""Which cells of a tile a splat can touch: a cell is 2 x 4 samples, and a bit of a word; conservative, the
-test of each sample decides.
+"""Cells of a tile that a splat can touch: a cell is 2 x 4 samples, and a bit of a word. The test is
+conservative; that of each sample decides.
 
 Fragments of a disk lie where f = n_u^2 + n_v^2 - h D^2 <= 0, h half the squared radius, and n_u, n_v, D are
 affine in the sample. So along a row, with a = (n_u, n_v, D) per x and b = (n_u, n_v, D) at x = 0,
@@ -50,7 +50,7 @@ def half_chord(c: Conic, y: float) -> float:
 
 @cache
 def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
-    """The function that says which cells of a tile a splat can touch."""
+    """The function that returns the cells of a tile that a splat can touch."""
     splats = make_splat(effects, outputs)
     Splat, screen, thick = splats.Splat, "lowpass_screen" in effects, EXACT in effects
     elliptic = "rays" not in effects and not any(name in effects for name in BOXES)

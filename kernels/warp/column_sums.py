@@ -1,4 +1,5 @@
-"""Sums over the device in a fixed order of additions: no atomics, so the same bits on every run."""
+"""Sums over the device in a fixed order of additions, without atomics, so that results are bit-identical on
+every run."""
 
 import warp as wp
 

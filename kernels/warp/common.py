@@ -1,4 +1,4 @@
-"""What all stages share: module options, uniforms, fused multiply-adds, packed loads."""
+"""Shared by all stages: module options, uniforms, fused multiply-adds, packed loads."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Exponentials and logarithms of sums and products, which all devices round alike. Blending has them with
+"""Exponentials and logarithms of sums and products, which all devices round equally. Blending uses them with
 `arithmetic="fast"`, the per-splat setup always.
 
 The polynomials and the bounds are those of kernels/opencl/slot/arithmetic_fast.cl and of math.cl, and so are

@@ -1,4 +1,4 @@
-"""What a splat's record says of the rays that meet it: the affine forms that each sample evaluates.
+"""The affine forms of a splat's record, which each sample evaluates for its ray.
 
 With rows T_u, T_v, T_w of the projection of tangents and centre, (n_u, n_v, D) =
 T_u x T_v + x (T_v x T_w) + y (T_w x T_u): kernels/opencl/splat.cl. All three are affine in the sample. They

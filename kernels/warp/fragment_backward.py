@@ -22,7 +22,7 @@ _FORMS = ("nu0", "nux", "nuy", "nv0", "nvx", "nvy", "d0", "dx", "dy", "log_opaci
 
 
 def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
-    """What a fragment adds to a loss's derivatives by its splat's record: by each form and by
+    """Contributions of a fragment to a loss's derivatives by its splat's record: by each form and by
     z_numerator its derivative times 1, x, y from the anchor; by ln(opacity), by the colour, by the further
     numbers of the record. That by D is at constant z_numerator - z_center D: the rest cancels most of that by
     z_numerator, so `make_project_backward` adds it in float64."""

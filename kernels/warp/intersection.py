@@ -1,4 +1,4 @@
-"""Where the ray of a sample meets a splat: how opaque the splat is there, and how far away."""
+"""Intersection of a sample's ray with a splat: opacity and depth there."""
 
 import math
 from functools import cache

@@ -1,4 +1,4 @@
-"""The low-pass `pixel`: a splat convolved, in its own plane, with what a sample sees of that plane."""
+"""The low-pass `pixel`: a splat convolved, in its own plane, with the footprint of a sample."""
 
 from functools import cache
 

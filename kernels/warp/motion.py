@@ -1,4 +1,4 @@
-"""Splats that move by themselves: their label says in which group, and each group has a pose of its own."""
+"""Moving groups of splats: a label selects the group of a splat, and each group has a pose."""
 
 from functools import cache
 from types import SimpleNamespace

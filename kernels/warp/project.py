@@ -1,4 +1,4 @@
-"""Per splat: is it visible, where, in which order, and what its record says."""
+"""Projection of splats: culling, image bounds, sort keys and records."""
 
 import math
 from functools import cache

@@ -1,5 +1,5 @@
-"""Derivatives of the set-up: from those by a splat's record, which its tiles have left in its slots, to those
-by its mean, rotation, scales, opacity and colour, and by the camera's pose. Decisions are taken as they were.
+"""Backward pass of the projection: from the derivatives by a splat's record, which its tiles have stored, to
+those by its mean, rotation, scales, opacity and colour, and by the camera's pose. Decisions are constant.
 
 With a = s_u t_u, b = s_v t_v a ray r meets the splat where n_u = (b x p) r, n_v = (p x a) r, D = (a x b) r,
 but for a common factor, on which nothing depends. A moment over the ray, g = sum dL/dn_u r, is by b then

@@ -1,4 +1,4 @@
-"""What a sensor makes of each pixel's light: the steps of post/, one after the other."""
+"""Sensor: the steps of post/ for each pixel, one after the other."""
 
 from functools import cache
 
@@ -10,7 +10,7 @@ from .common import STRICT, struct_of
 
 @cache
 def make_sensor(steps: tuple[str, ...]):
-    """The kernel that takes these steps, which stand in their order, and the struct of what they read."""
+    """The kernel of these steps, in their order, and the struct of their inputs."""
     declared = [post.declared(name) for name in steps]
     fields = {name: kind for step in declared for name, kind in step.numbers.items()}
     fields |= {name: wp.array(dtype=kind) for step in declared for name, kind in step.arrays.items()}

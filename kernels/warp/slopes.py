@@ -10,9 +10,9 @@ from .lens import LENSES, make_lens
 
 @cache
 def make_slopes(camera: str | None, real):
-    """slopes(p, view, lens): gradients by the point of the column and of the row in which it falls [samples
-    per metre] and of the logarithm of the depth [1/m] (0 for parallel rays, which have no use for it), and
-    whether the lens sees it. camera: a lens; None for a pinhole.
+    """slopes(p, view, lens): gradients by the point of its column and row [samples per metre]
+    and of the logarithm of the depth [1/m] (0 for parallel rays, which do not use it), and whether the point
+    is in the field of view. camera: a lens; None for a pinhole.
     """
     Lens = make_lens(camera if camera in LENSES else None)
     vec3 = wp.types.vector(3, real)

@@ -12,8 +12,8 @@ from .records import BOXES, Layout
 
 @cache
 def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """Splat; reading(line), what a function that finds the lines of records makes of them; read, of the splat
-    lists[k], finds its record in memory.
+    """Splat; reading(line), its readers from a function that loads the lines of records; read, of the splat
+    lists[k] in global memory.
     """
     layout = Layout(effects, outputs)
     each = layout.lines

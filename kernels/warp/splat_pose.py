@@ -1,4 +1,4 @@
-"""Where a splat stands before the camera: its pose, its tangents, and how far its fragments' depths reach."""
+"""Pose, tangents and depth range of a splat in the frame of the camera."""
 
 import math
 from functools import cache
@@ -13,7 +13,7 @@ from .records import BOXES
 
 @cache
 def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
-    """pose, tangents, depth_range, and the struct Moving of what moves by itself."""
+    """pose, tangents, depth_range, and the struct Moving of moving groups."""
     moves, k_buffered, layers = (
         name in effects for name in ("motion_groups", "compose_pixel", "compose_coplanar")
     )

@@ -71,7 +71,7 @@ class WarpImages(Images):
         """by the names of the outputs; complete or not"""
         for name, output in outputs.items():
             self.nbytes += 4 * pixels * output.channels
-            if self.nbytes > workspace.memory_budget:
+            if views > 1 and self.nbytes > workspace.memory_budget:  # a frame counts them in its plan
                 raise DeviceError(
                     f"the images of {views} views must be at most {bytes_words(workspace.memory_budget)}, "
                     f"the memory budget, got {bytes_words(self.nbytes)}; render fewer views or outputs at "

@@ -90,12 +90,12 @@ def known() -> frozenset[str]:
 
 
 def declared(name: str) -> Output:
-    """What the file of this name declares."""
+    """The declaration in the file of this name."""
     return import_module(f".{name}", __name__).OUTPUT
 
 
 def with_needed(names: Iterable[str]) -> tuple[str, ...]:
-    """Names with all that they need, sorted."""
+    """Names and those of their dependencies, sorted."""
     found: set[str] = set()
     todo = list(names)
     while todo:

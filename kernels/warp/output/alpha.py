@@ -1,4 +1,4 @@
-"""Which share of a pixel the splats cover: 1 less what they transmit."""
+"""Alpha: 1 less the transmittance of all splats."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""How many splats are composited: of a pixel the most of any of its samples."""
+"""Number of composited splats: the maximum over the samples of a pixel."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Expected depth along z [m]: the mean of what shows, by weight; 0 where nothing does."""
+"""Expected depth along z [m]: the weighted mean of the fragments; 0 if none is visible."""
 
 from typing import Any
 

@@ -1,5 +1,5 @@
-"""Depth of the first hit [m]: where light falls to what a first hit leaves; the nearest of a pixel's samples,
-0 if none is hit."""
+"""Depth of the first hit [m]: where the transmittance falls below the threshold of a first hit; the minimum
+over the samples of a pixel, 0 if none is hit."""
 
 from typing import Any
 

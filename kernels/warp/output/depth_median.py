@@ -1,5 +1,5 @@
-"""Median depth [m]: where half of a sample's light is taken; of a pixel the lower median of its samples that
-have one, 0 if none has."""
+"""Median depth [m]: where the transmittance of a sample falls below one half; of a pixel the lower median of
+its samples that have one, 0 if none has."""
 
 from typing import Any
 

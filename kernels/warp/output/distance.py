@@ -1,4 +1,4 @@
-"""Expected distance along the pixel's rays [m]: as depth.py, each sample's depth times its ray's length."""
+"""Expected distance along the pixel's rays [m]: each sample's depth times the length of its ray."""
 
 from typing import Any
 

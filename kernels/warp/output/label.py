@@ -1,4 +1,4 @@
-"""The label of the splat of the largest weight; -1 where nothing shows."""
+"""The label of the splat with the largest weight; -1 if none is visible."""
 
 from typing import Any
 

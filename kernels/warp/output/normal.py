@@ -1,4 +1,4 @@
-"""Unit normal towards the camera, in its frame: the mean of what shows, by weight; 0 where nothing does."""
+"""Unit normal towards the camera, in its frame: the weighted mean of the fragments; 0 if none is visible."""
 
 from typing import Any
 

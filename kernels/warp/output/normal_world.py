@@ -1,4 +1,4 @@
-"""Unit normal towards the camera, in the axes of the world: each row of pixels turned by its pose."""
+"""Unit normal towards the camera, in the axes of the world: each row of pixels is rotated by its pose."""
 
 from typing import Any
 

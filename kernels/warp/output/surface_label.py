@@ -1,5 +1,5 @@
-"""The label of an opaque surface of another renderer, where that has the largest weight. No output by itself:
-it changes `label`."""
+"""The label of the external depth image, if its surface has the largest weight. It changes the output
+`label`."""
 
 from typing import Any
 

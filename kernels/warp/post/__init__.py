@@ -1,5 +1,5 @@
-"""Steps that change rgb pixel by pixel after resolving, those of a sensor: one file for each, which declares
-a `Step`. A file needs no other place to be known.
+"""Steps of a sensor, which change rgb pixel by pixel after resolving: one file for each, which declares a
+`Step`. A file is found by its name.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """What one step reads, and what it does to a channel of a pixel."""
+    """A step: its inputs, and its function of a channel of a pixel."""
 
     uniforms: tuple[str, ...] = ()
     """numbers of the view (`View.uniform`) which fill `numbers`, in this order"""
@@ -32,5 +32,5 @@ def known() -> frozenset[str]:
 
 
 def declared(name: str) -> Step:
-    """What the file of this name declares."""
+    """The declaration in the file of this name."""
     return import_module(f".{name}", __name__).STEP

@@ -1,4 +1,4 @@
-"""Gain: what was measured, noise included, times a number."""
+"""Gain: the measured value, noise included, times a number."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Whole steps: what a sensor of so many bits says."""
+"""Quantisation to the integer values of a sensor."""
 
 from typing import Any
 
