@@ -1,4 +1,4 @@
-"""`pytest --certificates=FILE`: what the reference leaves open, over all pictures that a run compares.
+"""`pytest --certificates=FILE`: what the reference leaves open, over all images that a run compares.
 
 A certificate says what float32 may change in a pixel's colour (fidsplat/backends/reference/error_bounds.py):
 where it is large, a test sees little there. A plugin of pytest, which conftest.py names.
@@ -14,11 +14,11 @@ import numpy as np
 from fidsplat.backends.reference.backend import ReferencePipeline
 
 THRESHOLDS = 2e-5, 1e-3, 0.05
-"""the tolerance of colours, a quarter of an 8-bit step, and what a thousandth of a picture may exceed"""
+"""the tolerance of colours, a quarter of an 8-bit step, and what a thousandth of an image may exceed"""
 FILES = 5
 """that have a row of their own"""
 _found = defaultdict(lambda: np.zeros(2 + len(THRESHOLDS), int))
-"""pictures, pixels, pixels above each threshold, by the file of the test"""
+"""images, pixels, pixels above each threshold, by the file of the test"""
 
 
 def pytest_addoption(parser):
@@ -36,7 +36,7 @@ def pytest_configure(config):
 
 
 def counting(pixels):
-    """`ReferencePipeline.pixels`, through which each picture of the reference is drawn, and counted here."""
+    """`ReferencePipeline.pixels`, through which each image of the reference is rendered, and counted here."""
 
     def counted(self, resident, view, rows, columns, **how):
         images = pixels(self, resident, view, rows, columns, **how)

@@ -1,4 +1,4 @@
-"""Every effect as a switch, and any set of them that does not contradict itself as one picture."""
+"""Every effect as a switch, and any set of them that does not contradict itself as one image."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def with_thick(cloud: fs.SplatCloud) -> fs.SplatCloud:
 
 @dataclass(frozen=True)
 class Switch:
-    """One effect. Of a `kind` a picture has one at most; fog is a background, since nothing else is seen
+    """One effect. Of a `kind` an image has one at most; fog is a background, since nothing else is visible
     behind it."""
 
     kind: str
@@ -124,7 +124,7 @@ def goes(names: Iterable[str]) -> bool:
 
 def everything(lens: str | None) -> tuple[str, ...]:
     """All effects behind that lens (None: a pinhole); of those that exclude each other one, another for each
-    lens. None is coarse, so that pictures are compared closely."""
+    lens. None is coarse, so that images are compared closely."""
     kinds: dict[str, list[str]] = {}
     for name, switch in SWITCHES.items():
         kinds.setdefault(switch.kind, []).append(name)
@@ -151,7 +151,7 @@ class Combination:
 
 
 def combination(names: Iterable[str]) -> Combination:
-    """The picture in which all of them are switched on."""
+    """The image in which all of them are switched on."""
     chosen = [SWITCHES[name] for name in names]
     cloud = _cloud(2 if "spherical harmonics" in names else None)
     camera = fs.Camera.pinhole(*SIZE, 30.0, 30.0, 18.0, 11.0)
@@ -176,7 +176,7 @@ def combination(names: Iterable[str]) -> Combination:
 
 
 def assert_drawn(renderer: fs.Renderer, names: Iterable[str]) -> None:
-    """It builds, it draws, and all its images are the reference's within tolerance and certificate."""
+    """It builds, it renders, and all its images are the reference's within tolerance and certificate."""
     requested = combination(names)
     frame = renderer.render(requested.cloud, requested.capture)
     view = view_of(requested.capture, requested.cloud.origin)

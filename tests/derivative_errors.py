@@ -1,4 +1,4 @@
-"""A device's derivatives against the reference's: random pictures, a random loss, how far off they are."""
+"""A device's derivatives against the reference's: random images, a random loss, how far off they are."""
 
 from __future__ import annotations
 
@@ -91,9 +91,9 @@ def derivatives(
     distorted: bool = True,
     **build: Any,
 ) -> dict[str, np.ndarray]:
-    """A picture's derivatives in NumPy; those of a random loss unless `by_images` says by which images.
+    """An image's derivatives in NumPy; those of a random loss unless `by_images` says by which images.
 
-    distorted: pictures of depths have their distortion too. build: further arguments of
+    distorted: images of depths have their distortion too. build: further arguments of
     `Backend.differentiate`.
     """
     features, view = prepare(cloud, capture)

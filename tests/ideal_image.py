@@ -1,4 +1,4 @@
-"""Pictures of a perfectly printed code under a known pose, for tests of the detectors: no splats, no
+"""Images of a perfectly printed code under a known pose, for tests of the detectors: no splats, no
 device."""
 
 import math

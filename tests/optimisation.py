@@ -33,7 +33,7 @@ def hardly() -> None:
     os.environ.update(_OPENCL)
     if runtime.installed():
         config = runtime.load().config
-        # and without its thresholds for inlining. Level 0 compiles in yet half the time, but there a picture
+        # and without its thresholds for inlining. Level 0 compiles in yet half the time, but there an image
         # of 320 x 240 pixels takes 3 s
         config.optimization_level, config.cpu_compiler_flags = 1, "-march=native"
         # so 0 is for what runs once per splat, a third of all that is compiled
@@ -61,7 +61,7 @@ def as_users_compile() -> Iterator[None]:
 
 @pytest.fixture
 def optimised():
-    """For tests of large pictures, which take PoCL longer than to compile: within `as_users_compile`."""
+    """For tests of large images, which take PoCL longer than to compile: within `as_users_compile`."""
     with as_users_compile():
         yield
 

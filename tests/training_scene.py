@@ -25,7 +25,7 @@ QUICK = {
 
 
 def scene(views=4, held_out=1, size=(24, 18), count=16, renderer=None):
-    """A data set of `count` splats seen from an arc, and points near their centres."""
+    """A data set of `count` splats viewed from an arc, and points near their centres."""
     random = np.random.default_rng(0)
     cloud = fs.SplatCloud(
         random.uniform(-0.5, 0.5, (count, 3)),

@@ -1,4 +1,4 @@
-"""A cloud of which nothing is known but what decides the features of its picture."""
+"""A cloud of which nothing is known but what decides the features of its image."""
 
 from dataclasses import dataclass
 

@@ -131,8 +131,7 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
     if image.size > MAX_BITS:
         raise InputError(
             f"a marker image must have one pixel for each module, got {image.shape[1]} x {image.shape[0]} "
-            "pixels in "
-            f"{path}"
+            f"pixels in {path}"
         )
     if image.ndim == 2:
         image = image[:, :, None]

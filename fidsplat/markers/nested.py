@@ -38,7 +38,7 @@ class Ladder(NamedTuple):
 
 LADDERS = {
     LADDER: Ladder(ratio=2.0, pairs=5, overhang=0.03, reach=2.6, copies=1),
-    # a single one transmits 1 % between neighbours, and as much in its centre by an opacity ceiling of 0.99
+    # one copy would transmit 1 % between neighbours, and with an opacity ceiling of 0.99 also at its centre
     NESTED: Ladder(ratio=1.55, pairs=8, overhang=0.03, reach=CUT, copies=2),
 }
 """Parameters by the number of Gaussians of a square."""

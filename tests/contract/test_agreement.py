@@ -1,4 +1,4 @@
-"""Whole pictures against the float64 reference, from the same float32 inputs."""
+"""Whole images against the float64 reference, from the same float32 inputs."""
 
 import math
 
@@ -122,7 +122,7 @@ def test_principal_point_outside_the_image_and_odd_sizes(renderer):
 
 def test_no_sample_that_a_rim_just_reaches_is_lost(renderer):
     """Twenty disks whose lowest point lies 2e-5 samples below the centre of a sample, in row 12,000 of a
-    picture, where float32 rounds a place to a thousandth: more than the relative room of bounds makes up for.
+    image, where float32 rounds a place to a thousandth: more than the relative room of bounds makes up for.
     """
     quality, top = fs.Quality(lowpass="none", alpha_cutoff=1 / 255), 12_000
     samples = 5.0 * np.arange(20) - 46.5  # rows of their centres, from there
@@ -144,7 +144,7 @@ def test_no_sample_that_a_rim_just_reaches_is_lost(renderer):
 
 @pytest.mark.parametrize("focal", FOCAL_LENGTHS)
 def test_the_shortest_and_the_longest_focal_lengths(renderer, focal):
-    """What Camera lets pass is drawn as it should be: splats that fill the sphere, or the pixel."""
+    """What Camera lets pass is rendered as it should be: splats that fill the sphere, or the pixel."""
     camera = fs.Camera.pinhole(41, 31, focal, focal, 20.0, 15.0)
     assert_agrees(renderer, random_splats(60, seed=3, depth=(2, 4), scale=(0.05, 0.8)), camera)
 

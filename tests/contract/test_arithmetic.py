@@ -1,4 +1,4 @@
-"""Our own short exponential and logarithm (`Quality.arithmetic`): bounds, bits, pictures."""
+"""Our own short exponential and logarithm (`Quality.arithmetic`): bounds, bits, images."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""Renderer.render_batch, on every device: a view has the bits of itself alone, whatever is drawn with it."""
+"""Renderer.render_batch, on every device: a view has the bits of itself alone, whatever is rendered with
+it."""
 
 import pickle
 
@@ -128,7 +129,7 @@ LENSES = {
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_effects_are_those_of_single_views(renderer, cloud, lens):
-    """Rays of samples, fog, a sensor that counts in pixels, several samples; view by view where a picture has
+    """Rays of samples, fog, a sensor that counts in pixels, several samples; view by view where an image has
     more of its own than a batch can hold."""
     capture = fs.Capture(
         LENSES[lens], ("rgb", "normal"), "standard,samples=2", (0.1, 0.2, 0.3), fog=fs.Fog(0.1),

@@ -147,7 +147,7 @@ def boxes_of(middle, half):
 
 
 def test_light_is_conserved(renderer):
-    """The opacities that a small tilted box adds to a picture sum up to its projected area."""
+    """The opacities that a small tilted box adds to an image sum up to its projected area."""
     turn = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
     cloud = fs.SplatCloud([(0, 0, 4)], [turn], [(0.02, 0.07)], [1.0], colors=[(1, 1, 1)]).with_boxes()
     areas = []
@@ -174,8 +174,8 @@ def test_boxes_around_and_behind_the_camera(renderer, seed, quality):
 
 
 def test_a_sharp_corner_outside_the_image_reaches_into_it(renderer):
-    """A box beside a disk, almost edge-on and 42 pixels left of the picture: between edges that meet at so
-    sharp an angle lies a little of every sample far beyond the corner, in the picture's first columns too."""
+    """A box beside a disk, almost edge-on and 42 pixels left of the image: between edges that meet at so
+    sharp an angle lies a little of every sample far beyond the corner, in the image's first columns too."""
     along = np.array([-37, 0, 30]) / math.hypot(37, 30)  # of the ray to its middle
     across = np.array([30, 0, 37]) / math.hypot(37, 30)
     away = math.cos(0.016) * along + np.array([0, math.sin(0.016), 0])

@@ -44,7 +44,7 @@ def test_boxes_end_at_the_near_plane_and_the_far(renderer, camera):
 @each_camera
 @pytest.mark.parametrize("narrow", [0, 1])
 def test_narrow_boxes(renderer, camera, narrow):
-    """Lines far thinner than a pixel: samples beside them see them, whichever side is the short one."""
+    """Lines far thinner than a pixel: samples next to them see them, whichever side is the short one."""
     cloud = random_splats(60, 4, depth=(-2.0, 3.0), scale=(0.05, 0.3), across=2.0)
     scales = cloud.scales.copy()
     scales[:, narrow] = 1e-5
@@ -80,7 +80,7 @@ LARGE = {
 @pytest.mark.parametrize("camera", LARGE.values(), ids=LARGE)
 def test_a_small_box_is_listed_for_few_tiles(renderer, camera):
     """No more than 1.2 times those of a Gaussian cut off at 3.3 standard deviations (1/255), while it is not
-    seen edge-on."""
+    viewed edge-on."""
     cloud = random_splats(300, 2, depth=(0.8, 4.0), scale=(0.01, 0.04), across=0.8)
     turns = np.random.default_rng(1).uniform(-0.15, 0.15, (300, 4)) + np.array([1, 0, 0, 0])
     cloud = fs.SplatCloud(cloud.means, turns, cloud.scales, np.ones(300), colors=cloud.colors)
@@ -136,7 +136,7 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
 @each_camera
 @pytest.mark.parametrize("size", [0.004, 0.2])
 def test_light_is_that_of_the_image(renderer, camera, size):
-    """The opacities that a tilted box adds to a picture sum up to the area of its image, below a pixel and
+    """The opacities that a tilted box adds to an image sum up to the area of its image, below a pixel and
     above it."""
     turn = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
     box = fs.SplatCloud(

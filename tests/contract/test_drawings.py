@@ -1,4 +1,4 @@
-"""Slanted and curved edges of drawings in pictures."""
+"""Slanted and curved edges of drawings in images."""
 
 import math
 from pathlib import Path

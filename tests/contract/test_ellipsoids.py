@@ -1,4 +1,4 @@
-"""3D Gaussians on devices, beside disks and boxes in one picture, against the reference."""
+"""3D Gaussians on devices, beside disks and boxes in one image, against the reference."""
 
 import math
 from dataclasses import replace
@@ -56,7 +56,7 @@ def test_each_fragment_by_its_own_depth(renderer, way):
 
 ALONE = {
     "around the camera": lambda: thick(3),
-    # most centres lie outside: a processor leaves out what lies beside the picture as a whole
+    # most centres lie outside: a processor leaves out what lies next to the image as a whole
     "beside the picture": lambda: thick(7, (-4, -4, 0.1), (4, 4, 3.0), spread=2.0, count=600),
 }
 
@@ -75,7 +75,8 @@ def test_ellipsoids_are_bit_identical_in_any_cloud(renderer, place, order):
 
 
 def test_several_samples_are_widened_as_one_pixel(renderer):
-    """By 0.3 square pixels, not samples; and a Gaussian whose centre lies behind the camera is not drawn."""
+    """By 0.3 square pixels, not samples; and a Gaussian whose centre lies behind the camera is not
+    rendered."""
     cloud, quality = mixed(5), fs.Quality(ellipsoid="ewa", samples=2)
     assert_agrees(renderer, cloud, CAMERA, quality=quality)
     behind = fs.SplatCloud([[0, 0, -0.1]], [[1, 0, 0, 0]], [[1.0] * 3], [0.9], colors=[[1, 1, 1]])
@@ -145,9 +146,9 @@ REST = pytest.param(range(6, 1000), marks=pytest.mark.exhaustive)
 
 
 def thick_scene_of(seed: int) -> FrameSpec:
-    """The same with 3D Gaussians for most splats of no plane, drawn in one of the ways: a third standard
+    """The same with 3D Gaussians for most splats of no plane, rendered in one of the ways: a third standard
     deviation from 1e-6 of the first two, needles and balls among them, to 100 times as large. No two splats
-    of no plane have one depth: by nothing else are they ordered, as EWA draws them."""
+    of no plane have one depth: by nothing else are they ordered, as EWA renders them."""
     flat, generator = fuzz.scene_of(seed), np.random.default_rng([seed, 2])
     cloud, count = flat.cloud, len(flat.cloud)
     third = cloud.scales.max(axis=1) * log_uniform(generator, 1e-6, 1e2, count)

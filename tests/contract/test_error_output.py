@@ -18,7 +18,7 @@ from fidsplat.util.errors import InputError
 
 HAZE = fs.Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
 MIDDLE = fs.Camera.pinhole(16, 12, 60.0, 60.0, 8.0, 6.0)  # of HAZE
-RIM = fs.Camera.pinhole(16, 12, 60.0, 60.0, -16.0, 6.0)  # beside it, 16 to 32 pixels from the haze's middle
+RIM = fs.Camera.pinhole(16, 12, 60.0, 60.0, -16.0, 6.0)  # next to it, 16 to 32 pixels from the haze's middle
 SMALL = fs.Camera.pinhole(16, 12, 15.0, 15.0, 8.0, 6.0)
 OUTPUTS = ("rgb", "error")
 

@@ -51,7 +51,7 @@ CASES = {
 
 
 def differences(pipeline, resident, cloud, capture):
-    """A picture of a pipeline against the reference's."""
+    """An image of a pipeline against the reference's."""
     _, view = prepare(resident, capture)
     images = pipeline.render_view(resident, view)
     reference = ReferenceBackend()
@@ -124,7 +124,7 @@ def test_an_empty_surface_changes_no_bit(renderer):
 
 
 def test_our_depth_is_an_external_depth_image(renderer):
-    """What is drawn in two parts, each behind the other where it is: opaque splats give the same picture."""
+    """What is rendered in two parts, each behind the other where it is: opaque splats give the same image."""
     boxes = fs.SplatCloud(
         [[-0.2, 0, 1.5], [0.2, 0, 2.0], [0, 0.1, 1.8]],
         np.tile([1, 0, 0, 0], (3, 1)),

@@ -77,7 +77,7 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
 
 
 def test_warp_reads_no_ray_outside_the_image():
-    """A tile has samples there too. The rays end at a page that nobody may read, in a process of its own."""
+    """A tile has samples there too. The rays end at a page that no one may read, in a process of its own."""
     pytest.importorskip("warp")
     process = multiprocessing.get_context("spawn").Process(target=draw_with_guarded_rays)
     process.start()
@@ -86,7 +86,7 @@ def test_warp_reads_no_ray_outside_the_image():
 
 
 def draw_with_guarded_rays():
-    """The picture "distortion" on Warp's CPU."""
+    """The image "distortion" on Warp's CPU."""
     import warp as wp
 
     hardly()

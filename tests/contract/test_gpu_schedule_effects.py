@@ -1,5 +1,5 @@
-"""The schedule for GPUs draws every effect and every output as the reference does, on whatever OpenCL device
-this is: where these run there is no GPU."""
+"""The schedule for GPUs renders every effect and every output as the reference does, on whatever OpenCL
+device this is: where these run there is no GPU."""
 
 import numpy as np
 import pytest

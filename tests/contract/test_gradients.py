@@ -1,4 +1,4 @@
-"""Derivatives of every device against the reference's in float64, and the same bits on every run."""
+"""Derivatives of every device against the reference's in float64, and bit-identical results on every run."""
 
 import threading
 import weakref
@@ -79,7 +79,7 @@ def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
 
 def test_distortions_and_their_derivatives_are_the_references(backend):
     """Of splats a thousandth of their depth apart, far apart, and before the depth buffer. The derivatives by
-    distortions are small beside others, and are asked for by themselves."""
+    distortions are small beside others, and are requested by themselves."""
     near = {"depth": (0.1, 0.4), "scale": (0.1, 1.0), "across": 0.3}
     cases: list[dict] = [{"depth": (2.0, 2.002)}, {"depth": (0.3, 30.0), "scale": (0.1, 1.0)}, near]
     for case in cases:
@@ -189,7 +189,7 @@ def test_frames_that_are_not_awaited_have_the_same_derivatives(backend, renderer
 
 
 def test_a_cloud_outlives_what_is_under_way(renderer, backend):
-    """A processor reads the host's arrays: they go when nobody reads them any more."""
+    """A processor reads the host's arrays: they go when no one reads them any more."""
     if renderer.device.kind != "cpu" or not renderer.device.name.startswith("opencl"):
         pytest.skip("reads no arrays of the host, or does not work beside it")
     reported, (cloud, capture) = [], random_picture(6)

@@ -1,4 +1,4 @@
-"""Pictures through lenses against the reference, which sees every splat at every pixel: what bounds lose
+"""Images through lenses against the reference, which sees every splat at every pixel: what bounds lose
 shows."""
 
 import math
@@ -89,7 +89,7 @@ RIMS = {
 """disks (centre, half axes) whose rims a fisheye sees beyond the straight edges, or the corners, of a polygon
 around them: found at random, of each kind what a bound without its margin would cut off furthest"""
 TO_THE_RIM = fs.Quality(alpha_cutoff=math.exp(-0.5), lowpass="none")
-"""opaque disks of one standard deviation, whose rims are seen"""
+"""opaque disks of one standard deviation, whose rims are visible"""
 
 
 @pytest.mark.parametrize("name", RIMS)
@@ -151,7 +151,7 @@ def test_colours_that_depend_on_the_view(renderer, name):
 
 @pytest.mark.parametrize("name", ["fisheye 200", "panorama"])
 def test_splats_that_cross_the_rim_seam_and_poles(renderer, name):
-    """Splats centred within a few degrees of where the picture ends, or of its poles and seam."""
+    """Splats centred within a few degrees of where the image ends, or of its poles and seam."""
     generator = np.random.default_rng(7)
     polar = np.concatenate([np.radians(generator.uniform(92, 110, 150)), generator.uniform(3.0, math.pi, 50)])
     around = generator.uniform(0, 2 * math.pi, 200)

@@ -24,7 +24,7 @@ LENSES = {
 @pytest.mark.parametrize("place", ["ahead", "near", "aside"])
 def test_the_screen_dot_of_splats_about_as_wide_as_it(renderer, place, samples):
     """Devices may pass over a dot that is never the larger weight, and over no other: splats of 0.5 to 4
-    pixels, tilted at will, in the middle of the view, close to the near plane, at the edge of the picture.
+    pixels, tilted at will, in the middle of the view, close to the near plane, at the edge of the image.
     """
     camera = fs.Camera.pinhole(61, 47, 40.0, 40.0, 30.0, 24.0)
     generator = np.random.default_rng(5)
@@ -143,7 +143,7 @@ def test_splats_that_are_viewed_nearly_edge_on(renderer, camera):
 
 
 def test_walls_next_to_the_camera_have_no_streaks(renderer):
-    """A wall that is seen from its edge, in the columns at 300 x 1.5 mm / 0.1 to 0.9 m from the middle."""
+    """A wall that is visible from its edge, in the columns at 300 x 1.5 mm / 0.1 to 0.9 m from the middle."""
     generator, count = np.random.default_rng(5), 600
     at = generator.uniform((0.3, -1, 0.1), (0.3, 1, 0.9), (count, 3))
     quats = np.tile((math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 0.0), (count, 1))
@@ -157,7 +157,7 @@ def test_walls_next_to_the_camera_have_no_streaks(renderer):
 
 
 def test_disks_far_outside_the_image_that_are_widened_into_it(renderer):
-    """Their near ends, which a sample's depth brings nearer still, are in the picture: one by one, since all
+    """Their near ends, which a sample's depth brings nearer still, are in the image: one by one, since all
     that they show is their rims."""
     generator, count = np.random.default_rng(4), 120
     outward = generator.uniform((-10.0, -0.2, 0.0), (10.0, 0.2, 0.0), (count, 3))
@@ -186,7 +186,7 @@ def test_disks_far_outside_the_image_that_are_widened_into_it(renderer):
 
 
 def test_splats_that_reach_into_a_band(renderer):
-    """From above, from below and from behind the camera: a band shows them as the whole picture does."""
+    """From above, from below and from behind the camera: a band shows them as the whole image does."""
     cloud, camera = random_splats(600, 3, depth=(-1.0, 4.0), scale=(0.01, 0.5)), CAMERA
     whole = renderer.render(cloud, camera, quality=PIXEL)["rgb"]
     for band in ((0, 16), (16, 40), (40, 59)):
@@ -209,7 +209,7 @@ def test_a_splat_where_the_derivative_has_no_direction(renderer, name, mean):
 
 
 def test_the_screen_dot_of_walls_that_are_viewed_nearly_edge_on(renderer):
-    """Their horizon passes within a pixel or two of their centre: beyond it only the dot is drawn."""
+    """Their horizon passes within a pixel or two of their centre: beyond it only the dot is rendered."""
     camera = fs.Camera.pinhole(41, 31, 40.0, 40.0, 20.0, 15.0)
     generator = np.random.default_rng(3)
     for size in (0.5, 5.0, 50.0):
@@ -223,7 +223,7 @@ def test_the_screen_dot_of_walls_that_are_viewed_nearly_edge_on(renderer):
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
-    """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square
+    """The sum of alpha over the image is 2 pi opacity times the area of the image of the one-sigma square
     of a splat far below a pixel; the area from a finite parallelogram."""
     generator = np.random.default_rng(2)
     # seen by every lens here, off its axis
@@ -247,7 +247,7 @@ def test_boxes_are_left_to_their_own_filter(renderer):
 
 @pytest.mark.parametrize("spread_px", [0.01, 0.1, 0.5, 2.0])
 def test_light_does_not_depend_on_the_subpixel_position_of_a_splat(renderer, spread_px):
-    """The sum of alpha over the picture is the splat's own, 2 pi opacity s_u s_v, at any shift: to 3 % of
+    """The sum of alpha over the image is the splat's own, 2 pi opacity s_u s_v, at any shift: to 3 % of
     sigma 0.5 px, and what the cut-off takes.
     """
     sums = []
@@ -262,7 +262,7 @@ def test_light_does_not_depend_on_the_subpixel_position_of_a_splat(renderer, spr
 
 
 def test_the_screen_filter_keeps_no_light(renderer):
-    """Why there is another: a splat of a hundredth of a pixel is drawn as a dot of 0.7 px, some 5000 times
+    """Why there is another: a splat of a hundredth of a pixel is rendered as a dot of 0.7 px, some 5000 times
     too bright."""
     cloud = fs.SplatCloud([(0, 0, 1)], [(1, 0, 0, 0)], [(1e-4, 1e-4)], [0.9], colors=[(1, 1, 1)])
     camera = fs.Camera.pinhole(40, 40, 100.0, 100.0, 20.2, 20.4)

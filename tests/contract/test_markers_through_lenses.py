@@ -112,7 +112,7 @@ def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer
 )
 def test_parallel_rays_show_where_a_tag_is_across_them_and_its_rotation(renderer, turn_deg, blurred):
     """How far along the rays it is and to which side it leans, they do not show. The affine map from the tag
-    to the picture has its place, its turn in the picture and the cosine of its lean."""
+    to the image has its place, its turn in the image and the cosine of its lean."""
     camera = fs.Camera.orthographic(480, 360, 1.6)
     placed = tag_at((0.3, -0.15, 1.5), math.radians(turn_deg) - math.atan2(0.3, 1.5))
     effects = {}
@@ -170,7 +170,7 @@ def test_exact_corners_give_the_exact_pose(name):
 
 @in_turn(1)
 def test_a_rolling_shutter_shows_the_tag_at_its_rows_time(renderer):
-    """The camera turns, so the picture is sheared; rows at the tag's height are read at a known time."""
+    """The camera turns, so the image is sheared; rows at the tag's height are read at a known time."""
     camera, position = CASES["pinhole"]
     placed = tag_at(position, 0.2)
 

@@ -1,4 +1,4 @@
-"""A memory budget changes how a picture is drawn, never what it shows."""
+"""A memory budget changes how an image is rendered, never what it shows."""
 
 import sys
 import weakref
@@ -208,7 +208,7 @@ def test_plans_hold_to_the_budget():
 
 
 def test_views_are_rendered_like_single_frames(renderer):
-    """Renderer.render_views: one upload, pictures in the order of the cameras."""
+    """Renderer.render_views: one upload, images in the order of the cameras."""
     some = random_splats(300, seed=4)
     cameras = [fs.Camera.look_at(40, 30, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)) for x in (-0.5, 0.0, 0.5)]
     frames = list(renderer.render_views(some, cameras, ("rgb", "depth")))
@@ -237,7 +237,7 @@ def test_frames_of_many_sizes_leave_no_heap_of_buffers(opencl):
 
 @machines
 def test_a_pool_keeps_to_the_budget_whatever_was_rendered_before(opencl, machine):
-    """Pictures at once and in chunks, few and many outputs: what one kind has left does not count against
+    """Images at once and in chunks, few and many outputs: what one kind has left does not count against
     the next."""
     budget = 8 * 2**20
     own, opencl = machine(opencl, budget), machine(opencl)
@@ -294,7 +294,7 @@ def test_a_plan_counts_all_memory_of_a_frame(opencl, monkeypatch, machine, mebib
 
 
 def test_a_panorama_is_copied_once(opencl, monkeypatch):
-    """As long as it is the one that was drawn last; pictures show theirs, whatever was there before."""
+    """As long as it is the one that was rendered last; images show theirs, whatever was there before."""
     own = fs.Renderer(opencl.device.name)
     rng = np.random.default_rng(0)
     one, other = (fs.Panorama(rng.random((33, 70, 3))) for _ in range(2))
@@ -377,7 +377,7 @@ def views_until(failing):
 
 @pytest.mark.parametrize("error", [fs.InputError, KeyError])
 def test_views_before_an_error_are_given(renderer, error):
-    """Whether the next camera cannot be had or cannot be drawn."""
+    """Whether the next camera cannot be had or cannot be rendered."""
 
     def failing():
         if error is KeyError:

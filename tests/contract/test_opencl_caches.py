@@ -21,7 +21,8 @@ def opencl(renderer):
 
 
 def test_a_part_of_a_batch_on_the_device_keeps_its_images(opencl):
-    """The next batch is drawn into other buffers while a view of the last is held, though nothing else is."""
+    """The next batch is rendered into other buffers while a view of the last is held, though nothing else
+    is."""
     own, some = own_device(opencl), random_splats(100, seed=7)
     poses = np.tile([0, 0, 0, 1, 0, 0, 0.0], (2, 1))
     first = own.render_batch(some, CAMERA, poses=poses).wait()
@@ -75,7 +76,7 @@ def test_cached_views_do_not_retain_their_surroundings(opencl, monkeypatch):
 
 
 def test_lenses_that_come_and_go_leave_no_rays_on_the_device(opencl):
-    """A zoom: each picture has rays of its own."""
+    """A zoom: each image has rays of its own."""
     machine = as_on_a_gpu(opencl)
     resident = machine.upload(random_splats(20, seed=1))
     for k in range(10):

@@ -128,7 +128,7 @@ def test_of_equal_splats_in_a_layer_and_equal_samples_of_a_pixel_the_first_is_na
     frame = renderer.render(twice, POINT, ALL)
     assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
 
-    # columns 2.75 and 2.25 of the picture, row 2.5; within 1.2 sigma they are as opaque as the ceiling allows
+    # columns 2.75 and 2.25 of the image, row 2.5; within 1.2 sigma they are as opaque as the ceiling allows
     depths, sigma = np.array([2.0, 3.0]), 0.25 / 50
     sides = fs.SplatCloud(
         np.column_stack([np.array([0.25, -0.25]) / 50, [0, 0], [1, 1]]) * depths[:, None],
@@ -207,7 +207,7 @@ def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     seen = ids >= 0
     assert np.array_equal(cloud.labels[ids[seen]], whole["label"][seen])
     if not renderer.device.name.startswith("opencl"):
-        return  # Warp draws no cloud in chunks (docs/backends.md)
+        return  # Warp renders no cloud in chunks (docs/backends.md)
     # a GPU's tables for drawing in chunks take more
     budget = 1_000_000 if renderer.device.kind == "cpu" else 3_000_000
     small = fs.Renderer(renderer.device.name, memory_budget=budget)
@@ -238,7 +238,7 @@ def covered(frame, name):
 @in_turn(1)
 @pytest.mark.parametrize("samples", [1, 2])
 def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
-    """They end where 1/255 is covered, whatever is drawn beyond it for the sake of colours."""
+    """They end where 1/255 is covered, whatever is rendered beyond it for the sake of colours."""
     splat = fs.SplatCloud([(0.1, 0.1, 3)], [(1, 0, 0, 0)], [(0.2, 0.3)], [0.9], colors=[(1, 1, 1)], labels=7)
     masks = {}
     for cutoff in (1 / 255, 1e-3, 1e-5):

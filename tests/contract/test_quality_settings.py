@@ -1,4 +1,4 @@
-"""Knobs of Quality beside those of the presets: what each may change in a picture, against the reference."""
+"""Knobs of Quality beside those of the presets: what each may change in an image, against the reference."""
 
 import numpy as np
 import pytest

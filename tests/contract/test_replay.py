@@ -1,5 +1,5 @@
-"""OpenCL launches a picture of a kind again, and draws a batch's views in parts: with the bits of pictures
-that are drawn alone."""
+"""OpenCL launches an image of a kind again, and renders a batch's views in parts: with the bits of images
+that are rendered alone."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -21,7 +21,7 @@ def opencl(renderer):
 
 
 def test_kernels_see_new_buffers_at_old_addresses(opencl):
-    """Arguments are kept from picture to picture, buffers are not: each cloud is drawn, not the last one."""
+    """Arguments are kept from image to image, buffers are not: each cloud is rendered, not the last one."""
     expected = [random_splats(50, seed=seed) for seed in range(6)]
     first = [opencl.render(cloud, CAMERA)["rgb"] for cloud in expected]
     for _ in range(3):
@@ -61,8 +61,8 @@ def test_a_frame_is_replayed_for_each_view(opencl):
 
 
 def test_counts_of_another_kind_of_frame_are_ignored(opencl):
-    """One that is drawn for the first time, into buffers that are there, leaves its tallies to whom comes
-    next: a picture that is launched again."""
+    """One that is rendered for the first time, into buffers that are there, leaves its tallies to whom comes
+    next: an image that is launched again."""
     machine = as_on_a_gpu(opencl)
     resident = machine.upload(random_splats(300, seed=4))
     first, *_ = (machine.render(resident, CAMERA)["rgb"] for _ in range(3))
@@ -90,7 +90,7 @@ def test_a_frame_that_exceeds_the_last_is_rendered_again(opencl, scale):
 
 
 def test_threads_share_cached_launches(opencl):
-    """Sixteen draw pictures of two kinds with a GPU's kernels, of a cloud that outgrows its room at times,
+    """Sixteen draw images of two kinds with a GPU's kernels, of a cloud that outgrows its room at times,
     and read them, their times and their counts while others draw."""
     machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
     some = random_splats(500, seed=4, scale=(1e-2, 0.3), depth=(2.0, 6.0))
@@ -117,7 +117,7 @@ def test_threads_share_cached_launches(opencl):
 
 @machines
 def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine):
-    """Several views at a time, with planes, groups that move, a mask, and pictures of other kinds between."""
+    """Several views at a time, with planes, groups that move, a mask, and images of other kinds between."""
     own, some = machine(opencl), random_splats(300, seed=4, scale=(1e-2, 2.0)).with_labels(np.arange(300) % 3)
     some = some.with_coplanar_groups(np.arange(300) // 250 - 1)
     capture = fs.Capture(fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)), ("rgb", "label"))

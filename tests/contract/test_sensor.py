@@ -231,7 +231,7 @@ def test_the_sensor_keeps_the_other_outputs(renderer):
 @in_turn()
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
-    """Position error under 1 % of the distance, as the ideal plane's: the pictures are for robots."""
+    """Position error under 1 % of the distance, as the ideal plane's: the images are for robots."""
     from fidsplat.images.files import to_uint8
     from fidsplat.vision.detect import detect
     from fidsplat.vision.pose import marker_pose, pose_error

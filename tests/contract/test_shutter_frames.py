@@ -1,4 +1,4 @@
-"""Motion blur, rolling shutter and moving groups, against the reference and against pictures of single
+"""Motion blur, rolling shutter and moving groups, against the reference and against images of single
 poses."""
 
 import math
@@ -89,7 +89,7 @@ def test_moving_layers(renderer, samples):
 
 
 def test_normals_in_the_world_are_those_of_each_rows_pose(renderer):
-    """A wall that stands still has one normal, however the camera turns while it is read out."""
+    """A wall that does not move has one normal, however the camera turns while it is read out."""
     wall = fs.SplatCloud([(0, 0, 4)], [(0.97, 0.2, 0.1, 0)], [(9, 9)], [0.9], colors=[(1, 1, 1)])
     motion = fs.Motion(pose_at)
     outputs = (*ALL_OUTPUTS, "normal_world")
@@ -193,7 +193,7 @@ def test_a_rolling_shutter_takes_each_row_at_its_own_time(renderer):
 
 @pytest.mark.parametrize("rows", [1, 4, 15])
 def test_bands_are_off_by_at_most_their_stated_bound(renderer, rows):
-    """A bar that crosses the picture while it is read out: its middle in each row, and where the time puts
+    """A bar that crosses the image while it is read out: its middle in each row, and where the time puts
     it."""
     height, speed, readout = 60, 40.0, 1.0
     camera = fs.Camera.pinhole(80, height, 100.0, 100.0, 40.0, 30.0)

@@ -107,7 +107,7 @@ def test_loss(renderer, views, works, weight, lanes):
 
 
 def test_the_loss_is_summed_piece_by_piece(renderer, views, works, monkeypatch):
-    """As of large pictures, where a work-item adds up more than one value."""
+    """As of large images, where a work-item adds up more than one value."""
     monkeypatch.setattr(training, "_SUMS", 2)
     work, _ = works(lanes=1)  # on CPUs it is summed strip by strip
     truth = views[0].image / 255.0
@@ -165,9 +165,9 @@ def test_loss_of_normals(renderer, views, works):
     ],
 )
 def test_a_step_and_its_frame(renderer, views, works, strategy, sparse, lanes):
-    """By the derivatives that the same picture has in arrays, which are the reference's. At degree 0, which
+    """By the derivatives that the same image has in arrays, which are the reference's. At degree 0, which
     has plain colours, then at degrees 2 and 3; a third of the splats are behind the camera but in the last
-    step. Of a solid wall the picture depends by its colour alone; in the second step, by depths, by its
+    step. Of a solid wall the image depends by its colour alone; in the second step, by depths, by its
     place; then, black, no more."""
     device, host = works(lanes, strategy=strategy, sh_degree=3, sparse_adam=sparse)
     near = stretched(views[2].camera)
@@ -212,7 +212,7 @@ def moved_by_origin(camera):
 
 
 def drawn_alike(renderer, device, host, degree, when, origin):
-    """What the device draws, which is what its twin does."""
+    """What the device renders, which is what its twin does."""
     shown = [work.resident(degree, origin) for work in (device, host)]
     for name in ("means", "quats", "scales", "opacities", "sh" if degree else "colors"):
         a, b = (read(renderer, one, name).reshape(COUNT, -1) for one in shown)
@@ -221,7 +221,7 @@ def drawn_alike(renderer, device, host, degree, when, origin):
 
 
 def before_a_wall(camera, color=0.5, behind=True):
-    """Small splats, each third behind the camera, before a solid wall that fills the picture."""
+    """Small splats, each third behind the camera, before a solid wall that fills the image."""
     made = splats()
     made.values["means"][:] = np.random.default_rng(6).uniform(-0.5, 0.5, (COUNT, 3))
     made.values["log_scales"] -= np.float32(2.5)
@@ -235,7 +235,7 @@ def before_a_wall(camera, color=0.5, behind=True):
 
 
 def taken_back(renderer, device, view, resident, lanes, outputs=("rgb",)):
-    """A picture of splats on the device, taken back from a random loss of these outputs."""
+    """An image of splats on the device, taken back from a random loss of these outputs."""
     capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
     features, seen = prepare(resident, capture)
     shape = next(iter(renderer.backend.shapes("schedule").values())) if lanes == 1 else None
@@ -304,7 +304,7 @@ def test_shaking(renderer, works):
     device, host = works(strategy="mcmc", seed=2**40 + 7)
     before = host.read().values["means"].copy()
     for work in (device, host):
-        work.add_noise(17, 1e-4)  # as after splats were made, when nothing of them has been drawn
+        work.add_noise(17, 1e-4)  # as after splats were made, when nothing of them has been rendered
     assert np.abs(host.read().values["means"] - before).max() > 0.01
     agree(device, host, atol=2e-5)
 

@@ -23,7 +23,7 @@ STEADY = {**QUICK, "iterations": 40, "densify_from": 99, "sh_degree": 1}
 
 @pytest.fixture
 def on_groups(renderer, monkeypatch):
-    """The device with the schedule of GPUs, whose pictures nobody waits for."""
+    """The device with the schedule of GPUs, whose images no one waits for."""
     backend = renderer.backend
     monkeypatch.setattr(backend, "shape", next(iter(backend.shapes("schedule").values())))
     backend.limit_memory(backend.memory_budget)
@@ -116,7 +116,7 @@ def test_a_replayed_frame_that_exceeds_its_capacity_is_rendered_again(on_groups,
 
 
 def test_steps_are_the_same_if_they_are_reported_later(renderer, dataset):
-    """At the end of a run all are told, in their order."""
+    """At the end of a run all are reported, in their order."""
     settings = {**QUICK, "iterations": 40}
     prompt, late, at_once = (Trainer(dataset, renderer, **settings) for _ in range(3))
     reported, ahead = [], []
@@ -180,7 +180,8 @@ def test_an_interrupt_during_compilation_leaves_the_statistics_unchanged(rendere
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_a_failed_densification_keeps_the_checkpoint(renderer, dataset, tmp_path, monkeypatch, strategy):
-    """Arrays of two lengths are neither drawn nor kept: the last checkpoint stays, and gives the same run."""
+    """Arrays of two lengths are neither rendered nor kept: the last checkpoint stays, and gives the same
+    run."""
     settings = {**QUICK, "iterations": 24, "sh_degree": 1, "strategy": strategy, "growth": 1.5}
     file, pool = tmp_path / "run.training.npz", renderer.backend.pool
     whole = Trainer(dataset, renderer, **settings)
@@ -232,7 +233,7 @@ def test_an_interrupt_keeps_pending_losses(renderer, dataset, monkeypatch):
 
 @pytest.mark.parametrize("losses", [{}, {"normal_from": 24, "distortion_from": 30, "distortion_weight": 1.0}])
 def test_upcoming_kernels_are_compiled_in_the_background(renderer, dataset, monkeypatch, losses):
-    """Each set of kernels before the first iteration that draws by it, and all that are drawn by."""
+    """Each set of kernels before the first iteration that renders by it, and all that are rendered by."""
     begun, rendered = [], []
     backend = renderer.backend
     differentiate = backend.differentiate

@@ -31,7 +31,7 @@ def rendered(renderer, width, height):
 
 
 def put(frame, values):
-    """Other values in the place of what the device has drawn."""
+    """Other values in the place of what the device has rendered."""
     images = frame.wait()._images
     if hasattr(images, "arrays"):
         images.arrays["rgb"].assign(values.ravel())

@@ -1,5 +1,5 @@
-"""Warp's pictures that are drawn without waiting for what their lists take, and those that a captured graph
-draws: CUDA's, here on the CPU too."""
+"""Warp's images that are rendered without waiting for what their lists take, and those that a captured graph
+renders: CUDA's, here on the CPU too."""
 
 import gc
 import weakref
@@ -18,7 +18,7 @@ from fidsplat.capture.views import views_of
 
 BACKEND = "warp"
 WHOLE = random_picture(1, count=3000, degree=None, quality="surfel", outputs=("rgb",))
-"""as tests/contract/test_gradients.py draws, whose kernels it shares"""
+"""as tests/contract/test_gradients.py renders, whose kernels it shares"""
 CLOUD, CAPTURE = WHOLE
 ELSEWHERE = fs.Camera.look_at(61, 43, 1.1, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 FAR = fs.Camera.look_at(61, 43, 1.1, (0.0, 0.0, -60.0), (0.0, 0.0, 3.0))
@@ -34,14 +34,14 @@ def ahead(renderer):
 
 
 def pictures(backend, draw):
-    """How many pictures are begun while it draws."""
+    """How many images are begun while it renders."""
     before = backend.frames
     draw()
     return backend.frames - before
 
 
 def waiting(renderer, cameras):
-    """Their pictures, each drawn when its counts were known."""
+    """Their images, each rendered when its counts were known."""
     backend = renderer.backend
     before, backend.asynchronous = backend.asynchronous, False
     frames = [renderer.render(CLOUD, CAPTURE.with_(camera=camera)) for camera in cameras]
@@ -56,12 +56,12 @@ CAMERAS = {
     "fewer splats, more pairs": [FAR, CAPTURE.camera],
 }
 AGAIN = {"more and more": 2, "fewer splats, more pairs": 1}
-"""how many are drawn twice"""
+"""how many are rendered twice"""
 
 
 @pytest.mark.parametrize("case", CAMERAS)
 def test_frames_equal_those_that_wait(renderer, ahead, case):
-    """Those that need more than the room that was left are drawn twice."""
+    """Those that need more than the room that was left are rendered twice."""
     cameras, resident = CAMERAS[case], renderer.upload(CLOUD)
     drawn = []
 
@@ -84,7 +84,7 @@ def test_a_batch_of_views_waits_for_the_first_only(renderer, ahead):
 
 
 def test_adopted_arrays_are_waited_for(renderer, ahead):
-    """Who gave them may change them before a picture would have to be drawn again."""
+    """Who gave them may change them before an image would have to be rendered again."""
     arrays = {
         name: getattr(CLOUD, name).copy() for name in ("means", "quats", "scales", "opacities", "colors")
     }
@@ -94,7 +94,7 @@ def test_adopted_arrays_are_waited_for(renderer, ahead):
 
 
 def test_a_budget_that_is_full_is_waited_for(renderer, ahead):
-    """A picture within it is drawn once its counts are known, in bands if need be."""
+    """An image within it is rendered once its counts are known, in bands if need be."""
     resident = renderer.upload(CLOUD)
     renderer.render(resident, CAPTURE)
     before, ahead.pair_budget = ahead.pair_budget, 4000
@@ -106,7 +106,7 @@ def test_a_budget_that_is_full_is_waited_for(renderer, ahead):
 
 
 def test_unread_images_are_released_immediately(ahead):
-    """A loop that draws and never looks takes no more of the device."""
+    """A loop that renders and never looks takes no more of the device."""
     resident = ahead.upload(CLOUD)
     features, view = prepare(resident, CAPTURE)
     pipeline = ahead.pipeline(features)
@@ -125,7 +125,7 @@ def test_unread_images_are_released_immediately(ahead):
 
 @pytest.fixture
 def replayed(ahead, monkeypatch):
-    """What graphs have drawn, of its backend, which captures what it launches."""
+    """What graphs have rendered, of its backend, which captures what it launches."""
     drawn, own = [], RecordedFrame.replay
 
     def counted(replay, stack):
@@ -164,7 +164,7 @@ def test_a_replay_beyond_its_capacity_is_rendered_and_captured_again(renderer, r
 
 
 def test_what_another_kind_reallocated_is_not_replayed(renderer, replayed):
-    """Arrays that a larger picture has replaced are not those of the graph."""
+    """Arrays that a larger image has replaced are not those of the graph."""
     resident, large = (
         renderer.upload(CLOUD),
         fs.Camera.look_at(200, 160, 1.1, (0.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
@@ -177,7 +177,7 @@ def test_what_another_kind_reallocated_is_not_replayed(renderer, replayed):
 
 
 def test_what_moves_is_replayed(renderer, replayed):
-    """Groups, planes and what resolving reads are filled for each picture."""
+    """Groups, planes and what resolving reads are filled for each image."""
     cloud = CLOUD.with_labels(np.arange(3000) % 2).with_coplanar_groups(np.arange(3000) // 2900 - 1)
     resident, places = renderer.upload(cloud), (0.0, 0.1, 0.2, 0.3, 0.4)
 
@@ -213,7 +213,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("kind", OTHERS)
 def test_a_frame_between_replays_leaves_its_view_to_none(renderer, replayed, monkeypatch, kind):
-    """Of a picture of the same size that was launched kernel by kernel, as it is no picture of the graph's,
+    """Of an image of the same size that was launched kernel by kernel, as it is no image of the graph's,
     the next of these has nothing: the view is the same object as before it."""
     monkeypatch.setattr(renderer.backend, "pair_budget", renderer.backend.pair_budget)
     mine, other = OTHERS[kind]
@@ -228,7 +228,7 @@ def test_a_frame_between_replays_leaves_its_view_to_none(renderer, replayed, mon
 
 
 def test_a_replay_that_fails_half_filled_is_not_launched_again(renderer, replayed, monkeypatch):
-    """The view that it was to show is drawn again."""
+    """The view that it was to show is rendered again."""
     resident, there = renderer.upload(CLOUD), CAPTURE.with_(camera=ELSEWHERE)
     expected = renderer.render(resident, there)["rgb"]
     for _ in range(4):

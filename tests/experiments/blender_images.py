@@ -1,4 +1,4 @@
-"""Small pictures by Blender, and what the exact renderer makes of the same.
+"""Small images by Blender, and what the exact renderer makes of the same.
 
     python tests/experiments/blender_images.py [ENVIRONMENT]
 
@@ -49,7 +49,7 @@ def grid_of(name: str) -> np.ndarray:
 
 
 def ours(name: str, finer: int = 1, border: int = 0) -> np.ndarray:
-    """The exact picture of a shot with ``border`` more pixels around it, each divided into finer x finer:
+    """The exact image of a shot with ``border`` more pixels around it, each divided into finer x finer:
     display values."""
     _, camera, view, _ = IMAGES[name]
     grid, camera = grid_of(name), finely(CAMERAS[camera], finer, border)
@@ -79,12 +79,12 @@ def flat(name: str, room: int) -> np.ndarray:
 
 
 def theirs(name: str) -> np.ndarray:
-    """Blender's picture of a shot: display values."""
+    """Blender's image of a shot: display values."""
     return read_image(DATA / f"{name}.png")[:, :, 0] / 255.0
 
 
 def blackman_harris(name: str, finer: int = 16) -> np.ndarray:
-    """Our picture under the Blackman-Harris window of 3 pixels, Blender's filter of width 1.5."""
+    """Our image under the Blackman-Harris window of 3 pixels, Blender's filter of width 1.5."""
     fine = ours(name, finer, border=1)
     x = (np.arange(3 * finer) + 0.5) / finer - 1.5
     turn = 2 * np.pi * (x / 3 + 0.5)

@@ -1,4 +1,4 @@
-"""The exact renderer against Blender's own pictures, and the process that makes them."""
+"""The exact renderer against Blender's own images, and the process that makes them."""
 
 import json
 import sys
@@ -32,7 +32,7 @@ def test_edges_agree_where_blender_averages_over_the_pixel(name):
 
 
 def test_edges_differ_by_the_pixel_filter_and_by_nothing_else():
-    """Blender's default filter, put over our finely divided picture, gives Blender's picture again."""
+    """Blender's default filter, put over our finely divided image, gives Blender's image again."""
     name = "tag-blackman-harris"
     edges = ~flat(name, 2)
     seen = theirs(name)
@@ -46,7 +46,7 @@ def test_edges_differ_by_the_pixel_filter_and_by_nothing_else():
 
 
 def test_the_standard_view_averages_linear_light():
-    """Beside a picture of display means, Blender's 'Standard' view is lighter at edges, and only there."""
+    """Beside an image of display means, Blender's 'Standard' view is lighter at edges, and only there."""
     display, standard = ours("tag-raw"), theirs("tag-standard")
     edges = ~flat("tag-standard", 2)
     assert psnr(display[edges], standard[edges]) < 25
@@ -68,7 +68,7 @@ for marker in job["objects"]:
 
 @pytest.fixture
 def fake(tmp_path, monkeypatch) -> Path:
-    """A worker that writes its orders instead of pictures."""
+    """A worker that writes its orders instead of images."""
     script = tmp_path / "worker.py"
     script.write_text(FAKE)
     monkeypatch.setattr(blender, "WORKER", script)

@@ -112,7 +112,7 @@ def test_a_scene_of_one_truth_that_a_stop_left_with_images_of_two_is_rendered_ag
     folder = tmp_path / "blender" / "raw" / "apriltag-0"
     folder.mkdir(parents=True)
     write_png(folder / "view-00.png", np.zeros((800, 800, 3), np.uint8))
-    with pytest.raises(fs.InputError, match=r"view-01\.png is missing"):  # stopped after one picture
+    with pytest.raises(fs.InputError, match=r"view-01\.png is missing"):  # stopped after one image
         write_scene(part, tmp_path / "out", 0, "blender-raw", tmp_path / "blender")
     write_scene(part, tmp_path / "out", 0, "exact", Path("nowhere"))
     assert (scene / "images" / "view-00.png").read_bytes() == first

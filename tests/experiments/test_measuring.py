@@ -117,7 +117,7 @@ def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
 
 @in_turn()
 def test_trained_models_are_rows_where_they_are(renderer, tmp_path):
-    """A model that is our own marker, saved as a trainer saves it, is drawn like our own marker."""
+    """A model that is our own marker, saved as a trainer saves it, is rendered like our own marker."""
     spec = CATEGORIES["apriltag"].spec(2)
     made = fs.marker(spec, 2.0 * 8 / 10)
     folder = tmp_path / "2dgs-9"
@@ -211,7 +211,7 @@ def test_blenders_images_take_part_where_a_marker_has_all_of_them(pool, tmp_path
     ]
     point = points[1] | {"flip": False}
     found = views.measure_views(point, CEILING, 0, tmp_path, pool)
-    assert found["psnr"][0] is None  # the first view is in its place, the second is another view's picture
+    assert found["psnr"][0] is None  # the first view is in its place, the second is another view's image
     assert found["psnr"][1] < 20
     write_png(views.image_file(tmp_path, "raw", "small", 0, "test", 1), np.zeros((10, 10), np.uint8))
     with pytest.raises(fs.InputError, match="have another size"):

@@ -31,7 +31,7 @@ VIEWS = {
 
 
 def clipped_mean(camera: fs.Camera, row: int, column: int) -> float:
-    """A pixel's mean by clipping its square against every module's outline in the picture."""
+    """A pixel's mean by clipping its square against every module's outline in the image."""
     pixel = shapely.box(column, row, column + 1, row + 1)
     total, covered = 0.0, 0.0
     h, w = GRID.shape

@@ -75,7 +75,7 @@ def test_places_that_were_found_are_those_of_the_untouched_image():
 
 
 def test_a_code_that_is_only_read_enlarged_is_found_where_it_is():
-    """Modules of less than two pixels: read in a picture twice as large."""
+    """Modules of less than two pixels: read in an image twice as large."""
     image, target = ideal("small", 10.0)
     height, width = image.shape
     for pixels in range(width, 20, -4):

@@ -250,7 +250,7 @@ def test_results_of_another_version_are_one_line(tmp_path):
 
 
 def test_a_report_that_is_regenerated_has_the_same_tables(tmp_path):
-    """From its results and from the tables that lie beside them."""
+    """From its results and from the tables that lie next to them."""
     results = Results(tmp_path / "counts.jsonl", run_facts(None, 0))
     part = {"dark": 3, "light": 4}
     found = {key: part for key in ("cells", "runs", "rectangles", "components")}

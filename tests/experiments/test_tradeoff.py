@@ -53,7 +53,7 @@ def test_every_setting_changes_one_option_of_the_base():
             near = EXACT if point.setting == ABLATION else BASE
             turned = {name for name in vars(BASE) if getattr(point.quality, name) != getattr(near, name)}
             if point.setting in vars(BASE):
-                # the exclusive stop knows no layers; markers are also drawn without a low-pass
+                # the exclusive stop knows no layers; markers are also rendered without a low-pass
                 beside = {"order"} if point.value == "exclusive" else {"lowpass", "samples"}
                 expected = beside if point.setting == "marker" or "order" in beside else set()
                 assert turned, point
@@ -63,8 +63,8 @@ def test_every_setting_changes_one_option_of_the_base():
 
 
 def test_every_quality_setting_is_varied():
-    # first_hit decides where depth_first is, and nothing of rgb; detail_error what of a store is drawn, and
-    # scenes here are none (docs/large-scenes.md prices it)
+    # first_hit decides where depth_first is, and nothing of rgb; detail_error what of a store is rendered,
+    # and scenes here are none (docs/large-scenes.md prices it)
     assert {knob.name for knob in dataclasses.fields(fs.Quality)} - set(SETTINGS) == {
         "first_hit",
         "detail_error",
@@ -205,7 +205,7 @@ def test_memory_is_that_of_the_setting_only(session):
 
 
 def test_memory_does_not_depend_on_earlier_frames(session, monkeypatch):
-    """As on a GPU, where a cloud keeps its colours once a picture has asked for them."""
+    """As on a GPU, where a cloud keeps its colours once an image has requested them."""
     held = property(lambda self: sum(buffer.size for buffer in self._buffers.values()))
     monkeypatch.setattr(Resident, "memory_bytes", held)
     before = memory_of(session, "apriltag@0", BASE)

@@ -47,7 +47,7 @@ def record(scene: str, point: Point, found: dict, quick: bool = False, **run) ->
     return Record(json.loads(json.dumps(key)), found, RUN | run)
 
 
-# knob and value -> (time, largest error); the base has 1 and 0.02
+# quality setting and value -> (time, largest error); the base has 1 and 0.02
 NUMBERS = {
     ("base", "base"): (1.0, 0.02),
     ("preset", "gsplat"): (1.0, 0.04),
@@ -256,7 +256,7 @@ def test_names_in_a_chart_cover_neither_each_other_nor_the_legend(tmp_path):
 
 
 def test_devices_are_side_by_side_in_one_chart(tmp_path):
-    """Of a scene that all of them have drawn."""
+    """Of a scene that all of them have rendered."""
     write(tmp_path / "cpu", [*plain_records("hard"), *plain_records("r1m_1080p")])
     write(tmp_path / "gpu", plain_records("hard", **GPU))
     report.write_plot([tmp_path / "cpu", tmp_path / "gpu"], tmp_path / "both.svg")

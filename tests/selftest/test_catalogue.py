@@ -13,7 +13,7 @@ SIZES = {"A": 7, "B": 8, "C": 4, "D": 5, "E": 5, "F": 6, "G": 5}
 @pytest.mark.parametrize("case", all_cases(), ids=lambda case: case.name)
 def test_case(renderer, case, monkeypatch):
     """All frames agree with the reference, and all findings hold."""
-    monkeypatch.setattr(check, "reference_images", reference_images)  # each drawn once for all devices
+    monkeypatch.setattr(check, "reference_images", reference_images)  # each rendered once for all devices
     result, _ = check.run_case(renderer, case)
     assert result.wrong == []
 

@@ -109,7 +109,7 @@ def test_rendered_fragments_are_counted_exactly(renderer):
     alpha = renderer.render(one, CAMERA, outputs=("alpha",))["alpha"]
     np.testing.assert_array_equal(rendered, (alpha > 0).astype(np.int32))
     np.testing.assert_array_equal(count(facing([2.0, 2.5, 3.0], 0.1)), 3 * count(facing([2.0], 0.1)))
-    # nothing is drawn behind what lets no light through, here 1 - 0.9 a layer
+    # nothing is rendered behind what lets no light through, here 1 - 0.9 a layer
     stack = count(facing([2.0, 2.1, 2.2, 2.3, 2.4], 0.9), transmittance_stop=0.05)
     assert stack[24, 32] == 2
     assert stack.max() == 5  # towards the rim every layer lets light through
@@ -144,7 +144,7 @@ def test_memory_is_of_cloud_buffers_and_image(renderer):
     held = renderer.backend.memory_bytes
     assert held >= 640 * 480 * 16  # samples: colours and transmittance
     del frame
-    assert renderer.backend.memory_bytes >= held  # an image that is given back is kept for the next picture
+    assert renderer.backend.memory_bytes >= held  # an image that is given back is kept for the next image
 
 
 @pytest.mark.usefixtures("rates_once")
@@ -296,7 +296,7 @@ def test_the_wall_fills_the_image_with_200_codes(monkeypatch):
 
 
 def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
-    """Each pose is timed by itself, so many at most, and draws what it sees."""
+    """Each pose is timed by itself, so many at most, and renders what it sees."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(catalogue, "MOST_VIEWS", 3)
     fs.save_ply(random_cloud(200, 0.2), "own.ply")

@@ -34,7 +34,7 @@ def markers():
 
 
 def reading(placed, camera, noise=None):
-    """As if it had been seen, with corners that are off by so much; None: not seen."""
+    """As if it had been seen, with corners that are off by so much; None: not visible."""
     truth = marker_truth(placed, camera)
     found = Reading(placed, truth.truth, truth.corners, truth.visible, truth.box)
     code = Detection(

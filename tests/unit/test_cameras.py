@@ -17,7 +17,7 @@ point = st.tuples(coordinate, coordinate, coordinate)
 
 def test_pixel_centres():
     camera = fs.Camera.pinhole(5, 3, 100.0, 200.0, 2.5, 1.5)
-    # the middle of an odd picture is the centre of its middle pixel (row 1, column 2)
+    # the middle of an odd image is the centre of its middle pixel (row 1, column 2)
     assert camera.project([[0, 0, 1]]).tolist() == [[2.5, 1.5]]
     np.testing.assert_allclose(camera.project([[0.01, 0, 1], [0, 0.005, 1]]), [[3.5, 1.5], [2.5, 2.5]])
 
@@ -38,7 +38,7 @@ def test_nothing_behind_is_projected():
 def test_look_at_by_default_has_y_down():
     camera = fs.Camera.look_at(640, 480, math.radians(90), [0, 0, -2], [0, 0, 0])
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (pytest.approx(320), camera.fx, 320, 240)
-    # a marker's frame: x right, y down, seen from -z
+    # a marker's frame: x right, y down, viewed from -z
     np.testing.assert_allclose(camera.project([[1, 0, 0], [0, 1, 0]]), [[480, 240], [320, 400]])
     np.testing.assert_allclose(camera.position, [0, 0, -2])
 

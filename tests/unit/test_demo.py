@@ -21,13 +21,13 @@ def scene():
 
 @pytest.fixture(scope="module")
 def pictures():
-    """What the demo has drawn, by the camera's place."""
+    """What the demo has rendered, by the camera's place."""
     return {}
 
 
 @pytest.fixture(autouse=True)
 def drawn_once(pictures, monkeypatch):
-    """One frame of each view is timed, and none is drawn again for a second demo."""
+    """One frame of each view is timed, and none is rendered again for a second demo."""
     draw = demo._render
 
     def kept(renderer, resident, scene, camera):
@@ -69,7 +69,7 @@ def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):
     more = sum(len(p.marker.gaussians) - len(p.marker.cloud) for p in loaded.markers)
     assert len(loaded.cloud()) + more == len(fs.load_ply(folder / "scene.ply"))
     assert [p.marker.spec for p in loaded.markers] == list(result["marker_splats"])
-    # the scene file gives the picture that the demo saved
+    # the scene file gives the image that the demo saved
     assert main(["render", str(folder / "scene.toml"), "-o", str(folder / "again.png")]) == 0
     assert np.array_equal(read_image(folder / "again.png"), read_image(folder / "frontal-rgb.png"))
     assert main(["detect", str(folder / "frontal-rgb.png"), "--scene", str(folder / "scene.toml")]) == 0

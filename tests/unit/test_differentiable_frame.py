@@ -175,7 +175,9 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     assert [each is None for each in back] == [True, True, False, True, *[False] * 3, True, True, False]
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors"), (9, "pose")):
         np.testing.assert_array_equal(back[place].numpy(), expected[name])
-    tensors["scales"] = Tensor(given["scales"] * [[1], [0], [1], [1], [1], [1]])  # one that cannot be drawn
+    tensors["scales"] = Tensor(
+        given["scales"] * [[1], [0], [1], [1], [1], [1]]
+    )  # one that cannot be rendered
     with pytest.warns(UserWarning, match="1 of 6 splats left out"):
         bridge.draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
     kept = {name: array[[0, 2, 3, 4, 5]] for name, array in given.items()}

@@ -123,7 +123,7 @@ def published(cloud, camera, antialiased, depth_near=NEAR):
 
 @pytest.mark.parametrize("way", ["ewa", "ewa_antialiased"])
 def test_ewa_is_that_of_3dgs(renderer, way):
-    """Also of centres far outside the picture, needles, and splats far below a pixel."""
+    """Also of centres far outside the image, needles, and splats far below a pixel."""
     generator = np.random.default_rng(4)
     means = np.column_stack([generator.uniform(-4, 4, (60, 2)), generator.uniform(0.1, 4, 60)])
     scales = np.exp(generator.uniform(-8, 0, (60, 3)))

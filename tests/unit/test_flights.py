@@ -1,4 +1,4 @@
-"""Flights: what each picture shows, going on after a stop, sheets and videos; `fidsplat fly`."""
+"""Flights: what each image shows, going on after a stop, sheets and videos; `fidsplat fly`."""
 
 import json
 
@@ -64,7 +64,7 @@ def small_flight(rate=2.0, **changes) -> Flight:
 
 
 def test_each_image_has_its_pose(here):
-    """As drawn alone from there, in every output."""
+    """As rendered alone from there, in every output."""
     assert fly("--rate", "2", "--outputs", "rgb,depth") == 0
     scene, renderer = fs.Scene.load("scene.toml"), fs.Renderer()
     for k, x in enumerate((0.0, 0.15, 0.3)):
@@ -132,7 +132,7 @@ def test_a_video_does_not_say_where_its_camera_was(here, capsys):
 
 
 def test_the_shutter_sees_the_camera_move(here):
-    """Pictures of a flight are blurred along it, each about its own time."""
+    """Images of a flight are blurred along it, each about its own time."""
     flight = small_flight(shutter=fs.Shutter(exposure_time=0.2, sub_poses=2))
     capture = flight.captures[1]
     assert capture.exposed
@@ -201,7 +201,7 @@ def test_frames_are_not_mixed_with_those_of_another_flight(here, capsys):
 
 
 def test_what_a_flight_is_of(here):
-    """Its key changes with each thing that its pictures depend on, and with nothing else."""
+    """Its key changes with each thing that its images depend on, and with nothing else."""
     key = small_flight().key("a")
     assert key == small_flight().key("a")
     others = [

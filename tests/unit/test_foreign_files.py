@@ -42,7 +42,7 @@ def assert_placed(cloud, turn, move, scale, atol=2e-6):
 def test_a_gltf_of_pygltflib_with_a_matrix_and_rows_that_interleave(tmp_path, suffix):
     gltf = pytest.importorskip("pygltflib", reason="pip install 'fidsplat[test]'")
     parts = [MEANS, QUATS[:, [1, 2, 3, 0]], SCALES, COLORS, OPACITIES[:, None], np.full((COUNT, 2), 9.0)]
-    rows = np.column_stack(parts).astype("<f4")  # and two floats that nobody names
+    rows = np.column_stack(parts).astype("<f4")  # and two floats that no one names
     names = [
         "POSITION",
         *(f"KHR_gaussian_splatting:{n}" for n in ("ROTATION", "SCALE", "SH_DEGREE_0_COEF_0")),

@@ -14,7 +14,7 @@ from fidsplat.formats.plain import cloud_of
 
 @pytest.mark.parametrize("suffix", [".glb", ".gltf", *USD])
 def test_splats_of_planes_come_back_on_them(tmp_path, suffix):
-    """Those that cannot be drawn are left out, and the others keep their planes."""
+    """Those that cannot be rendered are left out, and the others keep their planes."""
     need(suffix)
     planes = np.arange(40) % 4 - 1
     cloud = some(thick=False).with_coplanar_groups(planes)
@@ -53,7 +53,7 @@ def test_planes_that_cannot_be(tmp_path, thick, plane, words):
 @pytest.mark.parametrize("opacity", [0.5, math.nan])
 @pytest.mark.parametrize("shape", [(3,), (5, 2), ()])
 def test_planes_of_other_splats_than_the_files(shape, opacity):
-    """As a USD file may have them, whether all splats can be drawn or not."""
+    """As a USD file may have them, whether all splats can be rendered or not."""
     cloud, opacities = some(5, thick=False), np.full(5, 0.5, np.float32)
     opacities[0] = opacity
     arrays = cloud.means, cloud.quats, np.pad(cloud.scales, [(0, 0), (0, 1)]), opacities, cloud.sh

@@ -13,7 +13,7 @@ TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def converted(file, to: str, **more):
-    """The file beside it in another format, written by GaussForge."""
+    """The file next to it in another format, written by GaussForge."""
     kind = "".join(file.suffixes)[1:]
     found = gaussforge.GaussForge().convert(file.read_bytes(), kind, to, **more)
     assert "error" not in found, found

@@ -1,4 +1,5 @@
-"""Files of gigabytes: what is none of ours is seen by its first bytes, and no more is read than is meant."""
+"""Files of gigabytes: what is none of ours is visible by its first bytes, and no more is read than is
+meant."""
 
 import base64
 import json

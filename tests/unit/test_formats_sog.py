@@ -16,7 +16,7 @@ def picture(kind: str, side: int) -> bytes:
 
 
 def sog(path, **changes):
-    """A SOG file by hand: two splats in pictures of 2 x 2, and a palette of SH of degree 1."""
+    """A SOG file by hand: two splats in images of 2 x 2, and a palette of SH of degree 1."""
     book = np.linspace(-4, 4, 256)
     red = lambda rows: np.array(rows, np.uint8).reshape(2, 2, -1)  # noqa: E731
     nothing = [0, 0, 0, 255]
@@ -92,7 +92,7 @@ def test_a_sog_file_by_hand(tmp_path):
         ),
         ({"count": math.inf}, r"damaged \(OverflowError"),
         ({"means": "nothing"}, r"damaged \(TypeError"),
-        # small files of huge pictures
+        # small files of huge images
         ({"q.webp": np.zeros((300, 300, 4), np.uint8)}, "q.webp must have about 2 pixels, got 90000"),
         ({"q.webp": picture(".png", 300)}, "q.webp must have about 2 pixels, got 90000"),
         ({"p.webp": np.zeros((2600, 192, 4), np.uint8)}, "p.webp must have about 196608 pixels, got 499200"),
@@ -133,7 +133,7 @@ def test_a_sog_file_that_says_nothing_or_too_much(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("spare", "fits"), [(0, True), (-1, False)])
 def test_images_may_have_twice_the_pixels_that_are_meant(tmp_path, monkeypatch, spare, fits):
-    """At that size exactly: two splats in pictures of 2 x 2."""
+    """At that size exactly: two splats in images of 2 x 2."""
     monkeypatch.setattr("fidsplat.formats.sog.SPARE", spare)
     sog(tmp_path / "a.sog")
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:

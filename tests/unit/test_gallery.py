@@ -1,4 +1,4 @@
-"""`fidsplat gallery`: a page of pictures."""
+"""`fidsplat gallery`: a page of images."""
 
 import json
 from urllib.parse import quote
@@ -42,7 +42,7 @@ def test_a_page_shows_scenes_with_their_outputs_and_text(here, capsys):
     assert any("#" in name for name in images)
     rgb = fs.Renderer("reference").render(fs.Scene.load("a.toml"))["rgb"]
     np.testing.assert_array_equal(read_image(facts["pictures"][0]), to_uint8(rgb))
-    # what has not changed is not drawn again, what has is
+    # what has not changed is not rendered again, what has is
     before = {file: file.stat().st_mtime_ns for file in (here / "out").glob("*.png")}
     (here / "c#2.toml").write_text(SCENE.replace("0.4", "0.3"))
     assert main(["gallery", "a.toml", "c#2.toml", "-o", "out"]) == 0

@@ -1,4 +1,4 @@
-"""The reference's derivatives: against central differences of its own pictures, decisions as they were."""
+"""The reference's derivatives: against central differences of its own images, decisions as they were."""
 
 from dataclasses import replace
 
@@ -28,8 +28,8 @@ def splats(n=5, seed=0, *, scale=0.35, opacity=(0.2, 0.9), degree=-1, depth=(1.2
 
 
 def edge_on():
-    """Seen along their planes but for little: most of what is seen are dots of the low-pass, whose rays miss
-    the plane or meet it far away."""
+    """Seen along their planes but for little: most of what is visible are dots of the low-pass, whose rays
+    miss the plane or meet it far away."""
     cloud = splats(6, 5)
     tilt = np.deg2rad(89.0 + np.arange(6) / 6) / 2
     quats = np.stack([np.cos(tilt), np.sin(tilt), 0 * tilt, 0 * tilt], 1)
@@ -134,7 +134,7 @@ def test_every_decision_occurs():
 
 
 def test_the_screen_statistic_is_the_derivative_by_the_centres_place():
-    """What the 2DGS authors call dL_dmean2D: by the centre's place in the picture, in half pictures."""
+    """What the 2DGS authors call dL_dmean2D: by the centre's place in the image, in half images."""
     cloud, features, view = pictured("dots")
     found = FrozenFrame(cloud, view, features).backward({"rgb": np.ones((view.height, view.width, 3))})
     z, (x, y, _) = cloud.means[:, 2].astype(float), found["means"].T

@@ -37,7 +37,7 @@ def test_plants_have_the_foot_at_the_origin(kind):
 
 def test_a_marker_that_faces_a_side_is_upright_there():
     pose = facing((1, 2, 0.5), (0, -1))
-    np.testing.assert_allclose(pose[:3, 2], [0, 1, 0])  # seen from its -z, from where y is less
+    np.testing.assert_allclose(pose[:3, 2], [0, 1, 0])  # viewed from its -z, from where y is less
     np.testing.assert_allclose(pose[:3, 1], [0, 0, -1])
     np.testing.assert_allclose(pose[:3, 0], [1, 0, 0])
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)

@@ -116,7 +116,7 @@ def test_a_scene_file_keeps_them(tmp_path):
 
 
 def test_numbers_of_numpy_are_numbers(tmp_path):
-    """They are what a script has that draws many pictures; a file says them as any others."""
+    """They are what a script has that renders many images; a file says them as any others."""
     one = np.float32(1.5)
     scene = fs.Scene(
         camera=fs.Camera.pinhole(8, 6, 8.0, 8.0, 4.0, 3.0),

@@ -86,7 +86,7 @@ HEAVY = (
     "rich",
 )
 
-# A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files
+# A wheel carries the kernels inside the package (`_kernels`), a checkout next to it; Warp's are Python files
 # of another house, which fidsplat loads by path and which import each other by relative names.
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path

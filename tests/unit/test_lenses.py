@@ -1,4 +1,4 @@
-"""Lenses: OpenCV's projections, their inverses, what is not seen, scene files."""
+"""Lenses: OpenCV's projections, their inverses, what is not visible, scene files."""
 
 import math
 
@@ -90,7 +90,7 @@ def test_beyond_the_fold_nothing_is_visible():
     radius = 52 * lens.fold * (1 - 0.35 * lens.fold**2)
     assert not np.isnan(camera.rays([[40 + radius - 1e-3, 30]])).any()
     assert np.isnan(camera.rays([[40 + radius + 1e-3, 30]])).all()
-    # the polynomial comes back to the picture there; the lens does not
+    # the polynomial comes back to the image there; the lens does not
     assert np.isnan(camera.project([[1.5, 0, 1]])).all()
     assert BrownConrady(k1=0.2, k4=-0.1).fold == pytest.approx(math.sqrt(10), rel=0.5)
 
@@ -291,7 +291,7 @@ def test_slopes_of_a_raster_are_the_differences_of_its_rays(lens):
     ids=["distortion", "fisheye", "panorama"],
 )
 def test_rays_of_a_raster_go_through_the_centres_of_its_samples(camera):
-    """Back on the picture they are there, to what float32 rounds. No comparison with the reference asks that:
+    """Back on the image they are there, to what float32 rounds. No comparison with the reference asks that:
     it has the same rays."""
     raster = RayRaster(camera.lens, 90, 70, camera.fx, camera.fy, camera.cx, camera.cy)
     for rows in (raster, raster.cropped(30, 50)):

@@ -171,7 +171,7 @@ def test_errors_are_those_of_evo():
 
 
 def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
-    """Odometry alone, which draws nothing."""
+    """Odometry alone, which renders nothing."""
     monkeypatch.setenv("FIDSPLAT_DEVICE", "reference")
     words = ["experiment", "localise", "--quick", "-o", str(tmp_path / "out"), "--variant", "odometry"]
     assert main([*words, "--json"]) == 0

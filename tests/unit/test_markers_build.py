@@ -19,7 +19,7 @@ def text_of(length: int) -> str:
 
 
 def coverage(made: Marker, per_module: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """The marker over grey as coplanar splats are drawn, in NumPy, and the marker as it is printed."""
+    """The marker over grey as coplanar splats are rendered, in NumPy, and the marker as it is printed."""
     cloud = made.gaussians
     h, w = made.grid.shape
     x = ((np.arange(w * per_module) + 0.5) / per_module - w / 2) * made.module
@@ -66,7 +66,7 @@ def test_frame_size_and_corners():
 
 
 def test_upright_as_printed():
-    """x right and y down: the picture is the grid, neither turned nor mirrored; it fits best as it is."""
+    """x right and y down: the image is the grid, neither turned nor mirrored; it fits best as it is."""
     made = marker("aruco:4x4_50:7")
     shown, printed = coverage(made, 6)
     error = np.mean((shown - printed) ** 2)
@@ -104,7 +104,7 @@ def test_the_paper_s_mixture_has_its_options():
 
 @pytest.mark.parametrize("spec", ["apriltag:36h11:0", "apriltag:25h9:3", "aruco:4x4_50:7"])
 def test_fitted_is_nearer_to_the_print_with_a_quarter_of_the_splats(spec):
-    """Here by the formula; benchmarks/marker_quality.py measures the renderer's pictures."""
+    """Here by the formula; benchmarks/marker_quality.py measures the renderer's images."""
     fitted, paper = marker(spec, mixture="fitted"), marker(spec, mixture="paper")
     assert 3.5 * len(fitted.cloud) < len(paper.cloud)
     assert psnr(fitted) > 23
@@ -249,7 +249,7 @@ def test_clouds_are_filled_part_by_part_bit_identically(noise, monkeypatch):
 
 
 def test_a_large_checkerboard(tmp_path):
-    """Every module a rectangle: what grows faster than the picture would not end."""
+    """Every module a rectangle: what grows faster than the image would not end."""
     bits = np.indices((1000, 1000)).sum(0) % 2 == 1
     spec = f"image:{write_png(tmp_path / 'board.png', bits)}"
     made = marker(spec, mixture="exact")

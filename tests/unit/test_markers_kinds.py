@@ -14,12 +14,12 @@ PIXELS = 10
 
 
 def printed(made: fs.markers.Marker) -> np.ndarray:
-    """A picture of the grid, quiet zone included."""
+    """An image of the grid, quiet zone included."""
     return np.kron(255 * (1 - made.grid), np.ones((PIXELS, PIXELS))).astype(np.uint8)
 
 
 def place(made, corners: np.ndarray) -> np.ndarray:
-    """Pixels in modules of the code: as drawn, pixel centres lie at halves."""
+    """Pixels in modules of the code: as rendered, pixel centres lie at halves."""
     return (corners + 0.5) / PIXELS - made.quiet_zone
 
 

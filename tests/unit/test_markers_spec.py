@@ -13,7 +13,7 @@ from fidsplat.vision.detect import detect
 
 
 def printed(bits: np.ndarray, pixels: int = 8) -> np.ndarray:
-    """A picture of the code, with 4 modules of white around."""
+    """An image of the code, with 4 modules of white around."""
     return np.kron(255 * (1 - np.pad(bits, 4)), np.ones((pixels, pixels))).astype(np.uint8)
 
 

@@ -85,14 +85,15 @@ MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
     ],
 )
 def test_a_shutter_that_does_nothing_is_none(motion, shutter, sub_frames):
-    """One picture, without the code of several."""
+    """One image, without the code of several."""
     camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24)
     view = view_of(fs.Capture(camera, motion=motion, shutter=shutter), np.zeros(3))
     assert len(view.sub_frames) == sub_frames
 
 
 def test_a_group_moves_about_the_worlds_origin_wherever_the_clouds_is():
-    """A splat's place in the camera frame: its own in the world, moved, then seen; and whence it is seen."""
+    """A splat's place in the camera frame: its own in the world, moved, then seen; and whence it is
+    visible."""
     generator = np.random.default_rng(3)
     pose, moved, origin = random_pose(generator), random_pose(generator), np.array([100.0, -20.0, 7.0])
     camera = fs.Camera.pinhole(8, 6, 5, 5, 4, 3, world_to_camera=pose)

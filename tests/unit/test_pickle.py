@@ -52,7 +52,7 @@ def plain() -> list:
 
 @pytest.mark.parametrize("way", WAYS)
 def test_plain_data(way):
-    """It draws the same, and its arrays are still read-only."""
+    """It renders the same, and its arrays are still read-only."""
     for value in plain():
         again = WAYS[way](value)
         assert type(again) is type(value)

@@ -27,7 +27,7 @@ DAMAGES = {
 
 @pytest.fixture(scope="module")
 def full_cache(tmp_path_factory):
-    """The cache that a process leaves which draws one picture, and what it printed."""
+    """The cache that a process leaves which renders one image, and what it printed."""
     folder = tmp_path_factory.mktemp("pocl")
     done = draw(folder)
     if "opencl:pocl" in done.stderr and done.returncode:

@@ -100,7 +100,7 @@ def test_a_marker_takes_from_a_quality_what_it_does_not_say():
     by_itself = fs.marker("apriltag:36h11:5", mixture="paper", levels=2, density=1, growth=0.2)
     assert np.array_equal(by_quality.cloud.scales, by_itself.cloud.scales)
     assert fs.marker("apriltag:36h11:5", mixture="fitted", quality=quality).quality.template == 9
-    # what does not concern the mixture is let be; what is asked for is not
+    # what does not concern the mixture is let be; what is requested is not
     assert fs.marker("apriltag:36h11:5", mixture="exact", quality=quality).mixture == "exact"
     with pytest.raises(fs.InputError, match="levels and density"):
         fs.marker("apriltag:36h11:5", mixture="paper", template=9)

@@ -88,7 +88,7 @@ def outlined(spec="apriltag:36h11:5", **camera):
 
 
 def test_a_box_is_as_tight_as_the_labels(renderer):
-    """The pixels of a drawn tag's label have its box's bounds, to a pixel."""
+    """The pixels of a rendered tag's label have its box's bounds, to a pixel."""
     placed, camera = outlined()
     frame = renderer.render(fs.Scene(markers=[placed]), camera, outputs=("rgb", "label"))
     (reading,), others = read_back(frame, fs.Scene(markers=[placed]), camera)
@@ -115,8 +115,8 @@ def test_the_outline_of_a_marker_that_is_not_square(spec):
 
 
 def test_what_the_images_edge_cuts_off():
-    """Half of a tag that is seen straight on; a tag that reaches behind the camera; one that is seen from
-    behind."""
+    """Half of a tag that is visible straight on; a tag that reaches behind the camera; one that is visible
+    from behind."""
     placed, straight = outlined(position=(0, 0, -1))
     aside = fs.Camera.pinhole(320, 240, straight.fx, straight.fy, 0.0, 120, straight.world_to_camera)
     assert visible(placed, aside).share == pytest.approx(0.5, abs=1e-9)
@@ -141,7 +141,7 @@ def test_what_the_images_edge_cuts_off():
 @in_turn()
 @pytest.mark.parametrize("spec", ["charuco:5x4:4x4_50", "gridboard:3x2:5x5_100", "aprilgrid:3x2:36h11"])
 def test_a_board_gives_one_pose(renderer, spec):
-    """From half of its tags too, and a tag of another place in the picture stays what it is."""
+    """From half of its tags too, and a tag of another place in the image stays what it is."""
     board = PlacedMarker(fs.marker(spec, size=0.3))
     camera = fs.Camera.look_at(640, 480, 0.9, (0.2, -0.15, -0.5), (0, 0, 0))
     scene = fs.Scene(markers=[board], camera=camera, background=(0.5, 0.5, 0.5))
@@ -218,7 +218,7 @@ def test_the_error_of_corners_is_the_root_mean_square_of_their_distances():
 
 
 def test_markers_that_face_away_or_lie_outside_are_not_missed(tmp_path, monkeypatch, capsys):
-    """One in front of the camera, one turned over, one beside the image; a blank image misses the first."""
+    """One in front of the camera, one turned over, one next to the image; a blank image misses the first."""
     tag = fs.marker("aruco:4x4_50:7", size=0.2)
     places = [
         rigid_matrix((0.05, 0, 0.1)),

@@ -17,7 +17,7 @@ LOWPASSES = ("none", "screen", "pixel")
 
 
 def clouds():
-    """From below a pixel to across the picture, around the camera; ellipsoids, thin boxes, planes."""
+    """From below a pixel to across the image, around the camera; ellipsoids, thin boxes, planes."""
     cloud = random_splats(90, 3, depth=(-5.0, 6.0), scale=(1e-4, 5.0))
     scales = cloud.scales.copy()
     scales[::4, 0] = 1e-5

@@ -78,7 +78,7 @@ except fs.DeviceError as error:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
 def test_memory_that_runs_out_is_an_error_of_the_device(tmp_path):
-    """PoCL takes a buffer's memory at its first use unless it is told otherwise, and crashes there."""
+    """PoCL takes a buffer's memory at its first use unless an option disables it, and crashes there."""
     status, out, err = shell(f"{sys.executable} -c '{SHORT}'", tmp_path)
     assert (status, err) == (0, "")
     assert out.startswith("no memory for a buffer (64 MiB): ")

@@ -87,7 +87,7 @@ def test_cameras_off_the_origin_have_the_images_of_a_scene_put_together_by_hand(
     rng = np.random.default_rng(3)
     mount = rigid_matrix((0.3, -0.2, 0.1), (0.9, 0.1, -0.05, 0.2))
     base = rigid_matrix((1.0, -0.7, -2.0), (0.95, -0.05, 0.2, 0.1))
-    around = rng.uniform(-4, 4, (200, 3))  # most of them beside the image or behind it
+    around = rng.uniform(-4, 4, (200, 3))  # most of them next to the image or behind it
     sizes = rng.uniform(0.02, 0.2, (200, 2))
     cloud = fs.SplatCloud(
         around, rng.normal(size=(200, 4)), sizes, rng.random(200), sh=0.3 * rng.normal(size=(200, 9, 3))

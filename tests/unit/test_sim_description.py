@@ -84,7 +84,7 @@ def test_a_sensor_looks_along_its_x_with_z_up(world):
     below = [0, 0, 1.0]
     np.testing.assert_allclose(camera.project([below]), [[32, 24]], atol=1e-6)
     ((x, y),) = camera.project([[0.1, 0, 1.0]])
-    assert y < 24  # the world's x is up in the picture
+    assert y < 24  # the world's x is up in the image
     assert x == pytest.approx(32)
     assert camera.project([[0, 0.1, 1.0]])[0, 0] < 32  # its y is to the left
 

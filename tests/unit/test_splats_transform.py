@@ -99,7 +99,7 @@ def test_transform_rotates_the_colours_with_the_splats(turn, move, scale, eye, d
     before = cloud_of(degree=degree)
     moved_eye = matrix[:3, :3] @ np.array(eye) + move
     difference = colors_from(before.transformed(matrix), moved_eye) - colors_from(before, np.array(eye))
-    # a splat next to the eye is seen from a direction that float32 centres do not fix
+    # a splat next to the eye is visible from a direction that float32 centres do not fix
     distance = np.linalg.norm(before.world_means() - eye, axis=1)
     assert np.abs(difference[distance > 0.1]).max(initial=0) < 1e-4
 

@@ -78,7 +78,7 @@ def test_nodes_cover_every_chunk_once_and_none_that_is_too_near(store, limit, aw
             # the middle lies no nearer than the nearest point, by which it was selected_nodes
             assert nodes["size"][number] * view.focal_x / depth <= limit
     assert len(covered) == len(set(covered))
-    if away >= 200:  # all of the city is in the picture
+    if away >= 200:  # all of the city is in the image
         assert sorted(covered) == np.flatnonzero(nodes["level"] == 0).tolist()
     assert list(numbers) == sorted(numbers)
 

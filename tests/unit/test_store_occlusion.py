@@ -192,7 +192,7 @@ def test_transparent_splats_occlude_nothing(tmp_path, culling, monkeypatch):
     for _ in range(4):
         assert np.array_equal(renderer.render(resident, look())["rgb"], renderer.render(faint, look())["rgb"])
     assert len(culling) == 2  # and then not for two views
-    assert all(count > 0.6 * of for count, of in culling)  # pieces beside the picture are left out
+    assert all(count > 0.6 * of for count, of in culling)  # pieces next to the image are left out
 
 
 def test_levels_of_detail_and_instances_are_culled(town, tmp_path, culling, monkeypatch):

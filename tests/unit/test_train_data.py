@@ -231,7 +231,7 @@ def test_views_that_are_held_out(made, folder):
 
 
 def test_views_that_nerfstudio_holds_out(made, tmp_path):
-    """Its lists name pictures with and without "./"."""
+    """Its lists name images with and without "./"."""
     for number, (lists, trained, held_out) in enumerate(
         [
             ({"test_filenames": ["2.png"]}, [1, 3, 4], [2]),

@@ -1,4 +1,4 @@
-"""Pictures that lenses took are trained on as pinholes would have taken them."""
+"""Images that lenses took are trained on as pinholes would have taken them."""
 
 import json
 from dataclasses import replace
@@ -42,7 +42,7 @@ LENSES = {
 
 
 def taken(camera):
-    """A smooth picture of directions alone, as a camera sees them; grey where it sees nothing."""
+    """A smooth image of directions alone, as a camera sees them; grey where it sees nothing."""
     y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
     rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1))
     slopes = (rays / rays[:, 2:])[:, :2].reshape(camera.height, camera.width, 2)
@@ -51,7 +51,7 @@ def taken(camera):
 
 
 def flat_as_wanted(view, lens, mask):
-    """Whether a view has the picture that a pinhole would have taken, where what it is made of was there."""
+    """Whether a view has the image that a pinhole would have taken, where what it is made of was there."""
     camera = view.camera
     assert camera.lens is None
     there = np.ones(mask.shape, bool) if view.mask is None else view.mask

@@ -90,7 +90,7 @@ def test_a_plane_has_the_normals_of_its_depths():
 
 
 def test_the_loss_is_what_its_definition_says():
-    """SSIM written out pixel by pixel: a window of 11 that sees zeros beyond the picture."""
+    """SSIM written out pixel by pixel: a window of 11 that sees zeros beyond the image."""
     image, truth = images(size=(5, 7))
     weights = np.outer(window(), window())
     similar = []
@@ -267,7 +267,7 @@ def ids(splats):
 def test_densification_keeps_the_order_and_puts_new_splats_behind():
     settings, splats = TrainSettings(), ready()
     splats.gradient_sums[[1, 2, 5]] = 4 * settings.gradient_threshold
-    splats.gradient_sums[3] = 3.99 * settings.gradient_threshold  # in 4 pictures: below the threshold
+    splats.gradient_sums[3] = 3.99 * settings.gradient_threshold  # in 4 images: below the threshold
     splats.values["log_scales"][[2, 5]] = np.log(0.03)  # larger than a hundredth of the extent
     splats.values["logits"][7] = logit(0.04)
     old = splats.select(slice(None))

@@ -86,12 +86,12 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_pa
 
 
 def test_a_frame_that_exceeds_its_capacity_is_rendered_again(whole, dataset, tmp_path):
-    """A device that did not wait finds out when it takes the picture back: the run gives the same bytes."""
+    """A device that did not wait finds out when it takes the image back: the run gives the same bytes."""
     trainer, refused = Trainer(dataset, whole[0].renderer, iterations=ITERATIONS, **QUICK), []
     differentiate = trainer._differentiate
 
     class Narrow:
-        """A pipeline in which every third picture that nobody waits for has too little room."""
+        """A pipeline in which every third image that no one waits for has too little room."""
 
         def __init__(self, features):
             self.own = differentiate(features)
@@ -393,7 +393,7 @@ def test_mcmc_grows_to_its_limit(dataset):
 
 def test_mcmc_begins_with_splats_that_learn_their_size(dataset):
     """Behind the low-pass `screen` scales far below a pixel have no gradient: splats as small as gsplat's
-    first ones, which are 0.002 in the end, never grow to the 0.08 to 0.2 of those in the pictures."""
+    first ones, which are 0.002 in the end, never grow to the 0.08 to 0.2 of those in the images."""
     rates = {"sh_degree": 0, "color_rate": 0.05, "scale_rate": 0.05}
     trainer = Trainer(dataset, fs.Renderer("opencl"), iterations=150, strategy="mcmc", **rates)
     assert 0.08 < np.median(trainer.run().scales) < 0.2

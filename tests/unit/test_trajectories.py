@@ -158,7 +158,7 @@ def test_colmap_reads_what_is_written(tmp_path):
 
 
 def test_colmaps_images_come_in_the_order_of_their_names(tmp_path):
-    """With points that are seen, in text and in binary; the second line of an image may be empty."""
+    """With points that are visible, in text and in binary; the second line of an image may be empty."""
     rows = [("b.png", 2.0, 2), ("a.png", 1.0, 0)]
     text = "# a comment\n" + "".join(
         f"{k} 1 0 0 0 0 0 {-z} 1 {name}\n{'1.0 2.0 -1 ' * seen}\n" for k, (name, z, seen) in enumerate(rows)

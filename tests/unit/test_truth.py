@@ -1,4 +1,4 @@
-"""Truth with every picture: markers, groups, flow; as COCO and BOP, poses as TUM."""
+"""Truth with every image: markers, groups, flow; as COCO and BOP, poses as TUM."""
 
 import contextlib
 import io
@@ -60,7 +60,7 @@ def test_a_marker_is_where_it_was_put(truth):
     assert tag.tilt == pytest.approx(2 * math.atan(0.15))
     np.testing.assert_allclose(tag.truth, tag.placed.pose, atol=1e-12)
     assert tag.corners[1, 0] > tag.corners[0, 0]
-    # the block ends at x = -0.1 at 1 m: in the picture at 82 - 11
+    # the block ends at x = -0.1 at 1 m: in the image at 82 - 11
     left, _, right, _ = tag.box
     assert 1 - tag.visible == pytest.approx((71 - left) / (right - left), abs=0.02)
 

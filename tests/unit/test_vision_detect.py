@@ -1,4 +1,4 @@
-"""Detectors on ideal pictures: what is found, where its corners are, what is not there is not found."""
+"""Detectors on ideal images: what is found, where its corners are, what is not there is not found."""
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ SIZE = 0.2
 
 
 def seen(bits, pixels, tilt=0.0, spin=0.0, quiet=1, camera=CAMERA, aside=(0.007, -0.011)):
-    """A code about ``pixels`` wide: uint8 picture, corners, camera_from_marker."""
+    """A code about ``pixels`` wide: uint8 image, corners, camera_from_marker."""
     placed = pose(turned(tilt, spin), [*aside, camera.fx * SIZE / pixels])
     picture, corners = draw(bits, SIZE, placed, camera, quiet)
     return photographed(picture), corners, placed
@@ -74,7 +74,7 @@ def test_a_steep_qr_code_is_read_by_stretching_the_image(aside):
         picture = np.ascontiguousarray(picture.T)
     (code,) = detect(picture, families=())
     assert code.payload == "a" * 20
-    # a transposed picture shows a mirrored code, whose corners go round the other way
+    # a transposed image shows a mirrored code, whose corners go round the other way
     expected = corners[:, ::-1] if aside else corners
     best = min(
         corner_error(np.roll(order, k, 0), expected)
@@ -286,7 +286,7 @@ def test_pose_error_is_the_distance_and_the_angle():
 
 
 def test_a_pose_behind_the_camera_is_not_taken(monkeypatch):
-    """It is seen in the same places: the plane's axes and its place with their signs changed."""
+    """It is visible in the same places: the plane's axes and its place with their signs changed."""
     placed = pose(turned(30, 20), [0.05, -0.04, 1.2])
     _, corners = draw(np.ones((1, 1), np.uint8), SIZE, placed, CAMERA, samples=1)
 

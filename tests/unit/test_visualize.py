@@ -1,4 +1,4 @@
-"""Output images as pictures: what a colour means, what nothing looks like."""
+"""Output images as images: what a colour means, what nothing looks like."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Pictures on a Warp tape: gradients through our rendering and somebody's own kernels; training on Warp."""
+"""Images on a Warp tape: gradients through our rendering and somebody's own kernels; training on Warp."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def draw():
 
 
 def picture():
-    """As tests/contract/test_gradients.py draws, whose kernels it shares."""
+    """As tests/contract/test_gradients.py renders, whose kernels it shares."""
     return random_picture(1, degree=None, quality="surfel", outputs=("rgb",), origin=(0.0, 0.0, 0.0))
 
 
@@ -105,7 +105,7 @@ def test_what_a_tape_cannot_record_is_an_error(renderer, draw):
 
 
 def test_derivatives_that_cannot_be_taken_are_errors(renderer):
-    """Pictures in bands; arrays of another type, which would be read as something else."""
+    """Images in bands; arrays of another type, which would be read as something else."""
     cloud, capture = picture()
     backend = renderer.backend
     features, view = prepare(cloud, capture)

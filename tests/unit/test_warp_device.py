@@ -197,7 +197,7 @@ def test_adopted_labels_harmonics_and_origins(renderer):
 
 
 def test_adopted_splats_with_three_scales(renderer):
-    """Disks among them; drawn where they lie, and left out where a third scale is none."""
+    """Disks among them; rendered where they lie, and left out where a third scale is none."""
     device = renderer.backend.device
     third = np.where(np.arange(len(CLOUD)) % 3 == 0, 0, CLOUD.scales[:, :1].T * 0.5)
     scales = np.column_stack([CLOUD.scales, third[0]])

@@ -74,7 +74,7 @@ CAMERA = fs.Camera.pinhole(25, 17, 20.0, 20.0, 12.5, 8.5)
 
 
 def two_splats():
-    """One behind the other in the middle of the picture."""
+    """One behind the other in the middle of the image."""
     one = np.ones((2, 1), np.float32)
     means = np.float32([[0, 0, 1], [0, 0, 2]])
     return fs.SplatCloud(
