@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.images.files import encoded
+from fidsplat.images.files import encode_image
 from fidsplat.scenes.random_clouds import SCENES, random_cloud, standard_camera
 from fidsplat.splats.rotations import matrix_to_quaternion
 from fidsplat.viewer.server import JPEG
@@ -75,7 +75,7 @@ def measured(session: Session, start: Viewpoint, rate: float, seconds: float) ->
 
         def send() -> None:
             taken = time.perf_counter()
-            sizes.append(len(encoded(image, "jpeg", JPEG)))
+            sizes.append(len(encode_image(image, "jpeg", JPEG)))
             scales.append(scale)
             encoding.append(time.perf_counter() - taken)
             latencies.append(time.perf_counter() - begun)
@@ -83,7 +83,7 @@ def measured(session: Session, start: Viewpoint, rate: float, seconds: float) ->
         return send
 
     def rest(viewpoint: Viewpoint) -> None:
-        encoded(session.render(viewpoint).frame.to_uint8(), "png")
+        encode_image(session.render(viewpoint).frame.to_uint8(), "png")
 
     stream = Stream(moving, rest, rate=rate)
     for warm in range(10):  # the scale converges

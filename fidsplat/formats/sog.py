@@ -89,13 +89,13 @@ def _part(path: Path, archive: zipfile.ZipFile, name: str, maximum: int = MAX_PA
 
 def _image(path: Path, archive: zipfile.ZipFile, name: str, count: int) -> np.ndarray:
     """Read an image (h, w, 4) uint8 RGBA of about `count` pixels: a small file can expand to a huge image."""
-    from fidsplat.images.files import declared_pixels, rgba_pixels  # here, since it imports OpenCV
+    from fidsplat.images.files import declared_pixels, decode_rgba  # here, since it imports OpenCV
 
     data = _part(path, archive, name)
     pixels = declared_pixels(data)
     if pixels > 2 * max(count, 0) + SPARE:
         raise InputError(f"{path}: {name} must have about {count} pixels, got {pixels}")
-    return rgba_pixels(data if pixels and data[:4] in (b"\x89PNG", b"RIFF") else b"", f"{path}: {name}")
+    return decode_rgba(data if pixels and data[:4] in (b"\x89PNG", b"RIFF") else b"", f"{path}: {name}")
 
 
 def _book(part: dict[str, Any]) -> np.ndarray:

@@ -115,7 +115,7 @@ def save_trajectory(
     elif suffix == ".kitti":
         text = _rows(trajectory.poses[:, :3, :].reshape(-1, 12))
     elif suffix == ".json":
-        text = json.dumps(_said(trajectory, _pinhole(camera, file), names), indent=2) + "\n"
+        text = json.dumps(_transforms_json(trajectory, _pinhole(camera, file), names), indent=2) + "\n"
     else:
         raise InputError(f"the suffix of a trajectory must be one of {_SUFFIXES}, got {file}")
     with atomic_write(file) as stream:
@@ -135,7 +135,7 @@ def _pinhole(camera: Camera | None, file: Path) -> Camera:
     return camera
 
 
-def _said(trajectory: Trajectory, camera: Camera, names: Sequence[str]) -> dict[str, Any]:
+def _transforms_json(trajectory: Trajectory, camera: Camera, names: Sequence[str]) -> dict[str, Any]:
     frames = [
         {"file_path": name, "time": time, "transform_matrix": (pose @ _FLIP + 0.0).tolist()}
         for name, time, pose in zip(
@@ -177,7 +177,7 @@ def _lines(file: Path, text: str) -> tuple[list[float] | None, list[np.ndarray]]
         if times and not values[0] > times[-1]:
             raise InputError(f"{where}: times must increase, got {words[0]} after {times[-1]:.15g}")
         times.append(values[0])
-        poses.append(_turned(where, values[1:4], (values[7], *values[4:7])))
+        poses.append(_pose(where, values[1:4], (values[7], *values[4:7])))
     return times or None, poses
 
 
@@ -193,7 +193,7 @@ def _numbers(where: str, words: Sequence[Any]) -> list[float]:
     return values
 
 
-def _turned(where: str, position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
+def _pose(where: str, position: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
     length = math.hypot(*quaternion)
     if abs(length - 1) > ROUNDED:
         raise InputError(f"{where}: the length of the quaternion must be 1, got {length:g}")
@@ -236,7 +236,7 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
 def _colmap(file: Path) -> list[np.ndarray]:
     """Camera-to-world matrices of COLMAP's images, sorted by name."""
     found = [
-        _turned(f"{file}, image {name}", _numbers(f"{file}, image {name}", pose)[4:], pose[:4])
+        _pose(f"{file}, image {name}", _numbers(f"{file}, image {name}", pose)[4:], pose[:4])
         for name, pose in image_poses(file)
     ]
     return list(Trajectory(np.arange(len(found)), np.array(found)).inverse().poses) if found else []

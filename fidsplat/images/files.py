@@ -209,13 +209,13 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
 
     Raises InputError when the folder cannot be written, and for another shape.
     """
-    data = png_bytes(image)
+    data = encode_png(image)
     with atomic_write(path) as stream:
         stream.write(data)
     return Path(path)
 
 
-def png_bytes(image: np.ndarray) -> bytes:
+def encode_png(image: np.ndarray) -> bytes:
     """Encode an image as a PNG file's content; shapes and errors as `write_png`."""
     array = pixels_of(image)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
@@ -230,7 +230,7 @@ def png_bytes(image: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-def encoded(image: np.ndarray, kind: str, quality: int = 95) -> bytes:
+def encode_image(image: np.ndarray, kind: str, quality: int = 95) -> bytes:
     """Encode an image (h, w, 3) RGB, float in [0, 1] or uint8, as "jpeg" (quality 0 to 100) or "png"."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
     done, data = cv2.imencode(f".{kind}", cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2BGR), options)
@@ -299,7 +299,7 @@ def _check_size(data: bytes, name: str | os.PathLike[str]) -> None:
     check_expansion(os.fspath(name), _PIXEL * pixels, f"{pixels:,} pixels", len(data))
 
 
-def decoded(content: bytes) -> np.ndarray:
+def decode_rgb(content: bytes) -> np.ndarray:
     """Decode a file's content to (h, w, 3) uint8 RGB. Raises InputError for content that is not an image or
     exceeds `input_limit`."""
     image = _decode(content, "a compressed image", cv2.IMREAD_COLOR)
@@ -308,7 +308,7 @@ def decoded(content: bytes) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def rgba_pixels(data: bytes, name: str) -> np.ndarray:
+def decode_rgba(data: bytes, name: str) -> np.ndarray:
     """Decode an image file's content to (h, w, 4) uint8 RGBA, alpha 255 where it has none.
 
     name: the file's name in errors. Raises InputError for content that is not an image of 8 bits or exceeds

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.images.files import decoded
+from fidsplat.images.files import decode_rgb
 from fidsplat.logs.bags import log_messages
 from fidsplat.logs.writers import typestore
 from fidsplat.splats.rotations import rigid_matrix
@@ -108,7 +108,7 @@ def _pose(transform: Any) -> np.ndarray:
 
 def _decode_image(message: Any) -> np.ndarray | None:
     if message.__msgtype__ == _COMPRESSED:
-        return decoded(bytes(message.data))
+        return decode_rgb(bytes(message.data))
     if message.encoding not in _ENCODINGS:
         return None
     channels, order = _ENCODINGS[message.encoding]

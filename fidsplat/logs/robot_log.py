@@ -11,7 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
 from fidsplat.effects import IMAGES
-from fidsplat.images.files import encoded, pixels_of, to_uint8
+from fidsplat.images.files import encode_image, pixels_of, to_uint8
 from fidsplat.logs.writers import log_file, typestore
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.util.arguments import instance, invalid, items, number, real_array, text
@@ -81,7 +81,7 @@ class RobotLog:
                 raise InputError(
                     f"compress must be 'jpeg' or 'png', for rgb only, got {compress!r} for {output}"
                 )
-            data = np.frombuffer(encoded(pixels, compress), np.uint8)
+            data = np.frombuffer(encode_image(pixels, compress), np.uint8)
             message = self._of("sensor_msgs/msg/CompressedImage")(self._header(time, camera), compress, data)
             self._write(f"{topic}/compressed", time, message)
             return

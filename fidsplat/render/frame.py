@@ -164,11 +164,11 @@ class Frame(Mapping):
 
     def _repr_png_(self) -> bytes:
         """PNG for notebooks: rgb, or else the first output in false colours."""
-        from fidsplat.images.files import png_bytes  # here, since it imports OpenCV
+        from fidsplat.images.files import encode_png  # here, since it imports OpenCV
         from fidsplat.render.output_files import picture_of
 
         name = "rgb" if "rgb" in self.outputs else self.outputs[0]
-        return png_bytes(picture_of(name, self[name]))
+        return encode_png(picture_of(name, self[name]))
 
     def _check(self, name: str) -> None:
         if not isinstance(name, str) or name not in self.outputs:

@@ -26,7 +26,7 @@ torch: Any = _torch  # without types, since it may not be installed
 _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh", "background", "pose")
 
 
-def draw(
+def render(
     renderer: Renderer,
     capture: Capture,
     means: Any,

@@ -8,7 +8,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
-from fidsplat.vision.undistort import flattened
+from fidsplat.vision.undistort import undistort_masked
 
 
 def undistorted_view(name: str, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> TrainingView:
@@ -19,6 +19,6 @@ def undistorted_view(name: str, camera: Camera, image: np.ndarray, mask: np.ndar
     """
     size = (camera.height, camera.width)
     if camera.lens is not None and image.shape[:2] == size and (mask is None or mask.shape == size):
-        image, inside = flattened(image, camera, np.ones(size, bool) if mask is None else mask)
+        image, inside = undistort_masked(image, camera, np.ones(size, bool) if mask is None else mask)
         mask, camera = None if inside.all() else inside, replace(camera, lens=None)
     return TrainingView(name, camera, image, mask)

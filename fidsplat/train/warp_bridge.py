@@ -20,7 +20,7 @@ from fidsplat.train.pose_offset import offset_camera, offset_gradient
 from fidsplat.util.errors import DeviceError, InputError
 
 
-def draw(
+def render(
     tape: Any,
     renderer: Renderer,
     capture: Capture,

@@ -19,7 +19,7 @@ import numpy as np
 from fidsplat.backends import devices
 from fidsplat.cameras import Trajectory
 from fidsplat.formats import save_trajectory
-from fidsplat.images.files import png_bytes
+from fidsplat.images.files import encode_png
 from fidsplat.scenes import Scene
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.util.arguments import settings_with
@@ -148,17 +148,17 @@ class Viewer:
         with client.gui.add_folder("Pixel"):
             self._messages[client.client_id] = client.gui.add_markdown("Click into the image.")
         stream = Stream(
-            lambda viewpoint, scale: self._draw(client, viewpoint, scale),
+            lambda viewpoint, scale: self._render_moving(client, viewpoint, scale),
             lambda viewpoint: self._send_exact(client, viewpoint),
             self._controls.show_status,
             self._rate,
         )
         self._streams[client.client_id] = stream
-        client.camera.on_update(lambda camera: self._look(stream, camera))
+        client.camera.on_update(lambda camera: self._set_camera(stream, camera))
         threading.Thread(target=stream.run, name=f"viewer stream {client.client_id}", daemon=True).start()
-        self._look(stream, client.camera)
+        self._set_camera(stream, client.camera)
 
-    def _look(self, stream: Stream, camera: Any) -> None:
+    def _set_camera(self, stream: Stream, camera: Any) -> None:
         """Use a browser's camera; one that cannot render changes nothing."""
         try:
             stream.set_viewpoint(_viewpoint(camera))
@@ -172,7 +172,7 @@ class Viewer:
         self._views.pop(client.client_id, None)
         self._messages.pop(client.client_id, None)
 
-    def _draw(self, client: Any, viewpoint: Viewpoint, scale: float) -> Callable[[], None]:
+    def _render_moving(self, client: Any, viewpoint: Viewpoint, scale: float) -> Callable[[], None]:
         image = self.session.render_moving(viewpoint, scale).to_uint8()
         return partial(client.scene.set_background_image, image, "jpeg", jpeg_quality=JPEG)
 
@@ -255,7 +255,7 @@ class Viewer:
         except (FidsplatError, MemoryError) as error:
             self._controls.show_status(str(error) or "not enough memory for this image")
             return
-        client.send_file_download("fidsplat.png", png_bytes(image))
+        client.send_file_download("fidsplat.png", encode_png(image))
 
     def add_keyframe(self, client: Any) -> None:
         """Add this browser's viewpoint as a keyframe."""

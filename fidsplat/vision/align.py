@@ -43,11 +43,11 @@ def align(
     Returns (4, 2) float64, or None if the fit does not converge near the given corners.
     """
     rough = np.asarray(corners, np.float64)
-    found = _settled(grey, rough, bits)
+    found = _fit_from(grey, rough, bits)
     for corner in unsure:
         if found is not None:
             break
-        found = _settled(grey, _best_start(grey, rough, bits, corner), bits)
+        found = _fit_from(grey, _best_start(grey, rough, bits, corner), bits)
     return found
 
 
@@ -64,7 +64,7 @@ def fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> float:
     return model.correlation(smooth, _homography(_SQUARE, start), FINE_BLUR)
 
 
-def _settled(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+def _fit_from(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
     window = _window(grey, corners, bits, _LARGE)
     if window is None:
         return None

@@ -45,7 +45,7 @@ class BopScene:
             (self._folder / name).mkdir(exist_ok=True)
         self._cameras: dict[str, Any] = {}
         self._poses: dict[str, Any] = {}
-        self._seen: dict[str, Any] = {}
+        self._info: dict[str, Any] = {}
         self._models: dict[str, Any] = {}
 
     def __enter__(self) -> BopScene:
@@ -81,7 +81,7 @@ class BopScene:
             "cam_t_w2c": (1000 * camera.world_to_camera[:3, 3]).tolist(),
             "depth_scale": DEPTH_SCALE,
         }
-        self._poses[str(number)], self._seen[str(number)] = [], []
+        self._poses[str(number)], self._info[str(number)] = [], []
         for i, marker in enumerate(truth.markers):
             label = marker.placed.label
             self._poses[str(number)].append(
@@ -94,7 +94,7 @@ class BopScene:
             group = truth.groups.get(label)
             mask = np.zeros((camera.height, camera.width), bool) if group is None else group.mask
             write_png(self._folder / "mask_visib" / f"{name}_{i:06d}.png", mask)
-            self._seen[str(number)].append(_seen(marker, truth, mask))
+            self._info[str(number)].append(_visibility(marker, truth, mask))
             self._models[str(label)] = _model(marker)
 
     def save(self) -> None:
@@ -116,13 +116,13 @@ class BopScene:
         for name, content in (
             ("scene_camera.json", self._cameras),
             ("scene_gt.json", self._poses),
-            ("scene_gt_info.json", self._seen),
+            ("scene_gt_info.json", self._info),
         ):
             _write(self._folder / name, content)
         _write(models, known | self._models)
 
 
-def _seen(marker: MarkerTruth, truth: Truth, mask: np.ndarray) -> dict[str, Any]:
+def _visibility(marker: MarkerTruth, truth: Truth, mask: np.ndarray) -> dict[str, Any]:
     whole, group = outline(marker.placed, truth.camera), truth.groups.get(marker.placed.label)
     return {
         "bbox_obj": _box(whole.box),

@@ -73,7 +73,7 @@ def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) 
     """Estimate camera_from_marker from points (n, 3) in OpenCV's axes."""
     observed, matrix, rotated = np.ascontiguousarray(corners, np.float64), camera.matrix, np.eye(4)
     if camera.lens is not None:
-        observed, matrix, rotated = _flattened(observed, camera)
+        observed, matrix, rotated = _undistorted(observed, camera)
     if not np.isfinite(observed).all():
         return np.full((4, 4), np.nan)
     best, smallest = np.full((4, 4), np.nan), math.inf
@@ -94,7 +94,7 @@ def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) 
     return rotated @ best @ _FLIP
 
 
-def _flattened(corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _undistorted(corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Undistort corners to a pinhole that looks at their centre; returns corners, intrinsics and
     camera_from_pinhole (4, 4)."""
     rays = camera.rays(corners)

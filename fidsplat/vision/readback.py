@@ -108,7 +108,7 @@ def match(
     left = list(detections)
     expected = [camera.project(placed.corners) for placed in markers]
     pairs = [
-        (_apart(found.corners, expected[i]), i, found)
+        (_distance(found.corners, expected[i]), i, found)
         for i, placed in enumerate(markers)
         for found in left
         if _same(found, placed.marker)
@@ -162,7 +162,7 @@ def _same(found: Detection, made: Marker) -> bool:
     return (found.kind, found.family, found.id) == (made.kind, made.family, made.id)
 
 
-def _apart(one: np.ndarray, other: np.ndarray) -> float:
+def _distance(one: np.ndarray, other: np.ndarray) -> float:
     distance = float(np.linalg.norm(one - other))
     return distance if math.isfinite(distance) else math.inf
 

@@ -61,20 +61,22 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
     return cv2.remap(np.ascontiguousarray(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
 
 
-def flattened(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def undistort_masked(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Undistort an image to a pinhole of the same pose, size and focal length, for many images of one lens.
 
     Returns the image and (h, w) bool: pixels whose samples are all inside the image and its mask (h, w).
     """
     lens = camera.lens
     assert lens is not None  # already undistorted
-    x, y = _found_at(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens)
+    x, y = _sample_positions(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens)
     counts = cv2.remap(np.where(mask, np.uint8(255), np.uint8(0)), x, y, cv2.INTER_LINEAR)
     return cv2.remap(np.ascontiguousarray(image), x, y, cv2.INTER_LINEAR), counts == 255
 
 
 @lru_cache(maxsize=2)
-def _found_at(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens) -> np.ndarray:
+def _sample_positions(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens
+) -> np.ndarray:
     """Positions x, y (2, h, w) float32 in the lens's image of each pixel of a pinhole."""
     at = np.empty((2, height, width), np.float32)
     rays = np.stack([(np.arange(width) + 0.5 - cx) / fx, np.empty(width), np.ones(width)], axis=1)

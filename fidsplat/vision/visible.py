@@ -37,7 +37,7 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
     points = corners @ placed.pose[:3, :3].T + placed.pose[:3, 3]
     if camera.lens is None or isinstance(camera.lens, Orthographic):
         depth = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-        points = _before(points, depth - camera.near)
+        points = _clipped(points, depth - camera.near)
     share = np.arange(POINTS)[:, None] / POINTS
     sides = [a + share * (b - a) for a, b in zip(points, np.roll(points, -1, 0), strict=True)]
     at = camera.project(np.concatenate(sides)) if sides else np.zeros((0, 2))
@@ -88,7 +88,7 @@ def outline(placed: PlacedMarker, camera: Camera) -> Outline:
     return Outline(float(shapely.area(whole)), box, float(shapely.area(part)), rings)
 
 
-def _before(points: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+def _clipped(points: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """Part of a polygon (n, 3) where a linear function is positive; ahead: its values at the corners."""
     clipped = []
     for a, b, at_a, at_b in zip(points, np.roll(points, -1, 0), ahead, np.roll(ahead, -1), strict=True):

@@ -14,7 +14,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.formats import load_splats, save_splats, usd
-from fidsplat.images.files import decoded, read_bits, read_image
+from fidsplat.images.files import decode_rgb, read_bits, read_image
 from fidsplat.sim import read_description
 from fidsplat.util.limits import FLOOR, RATIO, VARIABLE, input_limit
 
@@ -139,7 +139,7 @@ def images():
 def test_images_that_small_files_declare(tmp_path, kind, data):
     path = tmp_path / f"a.{kind}"
     path.write_bytes(data)
-    for read in (lambda: read_image(path), lambda: read_bits(path), lambda: decoded(data)):
+    for read in (lambda: read_image(path), lambda: read_bits(path), lambda: decode_rgb(data)):
         with pytest.raises(fs.InputError, match="268,435,456 pixels"):
             read()
 
@@ -152,7 +152,7 @@ def test_a_png_chunk_that_is_longer_than_its_file(tmp_path, kind):
     for length in (0x7FFFFFFF, 0xFFFFFF7F, len(whole) + 100):
         data = whole[:33] + struct.pack(">I", length) + kind + whole[41:]
         path.write_bytes(data)
-        for read in (lambda: read_image(path), lambda: read_bits(path), lambda data=data: decoded(data)):
+        for read in (lambda: read_image(path), lambda: read_bits(path), lambda data=data: decode_rgb(data)):
             with pytest.raises(fs.InputError, match=rf"chunks within its \d+ bytes, got one of {length:,}"):
                 read()
 

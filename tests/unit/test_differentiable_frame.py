@@ -160,7 +160,7 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     bridge = import_module("fidsplat.train.torch_bridge")
     renderer, given, pose = fs.Renderer("reference"), arrays(), POSES[2] / 10
     tensors = {name: Tensor(array) for name, array in (given | {"pose": pose}).items()}
-    images = bridge.draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
+    images = bridge.render(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
     by_depth = np.random.default_rng(1).normal(size=(18, 24))
     context = bridge._Rendered.context
     context.needs_input_grad[3] = False  # quats
@@ -179,7 +179,7 @@ def test_the_bridge_without_torch_itself(monkeypatch):
         given["scales"] * [[1], [0], [1], [1], [1], [1]]
     )  # one that cannot be rendered
     with pytest.warns(UserWarning, match="1 of 6 splats left out"):
-        bridge.draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
+        bridge.render(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
     kept = {name: array[[0, 2, 3, 4, 5]] for name, array in given.items()}
     frame = renderer.render_differentiable(fs.SplatCloud(**kept), offset_camera(CAMERA, pose), OUTPUTS)
     expected = frame.backward({"rgb": ONES})
@@ -188,18 +188,18 @@ def test_the_bridge_without_torch_itself(monkeypatch):
         np.testing.assert_array_equal(np.delete(back[place].numpy(), 1, 0), expected[name])
         assert not back[place].numpy()[1].any()
     with pytest.raises(fs.InputError, match="pose must be 6 numbers"):
-        bridge.draw(renderer, fs.Capture(CAMERA), **(tensors | {"pose": Tensor(np.zeros(7))}))
+        bridge.render(renderer, fs.Capture(CAMERA), **(tensors | {"pose": Tensor(np.zeros(7))}))
 
 
 @pytest.mark.parametrize("degree", [None, 0, 1])
 def test_tensors_have_the_gradients_of_the_backend(degree):
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    from fidsplat.train.torch_bridge import draw
+    from fidsplat.train.torch_bridge import render
 
     renderer, given = fs.Renderer("reference"), arrays(degree)
     given |= {"background": np.array([0.2, 0.3, 0.4]), "pose": POSES[2] / 10}
     tensors = {name: torch.tensor(array, requires_grad=True) for name, array in given.items()}
-    images = draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
+    images = render(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
     assert [tuple(image.shape) for image in images.values()] == [(18, 24, 3), (18, 24), (18, 24)]
     random = np.random.default_rng(1)
     weights = {name: random.normal(size=tuple(images[name].shape)) for name in ("rgb", "depth")}
@@ -223,7 +223,7 @@ def test_tensors_have_the_gradients_of_the_backend(degree):
 
 def test_tensors_are_fitted_to_an_image():
     torch = pytest.importorskip("torch", reason="torch is not installed")
-    from fidsplat.train.torch_bridge import draw
+    from fidsplat.train.torch_bridge import render
 
     renderer, given, capture = fs.Renderer("reference"), arrays(), fs.Capture(CAMERA)
     truth = torch.tensor(renderer.render(fs.SplatCloud(**given), capture)["rgb"])
@@ -232,7 +232,7 @@ def test_tensors_are_fitted_to_an_image():
     optimiser, losses = torch.optim.Adam([tensors["colors"]], lr=0.1), []
     for _ in range(15):
         optimiser.zero_grad()
-        loss = ((draw(renderer, capture, **tensors)["rgb"] - truth) ** 2).mean()
+        loss = ((render(renderer, capture, **tensors)["rgb"] - truth) ** 2).mean()
         loss.backward()
         optimiser.step()
         losses.append(loss.item())

@@ -28,10 +28,10 @@ def renderer():
 
 
 @pytest.fixture
-def draw():
-    from fidsplat.train.warp_bridge import draw
+def render():
+    from fidsplat.train.warp_bridge import render
 
-    return draw
+    return render
 
 
 def picture():
@@ -48,7 +48,7 @@ def on_device(cloud, gradients=tuple(TYPES)):
     }
 
 
-def test_a_tape_differentiates_frames_and_kernels(renderer, draw):
+def test_a_tape_differentiates_frames_and_kernels(renderer, render):
     """All gradients are those of the backend by the same loss; a second pass adds to them."""
     cloud, capture = picture()
     arrays = on_device(cloud)
@@ -56,7 +56,7 @@ def test_a_tape_differentiates_frames_and_kernels(renderer, draw):
     loss = wp.zeros(1, dtype=float, device="cpu", requires_grad=True)
     tape = wp.Tape()
     with tape:
-        images = draw(tape, renderer, capture, **arrays)
+        images = render(tape, renderer, capture, **arrays)
         wp.launch(squared, (43, 61, 3), [images["rgb"], expected, loss], device="cpu")
     tape.backward(loss)
     rgb = images["rgb"].numpy()
@@ -67,14 +67,14 @@ def test_a_tape_differentiates_frames_and_kernels(renderer, draw):
         np.testing.assert_array_equal(array.grad.numpy(), truth[name], err_msg=name)
 
 
-def test_a_tape_has_the_gradients_of_pose_and_background(renderer, draw):
+def test_a_tape_has_the_gradients_of_pose_and_background(renderer, render):
     cloud, capture = picture()
     arrays = on_device(cloud, ("colors",))
     pose = wp.array(POSE, dtype=float, device="cpu", requires_grad=True)
     behind = wp.array([0.2, 0.3, 0.4], dtype=float, device="cpu", requires_grad=True)
     weights = np.random.default_rng(0).normal(size=(43, 61, 3)).astype(np.float32)
     tape = wp.Tape()
-    images = draw(tape, renderer, capture, **arrays, pose=pose, background=behind)
+    images = render(tape, renderer, capture, **arrays, pose=pose, background=behind)
     tape.backward(grads={images["rgb"]: wp.array(weights, dtype=float, device="cpu")})
     at = pose.numpy().astype(np.float64)
     assert capture.camera
@@ -87,18 +87,18 @@ def test_a_tape_has_the_gradients_of_pose_and_background(renderer, draw):
     assert arrays["means"].grad is None
 
 
-def test_what_a_tape_cannot_record_is_an_error(renderer, draw):
+def test_what_a_tape_cannot_record_is_an_error(renderer, render):
     cloud, capture = picture()
     arrays, tape = on_device(cloud), wp.Tape()
     with pytest.raises(fs.DeviceError, match="must be of a Warp device, got reference"):
-        draw(tape, fs.Renderer("reference"), capture, **arrays)
+        render(tape, fs.Renderer("reference"), capture, **arrays)
     with pytest.raises(fs.InputError, match="exactly one of colors"):
-        draw(tape, renderer, capture, **arrays, sh=arrays["colors"])
+        render(tape, renderer, capture, **arrays, sh=arrays["colors"])
     with pytest.raises(fs.InputError, match=r"pose must be 6 numbers, got the shape \(7,\)"):
-        draw(tape, renderer, capture, **arrays, pose=np.zeros(7))
+        render(tape, renderer, capture, **arrays, pose=np.zeros(7))
     with pytest.raises(fs.InputError, match="samples=1"):
-        draw(tape, renderer, capture.with_(quality="surfel,samples=2"), **arrays)
-    images = draw(tape, renderer, capture, **arrays)
+        render(tape, renderer, capture.with_(quality="surfel,samples=2"), **arrays)
+    images = render(tape, renderer, capture, **arrays)
     renderer.render(cloud, capture)
     with pytest.raises(fs.InputError, match="images of an earlier frame"):
         tape.backward(grads={images["rgb"]: wp.zeros((43, 61, 3), dtype=float, device="cpu")})
