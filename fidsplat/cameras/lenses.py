@@ -17,9 +17,9 @@ from fidsplat.util.arguments import real_array
 from fidsplat.util.errors import InputError
 
 FISHEYE_LIMIT = math.radians(100)
-"""a fisheye sees no further from its axis: 200 degrees in all"""
+"""largest angle of a fisheye from its axis: a field of view of 200 degrees"""
 MAX_COEFFICIENT = 1e12
-"""of a lens, in size: far beyond any that can be inverted, and products of several still are numbers"""
+"""largest size of a lens coefficient: far beyond invertible ones, and products of several stay finite"""
 _STEPS = 4096  # of the tables from which Newton's iteration starts
 _ITERATIONS = 12
 _NOTHING = 1e-200  # a leading coefficient that would overflow when roots are found
@@ -27,8 +27,8 @@ _NOTHING = 1e-200  # a leading coefficient that would overflow when roots are fo
 
 @dataclass(frozen=True)
 class BrownConrady:
-    """Radial (k1 to k6), tangential (p1, p2) and thin-prism (s1 to s4) distortion of a perspective image,
-    as `cv2.projectPoints` has them. All 0 is a pinhole.
+    """OpenCV's distortion of a perspective image (`cv2.projectPoints`): radial (k1 to k6), tangential (p1,
+    p2), thin prism (s1 to s4). All 0 is a pinhole.
 
     Directions beyond the first fold of the radial part are outside the field of view. Raises InputError for a
     coefficient that is not finite.
@@ -59,19 +59,19 @@ class BrownConrady:
         """From OpenCV's distCoeffs: 4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty).
 
         Raises:
-            InputError: another count, or a sensor that is tilted: tx and ty, which calibrateCamera gives as 0
-                with CALIB_RATIONAL_MODEL, must be 0.
+            InputError: another count, or a tilted sensor: tx and ty must be 0, as calibrateCamera returns
+                them with CALIB_RATIONAL_MODEL.
         """
         order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
         values = real_array("distortion", coefficients).ravel().tolist()
         if len(values) not in (4, 5, 8, 12, 14):
             raise InputError(
-                f"distortion has {len(values)} coefficients; OpenCV's orders have 4, 5, 8, 12 or 14"
+                f"distortion must have 4, 5, 8, 12 or 14 coefficients in OpenCV's order, got {len(values)}"
             )
         if any(values[12:]):
             raise InputError(
-                f"the last two distortion coefficients, {values[12]:g} and {values[13]:g}, tilt the sensor, "
-                "which is not offered; calibrate without CALIB_TILTED_MODEL"
+                "the last two distortion coefficients, which tilt the sensor, must be 0, got "
+                f"{values[12]:g} and {values[13]:g}; calibrate without CALIB_TILTED_MODEL"
             )
         return cls(**dict(zip(order, values, strict=False)))
 
@@ -164,14 +164,14 @@ class BrownConrady:
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """What the kernels take: k1 to k6, p1, p2, s1 to s4, and the square of the fold."""
+        """Uniforms of the kernels: k1 to k6, p1, p2, s1 to s4, and the square of the fold."""
         return (*(getattr(self, field.name) for field in fields(self)), min(self.fold**2, 1e30))
 
 
 @dataclass(frozen=True)
 class Fisheye:
-    """Kannala-Brandt fisheye as `cv2.fisheye` has it: a ray at the angle t from the axis falls at the
-    distance t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle. All 0 is the equidistant lens.
+    """Kannala-Brandt fisheye (`cv2.fisheye`): a ray at the angle t from the axis has the distance
+    t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle of the image. All 0 is the equidistant lens.
 
     The field of view reaches 100 degrees from the axis, or less where that polynomial folds back. Raises
     InputError for a coefficient that is not finite.
@@ -216,8 +216,10 @@ class Fisheye:
             outward = self._slope(angle) / (across**2 + z**2)
             around = np.where(across > 0, self.distance(angle) / across, 1 / z)
         by_radius = outward * np.stack([z * cos, z * sin, -across])
-        by_turn = around * np.stack([-sin, cos, 0 * z])
-        return np.moveaxis(np.stack([cos * by_radius - sin * by_turn, sin * by_radius + cos * by_turn]), 2, 0)
+        by_theta = around * np.stack([-sin, cos, 0 * z])
+        return np.moveaxis(
+            np.stack([cos * by_radius - sin * by_theta, sin * by_radius + cos * by_theta]), 2, 0
+        )
 
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2) of points (n, 3); NaN outside the field of view."""
@@ -249,7 +251,7 @@ class Fisheye:
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """What the kernels take: k1 to k4 and the limit."""
+        """Uniforms of the kernels: k1 to k4 and the limit."""
         return (self.k1, self.k2, self.k3, self.k4, self.limit)
 
 

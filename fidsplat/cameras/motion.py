@@ -40,8 +40,8 @@ class Shutter:
     readout: float = 0.0
     """seconds from the first row's exposure to the last's (rolling shutter)"""
     rows_per_band: int = 8
-    """rows that share their poses, those of the band's middle row. What crosses v pixels during the readout
-    of h rows is off by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact, and slow"""
+    """rows that share the poses of the band's middle row. An object that crosses v pixels during the readout
+    of h rows is displaced by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact and slow"""
 
     def __post_init__(self) -> None:
         own_scalars(self)
@@ -68,7 +68,7 @@ class Shutter:
         ]
 
     def times(self, middle: float) -> list[float]:
-        """The times of the sub-poses of an exposure time with its middle there."""
+        """Times of the sub-poses of an exposure around a middle."""
         middle = number("the middle of an exposure", middle)
         n = self.sub_poses if self.exposure_time > 0 else 1
         return [middle + self.exposure_time * ((k + 0.5) / n - 0.5) for k in range(n)]
@@ -76,25 +76,26 @@ class Shutter:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What moves: poses as functions of the time in seconds, `Trajectory` or any callable."""
+    """Motion of the camera and of groups of splats: poses as functions of the time in seconds, each a
+    `Trajectory` or any callable."""
 
     camera: Pose | None = None
     """world_to_camera; None: the camera does not move"""
     groups: Mapping[int, Pose] = field(default_factory=dict)
-    """label of splats: the rigid motion of the world that they make from where their cloud has them"""
+    """label of splats -> their rigid motion in the world, applied to the poses in their cloud"""
 
     def __post_init__(self) -> None:
         if self.camera is not None and not callable(self.camera):
             raise InputError(
-                f"motion of the camera is {self.camera!r}; it must be a Trajectory or a function"
+                f"motion of the camera must be a Trajectory or a function of time, got {self.camera!r}"
             )
         if not isinstance(self.groups, Mapping) or not all(map(callable, self.groups.values())):
-            raise InputError("motion of groups must be {label: Trajectory or function of the time}")
+            raise invalid("motion of groups", "{label: Trajectory or function of time}", self.groups)
         for label in self.groups:
             if isinstance(label, bool) or not isinstance(label, (int, np.integer)):
                 raise InputError(
-                    f"motion of groups: a label must be a whole number, got {label!r}; splats have such "
-                    "(SplatCloud.with_labels)"
+                    f"label of a moving group must be a whole number, got {label!r}; SplatCloud.with_labels "
+                    "sets labels"
                 )
         object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))
 
@@ -107,7 +108,7 @@ class Motion:
         return self.camera is None and not self.groups
 
     def camera_at(self, time: float) -> np.ndarray | None:
-        """world_to_camera (4, 4) then; None if it does not move."""
+        """world_to_camera (4, 4) at a time; None if the camera does not move."""
         time = number("the time of a motion", time)
         return None if self.camera is None else _checked(self.camera(time), "the camera", time)
 
@@ -122,14 +123,14 @@ class Motion:
         return Motion(camera, groups)
 
     def moved(self, camera: Camera, time: float) -> Camera:
-        """The camera at its pose at that time."""
+        """The camera at its pose at a time."""
         instance("the camera of a motion", camera, Camera)
         pose = self.camera_at(time)
         # the position follows from the pose
         return camera if pose is None else camera.with_pose(pose)
 
     def groups_at(self, time: float) -> list[tuple[int, np.ndarray]]:
-        """(label, motion (4, 4)) then, of each group."""
+        """Label and motion (4, 4) of each group at a time."""
         time = number("the time of a motion", time)
         return [
             (label, _checked(pose(time), f"the splats of label {label}", time))
@@ -151,5 +152,6 @@ class _PoseTable:
 
 
 def _checked(matrix, who: str, time: float) -> np.ndarray:
+    """A rigid pose as float64. Raises InputError."""
     check_similarity(matrix, f"the pose of {who} at {time:g} s", rigid=True)
     return np.asarray(matrix, np.float64)

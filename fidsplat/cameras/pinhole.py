@@ -8,7 +8,7 @@ import numpy as np
 
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
 from fidsplat.splats.rotations import check_similarity
-from fidsplat.util.arguments import LARGEST, PickledByFields, real_array
+from fidsplat.util.arguments import LARGEST, PickledByFields, invalid, real_array
 from fidsplat.util.errors import InputError
 
 MAX_SIZE = 32767
@@ -20,8 +20,8 @@ FOCAL_LENGTHS = 1e-6, 1e18
 
 @dataclass(frozen=True, eq=False)
 class Camera(PickledByFields):
-    """A camera. Without a lens it is a pinhole: a point (X, Y, Z) of the camera frame falls on
-    x = fx X / Z + cx, y = fy Y / Z + cy. A lens replaces X / Z and Y / Z.
+    """Camera: a pinhole, or one with a lens. A pinhole projects a point (X, Y, Z) of the camera frame to
+    x = fx X / Z + cx, y = fy Y / Z + cy; a lens replaces X / Z and Y / Z.
 
     Pixel (row i, column j) has its centre at x = j + 0.5, y = i + 0.5. Raises InputError for values that
     are invalid, among them a distortion that leaves less than half of the image with rays.
@@ -73,7 +73,7 @@ class Camera(PickledByFields):
             if not abs(getattr(self, name)) <= LARGEST:
                 raise InputError(f"camera {name} must be finite, got {getattr(self, name)!r}")
         if not self.far > self.near:
-            raise InputError(f"camera far ({self.far!r}) must be above near ({self.near!r})")
+            raise InputError(f"camera far must be above near ({self.near!r}), got {self.far!r}")
         check_similarity(self.world_to_camera, "camera world_to_camera", rigid=True)
         matrix = np.array(self.world_to_camera, dtype=np.float64)
         rotation, moved = matrix[:3, :3], matrix[:3, 3]
@@ -84,8 +84,8 @@ class Camera(PickledByFields):
             position = _vector("position", self.position)
             if np.abs(rotation @ position + moved).max() > 1e-6 * (1 + np.abs(position).max()):
                 raise InputError(
-                    f"camera position {tuple(position.tolist())} is not that of its world_to_camera; "
-                    "leave it out"
+                    f"camera position must be that of world_to_camera, got {tuple(position.tolist())}; leave "
+                    "it out"
                 )
         for name, array in (("world_to_camera", matrix), ("position", position)):
             array.flags.writeable = False
@@ -96,7 +96,7 @@ class Camera(PickledByFields):
     def _check_lens(self) -> None:
         lens = self.lens
         if not isinstance(lens, Lens):
-            raise InputError(f"camera lens is {lens!r}; it must be BrownConrady, Fisheye, ... or None")
+            raise InputError(f"camera lens must be BrownConrady, Fisheye, ... or None, got {lens!r}")
         if lens.does_nothing:
             object.__setattr__(self, "lens", None)
         elif not isinstance(lens, Orthographic):
@@ -106,23 +106,24 @@ class Camera(PickledByFields):
                 values = [(each.name, getattr(lens, each.name)) for each in fields(lens)]
                 given = ", ".join(f"{name} = {value:g}" for name, value in values if value)
                 raise InputError(
-                    f"camera distortion ({given}) cannot be inverted in {100 * (1 - covered):.0f} % of the "
-                    "image: it folds back before its edge; check the coefficients and the focal length "
+                    f"camera distortion must be invertible in half of the image, got {given}, which folds "
+                    f"back in {100 * (1 - covered):.0f} % of it; check the coefficients and the focal length "
                     f"({self.fx:g} pixels)"
                 )
             if covered == 0:
                 raise InputError(
-                    f"camera lens: no pixel is in the field of view of a {lens.kind} lens; check fx, fy "
-                    f"({self.fx:g}, {self.fy:g} pixels per radian) and cx, cy ({self.cx:g}, {self.cy:g})"
+                    f"camera lens must have a pixel in its field of view, got none of a {lens.kind} lens; "
+                    f"check fx, fy ({self.fx:g}, {self.fy:g} pixels per radian) and cx, cy ({self.cx:g}, "
+                    f"{self.cy:g})"
                 )
 
     @staticmethod
     def pinhole(
         width, height, fx, fy, cx, cy, world_to_camera=None, near=0.01, far=math.inf, position=None, lens=None
     ) -> "Camera":
-        """A camera from its intrinsics (pixels) and its pose (4, 4), the identity when left out.
+        """A camera from its intrinsics in pixels and its pose (4, 4), by default the identity.
 
-        position (3,): the exact centre of projection, where the pose was made from one. lens: a distortion.
+        position (3,): exact centre of projection, if the pose was made from one. lens: a distortion.
         """
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         return Camera(width, height, fx, fy, cx, cy, pose, near, far, position, lens)  # type: ignore[arg-type]
@@ -131,14 +132,14 @@ class Camera(PickledByFields):
     def fisheye(
         width, height, fov_x, world_to_camera=None, coefficients=(0.0, 0.0, 0.0, 0.0), near=0.01, far=math.inf
     ) -> "Camera":
-        """A Kannala-Brandt fisheye whose middle row sees ``fov_x`` radians, at most 200 degrees.
+        """A Kannala-Brandt fisheye with a horizontal field of view of ``fov_x`` radians, at most 200 degrees.
 
-        coefficients: k1 to k4 as `cv2.fisheye` has them. Calibrated intrinsics go through
+        coefficients: k1 to k4 of `cv2.fisheye`. With calibrated intrinsics use
         `Camera.pinhole(..., lens=Fisheye(...))`.
         """
         factors = np.ravel(coefficients).tolist()
         if len(factors) != 4:
-            raise InputError(f"a fisheye has 4 coefficients, k1 to k4, got {len(factors)}")
+            raise InputError(f"a fisheye must have 4 coefficients, k1 to k4, got {len(factors)}")
         lens, width, height = Fisheye(*factors), _size("width", width), _size("height", height)
         f = fisheye_focal_length(width, fov_x, lens)
         pose = np.eye(4) if world_to_camera is None else world_to_camera
@@ -146,7 +147,7 @@ class Camera(PickledByFields):
 
     @staticmethod
     def equirectangular(width, height, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
-        """A panorama of the whole sphere: the middle looks along z, the edges along -z, the top along -y."""
+        """A panorama of the sphere: z in the middle, -z at the left and right edges, -y at the top."""
         width, height = _size("width", width), _size("height", height)
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         fx, fy = width / (2 * math.pi), height / math.pi
@@ -167,10 +168,10 @@ class Camera(PickledByFields):
     def look_at(
         width, height, fov_x, position, target, up=(0.0, -1.0, 0.0), near=0.01, far=math.inf
     ) -> "Camera":
-        """A camera with square pixels at ``position`` whose middle sees ``target`` (3,), metres.
+        """A camera with square pixels at ``position`` whose optical axis passes through ``target``, metres.
 
         fov_x: horizontal field of view in radians, between 0 and pi. up: the world direction that points up
-        in the image; by default -y, so that y points down as it does in a marker.
+        in the image; by default -y, so that y points down as in a marker.
         """
         width, height = _size("width", width), _size("height", height)
         f = focal_length(width, fov_x)
@@ -209,11 +210,11 @@ class Camera(PickledByFields):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points) -> np.ndarray:
-        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN outside the field of view: the depth
-        is not above 0, or they lie outside the lens."""
+        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN outside the field of view: for a depth
+        that is not above 0, or beyond the limit of the lens."""
         world = real_array("points", points)
         if world.ndim != 2 or world.shape[1] != 3:
-            raise InputError(f"points must have the shape (n, 3), but the shape is {world.shape}")
+            raise InputError(f"points must have the shape (n, 3), got {world.shape}")
         points = (world - self.position) @ self.world_to_camera[:3, :3].T
         if self.lens is not None:
             return self.lens.image(points) * (self.fx, self.fy) + (self.cx, self.cy)
@@ -226,63 +227,65 @@ class Camera(PickledByFields):
         the field of view.
 
         Scaled to Z = 1, or to unit length for a fisheye or panorama. Raises InputError for an orthographic
-        camera, whose rays differ by where they start.
+        camera, whose rays are parallel.
         """
         image = real_array("pixels", pixels)
         if image.ndim != 2 or image.shape[1] != 2:
-            raise InputError(f"pixels must have the shape (n, 2), but the shape is {image.shape}")
+            raise InputError(f"pixels must have the shape (n, 2), got {image.shape}")
         image = (image - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.lens is None:
             return np.concatenate([image, np.ones((len(image), 1))], 1)
         if isinstance(self.lens, Orthographic):
-            raise InputError("the rays of an orthographic camera are parallel to z; it has no directions")
+            raise InputError(
+                "lens must have rays from one point, got Orthographic, whose rays are parallel to z"
+            )
         return self.lens.rays(image)
 
 
 def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
-    """Focal length in pixels of a fisheye ``width`` pixels wide that sees ``fov_x`` radians from side to
-    side.
+    """Focal length of a fisheye in pixels, from its width in pixels and horizontal field of view in radians.
 
-    Raises InputError when fov_x is not above 0 (1e-9), or beyond what the lens sees.
+    Raises InputError when fov_x is not above 0 (1e-9), or beyond the field of view of the lens.
     """
     angle = _number("fov_x", fov_x)
     if not 1e-9 < angle <= 2 * lens.limit + 1e-12:
         raise InputError(
-            f"camera fov_x of this fisheye must lie between 0 and {math.degrees(2 * lens.limit):.4g} "
+            f"camera fov_x of this fisheye must be between 0 and {math.degrees(2 * lens.limit):.4g} "
             f"degrees, got {math.degrees(angle):.6g}"
         )
     return width / 2 / float(lens.distance(angle / 2))
 
 
 def focal_length(width: int, fov_x: float) -> float:
-    """Focal length in pixels of a camera ``width`` pixels wide that sees ``fov_x`` radians from side to side.
+    """Focal length of a pinhole in pixels, from its width in pixels and horizontal field of view in radians.
 
-    Raises InputError when fov_x does not lie between 0 (above 1e-9) and pi.
+    Raises InputError when fov_x is not between 0 (above 1e-9) and pi.
     """
     width, angle = _size("width", width), _number("fov_x", fov_x)
     if not 1e-9 < angle < math.pi:
-        raise InputError(f"camera fov_x must be between 0 and pi radians (180 degrees), got {angle!r}")
+        remedy = f"math.radians({angle:g}) converts degrees" if 10 <= angle < 180 else ""
+        raise invalid("camera fov_x", "between 0 and pi radians (180 degrees)", angle, remedy)
     return width / 2 / math.tan(angle / 2)
 
 
 def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:
-    """world_to_camera (4, 4) float64 of a camera at ``position`` looking at ``target`` with ``up`` upwards.
+    """world_to_camera (4, 4) float64 of a camera at ``position`` whose axis passes through ``target``.
 
-    Raises InputError when a vector is not three finite numbers, the points coincide, or up points along the
-    view.
+    Raises InputError when a vector is not three finite numbers, the points coincide, or up is parallel to the
+    axis.
     """
     eye, aim, upward = (_vector(n, v) for n, v in (("position", position), ("look_at", target), ("up", up)))
     forward = aim - eye
     distance = np.linalg.norm(forward)
     if not distance > 0:
-        raise InputError(f"camera position and look_at are the same point {tuple(eye.tolist())}")
+        raise InputError(f"camera position and look_at must be different points, got {tuple(eye.tolist())}")
     forward /= distance
     length = np.linalg.norm(upward)
     if not length > 0:
-        raise InputError("camera up must not be zero")
+        raise InputError("camera up must not be zero, got (0, 0, 0)")
     right = np.cross(forward, upward / length)
     if np.linalg.norm(right) < 1e-9:
-        raise InputError(f"camera up {tuple(upward.tolist())} points along the view; choose another")
+        raise InputError(f"camera up must not be parallel to the optical axis, got {tuple(upward.tolist())}")
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     matrix = np.eye(4)

@@ -10,14 +10,14 @@ import numpy as np
 from fidsplat.cameras.lenses import Fisheye, RayLens
 
 CELLS = 512
-"""most cells of the finest map along an axis"""
+"""maximum number of cells of the finest map along an axis"""
 _ROWS = 1 << 18  # samples whose rays are computed at once
 _EMPTY = np.array([32767, -1, 32767, -1], np.int16)
 
 
 @dataclass(frozen=True, eq=False)
 class RayRaster:
-    """The sample grid of one lens, whatever the pose; sizes, focal lengths and centre in samples."""
+    """Sample grid of a lens, independent of the pose; sizes, focal lengths and centre in samples."""
 
     lens: RayLens
     width: int
@@ -27,18 +27,18 @@ class RayRaster:
     center_x: float
     center_y: float
     whole: RayRaster | None = None
-    """the raster of which this one is a few rows"""
+    """the complete raster, if this one is a band of its rows"""
     top: int = 0
-    """which row of it the first one is"""
+    """first row in the complete raster"""
 
     def cropped(self, top: int, end: int) -> RayRaster:
-        """Rows [top, end); they share the map of the whole."""
+        """Rows [top, end), which share the map of the complete raster."""
         return replace(self, height=end - top, center_y=self.center_y - top, whole=self, top=top)
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """(h, w, 3) float32: the direction of each sample's ray, with Z = 1 or of unit length; NaN where
-        there is no ray. The image is that of these rounded rays, on every device and in the reference."""
+        """(h, w, 3) float32: direction of each sample's ray, with Z = 1 or of unit length; NaN outside the
+        field of view. Every device and the reference render with these rounded rays."""
         if self.whole is not None:
             return self.whole.rays[self.top : self.top + self.height]
         rays = np.empty((self.height, self.width, 3), np.float32)
@@ -84,8 +84,8 @@ class RayRaster:
         return float(np.sqrt(np.nanmax(squared))) * 1.00001
 
     def chart(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates in which the kernels enclose a splat: those of the ideal pinhole image [samples], or,
-        for a fisheye, the stereographic ones (X, Y) / (|ray| + Z)."""
+        """Coordinates in which kernels bound a splat: the ideal pinhole image in samples, or, for a fisheye,
+        the stereographic projection (X, Y) / (|ray| + Z)."""
         x, y, z = np.moveaxis(rays.astype(np.float64), -1, 0)
         if isinstance(self.lens, Fisheye):
             below = z + np.sqrt(x * x + y * y + z * z)
@@ -94,7 +94,7 @@ class RayRaster:
 
     @cached_property
     def map(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which samples' rays lie in each cell of the chart.
+        """Bounds of the samples whose rays are in each cell of the chart.
 
         Returns:
             boxes (cells^2 + (cells / 2)^2 + ... + 1, 4) int16: first and last column, first and last row of
@@ -130,7 +130,7 @@ class RayRaster:
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """Numbers that the kernels take: the lens's, then the map's and the first row."""
+        """Uniforms of the kernels: those of the lens, of the map, and the first row."""
         if self.lens.kind == "equirectangular":
             return self.lens.uniforms
         low_x, low_y, *rest = map(float, self.map[1])

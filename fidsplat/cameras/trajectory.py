@@ -12,22 +12,21 @@ import numpy as np
 
 from fidsplat.cameras.screw import between, exponential, twist
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, rigid_matrix
-from fidsplat.util.arguments import PickledByFields, as_float, number, real_array
+from fidsplat.util.arguments import PickledByFields, as_float, flag, invalid, number, real_array
 from fidsplat.util.errors import InputError
 
 UNIT = 1e-3
-"""how far from 1 the length of a quaternion may be: files round them"""
+"""largest deviation of a quaternion's length from 1, as files round quaternions"""
 MAX_SAMPLES = 10_000_000
-"""poses that one trajectory is sampled into: more is a mistake in the rate"""
+"""maximum number of sampled poses"""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(PickledByFields):
-    """A pose between keyframes: the screw motion from one to the next (a geodesic of SE(3)), at rest before
-    the first and after the last. Call it with a time in seconds.
+    """Pose as a function of time, by interpolation of keyframes: screw motions (geodesics of SE(3)), constant
+    before the first and after the last. Call it with a time in seconds.
 
-    What is posed is up to its user: files of trajectories hold camera to world, `Motion.camera` wants world
-    to camera, which is the `inverse()`.
+    Trajectory files hold camera-to-world poses; `Motion.camera` is world to camera, the `inverse()`.
 
     Raises InputError for times that do not increase, poses that are not rigid and quaternions whose length is
     not 1 (within 1e-3).
@@ -38,9 +37,9 @@ class Trajectory(PickledByFields):
     poses: np.ndarray
     """(k, 4, 4) rigid; or given as (k, 7): x, y, z in metres and a unit quaternion w, x, y, z"""
     smooth: bool = False
-    """without a kink at the keyframes: a cubic Bezier curve of screw motions from each to the next, whose
-    velocity at a keyframe is that of the parabola through it and its neighbours (slower where these turn so
-    fast that it would spin). Give keyframes less than half a turn apart"""
+    """continuous velocity: a cubic Bezier curve of screw motions between keyframes. The velocity at a
+    keyframe is that of the parabola through it and its neighbours, limited where rotations are fast.
+    Keyframes must be less than half a rotation apart"""
 
     def __post_init__(self) -> None:
         times = real_array("the times of a trajectory", self.times, "increasing numbers of seconds")
@@ -51,9 +50,8 @@ class Trajectory(PickledByFields):
             )
         count = len(self.poses) if isinstance(self.poses, Sequence) or np.ndim(self.poses) else 0
         if count != len(times):
-            raise InputError(f"a trajectory has {len(times)} times but {count} poses; give one for each time")
-        if not isinstance(self.smooth, bool):
-            raise InputError(f"smooth is {self.smooth!r}; it must be True or False")
+            raise InputError(f"a trajectory must have one pose for each of {len(times)} times, got {count}")
+        flag("smooth", self.smooth)
         first = self.poses[0]
         if isinstance(first, Sequence | np.ndarray) and len(first) == 7:
             poses = np.array([_of_vector(k, vector) for k, vector in enumerate(self.poses)])
@@ -99,8 +97,8 @@ class Trajectory(PickledByFields):
         along = np.array([twist(*pair) for pair in itertools.pairwise(self.poses)]) / durations
         before, after = durations[:-1], durations[1:]
         inner = (along[:-1] * after + along[1:] * before) / (before + after)
-        # a fast rotation in a short interval must not spin through a long neighbouring one: a third of that
-        # one's turn, which is what the curve takes, stays below a quarter turn, so that it has one direction
+        # limits a fast rotation of a short interval in its long neighbour: the curve uses a third of the
+        # rotation there, which stays below a quarter rotation and therefore has one direction
         rotations = np.linalg.norm(inner[:, :3], axis=1, keepdims=True) * np.maximum(before, after) / 3
         inner *= np.minimum(1.0, math.pi / 2 / np.maximum(rotations, 1e-300))
         return np.concatenate([along[:1], inner, along[-1:]])
@@ -111,7 +109,7 @@ class Trajectory(PickledByFields):
         return np.array([[*pose[:3, 3], *matrix_to_quaternion(pose[:3, :3])] for pose in self.poses])
 
     def inverse(self) -> Trajectory:
-        """World to camera of camera to world, and the other way round, at every time."""
+        """The inverse pose at every time: world to camera from camera to world, and vice versa."""
         turned = self.poses[:, :3, :3].transpose(0, 2, 1)
         poses = np.zeros_like(self.poses)
         poses[:, :3, :3], poses[:, 3, 3] = turned, 1.0
@@ -119,7 +117,7 @@ class Trajectory(PickledByFields):
         return Trajectory(self.times, poses, self.smooth)
 
     def sampled(self, rate: float) -> Trajectory:
-        """Its poses that many times a second, from the first keyframe to the last.
+        """Poses at a rate per second, from the first keyframe to the last.
 
         Raises:
             InputError: the rate is not above 0 or gives more than 10 million poses.
@@ -129,17 +127,17 @@ class Trajectory(PickledByFields):
         steps = (last - first) * rate
         if steps >= MAX_SAMPLES:
             raise InputError(
-                f"{rate:g} poses a second over {last - first:g} s are more than {MAX_SAMPLES:,}; give a "
-                "lower rate"
+                f"a trajectory must have at most {MAX_SAMPLES:,} poses, got {rate:g} per second over "
+                f"{last - first:g} s; give a lower rate"
             )
         times = first + np.arange(int(steps + 1e-6) + 1) / rate  # the last one too where it falls on a step
         return Trajectory(times, np.array([self(time) for time in times]))
 
 
 def check_rate(rate: float) -> None:
-    """Raises InputError for anything but a number of poses a second."""
+    """Raise InputError for a rate that is not a number of poses per second above 0."""
     if not 0 < as_float(rate) < math.inf:
-        raise InputError(f"the rate is {rate!r}; give a number of poses a second above 0, e.g. 30")
+        raise invalid("the rate", "a number of poses per second above 0", rate)
 
 
 def _of_vector(k: int, vector) -> np.ndarray:
@@ -153,14 +151,14 @@ def _of_vector(k: int, vector) -> np.ndarray:
     length = float(np.linalg.norm(numbers[3:]))
     if abs(length - 1) > UNIT:
         raise InputError(
-            f"pose {k} of a trajectory has a quaternion of length {length:g}, {numbers[3:].tolist()}; it "
-            "must be 1, and its order w, x, y, z"
+            f"the quaternion w, x, y, z of pose {k} of a trajectory must have length 1, got {length:g} for "
+            f"{numbers[3:].tolist()}"
         )
     return rigid_matrix(numbers[:3], numbers[3:])
 
 
 def _shown(given, times: np.ndarray) -> str:
-    """The times as an error shows them: where they stop increasing, if that is what is wrong."""
+    """The times for a message; those that do not increase, if that is the problem."""
     if times.ndim == 1 and len(times) > 1 and np.isfinite(times).all():
         k = int(np.argmax(np.diff(times) <= 0))
         return f"{times[k]:.15g} and then {times[k + 1]:.15g} (number {k + 1}, counted from 0)"

@@ -101,7 +101,7 @@ def test_a_position_far_from_the_origin_is_exact():
 
 
 def test_a_position_of_another_pose():
-    with pytest.raises(fs.InputError, match=r"position .* is not that of its world_to_camera"):
+    with pytest.raises(fs.InputError, match=r"position must be that of world_to_camera"):
         fs.Camera.pinhole(64, 48, 50, 50, 32, 24, np.eye(4), position=(0, 0, 1))
 
 
@@ -139,7 +139,7 @@ def test_another_pose_by_position_and_target():
         ({"world_to_camera": np.eye(4), "position": (0, 0, 0)}, "got both"),
         ({"world_to_camera": 2 * np.eye(4)}, "world_to_camera"),
         ({"position": (0, 0)}, "camera position must be three numbers"),
-        ({"position": (0, 0, 1), "target": (0, 0, 1)}, "the same point"),
+        ({"position": (0, 0, 1), "target": (0, 0, 1)}, "must be different points"),
     ],
 )
 def test_poses_that_are_refused(pose, words):
@@ -183,8 +183,8 @@ GOOD = {"width": 64, "height": 48, "fx": 50.0, "fy": 50.0, "cx": 32.0, "cy": 24.
         ({"cy": math.inf}, "cy must be finite"),
         ({"near": 0.0}, "near must be above 0"),
         ({"near": math.nan}, "near must be above 0"),
-        ({"near": 1.0, "far": 1.0}, "far .* must be above near"),
-        ({"far": math.nan}, "far .* must be above near"),
+        ({"near": 1.0, "far": 1.0}, "far must be above near"),
+        ({"far": math.nan}, "far must be above near"),
         ({"world_to_camera": np.eye(3)}, "world_to_camera must be a 4x4"),
         ({"world_to_camera": 2 * np.eye(4)}, "last row"),
         ({"world_to_camera": np.diag([2, 2, 2, 1])}, "world_to_camera must be rigid.*scales by 2"),
@@ -206,10 +206,10 @@ def test_what_makes_no_camera(changes, words):
         ((math.pi, [0, 0, 0], [0, 0, 1]), "fov_x must be between"),
         ((5e-324, [0, 0, 0], [0, 0, 1]), "fov_x must be between"),
         ((math.nan, [0, 0, 0], [0, 0, 1]), "fov_x must be between"),
-        ((1.0, [0, 0, 1], [0, 0, 1]), "the same point"),
+        ((1.0, [0, 0, 1], [0, 0, 1]), "must be different points"),
         ((1.0, [0, 0], [0, 0, 1]), "position must be three"),
         ((1.0, [0, 0, 0], [0, 0, math.inf]), "look_at must be three"),
-        ((1.0, [0, 0, 0], [0, 3, 0]), "up .* points along the view"),
+        ((1.0, [0, 0, 0], [0, 3, 0]), "up must not be parallel"),
         ((1.0, [0, 0, 0], [0, 0, 1], [0, 0, 0]), "up must not be zero"),
         ((1.0, [0, 0, 0], [0, 0, 1], "up"), "up must be three"),
     ],

@@ -298,14 +298,17 @@ def test_a_video_has_every_image(here):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--rate", "0"], "the rate is 0.0; give a number"),
+        (["--rate", "0"], "the rate must be a number of poses per second above 0, got 0.0"),
         (["--times", "0,noon"], "--times must be seconds separated by commas, got '0,noon'"),
         (["--times", "1,0"], "increasing"),
         (["--video", "a.avi"], "must have the suffix .mp4, got a.avi; use a.mp4"),
         (["--outputs", "deep"], "unknown output 'deep'"),
         (["--memory-budget", "lots"], "--memory-budget must be a number of bytes above 0, got 'lots'"),
         (["--trajectory", "none.tum"], "cannot read none.tum"),
-        (["--times", "0,1", "--rate", "-1"], "the rate is -1.0; give a number"),
+        (
+            ["--times", "0,1", "--rate", "-1"],
+            "rate must be a number of poses per second above 0, got -1.0",
+        ),
         (["--log", "poses.tum"], "poses.tum already exists"),
         (["--coco", "."], "got the folder ."),
     ],

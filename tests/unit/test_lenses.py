@@ -79,7 +79,7 @@ def test_parallel_rays():
     camera = fs.Camera.orthographic(400, 200, 8.0)
     np.testing.assert_allclose(camera.project([[1, 2, 5], [1, 2, 50]]), [[250, 200], [250, 200]])
     assert np.isnan(camera.project([[0, 0, -1]])).all()
-    with pytest.raises(fs.InputError, match="no directions"):
+    with pytest.raises(fs.InputError, match="rays from one point, got Orthographic"):
         camera.rays([[0, 0]])
 
 
@@ -111,21 +111,24 @@ def test_a_lens_that_does_nothing_is_none():
         (lambda: BrownConrady(k1=math.nan), "k1 must be a finite number"),
         (lambda: Fisheye(k2="a"), "k2 must be a finite number"),
         (lambda: BrownConrady(k6=-1e300), r"k6 must be .*at most 1e\+12, got -1e\+300"),
-        (lambda: BrownConrady.opencv([1, 2, 3]), "3 coefficients.*4, 5, 8, 12 or 14"),
+        (lambda: BrownConrady.opencv([1, 2, 3]), "4, 5, 8, 12 or 14 coefficients .* got 3"),
         (
             lambda: BrownConrady.opencv([0.1] * 12 + [0, 0.02]),
-            "last two distortion coefficients, 0 and 0.02, tilt",
+            "last two distortion coefficients, .* got 0 and 0.02",
         ),
         (
             lambda: fs.Camera.pinhole(64, 48, 20, 20, 32, 24, lens=BrownConrady(k1=-0.5, p2=0.01)),
-            r"distortion \(k1 = -0.5, p2 = 0.01\) cannot be inverted in .* focal length \(20 pixels\)",
+            r"invertible .* got k1 = -0.5, p2 = 0.01, .* focal length \(20 pixels\)",
         ),
         (
             lambda: fs.Camera.pinhole(64, 48, 9, 9, 900, 24, lens=Fisheye()),
-            "field of view of a fisheye .*900",
+            "field of view, got none of a fisheye .*900",
         ),
-        (lambda: fs.Camera.fisheye(64, 48, 1.0, coefficients=[0.1] * 5), "4 coefficients, k1 to k4, got 5"),
-        (lambda: fs.Camera.pinhole(64, 48, 20, 20, 32, 24, lens="fisheye"), "lens is 'fisheye'"),
+        (
+            lambda: fs.Camera.fisheye(64, 48, 1.0, coefficients=[0.1] * 5),
+            "4 coefficients, k1 to k4, got 5",
+        ),
+        (lambda: fs.Camera.pinhole(64, 48, 20, 20, 32, 24, lens="fisheye"), "lens must be .*, got 'fisheye'"),
         (lambda: fs.Camera.fisheye(64, 48, math.radians(201)), "between 0 and 200 degrees"),
         (lambda: fs.Camera.orthographic(64, 48, 0.0), "metres_wide must be above 0"),
     ],
@@ -222,7 +225,7 @@ def test_scene_files_switch_lenses_on(tmp_path, text, fx, fy):
             "unknown key 'camera.equirectangular.radius'; none is known here",
         ),
         ("fov_x_deg = 210\n[camera.fisheye]\n", "fov_x_deg: camera fov_x of this fisheye"),
-        ("fov_x_deg = 120\n[camera.distortion]\nk1 = -2.0\n", "cannot be inverted in"),
+        ("fov_x_deg = 120\n[camera.distortion]\nk1 = -2.0\n", "must be invertible in"),
     ],
 )
 def test_lenses_that_scene_files_cannot_have(tmp_path, text, words):

@@ -103,12 +103,18 @@ def test_samples_are_taken_at_a_rate():
     ("make", "words"),
     [
         (lambda: fs.Trajectory([0, 1, 1], np.zeros((3, 7))), r"got 1 and then 1 \(number 2"),
-        (lambda: fs.Trajectory([0.0], [[0, 0, 0, 1, 1, 0, 0]]), "length 1.41421.*w, x, y, z"),
+        (
+            lambda: fs.Trajectory([0.0], [[0, 0, 0, 1, 1, 0, 0]]),
+            "quaternion w, x, y, z .* length 1, got 1.41421",
+        ),
         (lambda: fs.Trajectory([0.0], [[0, 0, math.nan, 1, 0, 0, 0]]), "pose 0 .* 7 finite numbers"),
-        (lambda: fs.Trajectory([0.0], np.eye(4)[None], smooth="yes"), "smooth is 'yes'"),
-        (lambda: some().sampled(0), "the rate is 0; give"),
-        (lambda: some().sampled(math.inf), "the rate is inf"),
-        (lambda: some().sampled(1e9), "more than 10,000,000; give a lower rate"),
+        (
+            lambda: fs.Trajectory([0.0], np.eye(4)[None], smooth="yes"),
+            "smooth must be True or False, got 'yes'",
+        ),
+        (lambda: some().sampled(0), "the rate must be .* above 0, got 0"),
+        (lambda: some().sampled(math.inf), "the rate must be .* got inf"),
+        (lambda: some().sampled(1e9), "at most 10,000,000 poses, got 1e\\+09 per second over"),
     ],
 )
 def test_values_that_are_not_a_trajectory(make, words):
