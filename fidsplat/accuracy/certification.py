@@ -68,8 +68,7 @@ def certify(
     if ms is not None and times.late > ms:
         raise InputError(
             f"ms must be at least {times.late:.3g} on {choice.device} for a certified error of {error:g}, "
-            "got "
-            f"{ms:g}; allow more time or a larger error"
+            f"got {ms:g}; allow more time or a larger error"
         )
     settings = {
         name: getattr(quality, name) for name, value in DEFAULTS.items() if getattr(quality, name) != value

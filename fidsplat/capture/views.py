@@ -94,8 +94,7 @@ class Views:
                 if one != other:
                     raise InputError(
                         f"the views of a batch must have the same {what}, got {one} of view 0 and {other} "
-                        "of view "
-                        f"{number}; render them in separate batches"
+                        f"of view {number}; render them in separate batches"
                     )
 
 

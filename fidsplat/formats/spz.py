@@ -50,8 +50,7 @@ def load_spz(path: Path) -> SplatCloud:
     if version not in (2, 3) or degree not in _REST or point > _BITS:
         raise InputError(
             f"{path}: SPZ must have version 2 or 3, SH degree 0 to 3 and at most {_BITS} fractional bits, "
-            "got version "
-            f"{version}, degree {degree} and {point} bits"
+            f"got version {version}, degree {degree} and {point} bits"
         )
     widths = {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "quats": 4 if version == 3 else 3}
     widths["rest"] = 3 * _REST[degree]

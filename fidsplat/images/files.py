@@ -149,8 +149,7 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
     if len(levels) > 2:
         raise InputError(
             f"a marker image must have at most two grey levels, got {len(levels)} in {path}; use one pixel "
-            "for "
-            "each module, and threshold it without smoothing"
+            "for each module, and threshold it without smoothing"
         )
     dark = levels[0] if len(levels) == 2 or levels[0] <= top // 2 else None
     return (grey == dark).astype(np.uint8) if dark is not None else np.zeros(grey.shape, np.uint8)

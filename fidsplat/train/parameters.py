@@ -87,7 +87,7 @@ class Splats:
         return Splats(values, first, second, gradient_sums, visible_counts)
 
     def check(self, when: str) -> None:
-        """Raises TrainingError where a number is not finite."""
+        """Raise TrainingError if a value is not finite."""
         moments = {f"Adam's mean of {n}": a for n, a in self.first.items()}
         moments |= {f"Adam's mean square of {n}": a for n, a in self.second.items()}
         moments |= {"gradients": self.gradient_sums}

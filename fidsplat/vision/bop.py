@@ -110,8 +110,7 @@ class BopScene:
             if known.get(label, model) != model:
                 raise InputError(
                     f"{models}: object {label} must be {known[label].get('spec')}, got {model['spec']}; "
-                    "use the "
-                    "same labels in all scenes, or another data set"
+                    "use the same labels in all scenes, or another data set"
                 )
         for name, content in (
             ("scene_camera.json", self._cameras),

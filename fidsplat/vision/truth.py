@@ -117,8 +117,7 @@ def at_shutter(
     if (camera.height, camera.width) != tuple(shape[:2]):
         raise InputError(
             f"the image must have the camera's size, {camera.width} x {camera.height} pixels, got "
-            f"{shape[1]} x "
-            f"{shape[0]}"
+            f"{shape[1]} x {shape[0]}"
         )
     groups = dict(capture.motion.groups_at(time))
     markers = [replace(m, pose=groups[m.label] @ m.pose) if m.label in groups else m for m in scene.markers]
