@@ -61,7 +61,7 @@ class BufferPool:
 
     def lease(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
         """A buffer that belongs to the caller until `give_back`. larger: whether it may have more bytes."""
-        # removed before it is looked at: images that die meanwhile may give back others
+        # removed before its size is compared: images that are released meanwhile may give back others
         spare = self._spare.get(name, [])
         while spare:
             buffer = spare.pop()
@@ -80,7 +80,7 @@ class BufferPool:
     def memory_bytes(self) -> int:
         """Bytes of the scratch buffers, and of leased ones that were given back."""
         size = 0
-        # copied first: images that die meanwhile give back theirs
+        # copied first: images that are released meanwhile give back theirs
         for buffers in [list(self._buffers.values()), *self._spare.values()]:
             for buffer in buffers.copy():
                 size += buffer.size
@@ -177,7 +177,7 @@ class BufferPool:
 
     def _request_large_pages(self, buffer: cl.Buffer) -> None:
         """Advise the system on a buffer's memory, which stays the device's."""
-        queue = cl.CommandQueue(self._context)  # of its own: work on other queues is not waited for
+        queue = cl.CommandQueue(self._context)  # a separate queue, which does not wait for others
         memory, _ = cl.enqueue_map_buffer(
             queue, buffer, cl.map_flags.WRITE, 0, (buffer.size,), np.dtype(np.uint8)
         )

@@ -48,7 +48,7 @@ def lease_images(
         )
     leased = []
     for output in outputs:
-        name = f"{output.name} of views"  # single frames do not take the buffers of batches
+        name = f"{output.name} of views"  # single frames do not reuse the buffers of batches
         buffer = workspace.pool.lease(name, bytes_of[output.name])
         leased.append((name, buffer))
         if len(views) < views.total:

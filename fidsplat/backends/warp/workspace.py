@@ -65,11 +65,10 @@ class ArrayPool:
             return array
         per_element = 1 if values.dtype.names else wp.types.type_size(dtype)
         array = self.exact(name, values.size // per_element, dtype)
-        known, memory = self._memory.get((name, dtype), (None, None))
-        if known is not array:  # to make the NumPy array takes longer than to fill it
-            memory = array.numpy()
-            self._memory[name, dtype] = array, memory
-        memory[...] = values.reshape(memory.shape)
+        cached = self._memory.get((name, dtype))
+        if cached is None or cached[0] is not array:  # making the NumPy array takes longer than filling it
+            cached = self._memory[name, dtype] = array, array.numpy()
+        cached[1][...] = values.reshape(cached[1].shape)
         return array
 
     def host(self, name: str, size: int, dtype: Any) -> Any:
