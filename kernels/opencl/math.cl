@@ -121,13 +121,11 @@ static inline real ln(real x) {
     int bits = as_int(x) - root_half;
     real k = (real)(bits >> 23), f = as_float((bits & 0x7FFFFF) + root_half) - 1;
 #endif
-    real s = f / (2 + f), z = s * s, half_square = REAL(0.5) * f * f;
-    real r = REAL(1.531383769920937332e-01) + z * REAL(1.479819860511658591e-01);
-    r = REAL(1.818357216161805012e-01) + z * r;
-    r = REAL(2.222219843214978396e-01) + z * r;
-    r = REAL(2.857142874366239149e-01) + z * r;
-    r = REAL(3.999999999940941908e-01) + z * r;
-    r = z * (REAL(6.666666666666735130e-01) + z * r);
+    real s = f / (2 + f), z = s * s, w = z * z, half_square = REAL(0.5) * f * f;
+    real even = w * (REAL(3.999999999940941908e-01) + w * (REAL(2.222219843214978396e-01) + w * REAL(1.531383769920937332e-01)));
+    real odd = z * (REAL(6.666666666666735130e-01)
+                    + w * (REAL(2.857142874366239149e-01) + w * (REAL(1.818357216161805012e-01) + w * REAL(1.479819860511658591e-01))));
+    real r = even + odd;
     // ln 2 in two words
     return k * REAL(6.93147180369123816490e-01)
            - ((half_square - (s * (half_square + r) + k * REAL(1.90821492927058770002e-10))) - f);

@@ -67,12 +67,12 @@ def make_log(real):
         f = wp.cast((bits & mantissa) + root_half, real) - real(1.0)
         s = f / (real(2.0) + f)
         z, half_square = s * s, real(0.5) * f * f
-        r = real(1.531383769920937332e-01) + z * real(1.479819860511658591e-01)
-        r = real(1.818357216161805012e-01) + z * r
-        r = real(2.222219843214978396e-01) + z * r
-        r = real(2.857142874366239149e-01) + z * r
-        r = real(3.999999999940941908e-01) + z * r
-        r = z * (real(6.666666666666735130e-01) + z * r)
+        w = z * z
+        even = real(2.222219843214978396e-01) + w * real(1.531383769920937332e-01)
+        even = w * (real(3.999999999940941908e-01) + w * even)
+        odd = real(1.818357216161805012e-01) + w * real(1.479819860511658591e-01)
+        odd = z * (real(6.666666666666735130e-01) + w * (real(2.857142874366239149e-01) + w * odd))
+        r = even + odd
         # ln 2 in two words
         low = s * (half_square + r) + k * real(1.90821492927058770002e-10)
         return k * real(6.93147180369123816490e-01) - ((half_square - low) - f)
