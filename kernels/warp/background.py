@@ -6,7 +6,7 @@ from functools import cache
 
 import warp as wp
 
-from .common import STRICT, View, first_sample, fma, store_line, struct_of
+from .common import STRICT, View, first_sample, fma, fma3, fma_dot, store_line, struct_of
 from .rays import make_rays
 
 TURN = wp.constant(0.15915494309189535)
@@ -33,8 +33,8 @@ def make_backdrop(kind: str, bent: bool):
     @wp.func
     def gradient(surroundings: Surroundings, ray: wp.vec3) -> wp.vec3:
         """Gradient by the sine of the ray's elevation above the horizon."""
-        share = wp.clamp(0.5 + 0.5 * wp.dot(ray, surroundings.up) / wp.length(ray), 0.0, 1.0)
-        return surroundings.bottom + share * (surroundings.top - surroundings.bottom)
+        share = wp.clamp(fma(0.5, fma_dot(ray, surroundings.up) / wp.sqrt(fma_dot(ray, ray)), 0.5), 0.0, 1.0)
+        return fma3(share, surroundings.top - surroundings.bottom, surroundings.bottom)
 
     @wp.func
     def pixel_of(surroundings: Surroundings, column: int, row: int) -> wp.vec3:
@@ -52,11 +52,12 @@ def make_backdrop(kind: str, bent: bool):
         column, row = int(wp.floor(u)), int(wp.floor(v))
         across, down = u - wp.floor(u), v - wp.floor(v)
         above = between(surroundings, column, row, across)
-        return wp.lerp(above, between(surroundings, column, row + 1, across), down)
+        return fma3(down, between(surroundings, column, row + 1, across) - above, above)
 
     @wp.func
     def between(surroundings: Surroundings, column: int, row: int, share: float) -> wp.vec3:
-        return wp.lerp(pixel_of(surroundings, column, row), pixel_of(surroundings, column + 1, row), share)
+        left, right = pixel_of(surroundings, column, row), pixel_of(surroundings, column + 1, row)
+        return fma3(share, right - left, left)
 
     behind = {"gradient": gradient, "panorama": panorama}[kind]
 
@@ -78,7 +79,8 @@ def make_backdrop(kind: str, bent: bool):
             at = first_sample(number, view) + row * view.tiles_x * view.tile_w + column
             light = color[at]
             # in the axes of the world
-            added = behind(surroundings, wp.transpose(wp.mat33(view.rotation)) * ray)
+            r = wp.transpose(wp.mat33(view.rotation))
+            added = behind(surroundings, wp.vec3(fma_dot(r[0], ray), fma_dot(r[1], ray), fma_dot(r[2], ray)))
             for channel in range(3):
                 light[channel] = fma(light[3], added[channel], light[channel])
             store_line(color, at, light)

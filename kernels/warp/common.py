@@ -55,7 +55,7 @@ class View:
     slopes: wp.vec4d  # of rays, -x, x, -y, y: EWA takes derivatives there where a centre lies further out
     ray_step: wp.float64  # behind a lens, where there are boxes: from a ray to the next sample's, at most
     splats: int  # of the cloud
-    ray: wp.vec4  # a sample's ray is ((column - [2]) [0], (row - [3]) [1], 1); 0 where depths are distances
+    ray: wp.vec4  # a sample's ray is ((column - [2]) / [0], (row - [3]) / [1], 1), or (0, 0, 1) for distances
 
 
 # The compiler does not see that it is the same number, and loads again what stands there: a GPU's thread has
@@ -101,6 +101,12 @@ def fma(a: float, b: float, c: float) -> float:
 def fma3(a: float, b: wp.vec3, c: wp.vec3) -> wp.vec3:
     """a b + c, rounded once."""
     return wp.vec3(fma(a, b[0], c[0]), fma(a, b[1], c[1]), fma(a, b[2], c[2]))
+
+
+@wp.func
+def fma_dot(a: wp.vec3, b: wp.vec3) -> float:
+    """The scalar product, rounded once for each term."""
+    return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2]))
 
 
 # One 16-byte load where the device has it: Warp's vectors are not known to be aligned, so the compiler would

@@ -38,9 +38,9 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     boxes, opaque = any(name in effects for name in BOXES), "external_depth" in effects
     rays = make_rays(bent, "rays_length" in effects, bent and boxes, opaque)
     Rays, length_of = rays.Rays, rays.length_of
-    starts, attribute_readers, attenuates, composites, covers, clears = (
+    starts, attribute_readers, composites, covers, clears = (
         output.functions(outputs, part)
-        for part in ("start", "read_attributes", "attenuate", "composite", "cover", "clear")
+        for part in ("start", "read_attributes", "composite", "cover", "clear")
     )
     measured = bool(output.having(output.having(outputs, "start"), "length"))
     readers = [
@@ -129,14 +129,11 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
                 p.finished = 1
                 return p
         weight = p.t * opacity
-        color_weight = weight
-        for k in range(wp.static(len(attenuates))):
-            color_weight = wp.static(attenuates[k])(p, attributes, color_weight)
-        p.r = fma(color_weight, attributes.rgb[0], p.r)
-        p.g = fma(color_weight, attributes.rgb[1], p.g)
-        p.b = fma(color_weight, attributes.rgb[2], p.b)
+        p.r = fma(weight, attributes.rgb[0], p.r)
+        p.g = fma(weight, attributes.rgb[1], p.g)
+        p.b = fma(weight, attributes.rgb[2], p.b)
         for k in range(wp.static(len(composites))):
-            p = wp.static(composites[k])(p, attributes, weight, color_weight, view)
+            p = wp.static(composites[k])(p, attributes, weight, view)
         p.t = p.t - weight
         return p
 

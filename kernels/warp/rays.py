@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View, struct_of
+from .common import View, fma, struct_of
 
 SLOPES = wp.types.matrix((2, 3), wp.float32)
 """a ray's derivatives by the sample's column, and by its row"""
@@ -44,7 +44,7 @@ def make_rays(
     def ray_in(column: int, row: int, view: View) -> wp.vec3:
         """Ray of a sample with length 1 along z; (0, 0, 1) for parallel rays, or if depths are distances."""
         ray = view.ray
-        return wp.vec3((float(column) + 0.5 - ray[2]) * ray[0], (float(row) + 0.5 - ray[3]) * ray[1], 1.0)
+        return wp.vec3((float(column) + 0.5 - ray[2]) / ray[0], (float(row) + 0.5 - ray[3]) / ray[1], 1.0)
 
     @wp.func
     def ray_of(column: int, row: int, rays: Rays, view: View) -> wp.vec3:
@@ -54,16 +54,21 @@ def make_rays(
             return ray_in(column, row, view)
 
     @wp.func
+    def per_depth(ray: wp.vec3) -> float:
+        """Length of a ray with Z = 1."""
+        return wp.sqrt(fma(ray[0], ray[0], fma(ray[1], ray[1], 1.0)))
+
+    @wp.func
     def length_of(column: int, row: int, rays: Rays, view: View) -> float:
         if wp.static(stretched):
             length = float(1.0)
             # a tile can extend beyond the image
             if column < view.width and row < view.height:
-                own = wp.length(ray_of(column, row, rays, view))
+                own = per_depth(ray_of(column, row, rays, view))
                 if own == own:
                     length = own
             return length
         else:
-            return wp.length(ray_in(column, row, view))
+            return per_depth(ray_in(column, row, view))
 
     return SimpleNamespace(Rays=Rays, ray_of=ray_of, length_of=length_of)

@@ -6,7 +6,7 @@ import warp as wp
 
 from . import output
 from .buffers import make_images, make_samples, sample_fields
-from .common import STRICT, View, first_sample, fma
+from .common import STRICT, View, first_sample, fma3
 from .pixel_grid import PixelGrid, sample_at
 from .rays import make_rays
 
@@ -70,10 +70,11 @@ def make_resolve(
             if wp.static(measured):
                 lengths[k] = length_of(x + k % n, y + k / n, rays, view)
         left = total[3] * mean
+        rgb = fma3(left, background, wp.vec3(total[0] * mean, total[1] * mean, total[2] * mean))
         for k in range(wp.static(len(background_shares))):
-            left += wp.static(background_shares[k])(grid, samples)
+            rgb = fma3(wp.static(background_shares[k])(grid, samples), background, rgb)
         for channel in range(3):
-            out.rgb[3 * grid.pixel + channel] = fma(left, background[channel], total[channel] * mean)
+            out.rgb[3 * grid.pixel + channel] = rgb[channel]
         for k in range(wp.static(len(resolves))):
             wp.static(resolves[k])(grid, samples, lengths, out)
 

@@ -43,8 +43,9 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
         filled[name] = derived[name] if name in derived else getattr(view, name)
     for name in ("focal_x", "focal_y", "near"):
         filled[f"per_{name}"] = 1.0 / filled[name]
-    if not (view.along_ray or view.parallel):  # else depths are distances, and the ray is 0
-        own = (filled["per_focal_x"], filled["per_focal_y"], filled["center_x"], filled["center_y"])
+    filled["ray"] = view.uniform("ray")
+    if not (view.along_ray or view.parallel):  # else depths are distances
+        own = (filled["focal_x"], filled["focal_y"], filled["center_x"], filled["center_y"])
         filled["ray"] = np.stack(own, axis=1)
     if sloped and view.raster:
         filled["ray_step"] = view.raster.step

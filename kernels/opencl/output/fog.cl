@@ -20,7 +20,7 @@
                 ;
         }
 //@ composite
-    vfloat absorbed = weight * (1.0f - exp(pixel->fog_slope * attributes->z));
+    vfloat absorbed = weight * (1.0f - EXP(pixel->fog_slope * attributes->z));
     pixel->r = FMA(-absorbed, attributes->r, pixel->r);
     pixel->g = FMA(-absorbed, attributes->g, pixel->g);
     pixel->b = FMA(-absorbed, attributes->b, pixel->b);

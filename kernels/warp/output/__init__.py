@@ -55,10 +55,8 @@ class Output:
     """(pixel, s, c, x, y, disc, opacity, view): a splat of the tile's list before it is composited, whether
     it contributes to the sample or not (c.contributes); x, y: from the anchor; disc: squared distance from
     the projected centre in pixels, infinite without a low-pass; opacity: 0 if it does not contribute"""
-    attenuate: Any = None
-    """(pixel, attributes, color_weight): the weight of a fragment's colour"""
     composite: Any = None
-    """(pixel, attributes, weight, color_weight, view): a fragment or a layer of this weight, before `pixel.t`
+    """(pixel, attributes, weight, view): a fragment or a layer of this weight, before `pixel.t`
     changes"""
     cover: Any = None
     """(attributes): attributes of an external opaque surface, where they are not 0"""

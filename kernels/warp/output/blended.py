@@ -24,7 +24,7 @@ def accumulate(layer: Any, attributes: Any, tau: float, share: float):
 
 
 @wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     p.blended += attributes.blended
     return p

@@ -10,7 +10,7 @@ from . import Output
 
 
 @wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     p.depth = fma(weight, attributes.z, p.depth)
     p.depth_weight += weight

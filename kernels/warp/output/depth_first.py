@@ -11,7 +11,7 @@ from . import Output
 
 
 @wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     if p.depth_first == 0.0 and p.t - weight <= view.first_light:
         p.depth_first = attributes.z

@@ -18,7 +18,7 @@ def start(pixel: Any, length: float, view: View):
 
 
 @wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     # faint ones count together
     if p.t > 0.5 and p.median_light - (p.t - weight) >= MIN_ALPHA:

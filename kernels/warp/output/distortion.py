@@ -18,7 +18,7 @@ SPREAD_NEAR = wp.constant(0.2)
 
 
 @wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     if weight > 0.0 and attributes.z > 0.0:
         inverse = INVERSE_DEPTH / wp.max(attributes.z, SPREAD_NEAR)

@@ -5,7 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from ..common import View
+from ..common import View, fma
+from ..fast import fast_exp
 from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
@@ -18,14 +19,13 @@ def start(pixel: Any, length: float, view: View):
 
 
 @wp.func
-def attenuate(pixel: Any, attributes: Any, color_weight: float) -> float:
-    return color_weight * wp.exp(pixel.fog_slope * attributes.z)
-
-
-@wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
-    p.fogged += weight - color_weight
+    absorbed = weight * (1.0 - fast_exp(pixel.fog_slope * attributes.z))
+    p.r = fma(-absorbed, attributes.rgb[0], p.r)
+    p.g = fma(-absorbed, attributes.rgb[1], p.g)
+    p.b = fma(-absorbed, attributes.rgb[2], p.b)
+    p.fogged += absorbed
     return p
 
 
@@ -49,7 +49,6 @@ OUTPUT = Output(
     # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
     state={"fog_slope": wp.float32, "fogged": wp.float32},
     start=start,
-    attenuate=attenuate,
     composite=composite,
     samples={"fogged": wp.float32},
     store=store,

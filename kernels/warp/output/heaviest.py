@@ -34,7 +34,7 @@ def start(pixel: Any, length: float, view: View):
 
 
 @wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     if weight > p.weight:
         p.weight = weight

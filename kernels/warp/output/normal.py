@@ -36,7 +36,7 @@ def accumulate(layer: Any, attributes: Any, tau: float, share: float):
 
 
 @wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     p.normal = fma3(weight, attributes.normal, p.normal)
     return p
@@ -55,23 +55,22 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def unit_of(grid: PixelGrid, samples: Any) -> wp.vec3:
-    """The pixel's normal, of length 1 or 0."""
+def sum_of(grid: PixelGrid, samples: Any):
+    """The sum of the pixel's normals, and one over its length, or 0."""
     sum = wp.vec3()
     for k in range(grid.count):
         sum += samples.normal[sample_at(grid, k)]
-    length = wp.length(sum)
-    unit = wp.vec3()
+    length, scale = wp.length(sum), float(0.0)
     if length > 0.0:
-        unit = sum * (1.0 / length)
-    return unit
+        scale = 1.0 / length
+    return sum, scale
 
 
 @wp.func
 def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
-    unit = unit_of(grid, samples)
+    sum, scale = sum_of(grid, samples)
     for channel in range(3):
-        out.normal[3 * grid.pixel + channel] = unit[channel]
+        out.normal[3 * grid.pixel + channel] = sum[channel] * scale
 
 
 OUTPUT = Output(

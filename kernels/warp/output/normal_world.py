@@ -4,16 +4,18 @@ from typing import Any
 
 import warp as wp
 
+from ..common import fma_dot
 from ..pixel_grid import PixelGrid
 from . import Output
-from .normal import unit_of
+from .normal import sum_of
 
 
 @wp.func
 def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
-    turned = wp.transpose(out.row_rotations[grid.row]) * unit_of(grid, samples)
-    for channel in range(3):
-        out.normal_world[3 * grid.pixel + channel] = turned[channel]
+    sum, scale = sum_of(grid, samples)
+    to_world = wp.transpose(out.row_rotations[grid.row])
+    for axis in range(3):
+        out.normal_world[3 * grid.pixel + axis] = scale * fma_dot(to_world[axis], sum)
 
 
 OUTPUT = Output(
