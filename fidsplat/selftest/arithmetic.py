@@ -17,8 +17,8 @@ from fidsplat.selftest.clouds import camera, splats
 from fidsplat.splats.cloud import SplatCloud
 
 _COUNT = 1 << 18
-# in ulp: bounds of OpenCL C 1.2 (section 7.4), and of the fast functions over all arguments, with and without
-# a fused multiply-add (tools/fast_bounds.py)
+# in ulp: bounds of OpenCL C 1.2 (section 7.4); of the fast functions over all arguments, with and without a
+# fused multiply-add (tools/fast_bounds.py); reciprocals are correctly rounded
 BOUNDS = {
     "exp": 3.0,
     "log": 3.0,
@@ -30,6 +30,7 @@ BOUNDS = {
     "log64": 3.0,
     "fast_exp": 2.3,
     "fast_log": 1.1,
+    "reciprocal": 0.5,
 }
 VIEW = camera(60, 45, 48.0)
 UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
@@ -85,6 +86,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
         "log64": np.log(wide_below),
         "fast_exp": np.exp(exponents),
         "fast_log": np.log(shares),
+        "reciprocal": 1 / below,
     }
     ulp = {name: worst(got[name], truth[name]) for name in truth if name in got}
     denormals = bool(got["denormal"][0] > 0 and got["denormal"][1] == np.finfo(np.float32).tiny)

@@ -63,9 +63,11 @@ static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat 
 #endif
 }
 
-// Pixels that still transmit light (transmittance above the stop).
+// Pixels that are not terminated.
 static inline vint pixel_transmits(const Pixel *pixel, const BlendConstants *constants) {
-    return VMASK(pixel->t > constants->stop);
+    return VMASK(pixel->t > constants->stop)
+//@@ transmits
+        ;
 }
 
 // Pixels that a later fragment can still change.
@@ -81,7 +83,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
                                const BlendConstants *constants
 //@@ blend_parameters
 ) {
-    vfloat inverse_d = 1.0f / c.d;
+    vfloat inverse_d = INVERSE_D(c);
     vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->ceiling);
 //@@ footprint_opacity
     const Attributes attributes = fragment_attributes(s, c, inverse_d);

@@ -54,8 +54,8 @@ static inline void bounds_span(const Bounds *b, float y0, float y1, float *x0, f
     if (low <= high) {
         // 4e-7: 1 - Y^2 / hy^2 cancels at the tips
         float right = clamp(b->tip, low, high), left = clamp(-b->tip, low, high);
-        float wr = sqrt(fmax(1.0f - right * right * b->inverse_hy2, 0.0f) + 4e-7f);
-        float wl = sqrt(fmax(1.0f - left * left * b->inverse_hy2, 0.0f) + 4e-7f);
+        float wr = FAST_SQRT(fmax(1.0f - right * right * b->inverse_hy2, 0.0f) + 4e-7f);
+        float wl = FAST_SQRT(fmax(1.0f - left * left * b->inverse_hy2, 0.0f) + 4e-7f);
         *x1 = b->ex + fmin(FMA(b->slope, right, b->half_width * wr), b->hx);
         *x0 = b->ex + fmax(FMA(b->slope, left, -b->half_width * wl), -b->hx);
     }

@@ -101,6 +101,20 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #else
 #define FMA(a, b, c) ((a) * (b) + (c))
 #endif
+//@@ dialect
+// 1 / x, correctly rounded where x and the result are normal numbers.
+#ifndef RECIPROCAL
+#define RECIPROCAL(x) (1.0f / (x))
+#endif
+// Reserves `count` entries for each work-item of a group. Returns the first; *length grows by the sum.
+#ifndef RESERVE
+#define RESERVE(length, count) atomic_add(length, count)
+#endif
+// Within 3 ulp: for culling, not for what reaches the image.
+#ifndef FAST_SQRT
+#define FAST_SQRT(x) sqrt(x)
+#define FAST_RECIPROCAL(x) (1.0f / (x))
+#endif
 //@@ arithmetic
 // EXP and LOG (slot/arithmetic_*.cl) of one number.
 #if LANES == 1

@@ -74,7 +74,7 @@ kernel void project(
 //@@ cull_frustum
     wide log_opacity = (wide)ln((real)opacity);
     wide half_r2 = log_opacity - (wide)view->log_cut;
-    if (!(half_r2 > 0.0f && opacity < INFINITY)) return;        // a NaN culls
+    if (!(half_r2 > 0.0f && opacity > 0.0f && opacity < INFINITY)) return;        // a NaN culls
 
     // columns of the rotation of an unnormalised quaternion
     real w = quat.x, x = quat.y, y = quat.z, z = quat.w;

@@ -17,6 +17,10 @@ typedef struct {
 } Crossing;
 
 //@@ footprint
+#ifndef INVERSE_D
+#define INVERSE_D(c) RECIPROCAL((c).d)
+#define HALF_RHO(c, inverse_d) ((c).q * (inverse_d) * (inverse_d))
+#endif
 //@@ footprint_functions
 
 // Affine forms at heights y; `*_x` hold the terms that depend on the column only.

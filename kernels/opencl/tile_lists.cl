@@ -21,25 +21,50 @@ static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulon
 // Indices in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats.
 enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 
+// Classes of lists by decreasing length, of which there are SCAN_ITEMS.
+static inline uint length_class(uint length) { return SCAN_ITEMS - 1 - min(length / 4, SCAN_ITEMS - 1u); }
+
+// Lengths of the lists of four tiles from `first` on; 0 beyond the last tile.
+static inline uint4 tile_lengths(global const uint *tallies, uint first, uint tiles) {
+    uint length[4];
+    for (uint k = 0; k < 4; k++) length[k] = first + k < tiles ? tallies[TALLIES + first + k] : 0;
+    return (uint4)(length[0], length[1], length[2], length[3]);
+}
+
 // Index space: one work-group of SCAN_ITEMS.
-// Reads: tallies, zeroed for the next frame if `clear`. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts;
-// `emit` adds the number of visible splats.
+// Reads: tallies, zeroed for the next frame if `clear`. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts,
+// to which `emit` adds the number of visible splats; tile_order[tiles]: tiles by the classes of their lists, so that blending begins
+// with the longest, in any order within a class.
 // All lists are empty if there are more pairs than `capacity`, unless that is 2^32 - 1.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 //@@ arguments tile_starts
 ) {
     local ulong partial[SCAN_ITEMS];
+    local uint classes[SCAN_ITEMS];
     uint item = get_local_id(0);
-    ulong running = 0;
-    for (uint first = 0; first < tiles; first += 4 * SCAN_ITEMS) {
-        uint from = min(first + 4 * item, tiles), to = min(from + 4, tiles);
-        ulong mine = 0, total;
-        for (uint tile = from; tile < to; tile++) mine += tallies[TALLIES + tile];
-        ulong place = running + scan_group(partial, item, mine, &total);
-        for (uint tile = from; tile < to; tile++) {
-            starts[tile] = cursors[tile] = (uint)place;
-            place += tallies[TALLIES + tile];
-            if (clear) tallies[TALLIES + tile] = 0;
+    ulong total, running = 0;
+    classes[item] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint first = 4 * item; first < tiles; first += 4 * SCAN_ITEMS) {
+        uint4 lengths = tile_lengths(tallies, first, tiles);
+        atomic_inc(classes + length_class(lengths.x));
+        atomic_inc(classes + length_class(lengths.y));
+        atomic_inc(classes + length_class(lengths.z));
+        atomic_inc(classes + length_class(lengths.w));
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    classes[item] = (uint)scan_group(partial, item, classes[item], &total);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint round = 0; round < tiles; round += 4 * SCAN_ITEMS) {
+        uint first = round + 4 * item;
+        uint4 lengths = tile_lengths(tallies, first, tiles);
+        uint length[4] = {lengths.x, lengths.y, lengths.z, lengths.w};
+        uint place = (uint)(running + scan_group(partial, item, (ulong)lengths.x + lengths.y + lengths.z + lengths.w, &total));
+        for (uint k = 0; k < 4 && first + k < tiles; k++) {
+            starts[first + k] = cursors[first + k] = place;
+            place += length[k];
+            tile_order[atomic_inc(classes + length_class(length[k]))] = first + k;
+            if (clear) tallies[TALLIES + first + k] = 0;
         }
         running += total;
     }
@@ -57,7 +82,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     }
 }
 
-// Work-items of a group of the per-splat kernels. A splat that overlaps more tiles than a window is shared by a complete group.
+// Work-items of a group of the per-splat kernels. A splat that overlaps more tiles than a window is shared by a team of them.
 #define BIN_ITEMS 256
 
 // Rectangle of tiles that a big splat may overlap. Counting and listing both call this, so they agree, and `tile_count`
@@ -90,28 +115,16 @@ static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int
     return column >= span.first && column <= span.last ? row * rect->tiles_x + column : -1;
 }
 
-// Adds the tiles of big splats to the tallies.
-// Index space: any number of work-groups; each processes every n-th splat.
-// Reads: tallies' number of big splats, big, big_bounds.
-kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void tally_big(
-//@@ arguments tally_big
-) {
-    uint big_count = min(tallies[TALLY_BIG], big_capacity);
-    for (uint k = get_group_id(0); k < big_count; k += get_num_groups(0)) {
-        const Bounds b = big_bounds[k];
-        const TileRect rect = tile_rect(&b, width, height);
-        int before = (int)(big[k] / count) * tiles_of(width, height);
-        for (int cell = get_local_id(0); cell < rect.cells; cell += BIN_ITEMS) {
-            int tile = rect_tile(&rect, cell, &b, width, height);
-            if (tile >= 0) atomic_inc(tallies + TALLIES + before + tile);
-        }
-    }
-}
-
 #define NO_OFFSET 0xFFFFFFFFu
 #define NO_ENTRY 0xFFFFFFFFu
 #define WINDOW_TILES (WINDOW_W * WINDOW_H)
+#define QUEUED 0xFFFFu          // bits of a length of at most BIN_ITEMS * WINDOW_TILES;
+#define ONE_VISIBLE 0x10000u    // further bits count splats
 #define UNROLL 4                // atomics in flight per work-item
+#define TEAM 64                 // work-items that share a big splat
+#define TEAMS (BIN_ITEMS / TEAM)
+#define TEAM_CELLS (8 * TEAM)   // a splat of more cells is left to the complete group,
+#define TEAM_DEFERRED 16             // up to this many of each team
 
 // Lists of the tiles of a band [band_first, band_end), at most `capacity` pairs.
 typedef struct {
@@ -125,54 +138,100 @@ static inline uint next_offset(int tile, const Band *band, global uint *restrict
     return tile < band->first || tile >= band->end ? NO_OFFSET : atomic_inc(cursors + tile) - band->start;
 }
 
+typedef struct {
+    uint count;                 // splats of a view
+    int width, height;
+    global const uint *big;
+    global const Bounds *bounds;
+    global const uint *keys;
+} BigSplats;
+
+// Advances the cursors of all tiles that a big splat overlaps, and writes its pairs where the band has capacity for them.
+// `items` work-items share the cells, of which this is `item`.
+static inline void list_big_splat(const BigSplats *splats, uint k, const TileRect *rect, const Bounds *b, int item, int items,
+                                  const Band *band, global uint *restrict cursors, global uint2 *restrict pairs) {
+    uint splat = splats->big[k];
+    int before = (int)(splat / splats->count) * tiles_of(splats->width, splats->height);
+    for (int cell = item; cell < rect->cells; cell += items) {
+        int tile = rect_tile(rect, cell, b, splats->width, splats->height);
+        uint place = tile < 0 ? NO_OFFSET : next_offset(before + tile, band, cursors);
+        if (place < band->capacity) pairs[place] = (uint2)(splat, splats->keys[splat]);
+    }
+}
+
+// The same for every `groups`-th of the first `big_count` big splats, by a complete group: a team for each splat, then all teams for
+// each splat of very many tiles. deferred: scratch.
+static inline void list_big_splats(const BigSplats *splats, uint group, uint groups, uint big_count, const Band *band,
+                                   global uint *restrict cursors, global uint2 *restrict pairs, local uint (*deferred)[TEAM_DEFERRED + 1]) {
+    uint item = get_local_id(0), team = item / TEAM, deferred_count = 0;
+    for (uint k = group * TEAMS + team; k < big_count; k += groups * TEAMS) {
+        const Bounds b = splats->bounds[k];
+        const TileRect rect = tile_rect(&b, splats->width, splats->height);
+        if (rect.cells > TEAM_CELLS && deferred_count < TEAM_DEFERRED) {
+            deferred_count++;
+            if (item % TEAM == 0) deferred[team][deferred_count] = k;
+        } else list_big_splat(splats, k, &rect, &b, item % TEAM, TEAM, band, cursors, pairs);
+    }
+    if (item % TEAM == 0) deferred[team][0] = deferred_count;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (team = 0; team < TEAMS; team++)
+        for (uint n = 1; n <= deferred[team][0]; n++) {
+            const Bounds b = splats->bounds[deferred[team][n]];
+            const TileRect rect = tile_rect(&b, splats->width, splats->height);
+            list_big_splat(splats, deferred[team][n], &rect, &b, item, BIN_ITEMS, band, cursors, pairs);
+        }
+}
+
+// Adds the tiles of big splats to the tallies.
+// Index space: any number of work-groups; each processes every n-th splat.
+// Reads: tallies' number of big splats, big, big_bounds.
+kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void tally_big(
+//@@ arguments tally_big
+) {
+    local uint deferred[TEAMS][TEAM_DEFERRED + 1];
+    const BigSplats splats = {count, width, height, big, big_bounds, 0};
+    const Band no_pairs = {0, 0, INT_MAX, 0, 0};
+    list_big_splats(&splats, get_group_id(0), get_num_groups(0), min(tallies[TALLY_BIG], big_capacity), &no_pairs, tallies + TALLIES, 0, deferred);
+}
+
 // Writes the (splat, key) pairs of all tiles of a band.
-// Index space: for each view `splat_groups` work-groups, one work-item per splat, then the same number of work-groups for every
-// view, which share the big splats.
+// Index space: for each view the same number of work-groups, which share the big splats, then `splat_groups` work-groups, one
+// work-item per splat.
 // Reads: windows, keys, starts, big, big_bounds. Consumes: cursors of the band. Writes: pairs; adds to counts' number of visible
 // splats.
 kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
 ) {
-    local uint visible, queued;
+    local uint queued;          // length of the queue, and number of visible splats
     local ushort queue[BIN_ITEMS * WINDOW_TILES];     // (work-item of the splat, tile of its window)
-    local uint corners[BIN_ITEMS], depths[BIN_ITEMS];
+    local uint corners[BIN_ITEMS], depths[BIN_ITEMS], deferred[TEAMS][TEAM_DEFERRED + 1];
     const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
     uint item = get_local_id(0), number = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
-    if (item == 0) visible = queued = 0;
+    if (item == 0) queued = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (get_group_id(0) >= splat_groups) {
-        uint groups = get_num_groups(0) - splat_groups;
-        for (uint k = number * groups + get_group_id(0) - splat_groups; k < big_count; k += groups * get_num_groups(1)) {
-            const Bounds b = big_bounds[k];
-            const TileRect rect = tile_rect(&b, width, height);
-            uint splat = big[k], key = keys[splat];
-            int before = (int)(splat / count) * tiles_of(width, height);
-            for (int cell = item; cell < rect.cells; cell += BIN_ITEMS) {
-                int tile = rect_tile(&rect, cell, &b, width, height);
-                uint place = tile < 0 ? NO_OFFSET : next_offset(before + tile, &band, cursors);
-                if (place < band.capacity) pairs[place] = (uint2)(splat, key);
-            }
-        }
+    uint groups = get_num_groups(0) - splat_groups, i = get_global_id(0) - groups * BIN_ITEMS;
+    if (get_group_id(0) < groups) {     // first, since they may take long
+        const BigSplats splats = {count, width, height, big, big_bounds, keys};
+        list_big_splats(&splats, number * groups + get_group_id(0), groups * get_num_groups(1), big_count, &band, cursors,
+                        pairs, deferred);
     } else {
-        uint i = get_global_id(0), splat = number * count + i;
+        uint splat = number * count + i;
         uint key = i < count ? keys[splat] : CULLED;
-        if (key != CULLED) {
-            if (first_band) atomic_inc(&visible);
-            uint2 window = windows[splat];
-            corners[item] = window.x;
-            depths[item] = key;
-            for (uint at = window.y != 0 ? atomic_add(&queued, popcount(window.y)) : 0; window.y != 0; window.y &= window.y - 1)
-                queue[at++] = (ushort)(item * WINDOW_TILES + 31 - clz(window.y & -window.y));
-        }
+        uint2 window = key != CULLED ? windows[splat] : (uint2)(0);
+        corners[item] = window.x;
+        depths[item] = key;
+        uint at = RESERVE(&queued, popcount(window.y) | (key != CULLED ? ONE_VISIBLE : 0u)) & QUEUED;
+        for (; window.y != 0; window.y &= window.y - 1) queue[at++] = (ushort)(item * WINDOW_TILES + 31 - clz(window.y & -window.y));
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     // evenly shared, since splats overlap few or many tiles; several at once, since each atomic has latency
     int before = (int)number * tiles_of(width, height);
-    uint first_splat = number * count + (uint)get_global_id(0) - item;
-    for (uint from = item; from < queued; from += UNROLL * BIN_ITEMS) {
+    uint first_splat = number * count + i - item;
+    uint length = queued & QUEUED, visible = queued / ONE_VISIBLE;
+    for (uint from = item; from < length; from += UNROLL * BIN_ITEMS) {
         uint places[UNROLL], owners[UNROLL];
         for (uint n = 0; n < UNROLL; n++) {
-            uint entry = from + n * BIN_ITEMS < queued ? queue[from + n * BIN_ITEMS] : NO_ENTRY;
+            uint entry = from + n * BIN_ITEMS < length ? queue[from + n * BIN_ITEMS] : NO_ENTRY;
             owners[n] = entry / WINDOW_TILES;
             places[n] = NO_OFFSET;
             if (entry != NO_ENTRY) {
@@ -183,7 +242,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
         for (uint n = 0; n < UNROLL; n++)
             if (places[n] < band.capacity) pairs[places[n]] = (uint2)(first_splat + owners[n], depths[owners[n]]);
     }
-    if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
+    if (item == 0 && first_band && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }
 
 // Sorts each tile's list by (depth key, splat); all keys differ.

@@ -119,7 +119,7 @@ def make_project(
         # conditions are written so that a NaN culls
         log_opacity = float(ln(real(opacity)))
         half_r2 = log_opacity - view.log_cut
-        if not (half_r2 > 0.0 and opacity < wp.inf):
+        if not (half_r2 > 0.0 and opacity > 0.0 and opacity < wp.inf):
             return
         if not (size[0] >= 0.0 and size[0] < wp.inf and size[1] >= 0.0 and size[1] < wp.inf):
             return

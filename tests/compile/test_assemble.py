@@ -215,12 +215,12 @@ TAKEN = {
         "sort_scatter": (10, 7, 0),
     },
     "group": {
-        "blend": (17, 6, 15508),
-        "emit": (17, 8, 18440),
+        "blend": (19, 7, 15508),
+        "emit": (17, 8, 18708),
         "project": (14, 12, 0),
         "sort_tiles": (4, 3, 20556),
-        "tally_big": (7, 3, 0),
-        "tile_starts": (7, 4, 8192),
+        "tally_big": (7, 3, 272),
+        "tile_starts": (8, 5, 12288),
     },
 }
 

@@ -1,5 +1,7 @@
 """Our own short exponential and logarithm (`Quality.arithmetic`): bounds, bits, images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
@@ -95,6 +97,17 @@ def test_both_schedules_are_bit_identical(renderer, cloud):
         trace(renderer, image, renderer.backend.shapes("schedule")["groups"]),
     )
     assert differing(own, other, ALL_OUTPUTS) == 0
+
+
+def test_instructions_of_a_vendor_change_no_bit(renderer):
+    """Kernels with and without the file of kernels/opencl/dialect/ that the device selects."""
+    shape = getattr(renderer.backend.shape, "dialect", "") and replace(renderer.backend.shape, dialect="")
+    if not shape:
+        pytest.skip("the device has no dialect")
+    for quality in (FAST, PRECISE, FAST.with_(order="pixel")):
+        picture = FrameSpec(random_splats(3000, seed=2, scale=(1e-3, 0.8)), CAMERA, quality, ALL_OUTPUTS)
+        own, other = trace(renderer, picture), trace(renderer, picture, shape)
+        assert differing(own, other, ALL_OUTPUTS) == 0
 
 
 def test_blending_in_float64_takes_the_library_s():

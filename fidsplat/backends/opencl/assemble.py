@@ -168,7 +168,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     # without a pass of its own, if a pixel is one sample of one pose, and nothing but blending adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
-    files = [layout.file for layout in layouts.values() if layout.file]
+    files = [layout.file for layout in layouts.values() if layout.file] + _dialect(features, shape)
     files.append(LAYOUTS["resolve_pixel"].file)
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
         # not for mixtures of disks and 3D Gaussians, whose bounds are computed otherwise
@@ -204,7 +204,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         ],
     }
     _refuse_unknown_hooks(files)
-    declared = Declarations(_scalars(features), layouts, features.images, fused)
+    declared = Declarations(_scalars(features), layouts, features.images, fused, kernels_of(shape))
     return Assembler(files, declared, numbers_of(features, shape)).source(stages)
 
 
@@ -222,13 +222,28 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
     layouts = layouts_of(features)
     # the forward text of slots is used again, of outputs only the derivatives
     slots = (part for slot in features.slots for part in (slot, *LAYOUTS[slot].parts))
-    files = [LAYOUTS[part].file for part in dict.fromkeys(slots)]
+    files = [LAYOUTS[part].file for part in dict.fromkeys(slots)] + _dialect(features, shape)
     files += [layout.backward_file for layout in layouts.values()]
-    kernels = KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
+    kernels = kernels_of(shape)
     declared = Declarations(_scalars(features), layouts, kernels=kernels)
     backward = {"BACK_ITEMS": backward_items(features, shape), "CHUNK": backward_chunk(features, shape)}
     assembler = Assembler(files, declared, numbers_of(features, shape) | backward)
     return assembler.source({name: [stage.format(shape.schedule) for stage in stages]})
+
+
+def _dialect(features: FeatureSet, shape: DeviceShape) -> list[str]:
+    """The file of the vendor's instructions, of float32."""
+    return [dialect_file(shape)] if shape.dialect and "blend_double" not in features.slots else []
+
+
+def dialect_file(shape: DeviceShape) -> str:
+    """The file of the vendor's instructions, below kernels/opencl/."""
+    return f"dialect/{shape.dialect}.cl"
+
+
+def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
+    """The arguments of each kernel in the schedule of a shape."""
+    return KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
 
 
 @cache

@@ -302,4 +302,5 @@ def _shape(device: cl.Device) -> DeviceShape:
     if device.type & cl.device_type.CPU:
         lanes = 16 if device.native_vector_width_float >= 16 else 8
         return cpu_shape(lanes, device.max_compute_units, fast_fma)
-    return gpu_shape(min(1024, device.max_work_group_size), fast_fma)
+    dialect = "ptx" if device.platform.name == "NVIDIA CUDA" else ""
+    return gpu_shape(min(1024, device.max_work_group_size), fast_fma, dialect)

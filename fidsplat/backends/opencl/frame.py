@@ -143,7 +143,12 @@ def render_in_chunks(frame: DeviceFrame) -> None:
 def blend(frame: DeviceFrame, band: TileBand) -> None:
     """Composite the splats of a band of tiles to samples."""
     group = frame.shape.blend_items
-    frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), band_first=band.first)
+    given: dict[str, Any] = {"band_first": band.first}
+    if frame.shape.schedule == "group":
+        ordered = frame.shape.lists != "ordered" and band.end - band.first == frame.tiles
+        given["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
+        given["longest_first"] = ordered
+    frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), **given)
 
 
 def resolve(frame: DeviceFrame) -> None:

@@ -106,6 +106,14 @@ _BLENDED = takes(
     *("int stride  // of the padded image", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
 )
 
+_BLEND = takes(
+    *("in Splat splats", "in uint lists starts"),
+    "uint band_first  // the first tile of this launch; lists begin with its list",
+    *(_SIZE, "wide log_cut ceiling stop filter"),
+    "uint channel_stride  // samples per channel of raw, of all views",
+    "out float raw  // 4 channels: r, g, b, transmittance",
+)
+
 _LOSS_SIZE = takes(
     "int width height  // values of a row: three of a pixel; rows",
     "int stride  // floats of an image's row",
@@ -153,7 +161,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "bin_emit": takes(
         *(_WALK, "in uint starts", "int band_first band_end", "out uint lists"),
     ),
-    "tile_starts": takes("uint tiles capacity clear", "out uint tallies starts cursors counts"),
+    "tile_starts": takes("uint tiles capacity clear", "out uint tallies starts cursors counts tile_order"),
     "tally_big": takes("uint count", _SIZE, _BIG, "in uint big", "out uint tallies"),
     "emit": takes(
         *(
@@ -171,13 +179,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in uint2 windows", "in uint keys starts", "out uint counts cursors", "out uint2 pairs"),
     ),
     "sort_tiles": takes("int band_first", "in uint starts", "out ulong pairs", "out uint lists"),
-    "blend": takes(
-        *("in Splat splats", "in uint lists starts"),
-        "uint band_first  // the first tile of this launch; lists begin with its list",
-        *(_SIZE, "wide log_cut ceiling stop filter"),
-        "uint channel_stride  // samples per channel of raw, of all views",
-        "out float raw  // 4 channels: r, g, b, transmittance",
-    ),
+    "blend": _BLEND,
     "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
     "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),
     "backdrop": takes(
@@ -305,6 +307,11 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
 
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": _RESERVED,
+    "blend": takes(
+        "uint longest_first  // blend the tiles in the order of tile_order",
+        "in uint tile_order",
+        _BLEND,
+    ),
     "blend_checkpoints": takes(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
         "out float checkpoints  // per pixel and CHUNK splats: transmittance in front, light behind",

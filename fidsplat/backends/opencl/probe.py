@@ -134,8 +134,8 @@ class OpenCLProbe(Probe):
             return made
 
         single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
-        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
-        made, count, items = np.empty((7, n), np.float32), np.uint32(n), n // workspace.shape.lanes
+        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log", "reciprocal")
+        made, count, items = np.empty((8, n), np.float32), np.uint32(n), n // workspace.shape.lanes
         try:
             parts = run("arithmetic_float", items, made, count, *single)
             results: dict[str, np.ndarray] = dict(zip(names, parts, strict=True))
@@ -165,6 +165,7 @@ class OpenCLProbe(Probe):
             given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "clear": 0, "counts": sums}
             tallies = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
             given |= {"tallies": tallies, "cursors": buffer_of(workspace, lengths)}
+            given["tile_order"] = buffer_of(workspace, np.empty_like(lengths))
         else:
             kernel, place = "scan_bins", 4
             given |= {

@@ -32,6 +32,9 @@ class DeviceShape:
     tape: int = 1024
     """capacity of the tape (`lanes`): splats of a tile whose fragments the forward pass stores for the
     backward pass, 2 KiB each for each core; longer lists are evaluated twice"""
+    dialect: str = ""
+    """a file of kernels/opencl/dialect/ with instructions of a vendor; without one kernels are portable, with
+    the same bits"""
 
     @property
     def pair_bytes(self) -> int:
@@ -49,9 +52,9 @@ def cpu_shape(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> DeviceS
     return DeviceShape("lanes", "ordered", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma, 32)
 
 
-def gpu_shape(scan_items: int = 1024, fast_fma: bool = True) -> DeviceShape:
+def gpu_shape(scan_items: int = 1024, fast_fma: bool = True, dialect: str = "") -> DeviceShape:
     """The shape for GPUs: a work-group per tile of 16 x 16 pixels."""
-    return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma, 8)
+    return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma, 8, dialect=dialect)
 
 
 def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:

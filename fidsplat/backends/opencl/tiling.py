@@ -239,6 +239,7 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     items = frame.shape.scan_items
     frame.take("starts", 4 * (frame.tiles + 1))
     frame.take("cursors", 4 * frame.tiles)
+    frame.take("tile_order", 4 * frame.tiles)
     given = {"tiles": frame.tiles, "capacity": capacity, "clear": not frame.waits}
     return frame.launch("bin", "tile_starts", (items,), (items,), **given)
 

@@ -3,7 +3,7 @@
 
 // Index space: one work-item per LANES values.
 // Reads:  exponents, shares, above, below (each n; n a multiple of LANES). Writes: out, n floats of each:
-//         exp, log, above / below, sqrt of below, fma, fast_exp, fast_log.
+//         exp, log, above / below, sqrt of below, fma, fast_exp, fast_log, RECIPROCAL of below.
 kernel void arithmetic_float(uint n, global const float *restrict exponents, global const float *restrict shares,
                              global const float *restrict above, global const float *restrict below,
                              global float *restrict out) {
@@ -17,6 +17,7 @@ kernel void arithmetic_float(uint n, global const float *restrict exponents, glo
     VSTORE(fma(a, b, a), out + 4 * (size_t)n + at);
     VSTORE(fast_exp(VLOAD(exponents + at)), out + 5 * (size_t)n + at);
     VSTORE(fast_log(VLOAD(shares + at)), out + 6 * (size_t)n + at);
+    VSTORE(RECIPROCAL(b), out + 7 * (size_t)n + at);
 }
 
 // Index space: one work-item per value.

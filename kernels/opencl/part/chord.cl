@@ -13,7 +13,7 @@ typedef struct {                        // an ellipse, relative to the splat's a
 
 static inline float conic_half_chord(const Conic *c, float y) {
     float above = y - c->y;
-    return sqrt(fmax(c->square - c->bend * above * above, 0.0f)) + c->pad;
+    return FAST_SQRT(fmax(c->square - c->bend * above * above, 0.0f)) + c->pad;
 }
 
 // Chord of the rows from y0 to y1.

@@ -34,13 +34,13 @@ static inline Conic conic_of(local const Splat *s, float h, float far_x, float f
     float u0 = s->nu0, ux = s->nux, uy = s->nuy, v0 = s->nv0, vx = s->nvx, vy = s->nvy, d0 = s->d0, dx = s->dx, dy = s->dy;
     float u = fabs(u0) + fabs(ux) * far_x + fabs(uy) * far_y, v = fabs(v0) + fabs(vx) * far_x + fabs(vy) * far_y;
     float d = fabs(d0) + fabs(dx) * far_x + fabs(dy) * far_y;
-    float steep = ux * ux + vx * vx, bent = h * dx * dx, aa = steep - bent, inverse = 1.0f / aa;
+    float steep = ux * ux + vx * vx, bent = h * dx * dx, aa = steep - bent, inverse = FAST_RECIPROCAL(aa);
     float ud = ux * d0 - dx * u0, vd = vx * d0 - dx * v0, uv = ux * v0 - vx * u0;               // of a x b: at y = 0,
     float ud_y = ux * dy - dx * uy, vd_y = vx * dy - dx * vy, uv_y = ux * vy - vx * uy;         // per y
     // q = q0 + 2 q1 y - q2 y^2
     float q0 = h * (ud * ud + vd * vd) - uv * uv + CONIC_SLACK * (u * u + v * v + h * d * d) * aa;
     float q1 = h * (ud * ud_y + vd * vd_y) - uv * uv_y, grows = h * (ud_y * ud_y + vd_y * vd_y), q2 = uv_y * uv_y - grows;
-    float shrinks = 1.0f / q2;
+    float shrinks = FAST_RECIPROCAL(q2);
     Conic c;
     c.valid = steep > 1e-12f && bent <= 0.5f * steep && uv_y * uv_y > 1e-12f * steep && grows <= 0.5f * uv_y * uv_y;
     c.middle = (h * dx * d0 - ux * u0 - vx * v0) * inverse;
@@ -50,8 +50,8 @@ static inline Conic conic_of(local const Splat *s, float h, float far_x, float f
     c.bend = q2 * inverse * inverse;
     c.square = square_height * c.bend;
     c.pad = CELLS_PAD + 1e-4f * far_x;
-    c.half_height = sqrt(square_height) + CELLS_PAD + 1e-4f * far_y;
-    c.tip = c.slope * square_height / sqrt(c.slope * c.slope * square_height + c.square + 1e-12f);
+    c.half_height = FAST_SQRT(square_height) + CELLS_PAD + 1e-4f * far_y;
+    c.tip = c.slope * square_height * FAST_RECIPROCAL(FAST_SQRT(c.slope * c.slope * square_height + c.square + 1e-12f));
     return c;
 }
 //@ cells_start

@@ -21,8 +21,8 @@
 static inline Conic conic_of(local const Splat *s, float h, float far_x, float far_y) {
     float u0 = s->nu0, ux = s->nux, v0 = s->nv0, vx = s->nvx, vy = s->nvy;
     float u = fabs(u0) + fabs(ux) * far_x, v = fabs(v0) + fabs(vx) * far_x + fabs(vy) * far_y;
-    float steep = ux * ux + vx * vx, inverse = 1.0f / steep, uv = ux * v0 - vx * u0, uv_y = ux * vy;    // a x b: at y = 0, per y
-    float shrinks = 1.0f / uv_y, grown = h + CONIC_SLACK * (u * u + v * v + h);
+    float steep = ux * ux + vx * vx, inverse = FAST_RECIPROCAL(steep), uv = ux * v0 - vx * u0, uv_y = ux * vy;    // a x b: at y = 0, per y
+    float shrinks = FAST_RECIPROCAL(uv_y), grown = h + CONIC_SLACK * (u * u + v * v + h);
     float square_height = grown * steep * shrinks * shrinks;
     Conic c;
     c.valid = steep > 1e-12f && uv_y * uv_y > 1e-12f * steep;
@@ -32,8 +32,8 @@ static inline Conic conic_of(local const Splat *s, float h, float far_x, float f
     c.bend = uv_y * uv_y * inverse * inverse;
     c.square = grown * inverse;
     c.pad = CELLS_PAD + 1e-4f * far_x;
-    c.half_height = sqrt(square_height) + CELLS_PAD + 1e-4f * far_y;
-    c.tip = c.slope * square_height / sqrt(c.slope * c.slope * square_height + c.square + 1e-12f);
+    c.half_height = FAST_SQRT(square_height) + CELLS_PAD + 1e-4f * far_y;
+    c.tip = c.slope * square_height * FAST_RECIPROCAL(FAST_SQRT(c.slope * c.slope * square_height + c.square + 1e-12f));
     return c;
 }
 //@ cells_start

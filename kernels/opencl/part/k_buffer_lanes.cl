@@ -285,7 +285,7 @@ static inline void k_buffer_insert(Pixel *pixel, vfloat nearest, vfloat z, vfloa
         queue->from = VSELECT(queue->from, (vfloat)-INFINITY, ready);
 //@ skip_fragment
             if (lookahead > next) {
-                vfloat z = fragment_attributes(&s, c, 1.0f / c.d).z;
+                vfloat z = fragment_attributes(&s, c, INVERSE_D(c)).z;
                 depths[lookahead - 1] = VSELECT(depths[lookahead], VMIN(z, depths[lookahead]), mask);
                 lookahead--;
                 continue;

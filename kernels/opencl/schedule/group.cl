@@ -16,7 +16,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     local uchar places[CELLS_X * CELLS_Y][CELLS_STRIDE];    // [cell]: staged splats that overlap it, in order
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
-    uint tile = band_first + get_group_id(0), item = get_local_id(0);
+    uint tile = longest_first ? tile_order[get_group_id(0)] : band_first + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
@@ -45,12 +45,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 //@@ staged
         for (int row = 0; row < ROWS; row++)
             if (px < width && py + row < height && pixel_unfinished(&pixels[row], &constants)) alive = 1;
-        for (uint which = item; which < length; which += GROUP) {
-            local const Splat *s = &staged[which].splat;
-            touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, (local uchar *)cells + which
+        find_cells(staged, length, x0, y0, &constants, cells, touched
 //@@ cells_arguments
-            );
-        }
+        );
         barrier(CLK_LOCAL_MEM_FENCE);
         // uniform: all work-items read the same vote, taken before this batch is blended
 //@@ voted
@@ -69,14 +66,13 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             wide x = (wide)(px - s.ax);
             wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
             for (int row = 0; row < ROWS; row++) {
-                if (!pixel_transmits(&pixels[row], &constants)) continue;
                 wide y = (wide)(py + row - s.ay);
                 Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ cross
                 wide screen;
                 int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
-                if (!VANY(mask)) continue;
+                if (!VANY(mask & pixel_transmits(&pixels[row], &constants))) continue;
                 pixel_blend(&pixels[row], &s, c, mask, screen, &constants
 //@@ blend_arguments
                 );

@@ -34,7 +34,7 @@ static inline FragmentTerms fragment_terms(const Splat *s, int px, int py, const
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     FragmentTerms terms;
     terms.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
-    terms.opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
+    terms.opacity = fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->ceiling);
     const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
     terms.by_weight = fragment_by_weight(s, gradient, &g);
     return terms;
@@ -46,7 +46,7 @@ static inline wide forward_fragment(const Splat *s, int px, int py, Pixel *pixel
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
     if (!VANY(mask)) return 0.0f;
-    return attenuate(pixel, fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling), mask, constants);
+    return attenuate(pixel, fragment_opacity(s, fragment_half_rho(s, c, INVERSE_D(c), screen), constants->ceiling), mask, constants);
 }
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
@@ -108,10 +108,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
         bool unfinished = false;
         for (int row = 0; row < ROWS; row++) unfinished |= pixels[row].t > stop;
         if (unfinished) alive = 1;
-        for (uint which = item; which < length; which += GROUP) {
-            local const Splat *s = &staged[which].splat;
-            touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, (local uchar *)cells + which);
-        }
+        find_cells(staged, length, x0, y0, &constants, cells, touched);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (!alive) break;
         uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);

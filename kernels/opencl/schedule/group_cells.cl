@@ -20,15 +20,26 @@ typedef union {              // a staged record, as vectors for fewer reads
 
 //@@ cells_functions
 
-// Cells of the tile at (left, top) that the splat overlaps: one byte of bits per row of cells, set from `first_row` to `last_row`.
-// Conservative; the test of each pixel decides.
-static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, local uchar *cells
+// Bits of a splat's cells: with the vendor's shuffles, and 32 cells, a word for each splat, which a warp transposes to a word for each
+// cell; else a byte for each row of cells.
+#if defined(TRANSPOSE_BITS) && CELLS_X * (TILE_H / CELL_H) == 32
+#define CELLS_BY_WARP
+#define CELL_BITS uint
+#define SET_CELLS(cells, row, bits) (*(cells) |= (bits) << (CELLS_X * (row)))
+#else
+#define CELL_BITS local uchar
+#define SET_CELLS(cells, row, bits) ((cells)[(row) * CELLS_STRIDE] = (uchar)(bits))
+#endif
+
+// Cells of the tile at (left, top) that the splat overlaps, from `first_row` to `last_row`. Conservative; the test of each pixel
+// decides.
+static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, CELL_BITS *cells
 //@@ cells_parameters
 ) {
     int first_row = max(s->y0 - top, 0) / CELL_H, last_row = (min(s->y1 - top, TILE_H) - 1) / CELL_H;
     float shift = (float)s->ax - (float)left;
 //@@ cells_start
-    for (int cell_row = 0; cell_row < CELLS_Y; cell_row++) cells[cell_row * CELLS_STRIDE] = 0;
+    for (int cell_row = 0; cell_row < CELLS_Y; cell_row++) SET_CELLS(cells, cell_row, 0u);
 //@@ cells_occluded
     for (int cell_row = first_row; cell_row <= last_row; cell_row++) {
         // columns with fragments in the cell's rows of samples
@@ -37,15 +48,46 @@ static inline void touched_cells(local const Splat *s, int left, int top, wide h
 //@@ cells_disc
         int first = max((int)clamp(ceil(low + shift), 0.0f, (float)TILE_W), s->x0 - left);
         int last = min((int)clamp(floor(high + shift), -1.0f, (float)(TILE_W - 1)), s->x1 - left - 1);
-        if (first <= last) cells[cell_row * CELLS_STRIDE] = (uchar)((2u << (last / CELL_W)) - (1u << (first / CELL_W)));
+        if (first <= last) SET_CELLS(cells, cell_row, (2u << (last / CELL_W)) - (1u << (first / CELL_W)));
     }
 }
 
-// Lists the staged splats that overlap a cell, in order. Called by the complete group, after `cells` is filled for all `length`
-// splats; `own` is the index of the work-item in its cell. touched, places: of this cell. Returns the number of splats.
+// Finds the cells of all `length` staged splats. Called by the complete group, before a barrier and list_cell.
+static inline void find_cells(local const Staged *staged, uint length, int left, int top, const BlendConstants *constants,
+                              local uint *cells, local uint (*touched)[ITEMS]
+//@@ cells_parameters
+) {
+#ifdef CELLS_BY_WARP
+    uint lane = get_local_id(0) % 32;
+    for (uint share = get_local_id(0) / 32; share < ITEMS; share += GROUP / 32) {
+        uint which = share * SHARE + lane, bits = 0;
+        local const Splat *s = &staged[which].splat;
+        if (which < length) {
+            touched_cells(s, left, top, s->log_opacity - constants->log_cut, constants->filter, &bits
+//@@ cells_arguments
+            );
+        }
+        touched[lane][share] = TRANSPOSE_BITS(bits);
+    }
+#else
+    for (uint which = get_local_id(0); which < length; which += GROUP) {
+        local const Splat *s = &staged[which].splat;
+        touched_cells(s, left, top, s->log_opacity - constants->log_cut, constants->filter, (local uchar *)cells + which
+//@@ cells_arguments
+        );
+    }
+#endif
+}
+
+// Lists the staged splats that overlap a cell, in order. Called by the complete group; `own` is the index of the work-item in its
+// cell. touched, places: of this cell. Returns the number of splats.
 static inline uint list_cell(local const uint *cells, uint cell_x, uint cell_y, uint own, uint length, local uint *touched,
                              local uchar *places) {
-    uint bits = 0, listed = 0, before = 0;
+    uint listed = 0, before = 0;
+#ifdef CELLS_BY_WARP
+    uint bits = touched[own];
+#else
+    uint bits = 0;
     // the lowest byte of a word is its first on all devices
     for (uint k = 0; k < SHARE / 4; k++) {
         uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;
@@ -55,11 +97,16 @@ static inline uint list_cell(local const uint *cells, uint cell_x, uint cell_y, 
     if (rest < SHARE) bits &= (1u << rest) - 1u;     // stale bytes of an earlier batch
     touched[own] = bits;
     barrier(CLK_LOCAL_MEM_FENCE);
+#endif
     for (uint other = 0; other < ITEMS; other++) {
         if (other == own) before = listed;
         listed += popcount(touched[other]);
     }
     for (; bits != 0; bits &= bits - 1) places[before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
+#ifdef CELLS_BY_WARP
+    WARP_BARRIER();
+#else
     barrier(CLK_LOCAL_MEM_FENCE);
+#endif
     return listed;
 }

@@ -61,7 +61,7 @@ static inline uint forward_splat(const Splat *s, const Tile *tile, Pixel *pixels
         int block = 31 - clz((int)(touched & -touched));
         const Block b = block_of(s, tile, &at, block);
         if (UNLIKELY(!VANY(b.mask))) continue;
-        vfloat half_rho = fragment_half_rho(s, b.crossing, 1.0f / b.crossing.d, b.screen);
+        vfloat half_rho = fragment_half_rho(s, b.crossing, INVERSE_D(b.crossing), b.screen);
         vfloat opacity = fragment_opacity(s, half_rho, constants->ceiling);
         tape->transmittance[length] = pixels[block].t;
         tape->opacity[length++] = attenuate(&pixels[block], opacity, b.mask, constants);

@@ -73,7 +73,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         vfloat squared = FMA((vfloat)s->bulge, c.q, c.d * c.d);      // D^2 (1 + rho_disk / m^2)
         c.inside = VMASK(c.q <= half_r2 * squared) & VMASK(c.d > 0.0f) & VMASK(squared <= s->d_near * c.d);
         // expressed as a disk's fragment: rho / 2 = q / d^2, depth = z_numerator / d
-        vfloat inverse = 1.0f / c.d;
+        vfloat inverse = RECIPROCAL(c.d);
         c.d = squared * inverse;
         c.q = c.q * c.d * inverse;
     }

@@ -6,5 +6,5 @@ static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y,
 }
 //@ fragment_half_rho
 static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat inverse_d, vfloat screen) {
-    return (c.q * inverse_d) * inverse_d;
+    return HALF_RHO(c, inverse_d);
 }

@@ -10,7 +10,7 @@
     float disc_low = fmax(y0 - b->py, -b->pr), disc_high = fmin(y1 - b->py, b->pr);
     if (disc_low <= disc_high) {
         float at = clamp(0.0f, disc_low, disc_high);
-        float half_chord = sqrt(fmax(b->pr * b->pr - at * at, 0.0f)) + BOUNDS_PAD;
+        float half_chord = FAST_SQRT(fmax(b->pr * b->pr - at * at, 0.0f)) + BOUNDS_PAD;
         *x0 = fmin(*x0, b->px - half_chord);
         *x1 = fmax(*x1, b->px + half_chord);
     }
@@ -29,7 +29,7 @@
 //@ cells_disc
             float disc_y = clamp((float)s->disc_y, y0, y1) - (float)s->disc_y, disc_rest = disc_square - disc_y * disc_y;
             if (disc_rest >= 0.0f) {
-                float half_chord = sqrt(disc_rest) + CELLS_PAD;
+                float half_chord = FAST_SQRT(disc_rest) + CELLS_PAD;
                 low = fmin(low, (float)s->disc_x - half_chord);
                 high = fmax(high, (float)s->disc_x + half_chord);
             }
@@ -60,7 +60,7 @@ static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y,
 }
 //@ fragment_half_rho
 static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat inverse_d, vfloat screen) {
-    vfloat half_rho = (c.q * inverse_d) * inverse_d;
+    vfloat half_rho = HALF_RHO(c, inverse_d);
     return SKIPS_DISC(s) ? half_rho : VSELECT(screen, VMIN(half_rho, screen), c.inside);
 }
 //@ disc_crossing

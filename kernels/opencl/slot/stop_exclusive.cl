@@ -9,5 +9,7 @@
     vint drop = live & VMASK(pixel->t * (1.0f - opacity) <= constants->stop);
     pixel->finished |= drop;
     live &= ~drop;
+//@ transmits
+        & ~pixel->finished
 //@ external_attributes
         pixel->finished = 0;
