@@ -6,12 +6,11 @@ import math
 import time
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.capture.quality import MIXTURES, MarkerQuality
+from fidsplat.capture.quality import MarkerQuality
 from fidsplat.markers.facets import count_facets, facet_cloud
 from fidsplat.markers.kinds import bits_of, kind_of, parse_spec
 from fidsplat.markers.mixture import (
@@ -34,8 +33,8 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
-from fidsplat.util.arguments import PickledByFields, text, whole_number
-from fidsplat.util.errors import InputError
+from fidsplat.util.arguments import PickledByFields, flag, number, text, whole_number
+from fidsplat.util.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
@@ -43,6 +42,14 @@ from fidsplat.splats.cloud import SplatCloud
 
 MAX_MODULES = 4096
 """Maximum edge of a grid with its quiet zone, in modules."""
+
+_SETTINGS = {
+    "exact": ("template",),
+    "fitted": ("template", "growth"),
+    "paper": ("levels", "density", "duplicates", "growth"),
+    "facets": (),
+}
+"""settings of each mixture; `template` of `exact` is for `Marker.gaussians`"""
 
 
 class Rectangle(NamedTuple):
@@ -132,7 +139,7 @@ class Marker(PickledByFields):
         )
         count = int(count_gaussians(aspect_of(printed.boxes), templates).sum())
         refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
-        return gaussian_cloud(printed, templates, fitted_growth(), _no_progress)
+        return gaussian_cloud(printed, templates, fitted_growth(), lambda task, share: None)
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
@@ -204,15 +211,15 @@ def marker(
         InputError: an invalid argument, or more splats than `max_splats`.
     """
     start = time.perf_counter()
-    progress = _no_progress if progress is None else progress
+    progress = (lambda task, share: None) if progress is None else progress
     max_splats = whole_number("max_splats", max_splats, 1, 2**31 - 1)
     parsed = parse_spec(spec)
     given = {"levels": levels, "density": density, "growth": growth, "template": template}
-    if not isinstance(duplicates, bool | None):
-        raise InputError(f"duplicates must be True or False, got {duplicates!r}")
-    chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, duplicates, given)
+    given["duplicates"] = None if duplicates is None else flag("duplicates", duplicates)
+    chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, given)
     templates, growth = _mixture(chosen, bool(duplicates))
-    _check_size(size)
+    # outside, a module or a splat's scale would exceed the range of float32
+    size = number("size", size, "a length from 1e-9 to 1e9 metres", 1e-9, 1e9)
     parsed, bits = bits_of(parsed)
     quiet = _quiet_zone(spec, parsed, bits, quiet_zone)
     grid = np.pad(bits, quiet)
@@ -249,7 +256,7 @@ def marker(
         payload=parsed.payload,
         bits=bits,
         quiet_zone=quiet,
-        size=float(size),
+        size=size,
         mixture=chosen.mixture,
         quality=chosen,
         grid=grid,
@@ -290,13 +297,7 @@ def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette:
     return Printed(grid, boxes, values, angles, regions, module, palette)
 
 
-def _no_progress(words: str, share: float) -> None:
-    """Progress callback that does nothing."""
-
-
-def _chosen(
-    quality: MarkerQuality, mixture: str | None, duplicates: bool | None, given: dict[str, Any]
-) -> MarkerQuality:
+def _chosen(quality: MarkerQuality, mixture: str | None, given: dict[str, Any]) -> MarkerQuality:
     """Quality settings, with the given ones (not None) replaced."""
     if not isinstance(quality, MarkerQuality):
         raise InputError(f"quality must be an fs.MarkerQuality, e.g. fs.Quality(...).marker, got {quality!r}")
@@ -306,28 +307,17 @@ def _chosen(
             "mixture must be computed without a device, got 'refined'; give a marker with the mixture "
             "'fitted' to fs.train.refine, or run `fidsplat marker --mixture refined`"
         )
-    if name not in MIXTURES:
-        raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
+    if name not in _SETTINGS:
+        raise InputError(unknown("mixture", name, _SETTINGS))
     given = {key: value for key, value in given.items() if value is not None}
-    of_paper = [key for key in ("levels", "density") if key in given]
-    of_paper += [] if duplicates is None else ["duplicates"]
-    if of_paper and name != "paper":
-        raise InputError(
-            f"{', '.join(of_paper)} must be given with mixture='paper', got mixture={name!r}; write "
-            "mixture='paper'"
-        )
-    if "template" in given and name == "paper":
-        raise InputError(
-            "template must be given with another mixture than 'paper'; give levels and density instead"
-        )
-    if "template" in given and name == "facets":
-        raise InputError(
-            "template must not be given with mixture='facets'; leave it out, or write mixture='fitted'"
-        )
-    if "growth" in given and name in ("exact", "facets"):
-        raise InputError(
-            f"growth must not be given with mixture={name!r}; leave it out, or write mixture='fitted'"
-        )
+    for key in given:
+        users = [mixture for mixture, settings in _SETTINGS.items() if key in settings]
+        if name not in users:
+            raise InputError(
+                f"{key} must be given with mixture {' or '.join(users)}, got {name}; leave it out, or write "
+                f"mixture={users[0]!r}"
+            )
+    given.pop("duplicates", None)
     return replace(quality, mixture=name, **given)
 
 
@@ -339,9 +329,3 @@ def _mixture(quality: MarkerQuality, duplicates: bool) -> tuple[tuple[Template, 
     else:
         templates, growth = fitted_templates(quality.template), fitted_growth()
     return templates, growth if quality.growth is None else float(quality.growth)
-
-
-def _check_size(size: float) -> None:
-    # outside, a module or a splat's scale would exceed the range of float32
-    if not (isinstance(size, Real) and 1e-9 <= size <= 1e9):
-        raise InputError(f"size must be a length from 1e-9 to 1e9 metres, got {size!r}")

@@ -186,11 +186,11 @@ def test_the_same_bits_on_every_run():
         ({"mixture": "paper", "levels": 40}, "1 to 8"),
         (
             {"mixture": "facets", "template": 9},
-            "template must not be given with mixture='facets'; leave it out, or write",
+            "template must be given with mixture exact or fitted, got facets; leave it",
         ),
         (
             {"mixture": "facets", "growth": 0.1},
-            "growth must not be given with mixture='facets'; leave it out, or write",
+            "growth must be given with mixture fitted or paper, got facets; leave it",
         ),
         ({"mixture": "facets", "max_splats": 587}, "at most 587 splats, got 588"),
         ({"max_splats": 0}, "max_splats must be .* got 0"),
