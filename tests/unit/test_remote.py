@@ -149,7 +149,9 @@ def test_workers_read_stores_at_the_same_path(tmp_path):
     ours, here = pickle.loads(sent)()(2), FlightWork(flown, "reference")()(2)
     assert ours == here
     store.path.rename(tmp_path / "b.fss")
-    with pytest.raises(fs.InputError, match=r"must share the disk of stores, and on .*a\.fss is not a store"):
+    with pytest.raises(
+        fs.InputError, match=r"must share the disk of stores, and on .*a\.fss must be the folder of a store"
+    ):
         pickle.loads(sent)()
     fs.save_ply(fs.marker("aruco:4x4_50:3", size=0.4, mixture="fitted").cloud, tmp_path / "a.ply")
     fs.build_store([tmp_path / "a.ply"], tmp_path / "a.fss")
