@@ -318,9 +318,7 @@ def use_path(file):
 def use_results(file):
     from paper_targets import targets
 
-    from fidsplat.experiments.results import load
-
-    targets(load([file.parent]))
+    targets([file.parent])
 
 
 def signed(folder):
