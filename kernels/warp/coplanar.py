@@ -13,6 +13,8 @@ from . import output
 from .common import fma, fma3, struct_of
 from .fast import fast_log
 
+FAINT = wp.constant(1e-3)
+"""below it 1 - opacity rounds, and the optical depth is that of its series, to 3e-7"""
 DARKEST = wp.constant(wp.float32(2.0**-24))
 """transmittance of an opaque fragment, whose optical depth would be infinite"""
 
@@ -113,6 +115,8 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
         # an opaque fragment has the optical depth at which float32 leaves no light
         tau = -log(wp.max(1.0 - opacity, DARKEST))
+        if opacity < FAINT:
+            tau = fma(0.5 * opacity, opacity, opacity)
         after = with_fragment(layer, attributes, tau)
         after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
         return after

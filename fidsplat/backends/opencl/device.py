@@ -24,7 +24,7 @@ from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
 from fidsplat.backends.opencl.training import OpenCLTraining
-from fidsplat.backends.opencl.vendors import intel_registered
+from fidsplat.backends.opencl.vendors import intel_registered, processor_flags
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.effects import FeatureSet
@@ -300,6 +300,7 @@ def _shape(device: cl.Device) -> DeviceShape:
     """Build constants for this device."""
     fast_fma = bool(device.single_fp_config & cl.device_fp_config.FMA)
     if device.type & cl.device_type.CPU:
+        fast_fma |= "fma" in processor_flags()  # which Intel's runtime does not report
         lanes = 16 if device.native_vector_width_float >= 16 else 8
         return cpu_shape(lanes, device.max_compute_units, fast_fma)
     dialect = "ptx" if device.platform.name == "NVIDIA CUDA" else ""

@@ -1,4 +1,5 @@
-"""Registration of Intel's OpenCL runtime for CPUs, installed by pip, with the OpenCL loader.
+"""Registration of Intel's OpenCL runtime for CPUs, installed by pip, with the OpenCL loader; what it leaves
+unreported.
 
 The packages intel-opencl-rt and intel-cmplr-lib-rt contain the libraries, but no file in /etc/OpenCL/vendors
 that names them, and the loader does not find their dependencies.
@@ -8,10 +9,12 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -32,6 +35,17 @@ def intel_library() -> Path | None:
         if file.name == "libintelocl.so" and all((library.parent / name).exists() for name in _NEEDED):
             return library
     return None
+
+
+@cache
+def processor_flags() -> frozenset[str]:
+    """Feature flags of the processor as Linux names them; empty on other systems."""
+    try:
+        text = Path("/proc/cpuinfo").read_text("utf-8")
+    except OSError:
+        return frozenset()
+    flags = re.search(r"^flags\s*:(.*)$", text, re.MULTILINE)
+    return frozenset(flags[1].split() if flags else ())
 
 
 @contextmanager

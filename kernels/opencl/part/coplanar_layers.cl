@@ -131,8 +131,8 @@ static inline void layers_start(Pixel *pixel, Layers *layers) {
 // Adds a fragment where `mask` is set.
 static inline void layer_add(Layer *layer, const Splat *s, const Attributes *attributes, vfloat opacity, vint mask) {
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
-    // clamped to the optical depth at which float32 transmittance is 0
-    vfloat tau = -LOG(fmax(1.0f - opacity, (vfloat)0x1p-24f));
+    // clamped to the optical depth at which float32 transmittance is 0; below 1e-3, where 1 - opacity rounds, by its series to 3e-7
+    vfloat tau = VSELECT(-LOG(fmax(1.0f - opacity, (vfloat)0x1p-24f)), FMA(0.5f * opacity, opacity, opacity), VMASK(opacity < 1e-3f));
 //@@ footprint_tau
     layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);
     layer->optical_depth += tau;

@@ -22,6 +22,8 @@ import struct
 import warnings
 from pathlib import Path
 
+from fidsplat.backends.opencl.vendors import processor_flags
+
 # The x86 levels of PoCL's "distro" kernel libraries, best last, with LLVM's name for each.
 _LEVELS = (
     ("x86-64", ()),
@@ -112,9 +114,7 @@ def _name_of_llvm(device_version: str) -> str:
 
 
 def _processor_name() -> str:
-    flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    have = set(flags[1].split()) if flags else set()
-    return [name for name, needed in _LEVELS if have.issuperset(needed)][-1]
+    return [name for name, needed in _LEVELS if processor_flags().issuperset(needed)][-1]
 
 
 def _read(memory: int, address: int, count: int) -> bytes:
