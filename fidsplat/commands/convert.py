@@ -20,18 +20,18 @@ class Convert:
     """Convert splats to another format, and measure the loss.
 
     Formats by ending: .ply, .splat, .spz, .glb and .gltf (KHR_gaussian_splatting), .usda, .usdc and .usd
-    (OpenUSD's ParticleField; extra usd), and .sog (read only). The command lists what format B cannot store,
-    renders both files from the camera of `fidsplat render A`, and prints the largest and mean difference of
-    the images and their PSNR.
+    (OpenUSD's ParticleField; extra usd), and .sog (read only). The command lists what the format of OUT
+    cannot store, renders both files from the camera of `fidsplat render IN`, and prints the largest and mean
+    difference of the images and their PSNR.
 
     Examples:
       fidsplat convert room.ply room.spz
       fidsplat convert tag.ply tag.usda --json
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("A", "splat file to read")]
-    target: Annotated[tyro.conf.Positional[str], option("B", "splat file to write")]
-    no_pictures: Annotated[bool, switch("do not render and compare both files")] = False
+    source: Annotated[tyro.conf.Positional[str], option("IN", "splat file to read")]
+    target: Annotated[tyro.conf.Positional[str], option("OUT", "splat file to write")]
+    no_images: Annotated[bool, switch("do not render and compare both files", "--no-pictures")] = False
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False
@@ -44,7 +44,7 @@ class Convert:
         known = check_writable(self.target)
         source, target = Path(self.source), Path(self.target)
         if source.exists() and target.exists() and source.samefile(target):
-            raise InputError(f"B must be another file than A, got {self.target}")
+            raise InputError(f"OUT must be another file than IN, got {self.target}")
         new_file(self.target, self.overwrite)
         with delayed_progress() as progress:
             cloud = fs.load_splats(self.source, progress)
@@ -53,7 +53,7 @@ class Convert:
         sizes = [Path(name).stat().st_size for name in (self.source, self.target)]
         facts: dict[str, Any] = {"source": self.source, "target": self.target, "format": known.name}
         facts |= {"splats": len(cloud), "bytes": sizes, "lost": lost, "error": None}
-        if not self.no_pictures and len(cloud):
+        if not self.no_images and len(cloud):
             with console(True).status("rendering both"):
                 facts["error"] = image_error(cloud, fs.load_splats(self.target), self.device)
         lines = [f"{len(cloud):,} splats, {sizes[0]:,} to {sizes[1]:,} bytes, {known.name}: {self.target}"]

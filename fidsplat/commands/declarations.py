@@ -52,9 +52,9 @@ def option(metavar: str, text: str | None = None, short: str | None = None):
     return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint=_shown_default)
 
 
-def switch(text: str | None):
+def switch(text: str | None, alias: str | None = None):
     """tyro's description of an option without a value."""
-    return tyro.conf.arg(help=text, help_behavior_hint="")
+    return tyro.conf.arg(help=text, aliases=[] if alias is None else [alias], help_behavior_hint="")
 
 
 def _shown_default(value: str) -> str:

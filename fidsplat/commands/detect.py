@@ -69,24 +69,25 @@ class Detect:
         scene = None if self.scene is None else _load_scene(self.scene)
         results: list[dict[str, Any]] = []
         readings: list[Reading] = []
-        bundles: list[BundleReading] = []
+        rows: list[tuple[str, ...]] = []
         for path in self.images:
             for name, image, then in self._images(path, scene):
                 result, read, bundled = self._detect(name, image, then)
                 results.append(result)
                 readings += read
-                bundles += bundled
+                rows += [(name, *row) for row in (*map(reading_row, read), *map(_bundle_row, bundled))]
         mean = {} if scene is None else {"means": means(readings)}
         if self.json:
             print_json((results[0] if len(results) == 1 else {"pictures": results}) | mean)
             return 0
         _print_codes(results)
         if scene is not None:
-            rows = [reading_row(reading) for reading in readings]
-            rows += [_mean_row(mean["means"])] if len(readings) > 1 else []
-            rows += map(_bundle_row, bundles)
-            heads = ("marker", "found", "distance [m]", "position [mm]", "angle [deg]", "corners [px]")
-            print_table(console(False), f"Distances and errors, {self.scene}", heads, rows)
+            rows += [("", *_mean_row(mean["means"]))] if len(readings) > 1 else []
+            errors = ("distance [m]", "position [mm]", "angle [deg]", "corners [px]")
+            heads = ("image", "marker", "found", *errors)
+            first = int(len(results) == 1)  # without a column for the image
+            rows = [row[first:] for row in rows]
+            print_table(console(False), f"Distances and errors, {self.scene}", heads[first:], rows)
         return 0
 
     def _images(self, path: str, scene: "Scene | None") -> "Iterator[tuple[str, np.ndarray, Scene | None]]":

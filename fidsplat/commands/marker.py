@@ -50,7 +50,7 @@ class Marker:
       fidsplat marker apriltag:36h11:5 --mixture refined -o tag.ply
     """
 
-    spec: Annotated[tyro.conf.Positional[str], option("SPEC", "marker, as above")]
+    spec: Annotated[tyro.conf.Positional[str], option("SPEC", "marker, e.g. apriltag:36h11:5")]
     out: Annotated[str | None, option("FILE.ply", "file for the splats", "-o")] = None
     size: float = 1.0
     """M: edge of the code (width of a board) in metres, without the quiet zone"""

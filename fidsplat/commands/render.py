@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -78,7 +79,8 @@ class Render(RenderInput):
         self.check()
         bounded = self.max_error is not None or self.max_ms is not None
         if bounded:
-            check_bounds(self.max_error, self.max_ms)
+            with _option_names():
+                check_bounds(self.max_error, self.max_ms)
         name_of = _file_names(self.out, path_of(self.source))
         scene = self.load()
         with _scene_key(self.source, "render.outputs", self.outputs is None):
@@ -119,7 +121,7 @@ class Render(RenderInput):
         from fidsplat.accuracy.quality_within import choose
 
         capture = scene.capture.with_(quality=self.quality)
-        with console(self.json).status("measuring") as status:
+        with console(self.json).status("measuring") as status, _option_names():
             choice = choose(self.max_error, self.max_ms, scene, capture, renderer, report=status.update)
             if self.max_error is None:
                 return choice
@@ -127,7 +129,9 @@ class Render(RenderInput):
 
     def _render(self, renderer: Renderer, scene: Scene, quality: Quality | str | None) -> Frame:
         """The frame; the slow reference device shows its progress."""
-        if renderer.device.always_float64 or self.every is not None:
+        if self.every is not None and not renderer.device.always_float64:
+            raise InputError(f"--every needs --device reference, got {renderer.device.name}")
+        if renderer.device.always_float64:
             with delayed_progress() as progress:
                 step = 1 if self.every is None else self.every
                 return renderer.render_every(
@@ -149,6 +153,16 @@ def _scene_key(source: str, key: str, from_scene: bool) -> Iterator[None]:
         if from_scene and Path(source).suffix.lower() == ".toml":
             raise type(error)(f"{source}: {key}: {error}") from error
         raise
+
+
+@contextmanager
+def _option_names() -> Iterator[None]:
+    """Name the options in errors about the bounds `error` and `ms`."""
+    try:
+        yield
+    except InputError as error:
+        text = re.sub(r"^(error|ms) must", r"--max-\1 must", str(error))
+        raise InputError(re.sub(r"try (error|ms)=", r"try --max-\1 ", text)) from error
 
 
 def _file_names(out: str | None, source: Path) -> Callable[[str, str], Path]:

@@ -194,7 +194,7 @@ class Measure:
             return 0
         for one in made:
             rows = (
-                (f"{size:.3f}", "not met" if error is None else f"{error:.4f}")
+                (f"{size:.3f}", "not measured" if error is None else f"{error:.4f}")
                 for size, error in zip(one.sizes, one.errors, strict=True)
             )
             title = f"lowpass {one.lowpass}, level {one.level}, {one.views} views, {one.device}"

@@ -39,8 +39,8 @@ def test_splats_that_are_there_are_replaced_on_request(capsys, tmp_path):
         (("train", tmp_path, "-o", mine), f"{mine} already exists; give another name, or --overwrite"),
         (("convert", tmp_path / "nowhere.ply", mine), f"{mine} already exists"),
         (("convert", tmp_path / "nowhere.ply", mine, "--overwrite"), "cannot read"),
-        (("convert", mine, mine), f"B must be another file than A, got {mine}"),
-        (("convert", mine, tmp_path / "the same.ply", "--overwrite"), "B must be another file than A"),
+        (("convert", mine, mine), f"OUT must be another file than IN, got {mine}"),
+        (("convert", mine, tmp_path / "the same.ply", "--overwrite"), "OUT must be another file than IN"),
     ):
         status, line = fails(capsys, *words)
         assert (status, mine.read_bytes()) == (2, b"a scan of months"), words

@@ -81,7 +81,8 @@ def test_each_image_has_its_pose(here):
     assert (here / "out" / "contact-sheet.png").exists()
 
 
-def test_a_flights_images_are_read_from_where_its_camera_was(here, capsys):
+def test_a_flights_images_are_read_from_where_its_camera_was(here, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     (here / "scene.toml").write_text(SCENE.replace("33", "160").replace("24", "120"))
     assert fly("--times", "0,0.2,0.5") == 0
     capsys.readouterr()
@@ -91,6 +92,9 @@ def test_a_flights_images_are_read_from_where_its_camera_was(here, capsys):
         assert [one["image"] for one in said["pictures"]] == [f"out/rgb/{k:06d}.png" for k in range(3)]
         assert said["means"]["found"] == 3
         assert said["means"]["position_error_mm"] < 2  # by the scene's own camera it would be 70
+    assert main(["detect", "out", "--scene", "scene.toml"]) == 0
+    errors = capsys.readouterr().out.partition("Distances and errors")[2]
+    assert all(f"{k:06d}" in errors for k in range(3))  # the image of each row
     copied = here / "alone.png"
     copied.write_bytes((here / "out/rgb/000002.png").read_bytes())
     assert main(["detect", "alone.png", "--scene", "scene.toml", "--json"]) == 0
