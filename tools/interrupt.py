@@ -82,7 +82,7 @@ COMMANDS = {
     "convert": Command("convert ../splats.ply splats.spz --overwrite", 60, 4),
     "fly": Command("fly ../scene.toml --trajectory ../flight.tum --rate 5 -o run.mcap", 60, 4),
     "bag": Command("fly ../scene.toml --trajectory ../flight.tum --rate 5 --log bag", 12, 0),
-    "store": Command("store build ../splats.ply -o city.fss --chunk 256", 60, 4),
+    "store": Command("store build ../splats.ply -o city.fss --chunk 256 --overwrite", 60, 4),
     "train": Command("train ../views -o out.ply --iterations 150 --random-points 200", 60, 2),
     "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 51, 1),
 }
@@ -131,6 +131,9 @@ def facts(path: Path) -> Facts:
                 raise ValueError("not an image")
         case ".npy":
             np.load(path)
+        case ".npz":
+            with np.load(path) as arrays:
+                dict(arrays)
         case ".md" | ".csv" | ".svg" | ".html":
             if not content.endswith(b"\n"):
                 raise ValueError("truncated")
@@ -198,7 +201,7 @@ class Trial:
             yield f"ended with {status}: {said}"
         if status != -signal.SIGKILL:
             yield from (f"left {path.name}" for path in folder.rglob(".*.part"))
-        yield from self._different(folder, growing=(".jsonl",))
+        yield from self._different(folder, growing=(".jsonl",), replaced=(".npz",))
         if folder.is_mount():
             subprocess.run(["mount", "-o", f"remount,size={4 * self.bytes + 2**24}", folder], check=True)
         status, said = self.run(folder)
@@ -207,12 +210,16 @@ class Trial:
         yield from self._different(folder)
         yield from (f"no {name}" for name in sorted(set(self.result) - set(files_below(folder))))
 
-    def _different(self, folder: Path, growing: tuple[str, ...] = ()) -> Iterator[str]:
+    def _different(
+        self, folder: Path, growing: tuple[str, ...] = (), replaced: tuple[str, ...] = ()
+    ) -> Iterator[str]:
         for name, path in files_below(folder).items():
             try:
                 found = facts(path)
             except (ValueError, OSError, EOFError) as error:
                 yield f"{name} is incomplete: {error}"
+                continue
+            if path.suffix in replaced:  # such as checkpoints
                 continue
             for place, value in self.result.get(name, {}).items():
                 if found.get(place) != value and (place in found or path.suffix not in growing):

@@ -13,7 +13,7 @@ from typing import ClassVar, TypeAlias
 
 import numpy as np
 
-from fidsplat.util.arguments import real_array
+from fidsplat.util.arguments import number, real_array
 from fidsplat.util.errors import InputError
 
 FISHEYE_LIMIT = math.radians(100)
@@ -330,17 +330,9 @@ def _rows(name: str, value: np.ndarray, width: int) -> np.ndarray:
 
 def _check(lens) -> None:
     for field in fields(lens):
-        value = getattr(lens, field.name)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, (int, float, np.number))
-            or not abs(value) <= MAX_COEFFICIENT
-        ):
-            raise InputError(
-                f"lens coefficient {field.name} must be a finite number, in size at most "
-                f"{MAX_COEFFICIENT:g}, got {value!r}"
-            )
-        object.__setattr__(lens, field.name, float(value))
+        requirement = f"a finite number, in size at most {MAX_COEFFICIENT:g}"
+        given = getattr(lens, field.name), requirement, -MAX_COEFFICIENT, MAX_COEFFICIENT
+        object.__setattr__(lens, field.name, number(f"lens coefficient {field.name}", *given))
 
 
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:

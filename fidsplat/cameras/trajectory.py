@@ -124,7 +124,7 @@ class Trajectory(PickledByFields):
         """
         check_rate(rate)
         first, last = float(self.times[0]), float(self.times[-1])
-        steps = (last - first) * rate
+        steps = (last - first) * float(rate)
         if steps >= MAX_SAMPLES:
             raise InputError(
                 f"a trajectory must have at most {MAX_SAMPLES:,} poses, got {rate:g} per second over "

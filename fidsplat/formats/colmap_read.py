@@ -72,7 +72,8 @@ def load_colmap(folder: Path) -> ColmapModel:
         if number not in lenses:
             raise InputError(f"{folder}: the camera of image {name} must be in cameras, got {number}")
         matrix = np.eye(4)
-        with np.errstate(invalid="ignore"):  # a quaternion of 0 becomes NaN, which Camera rejects
+        # a quaternion of about 0 becomes NaN, which Camera rejects
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
         try:
             cameras.append(_camera(lenses[number], matrix))

@@ -36,7 +36,12 @@ _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 def load_sog(path: Path) -> SplatCloud:
     """Read a .sog file. Raises InputError for a damaged or incomplete file, or another version."""
     try:
-        with open_input(path) as stream, zipfile.ZipFile(stream) as archive:
+        # numbers beyond float32 become splats that are left out
+        with (
+            np.errstate(over="ignore", invalid="ignore"),
+            open_input(path) as stream,
+            zipfile.ZipFile(stream) as archive,
+        ):
             return _cloud(path, archive)
     except InputError:
         raise

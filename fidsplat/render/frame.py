@@ -206,10 +206,11 @@ class Frame(Mapping):
         images, index = self._images, self._index
         if name == "error":
             images, index = HostImages({name: self[name][None]}, {}, {}), 0
+        complete = images.empty(name)
         if into is None:
-            into = images.empty(name)
-        elif not isinstance(into, np.ndarray):
-            raise invalid("into", "an array of the shape of the output", into)
+            into = complete
+        elif not isinstance(into, np.ndarray) or (into.shape, into.dtype) != (complete.shape, complete.dtype):
+            raise invalid("into", f"an array {complete.shape} of {complete.dtype}", into)
         whole_number("the end of the rows", end, 0, len(into))
         whole_number("the first row", first, 0, end)
         images.read_rows(name, first, end, into, index)

@@ -4,6 +4,8 @@ import math
 import os
 import re
 import tomllib
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from fidsplat.store.layout import SUFFIX
 from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of, read_input
+from fidsplat.util.limits import check_total
 
 MAX_BYTES = 16 * 2**20
 MAX_PARTS = 8
@@ -79,14 +82,20 @@ def read_scene(
     marker_quality = Quality.of(quality).marker
     tables = top.tables("splats", SPLATS)
     on_disk = [table for table in tables if table.text("file").lower().endswith(SUFFIX)]
-    splats = [_splats(table, file.parent, progress) for table in tables if table not in on_disk]
+    load = cache(lambda name: load_splats(file.parent / name, progress))
+    splats, markers, total = [], [], 0
+    for table in tables:
+        if table not in on_disk:
+            splats.append(_splats(table, load))
+            total = _checked_total(file, total, splats[-1][0])
+    for table in top.tables("markers", MARKERS):
+        markers.append(_marker(table, file.parent, marker_quality, progress))
+        total = _checked_total(file, total, markers[-1].marker.cloud)
     return dict(
         clouds=tuple(cloud for cloud, _ in splats),
         stores=tuple(_store(table, file.parent) for table in on_disk),
         camera=camera,
-        markers=tuple(
-            _marker(table, file.parent, marker_quality, progress) for table in top.tables("markers", MARKERS)
-        ),
+        markers=tuple(markers),
         background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
         outputs=render.texts("outputs", ("rgb",)),
         quality=quality,
@@ -169,7 +178,16 @@ def _store(table: Table, folder: Path) -> Store:
         return Store(folder / table.text("file"))
 
 
-def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[SplatCloud, Trajectory | None]:
+def _checked_total(file: Path, total: int, cloud: SplatCloud) -> int:
+    """Bytes of splats with another cloud. Raises InputError beyond the limit: a short file could repeat one
+    splat file any number of times."""
+    arrays = (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh, cloud.colors)
+    total += sum(array.nbytes for array in arrays if array is not None)
+    check_total(f"the splats of {file}", total, "build a store of them (`fidsplat store build`)")
+    return total
+
+
+def _splats(table: Table, load: Callable[[str], SplatCloud]) -> tuple[SplatCloud, Trajectory | None]:
     """Splats of a file at their pose, and their motion from there."""
     name, scale = table.text("file"), table.number("scale", 1.0)
     if not scale > 0:
@@ -178,7 +196,7 @@ def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[Spla
     if motion is not None:
         motion = Trajectory(motion.times, motion.poses @ np.linalg.inv(_pose(table)))
     with table.at("file"):
-        cloud = load_splats(folder / name, progress)
+        cloud = load(name)
         moved = any(key in table for key in ("position", "quaternion", "scale"))
         return (cloud.transformed(pose) if moved else cloud), motion
 

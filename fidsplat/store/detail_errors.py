@@ -112,6 +112,6 @@ def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
             known = isinstance(one.lowpass, str) and type(one.level) is int
             if not known or not all(type(n) in (int, float) and 0 <= n < math.inf for n in numbers):
                 raise ValueError
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError):
         raise InputError(f"{file} is damaged; remove it, and run `fidsplat store measure` again") from None
     return loaded

@@ -104,7 +104,8 @@ def colors_of_degree(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[st
         common = min(terms, given["sh"].shape[1])
         sh[:, :common] = given["sh"][:, :common]
     else:
-        sh[:, 0] = (given["colors"].astype(np.float64) - 0.5) / C0
+        with np.errstate(over="ignore"):  # colours of a damaged store
+            sh[:, 0] = (given["colors"].astype(np.float64) - 0.5) / C0
     return {"sh": sh}
 
 

@@ -204,10 +204,12 @@ class CameraBoxes:
         Points may be displaced by a share `step` of their distance to the camera, and `further` (n,) metres.
         """
         distance = np.linalg.norm(self.middle, axis=1)
-        around = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
+        with np.errstate(over="ignore"):  # infinite for a box around the camera
+            around = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
         off = np.arctan2(np.hypot(self.middle[:, 0], self.middle[:, 1]), self.middle[:, 2])
         if further is not None:
-            aside = step + further / np.maximum(distance - self._radius, 1e-300)
+            with np.errstate(over="ignore"):
+                aside = step + further / np.maximum(distance - self._radius, 1e-300)
             around = np.where(aside < 1, around + np.arcsin(np.minimum(aside, 1.0)), np.inf)
         return (distance <= self._radius) | (off - around <= angle)
 
@@ -277,7 +279,7 @@ def projected_sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
         placed = CameraBoxes(one, *boxes(0.0))
         panorama = one.raster is not None and isinstance(one.raster.lens, Equirectangular)
         nearest = placed.off_axis() if panorama else placed.nearest(one)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             size = np.where(nearest > 0, edges * focal / np.maximum(nearest, 1e-300), np.inf)
         largest = np.maximum(largest, np.where(edges > 0, size, 0.0))
     return largest

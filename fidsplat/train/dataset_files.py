@@ -10,7 +10,7 @@ import numpy as np
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
 from fidsplat.images.files import read_image, read_on_background
 from fidsplat.train.dataset import MAX_POINTS, Dataset, TrainingView
-from fidsplat.train.transforms import DatasetContents, has_transforms, load_transforms
+from fidsplat.train.transforms import DatasetContents, check_other_image, has_transforms, load_transforms
 from fidsplat.train.undistorted_view import undistorted_view
 from fidsplat.util.arguments import callback, whole_number
 from fidsplat.util.errors import InputError
@@ -99,9 +99,11 @@ def _model(
     folder: Path, place: Path, background: Background, progress: Progress, words: str
 ) -> tuple[list[TrainingView], np.ndarray, np.ndarray]:
     model = load_colmap(place)
-    views = []
+    views: list[TrainingView] = []
+    others: set[tuple[int, int]] = set()
     for i, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
         progress(words, i / len(model.names))
+        check_other_image(folder / "images" / name, others)
         image = read_on_background(folder / "images" / name, background)
         views.append(undistorted_view(name, camera, image, _mask(folder / "masks" / name)))
     return views, model.points, model.colors
@@ -122,7 +124,7 @@ def _background(folder: Path) -> Background:
             try:
                 value = from_json(text).get("background", 0.0)
                 red, green, blue = np.broadcast_to(np.asarray(value, float), 3).tolist()
-            except (ValueError, AttributeError, TypeError):
+            except (ValueError, AttributeError, TypeError, OverflowError):
                 raise InputError(
                     f"background of {file} must be one number or three, got another value"
                 ) from None

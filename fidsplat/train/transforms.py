@@ -79,7 +79,8 @@ def _table(file: Path) -> dict[str, Any]:
 
 
 def _views(file: Path, table: dict, progress: Callable[[str, float], None], words: str) -> list[TrainingView]:
-    views = []
+    views: list[TrainingView] = []
+    others: set[tuple[int, int]] = set()
     for number, frame in enumerate(table["frames"]):
         progress(words, number / len(table["frames"]))
         try:
@@ -92,7 +93,7 @@ def _views(file: Path, table: dict, progress: Callable[[str, float], None], word
             raise InputError(
                 f"{file}: frame {number} must have a file_path and a transform_matrix of 4 x 4 finite numbers"
             ) from None
-        image, mask = _image(file, name), None
+        image, mask = _image(file, name, others), None
         if "mask_path" in frame:
             mask = read_image(file.parent / str(frame["mask_path"])).max(axis=2) > 0
         given = {**table, **frame}
@@ -118,9 +119,22 @@ def _divided(
     return first, second
 
 
-def _image(file: Path, name: str) -> np.ndarray:
+def _image(file: Path, name: str, others: set[tuple[int, int]]) -> np.ndarray:
     candidates = [file.parent / (name + suffix) for suffix in _SUFFIXES]
-    return read_on_background(next((one for one in candidates if one.is_file()), candidates[0]), _BLACK)
+    image = next((one for one in candidates if one.is_file()), candidates[0])
+    check_other_image(image, others)
+    return read_on_background(image, _BLACK)
+
+
+def check_other_image(image: Path, others: set[tuple[int, int]]) -> None:
+    """Raise InputError if a view has the image file of another view: a short list of views could expand one
+    file any number of times. others: device and inode of the images so far, extended."""
+    if not image.is_file():
+        return  # reported when it is read
+    status = image.stat()
+    if (status.st_dev, status.st_ino) in others:
+        raise InputError(f"views must have different images, got {image} twice; remove one of the views")
+    others.add((status.st_dev, status.st_ino))
 
 
 def _camera(what: str, given: dict, image: np.ndarray, camera_to_world: np.ndarray) -> Camera:

@@ -28,13 +28,28 @@ def input_limit(size: int) -> int:
     times its size, but at most half of the machine's memory."""
     text = os.environ.get(VARIABLE)
     if text is None:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**33
-        return min(max(FLOOR, RATIO * size), memory // 2)
+        return min(max(FLOOR, RATIO * size), _half_of_memory())
     if not text.isdecimal() or int(text) == 0:
         raise InputError(
             f"{VARIABLE} must be a number of bytes above 0, got {text!r}; write for example {2**32}"
         )
     return int(text)
+
+
+def _half_of_memory() -> int:
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**33
+    return memory // 2
+
+
+def check_total(what: str, need: int, remedy: str) -> None:
+    """Raise InputError if the parts of a scene take more than half of the machine's memory together, or than
+    `FIDSPLAT_INPUT_LIMIT`."""
+    limit = input_limit(0) if VARIABLE in os.environ else _half_of_memory()
+    if need > limit:
+        raise InputError(
+            f"{what} must take at most {bytes_words(limit)}, got {bytes_words(need)} and more; {remedy}, or "
+            f"set {VARIABLE}"
+        )
 
 
 def check_expansion(path: Path | str, need: float, what: str, size: int | None = None) -> None:

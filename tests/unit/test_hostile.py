@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import warnings
+import zipfile
 import zlib
 
 import cv2
@@ -442,21 +443,70 @@ def test_points_whose_colors_are_no_bytes(tmp_path, color):
             use_views(tmp_path)
 
 
+def test_a_quaternion_of_about_zero(tmp_path):
+    colmap_text(tmp_path)
+    (tmp_path / "sparse/0/images.txt").write_text(COLMAP["images"].replace("1 1 0", "1 1e-320 0", 1))
+    with limits(), pytest.raises(fs.InputError, match=r"image 0\.png"):
+        use_views(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value"), [("scales", "codebook", 1e300), ("means", "mins", 2.0**31)]
+)
+def test_numbers_of_sog_beyond_float32(tmp_path, part, key, value):
+    packed_sog(tmp_path)
+    file = tmp_path / "a.sog"
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(members["meta.json"])
+    meta[part][key][0] = value
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in (members | {"meta.json": json.dumps(meta)}).items():
+            archive.writestr(name, content)
+    with limits():
+        use_splats(file)
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_views_that_repeat_one_image(tmp_path, link):
+    """Each would be a copy in memory."""
+    views(tmp_path)
+    text = (tmp_path / "transforms.json").read_text()
+    if link:
+        (tmp_path / "1.png").unlink()
+        os.link(tmp_path / "0.png", tmp_path / "1.png")
+    else:
+        (tmp_path / "transforms.json").write_text(text.replace("1.png", "./0.png"))
+    with pytest.raises(fs.InputError, match=r"views must have different images, got .* twice"):
+        use_views(tmp_path)
+
+
+def test_a_scene_that_repeats_one_file_of_splats(tmp_path, monkeypatch):
+    fs.save_ply(cloud(1000), tmp_path / "a.ply")
+    text = '[[splats]]\nfile = "a.ply"\nposition = [0.0, 0.0, 1.0]\n'
+    (tmp_path / "a.toml").write_text(text * 3)
+    assert len(fs.Scene.load(tmp_path / "a.toml").cloud()) == 3000
+    monkeypatch.setenv("FIDSPLAT_INPUT_LIMIT", str(300_000))
+    (tmp_path / "a.toml").write_text(text * 5)
+    with pytest.raises(fs.InputError, match=r"the splats of .* must take at most 293 KiB, got .*store build"):
+        fs.Scene.load(tmp_path / "a.toml")
+
+
 # --- Python
 
 
-ODD = (object(), [10**400] * 3, np.zeros((0, 3)), 10**400, "\ud800", float("nan"))
+ODD = (object(), [10**400] * 3, np.float16(1), np.zeros((0, 3)), 10**400, "\ud800", float("nan"))
 
 
 @pytest.mark.parametrize("name", sorted(CALLS))
 def test_every_argument_is_validated(name, tmp_path, monkeypatch):
-    """Each argument of a public function in turn takes three values that nobody expects: it does its work, or
+    """Each argument of a public function in turn takes four values that nobody expects: it does its work, or
     refuses them with an error of ours."""
     monkeypatch.chdir(tmp_path)
     ground(tmp_path)
     monkeypatch.setattr(warnings, "showwarning", lambda *_: None)
     for number, key in enumerate(CALLS[name](tmp_path)[1]):
-        for odd in (*ODD[:2], ODD[2 + number % 4]):
+        for odd in (*ODD[:3], ODD[3 + number % 4]):
             function, good, use = CALLS[name](tmp_path)
             with contextlib.suppress(fs.FidsplatError):
                 made = function(**good | {key: odd})

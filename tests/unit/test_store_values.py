@@ -181,3 +181,32 @@ def test_group_ids_beyond_int32_together_are_refused(folder, tmp_path):
     fs.save_ply(ids, tmp_path / "a.ply")
     with pytest.raises(fs.InputError, match="number the groups from 0"):
         fs.build_store([tmp_path / "a.ply"] * 2, tmp_path / "b.fss")
+
+
+@pytest.mark.parametrize("edge", [3e38, 1e19, 0.0])
+def test_false_boxes_are_rendered_without_a_warning(folder, tmp_path, edge):
+    """Boxes of valid checksums that contain no splat, or everything."""
+    path = tmp_path / "a.fss"
+    shutil.copytree(folder, path)
+    nodes = np.load(path / "nodes.npy")
+    for name, sign in (("far_low", -1), ("low", -1), ("high", 1), ("far_high", 1)):
+        nodes[name] = sign * edge
+    nodes["reach"] = edge
+    np.save(path / "nodes.npy", nodes)
+    header_of(path, nodes_crc=zlib.crc32(nodes.tobytes()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for camera in (CAMERA, fs.Camera.fisheye(32, 24, 2.5), fs.Camera.equirectangular(32, 16)):
+            fs.Renderer("reference").render(
+                fs.Scene([], camera, stores=(fs.Store(path),)), outputs=("alpha",)
+            )
+
+
+def test_an_error_beyond_floats_is_a_damaged_file(folder, tmp_path):
+    path = tmp_path / "a.fss"
+    shutil.copytree(folder, path)
+    one = {"lowpass": "screen", "level": 0, "sizes": [10**400], "errors": [0.1], "views": 1}
+    said = {"identity": fs.Store(path).identity, "details": [one | {"device": "", "date": ""}]}
+    (path / "detail.json").write_text(json.dumps(said | {"crc": header_crc(said)}))
+    with pytest.raises(fs.InputError, match=r"detail\.json is damaged"):
+        _ = fs.Store(path).detail_errors
