@@ -288,6 +288,8 @@ class Tree:
                 return "limit", test, f"{self._limit} s of CPU time"
             if status in (0, 5):  # 5: no test is left
                 return "survived", "", ""
+            if "ImportError while loading conftest" in output:
+                return "caught", "tests/conftest.py", "fails"
             if not test:
                 raise RuntimeError(f"pytest ended with {status}:\n{output[-2000:]}")
             if self._passes.setdefault(test, self._alone(test)):
