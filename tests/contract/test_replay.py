@@ -147,3 +147,20 @@ def test_a_batch_whose_images_are_too_many_is_an_error(opencl):
     own, poses = own_device(opencl, 2**23), np.tile([0, 0, 0, 1, 0, 0, 0.0], (400, 1))
     with pytest.raises(fs.DeviceError, match=r"images of 400 views must be .* render fewer views"):
         own.render_batch(random_splats(10, seed=1), CAMERA, poses=poses)
+
+
+SIDES = [(40, 30), (40, 50), (60, 30), (60, 50)]
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_sizes_that_share_a_side_have_frames_of_their_own(renderer, number):
+    """Repeatedly, so that commands of each size are replayed between those of the others."""
+    cloud = random_splats(300, seed=4)
+    cameras = [fs.Camera.look_at(*size, 1.0, (0, 0, -0.1), (0, 0, 3)) for size in SIDES]
+    expected = [renderer.render(cloud, camera)["rgb"] for camera in cameras]
+    resident = renderer.upload(cloud)
+    for _ in range(4):
+        for camera, image in zip(cameras, expected, strict=True):
+            batch = renderer.render_batch(resident, [fs.Capture(camera)] * number)
+            assert all(np.array_equal(each, image) for each in batch["rgb"])
+            assert np.array_equal(renderer.render(resident, camera)["rgb"], image)

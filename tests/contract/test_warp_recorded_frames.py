@@ -163,6 +163,16 @@ def test_a_replay_beyond_its_capacity_is_rendered_and_captured_again(renderer, r
     assert_drawn(renderer, more, [CAPTURE.camera] * 3)
 
 
+@pytest.mark.parametrize("size", [(61, 40), (50, 43)])
+def test_sizes_that_share_a_side_are_replayed_alternately(renderer, replayed, size):
+    other = fs.Camera.look_at(*size, 1.1, (0.0, 0.0, 0.0), (0.0, 0.0, 3.0))
+    cameras, resident = [CAPTURE.camera, other] * 6, renderer.upload(CLOUD)
+    frames = [renderer.render(resident, CAPTURE.with_(camera=camera)) for camera in cameras]
+    assert {stack.view.height for stack in replayed} == {43, size[1]}
+    assert {stack.view.width for stack in replayed} == {61, size[0]}
+    assert_drawn(renderer, frames, cameras)
+
+
 def test_what_another_kind_reallocated_is_not_replayed(renderer, replayed):
     """Arrays that a larger image has replaced are not those of the graph."""
     resident, large = (

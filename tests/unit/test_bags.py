@@ -129,6 +129,11 @@ KEY = "rosbag2_bagfile_information"
         (f"{KEY}: 1", "cannot read .* as a log"),
         (f"{KEY}: {{relative_file_paths: [../a.db3]}}", "cannot read"),
         (f"{KEY}: {{relative_file_paths: [], compression_mode: x}}", "must be zstd"),
+        (
+            f"{KEY}: {{relative_file_paths: [], compression_mode: file, compression_format: lz4}}",
+            "zstd .* lz4",
+        ),
+        (f"{KEY}: {{relative_file_paths: [], compression_mode: message}}", "must be zstd"),
         (f"{KEY}: {{relative_file_paths: [], compression_mode: 1}}", "cannot read .* as a log"),
     ],
 )

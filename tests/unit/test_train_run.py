@@ -127,6 +127,28 @@ def test_a_run_that_ends_where_opacities_fall_keeps_its_own(whole, dataset, tmp_
     assert sha(tmp_path / "scene.ply") == sha(whole[3])
 
 
+@pytest.mark.parametrize(
+    ("every", "expected"), [(8, [8, 16, 24]), (16, [16]), (24, [24]), (12, [24]), (9, [])]
+)
+def test_opacities_are_reset_at_multiples_of_an_interval_that_densification_follows(
+    dataset, every, expected, monkeypatch
+):
+    trainer = Trainer(
+        dataset, fs.Renderer("reference"), iterations=ITERATIONS, **QUICK | {"reset_every": every}
+    )
+    found, limit = [], QUICK["reset_opacity"] + 1e-6
+    reset = type(trainer._model).reset_opacities
+
+    def counted(model):
+        reset(model)
+        found.append(trainer.iteration)
+        assert model.read().opacities.max() <= limit
+
+    monkeypatch.setattr(type(trainer._model), "reset_opacities", counted)
+    trainer.run()
+    assert found == expected
+
+
 def test_a_run_that_restarts_keeps_the_old_checkpoint_until_it_has_its_own(dataset, tmp_path):
     file, renderer = tmp_path / "scene.training.npz", fs.Renderer("reference")
     Trainer(dataset, renderer, iterations=2, checkpoint=file, **QUICK).run()

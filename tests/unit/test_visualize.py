@@ -85,6 +85,19 @@ def test_captions_are_below_their_outlines_and_not_over_each_other():
     assert two[rows].all()
 
 
+def test_captions_stay_inside_the_image():
+    """Of outlines that are cut off by each edge and corner of the image."""
+    image = np.zeros((200, 160, 3), np.uint8)
+
+    def white(shift):
+        return (draw_outlines(image, [(SQUARE + shift, "12345")], size=0.5).min(axis=2) == 255).sum()
+
+    inside = white((40, 60))
+    assert inside > 0
+    for shift in np.stack(np.meshgrid((-60, 40, 140), (60, 180)), -1).reshape(-1, 2):
+        assert white(shift) == inside, shift
+
+
 def test_keys_say_what_the_colours_mean():
     depth = np.tile(np.linspace(1, 5, 200), (10, 1))
     span = depth_span([depth, np.zeros((2, 2))])
