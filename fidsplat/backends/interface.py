@@ -48,8 +48,6 @@ class DeviceInfo:
 class DeviceTraits:
     """Optional capabilities of a device."""
 
-    adopts_arrays: bool = False
-    """`Backend.adopt`"""
     caches_chunks: bool = False
     """`Backend.chunk_cache`"""
     termination_depths: bool = False

@@ -124,7 +124,7 @@ class MemoryPlanner:
         splat += SORTED if self._shape.lists == "ordered" else 0
         each = resident.capacity * splat + tables + 4 * self._channels * samples
         free = min(self._device.memory_budget - plan.total + each, self._device.largest_buffer)
-        most = min(free, PART_BYTES.get(self._device.kind, OTHER_PART_BYTES)) // each
+        most = min(free, PART_BYTES.get(self._device.info.kind, OTHER_PART_BYTES)) // each
         most = max(1, min(most, _PART_SAMPLES // samples))
         # parts of equal size have buffers of equal size
         parts = -(-count // most)

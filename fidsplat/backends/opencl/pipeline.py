@@ -145,7 +145,7 @@ class OpenCLPipeline(Pipeline):
         with workspace.rendering():
             cached, queue = resident.cached_frames.get(key), workspace.switch_to(workspace.queue)
             recorded = None if cached is None else cached.recorded
-            if cached is not None and recorded is not None and recorded.set_view(resident, view, queue):
+            if cached is not None and recorded is not None and recorded.set_view(view, queue):
                 frame = self._frame(resident, view, cached.plan, recorded.commands, queue, pair_limit)
                 recorded.render(frame)
                 return frame
@@ -180,7 +180,7 @@ class OpenCLPipeline(Pipeline):
             return None
         queue = workspace.switch_to(workspace.queue if waits else workspace.replay_queue)
         workspace.frames += 1
-        if recorded is not None and recorded.set_view(resident, view, queue):
+        if recorded is not None and recorded.set_view(view, queue):
             rendered = recorded.submit(queue, resident.count)
             if rendered is None:
                 return None

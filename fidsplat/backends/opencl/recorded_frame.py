@@ -60,7 +60,7 @@ class RecordedFrame:
         self._leases = [(name, buffer.size) for name, buffer in frame.leased]
         self._scratch = [name for name in frame.bound if name not in dict(frame.leased)]
 
-    def set_view(self, resident: Resident, view: View, queue: cl.CommandQueue) -> bool:
+    def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
         """Bind the uniforms of a view. Returns whether the command list can be submitted: not after a scratch
         buffer was replaced."""
         pool = self.workspace.pool
@@ -174,7 +174,7 @@ class Replay:
             queue = workspace.switch_to(workspace.queue)
             workspace.frames += 1
             rendered = None
-            if recorded.set_view(resident, self._view, queue):
+            if recorded.set_view(self._view, queue):
                 rendered = recorded.submit(queue, resident.count)
             rendered = rendered or self._render_again(resident, self._view)
             workspace.finish()

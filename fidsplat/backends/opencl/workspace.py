@@ -94,8 +94,3 @@ class Workspace:
         largest = self.largest_buffer // 8
         self.pair_budget = max(1, min(largest, budget // 8 // self.shape.pair_bytes, 2**32 - 1))
         """most pairs of splats and tiles that are listed at once"""
-
-    @property
-    def kind(self) -> str:
-        """cpu, gpu or other."""
-        return self.info.kind

@@ -31,7 +31,7 @@ def composite(
     span = error_bounds.span_of(s, view, f)
     surface = None if view.external_depth is None else surface_at(view.external_depth, view, x, y)
     if surface is not None:
-        span = surface.occlude(s, f, span)
+        span = surface.occlude(f, span)
     sort = by_depth if s.by_depth else by_layers if s.coplanar_groups is not None else by_center
     ordered = sort(s, f, span)
     before, live, final = transmittance(ordered.alpha, view.stop, s.exclusive)

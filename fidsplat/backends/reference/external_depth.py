@@ -9,7 +9,6 @@ import numpy as np
 from fidsplat.backends.reference.error_bounds import Span
 from fidsplat.backends.reference.fragment_order import OrderedFragments
 from fidsplat.backends.reference.fragments import Fragments
-from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.capture.environment import ExternalDepth
 
@@ -30,7 +29,7 @@ class Surface:
         """(k,) bool: whether there is a surface."""
         return np.isfinite(self.z)
 
-    def occlude(self, s: Setup, f: Fragments, span: Span) -> Span:
+    def occlude(self, f: Fragments, span: Span) -> Span:
         """Remove fragments at its depth or behind it. In the returned span a fragment that rounding may move
         to the other side has opacities down to 0."""
         z = self.z[:, None]

@@ -59,7 +59,7 @@ def open_device(selector: str = "") -> WarpBackend:
 class WarpBackend(Workspace, Backend):
     """An open Warp device and its compiled pipelines."""
 
-    traits = DeviceTraits(adopts_arrays=True, differentiates=True, probed=True)
+    traits = DeviceTraits(differentiates=True, probed=True)
 
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
