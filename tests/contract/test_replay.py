@@ -74,6 +74,26 @@ def test_counts_of_another_kind_of_frame_are_ignored(opencl):
     assert known is not None
 
 
+def test_a_replay_on_a_cpu_enlarges_its_lists(opencl):
+    """A camera that approaches splats: each frame is rendered once, with the pairs that it has."""
+    if opencl.device.kind != "cpu":
+        pytest.skip("the host waits for the counts on CPUs only")
+    machine, own = fs.Renderer(opencl.device.name), fs.Renderer(opencl.device.name)
+    some = random_splats(2000, seed=4, scale=(1e-2, 0.1), depth=(2.0, 6.0))
+    places = np.linspace(-30, 1, 9)
+    cameras = [fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)) for z in places]
+    resident, begun = machine.upload(some), machine.backend.frames
+    frames = [machine.render(resident, camera) for camera in cameras]
+    assert machine.backend.frames - begun == len(cameras)
+    (cached,) = resident.data.cached_frames.values()
+    assert cached.recorded.state is machine.backend.pool.state
+    assert cached.recorded.capacity.pairs > 1.2 * frames[0].stats["pairs"], "lists were enlarged"
+    for frame, camera in zip(frames, cameras, strict=True):
+        expected = own.render(some, camera)
+        assert np.array_equal(frame["rgb"], expected["rgb"])
+        assert frame.stats == expected.stats
+
+
 @pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])
 def test_a_frame_that_exceeds_the_last_is_rendered_again(opencl, scale):
     """More pairs, or more splats of many tiles, than there is room for: found when the frame is read."""

@@ -58,3 +58,9 @@ class Capacity:
 def read_stats(queue: cl.CommandQueue, counts: cl.Buffer, last: cl.Event, splats: int) -> dict[str, int]:
     """`Frame.stats` of a frame whose last launch was `last`, on a queue that is flushed."""
     return Counts.read(queue, counts, [last]).stats(splats)
+
+
+def enlarged(pairs: int, budget: int) -> int:
+    """Capacity of lists that must grow: a view with more pairs than the last one is often followed by one
+    with still more."""
+    return max(pairs, min(pairs * 9 // 8, budget))

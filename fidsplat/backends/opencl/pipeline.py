@@ -179,8 +179,8 @@ class OpenCLPipeline(Pipeline):
         if not waits and not tiling.pair_capacity(workspace):
             return None
         queue = workspace.switch_to(workspace.queue if waits else workspace.replay_queue)
-        workspace.frames += 1
         if recorded is not None and recorded.set_view(view, queue):
+            workspace.frames += 1
             rendered = recorded.submit(queue, resident.count)
             if rendered is None:
                 return None

@@ -17,7 +17,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.opencl.counts import TALLIES, Capacity, Counts, read_stats
+from fidsplat.backends.opencl.counts import TALLIES, Capacity, Counts, enlarged, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uniforms import numbers_of, projection_arrays
@@ -97,12 +97,21 @@ class RecordedFrame:
         words = np.empty((1, TALLIES), np.uint32)
         cl.enqueue_copy(queue, words, tallies)
         counts = Counts.of_tallies(words)
-        if not self.capacity.holds(counts):
+        if not (self.capacity.holds(counts) or self._enlarge_lists(counts)):
             pool.give_back(leased)
             return None
         events += commands.submit(queue, self._counted)
         queue.flush()
         return Rendered(queue, leased, partial(counts.stats, splats), events, self._stages)
+
+    def _enlarge_lists(self, counts: Counts) -> bool:
+        """Bind larger lists, where the host waits for the counts. Returns whether they suffice."""
+        if counts.big > self.capacity.big or counts.pairs > self.workspace.pair_budget:
+            return False
+        pairs = enlarged(counts.pairs, self.workspace.pair_budget)
+        self.commands.set({"lists": self.workspace.pool.scratch("lists", 4 * pairs)})
+        self.capacity, self.state = Capacity(self.capacity.big, pairs), self.workspace.pool.state
+        return True
 
     def render(self, frame: DeviceFrame) -> None:
         """Replay as a frame of the view that is bound, with the buffers that its stages leave for

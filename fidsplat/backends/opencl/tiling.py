@@ -18,7 +18,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.bands import split_by_cost
-from fidsplat.backends.opencl.counts import BIG, PAIRS, TALLIES, VISIBLE, Counts
+from fidsplat.backends.opencl.counts import BIG, PAIRS, TALLIES, VISIBLE, Counts, enlarged
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.memory_plan import KEYS, MIN_BIG, WINDOWS
 from fidsplat.backends.opencl.workspace import Workspace
@@ -122,9 +122,7 @@ def tile_pairs(frame: DeviceFrame) -> np.ndarray:
 def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
     """Write the lists of a band, from splats that are sorted."""
     allocated, budget = frame.pool.size("lists") // 4, frame.workspace.pair_budget
-    # a view that needs more than the last one is often followed by one that needs more still
-    grows = 0 < allocated < band.pairs
-    size = max(band.pairs, min(band.pairs * 9 // 8, budget)) if grows else band.pairs
+    size = enlarged(band.pairs, budget) if 0 < allocated < band.pairs else band.pairs
     frame.take("lists", 4 * size)
     given = {"band_first": band.first, "band_end": band.end, "count": count}
     table = frame.named["bin table"]
