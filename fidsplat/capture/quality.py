@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import as_float, invalid, whole_number
+from fidsplat.util.arguments import as_float, instance, invalid, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 LOWPASS = ("screen", "pixel", "none")
@@ -184,8 +184,7 @@ class Quality:
             ("blend_precision", BLEND_PRECISIONS),
         ):
             _one_of(f"quality: {name}", getattr(self, name), known)
-        if not isinstance(self.marker, MarkerQuality):
-            raise InputError(f"quality: marker must be an fs.MarkerQuality(...), got {self.marker!r}")
+        instance("quality: marker", self.marker, MarkerQuality, "an fs.MarkerQuality")
         if self.blend_precision == "float64" and self.setup_precision != "float64":
             raise InputError(
                 "quality: setup_precision must be 'float64' with blend_precision='float64', got 'float32'"

@@ -18,6 +18,7 @@ from fidsplat.formats.splat import load_splat, save_splat
 from fidsplat.formats.spz import load_spz, save_spz
 from fidsplat.formats.usd import load_usd, save_usd
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import path_of
 
@@ -85,8 +86,7 @@ def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:
 
     Raises InputError for an unknown or read-only suffix, boxes, or a file that cannot be written.
     """
-    if not isinstance(cloud, SplatCloud):
-        raise InputError(f"cloud must be a SplatCloud, got a {type(cloud).__name__}")
+    instance("cloud", cloud, SplatCloud)
     save = check_writable(path).save
     assert save is not None
     save(cloud, path_of(path))

@@ -9,6 +9,7 @@ from fidsplat.formats.plain import refuse_boxes
 from fidsplat.formats.ply import ORIGIN_COMMENT
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import C0
+from fidsplat.util.arguments import flag, instance
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
 
@@ -28,12 +29,8 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
     Raises InputError for a file that cannot be written, boxes, or 3D Gaussians with `native_2dgs`; an
     existing file then stays unchanged.
     """
-    if not isinstance(cloud, SplatCloud):
-        raise InputError(f"cloud must be a SplatCloud, got a {type(cloud).__name__}")
-    if not isinstance(native_2dgs, bool):
-        raise InputError(f"native_2dgs must be True or False, got {native_2dgs!r}")
-    refuse_boxes(cloud, "a PLY file")
-    if native_2dgs and cloud.thickness is not None:
+    refuse_boxes(instance("cloud", cloud, SplatCloud), "a PLY file")
+    if flag("native_2dgs", native_2dgs) and cloud.thickness is not None:
         raise InputError(
             "splats must be disks for native_2dgs, got "
             f"{int((cloud.thickness > 0).sum())} 3D Gaussians of {len(cloud)}; use native_2dgs=False, or "

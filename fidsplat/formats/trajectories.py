@@ -21,6 +21,7 @@ from fidsplat.cameras.trajectory import check_rate
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import image_poses
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, path_of, read_input
 
@@ -92,8 +93,7 @@ def save_trajectory(
         InputError: an unknown suffix, a missing camera, a camera with a lens, a number of names other than
             k, a file that cannot be written.
     """
-    if not isinstance(trajectory, Trajectory):
-        raise InputError(f"trajectory must be a Trajectory, got a {type(trajectory).__name__}")
+    instance("trajectory", trajectory, Trajectory)
     file = path_of(path)
     names = [f"frame-{k:06d}.png" for k in range(len(trajectory))] if images is None else images
     if isinstance(names, str) or not isinstance(names, Sequence) or len(names) != len(trajectory):

@@ -33,7 +33,7 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
-from fidsplat.util.arguments import PickledByFields, flag, number, text, whole_number
+from fidsplat.util.arguments import PickledByFields, flag, instance, number, text, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 if TYPE_CHECKING:
@@ -299,8 +299,7 @@ def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette:
 
 def _chosen(quality: MarkerQuality, mixture: str | None, given: dict[str, Any]) -> MarkerQuality:
     """Quality settings, with the given ones (not None) replaced."""
-    if not isinstance(quality, MarkerQuality):
-        raise InputError(f"quality must be an fs.MarkerQuality, e.g. fs.Quality(...).marker, got {quality!r}")
+    instance("quality", quality, MarkerQuality, "an fs.MarkerQuality, e.g. fs.Quality(...).marker")
     name = quality.mixture if mixture is None else text("mixture", mixture)
     if name == "refined":
         raise InputError(

@@ -15,6 +15,7 @@ from fidsplat.scenes import Scene
 from fidsplat.sim.rig import Rig, RigCamera, RigImages
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
+from fidsplat.util.arguments import instance
 from fidsplat.util.errors import InputError, unknown
 
 try:
@@ -64,8 +65,7 @@ class MujocoRig(Rig):
         rest: Mapping[str, Any] | None = None,
         outputs: Iterable[str] | None = None,
     ) -> None:
-        if not isinstance(model, mujoco.MjModel):
-            raise InputError(f"model must be a mujoco.MjModel, got {model!r}")
+        instance("model", model, mujoco.MjModel, "a mujoco.MjModel")
         if isinstance(cameras, str):
             raise InputError(f"cameras must be a list of names, got {cameras!r}; use [{cameras!r}]")
         names_of_model = [model.camera(i).name for i in range(model.ncam)]

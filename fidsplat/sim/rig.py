@@ -37,8 +37,7 @@ class RigCamera:
     """frames a second, for schedulers; rendering ignores it"""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.camera, Camera):
-            raise invalid("camera", "a Camera", self.camera, "use fs.Camera.pinhole(...)")
+        instance("camera", self.camera, Camera, remedy="use fs.Camera.pinhole(...)")
         if not isinstance(self.body, str | None):
             raise invalid("the body of a camera", "a name, or None for the world", self.body)
         if not isinstance(self.sensor, Sensor | None):

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.util.arguments import LARGEST, real_array
+from fidsplat.util.arguments import LARGEST, instance, real_array
 from fidsplat.util.errors import InputError
 
 # OpenCV's marker frame has y up and z towards the viewer, ours y down and z away (docs/conventions.md)
@@ -43,8 +43,7 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
         raise InputError(f"corners must be (4, 2) pixels, got {corners.shape}")
     if edge.shape != () or not SMALLEST <= edge < LARGEST:
         raise InputError(f"size must be a positive length in metres, {SMALLEST:g} or more, got {size!r}")
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera must be a Camera, got a {type(camera).__name__}")
+    instance("camera", camera, Camera)
     half = float(edge) / 2
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]], np.float64)
     return _pose(square, corners, camera, cv2.SOLVEPNP_IPPE_SQUARE)

@@ -102,7 +102,9 @@ def test_a_marker_takes_from_a_quality_what_it_does_not_say():
     assert fs.marker("apriltag:36h11:5", mixture="fitted", quality=quality).quality.template == 9
     # what does not concern the mixture is let be; what is requested is not
     assert fs.marker("apriltag:36h11:5", mixture="exact", quality=quality).mixture == "exact"
-    with pytest.raises(fs.InputError, match="levels and density"):
+    with pytest.raises(
+        fs.InputError, match="template must be given with mixture exact or fitted, got paper; leave it"
+    ):
         fs.marker("apriltag:36h11:5", mixture="paper", template=9)
     with pytest.raises(fs.InputError, match="MarkerQuality"):
         fs.marker("apriltag:36h11:5", quality=fs.Quality())  # type: ignore[arg-type]

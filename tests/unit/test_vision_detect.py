@@ -215,7 +215,7 @@ def test_what_has_no_pose():
         ((np.eye(4), 0.1, camera), r"corners must be \(4, 2\)"),
         ((corners, (0, 0, 0), camera), "size must be a positive length"),
         ((corners, float("nan"), camera), "size must be a positive length"),
-        ((corners, 0.1, None), "camera must be a Camera, got a NoneType"),
+        ((corners, 0.1, None), "camera must be a Camera, got None"),
     ):
         with pytest.raises(InputError, match=says):
             marker_pose(*given)
