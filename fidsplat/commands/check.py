@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 class Check:
     """Test a device with the hard cases of splat rendering.
 
-    Renders scenes that are known to break renderers, compares every pixel with a float64 reference, measures
-    the device's arithmetic, and reports what fails. Takes under two minutes on two cores. Writes an image of
-    the worst case to DIR/worst.png. The exit status is 1 if anything fails.
+    Renders scenes that are known to break renderers, compares every pixel with a float64 reference,
+    measures the device's arithmetic, and reports what fails. Takes about half a minute on two cores.
+    Writes an image of the worst case to DIR/worst.png. The exit status is 1 if anything fails.
 
     --fuzz renders random scenes of up to 200 splats instead, until they add up to N splats. An interrupted
     run resumes (DIR/fuzz.json).

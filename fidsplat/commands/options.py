@@ -27,7 +27,7 @@ Devices = Annotated[
 ]
 Json = Annotated[bool, switch("print one JSON object on stdout and nothing else there")]
 Overwrite = Annotated[bool, switch("replace existing files")]
-"""Commands whose output may be somebody's own or cost hours refuse to replace it without this option. Images,
+"""Commands whose output may be a user's own file or cost hours refuse to replace it without this option. Images,
 charts and tables replace earlier ones without asking."""
 MemoryBudget = Annotated[
     Bytes | None,
