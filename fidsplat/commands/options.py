@@ -27,8 +27,8 @@ Devices = Annotated[
 ]
 Json = Annotated[bool, switch("print one JSON object on stdout and nothing else there")]
 Overwrite = Annotated[bool, switch("replace existing files")]
-"""Commands whose output may be a user's own file or cost hours refuse to replace it without this option. Images,
-charts and tables replace earlier ones without asking."""
+"""Commands whose output may be a user's own file or cost hours refuse to replace it without this option.
+Images, charts and tables replace earlier ones without asking."""
 MemoryBudget = Annotated[
     Bytes | None,
     option("SIZE", "device memory for an image and its splats, e.g. 2GiB (default: nine tenths of it)"),
