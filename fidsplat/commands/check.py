@@ -129,7 +129,7 @@ class Check:
         total, state = self.fuzz or 0, None
         with delayed_progress(where) as progress:
             for state in fuzz_run(renderer, total, folder / "fuzz.json"):
-                progress(f"{state.splats:,} splats", state.splats / total)
+                progress(f"{state.splats:,} splats", min(state.splats / total, 1.0))
         assert state is not None
         if self.json:
             print_json({"device": renderer.device.name, "passed": state.passed, **vars(state)})
