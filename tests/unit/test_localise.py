@@ -148,6 +148,29 @@ def test_a_tag_behind_the_robot_is_not_believed():
     assert not filtered.correct(np.full((4, 2), 100.0), tag, lambda pose: camera_at(CAMERA, pose))
 
 
+@pytest.mark.parametrize("bad", ["corner", "derivative", "tilt"])
+def test_one_number_that_is_not_finite_changes_nothing(bad):
+    """Of the corners, or of the images of a camera that moved or is tilted."""
+    tag = np.array([[2.0, 0.3, 0.5], [2.0, 0.1, 0.5], [2.0, 0.1, 0.3], [2.0, 0.3, 0.3]])
+    filtered, calls = Localiser(np.zeros(3)), []
+    corners = camera_at(CAMERA, np.eye(4)).project(tag)
+    wrong = {"corner": 0, "derivative": 2, "tilt": 5}[bad]  # number of the call
+
+    class Camera:
+        def project(self, points):
+            calls.append(points)
+            return np.full((4, 2), np.nan) if len(calls) == wrong else corners + 0.1
+
+    if bad == "corner":
+        corners = corners.copy()
+        corners[2, 1] = np.nan
+        assert not filtered.correct(corners, tag, lambda pose: camera_at(CAMERA, pose))
+    else:
+        assert not filtered.correct(corners, tag, lambda pose: Camera())
+    np.testing.assert_array_equal(filtered.state, [0, 0, 0, 0, 1])
+    assert filtered.rejected == 0
+
+
 def test_errors_are_those_of_evo():
     times = np.linspace(0, 10, 400)
     truth = np.array([headed(0.1 * t, 0.5 * t, math.sin(t)) for t in times])
