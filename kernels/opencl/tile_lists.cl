@@ -256,6 +256,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 #define SHORT 64                 // pairs for which the network is faster
 #define BUCKETS 1024              // buckets of the depth range
 #define BUCKET_LIMIT 128              // pairs of one bucket: larger ones are not sorted by comparing all pairs
+#define FIRST_DEPTH_KEY 0x01000000u   // below: coplanar groups (part/coplanar_layers.cl), in the first bucket
 #define ROW 16                   // work-items whose sums are added serially; SORT_ITEMS is its square
 enum { ITEM_PAIRS = SORT_LOCAL / SORT_ITEMS, ITEM_BUCKETS = BUCKETS / SORT_ITEMS };   // per work-item
 
@@ -301,7 +302,7 @@ static inline void find_key_range(global const ulong *pairs, uint length, local 
     uint item = get_local_id(0), lowest = 0xFFFFFFFFu, highest = 0;
     for (uint k = item; k < length; k += SORT_ITEMS) {
         uint key = (uint)(pairs[k] >> 32);
-        lowest = min(lowest, key);
+        lowest = min(lowest, key < FIRST_DEPTH_KEY ? 0xFFFFFFFFu : key);
         highest = max(highest, key);
     }
     scratch[item] = (uint2)(lowest, highest);
