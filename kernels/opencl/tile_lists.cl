@@ -115,6 +115,7 @@ static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int
     return column >= span.first && column <= span.last ? row * rect->tiles_x + column : -1;
 }
 
+#define FIRST_DEPTH_KEY 0x01000000u   // below: coplanar groups (part/coplanar_layers.cl)
 #define NO_OFFSET 0xFFFFFFFFu
 #define NO_ENTRY 0xFFFFFFFFu
 #define WINDOW_TILES (WINDOW_W * WINDOW_H)
@@ -144,6 +145,7 @@ typedef struct {
     global const uint *big;
     global const Bounds *bounds;
     global const uint *keys;
+//@@ big_records
 } BigSplats;
 
 // Advances the cursors of all tiles that a big splat overlaps, and writes its pairs where the band has capacity for them.
@@ -155,7 +157,10 @@ static inline void list_big_splat(const BigSplats *splats, uint k, const TileRec
     for (int cell = item; cell < rect->cells; cell += items) {
         int tile = rect_tile(rect, cell, b, splats->width, splats->height);
         uint place = tile < 0 ? NO_OFFSET : next_offset(before + tile, band, cursors);
-        if (place < band->capacity) pairs[place] = (uint2)(splat, splats->keys[splat]);
+        if (place >= band->capacity) continue;
+        uint key = splats->keys[splat];
+//@@ big_key
+        pairs[place] = (uint2)(splat, key);
     }
 }
 
@@ -189,9 +194,9 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void tally_big(
 //@@ arguments tally_big
 ) {
     local uint deferred[TEAMS][TEAM_DEFERRED + 1];
-    const BigSplats splats = {count, width, height, big, big_bounds, 0};
+    const BigSplats shared = {count, width, height, big, big_bounds};
     const Band no_pairs = {0, 0, INT_MAX, 0, 0};
-    list_big_splats(&splats, get_group_id(0), get_num_groups(0), min(tallies[TALLY_BIG], big_capacity), &no_pairs, tallies + TALLIES, 0, deferred);
+    list_big_splats(&shared, get_group_id(0), get_num_groups(0), min(tallies[TALLY_BIG], big_capacity), &no_pairs, tallies + TALLIES, 0, deferred);
 }
 
 // Writes the (splat, key) pairs of all tiles of a band.
@@ -211,8 +216,10 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
     barrier(CLK_LOCAL_MEM_FENCE);
     uint groups = get_num_groups(0) - splat_groups, i = get_global_id(0) - groups * BIN_ITEMS;
     if (get_group_id(0) < groups) {     // first, since they may take long
-        const BigSplats splats = {count, width, height, big, big_bounds, keys};
-        list_big_splats(&splats, number * groups + get_group_id(0), groups * get_num_groups(1), big_count, &band, cursors,
+        const BigSplats shared = {count, width, height, big, big_bounds, keys
+//@@ big_record_arguments
+        };
+        list_big_splats(&shared, number * groups + get_group_id(0), groups * get_num_groups(1), big_count, &band, cursors,
                         pairs, deferred);
     } else {
         uint splat = number * count + i;
@@ -256,7 +263,6 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 #define SHORT 64                 // pairs for which the network is faster
 #define BUCKETS 1024              // buckets of the depth range
 #define BUCKET_LIMIT 128              // pairs of one bucket: larger ones are not sorted by comparing all pairs
-#define FIRST_DEPTH_KEY 0x01000000u   // below: coplanar groups (part/coplanar_layers.cl), in the first bucket
 #define ROW 16                   // work-items whose sums are added serially; SORT_ITEMS is its square
 enum { ITEM_PAIRS = SORT_LOCAL / SORT_ITEMS, ITEM_BUCKETS = BUCKETS / SORT_ITEMS };   // per work-item
 

@@ -44,6 +44,10 @@ PICTURES = {
         random_splats(60, 0, depth=(-5.0, 6.0)),
         fs.Capture(fs.Camera.fisheye(*SIZE, 2.0), ("rgb", "depth", "normal"), quality="standard"),
     ),
+    "coplanar groups by pixel": lambda: taken(
+        SPLATS.with_coplanar_groups(np.maximum(np.arange(len(SPLATS)) % 9 - 6, -1)),
+        quality="standard,order=pixel",
+    ),
     "boxes in float64": lambda: taken(SPLATS.with_boxes(), quality="standard,blend_precision=float64"),
 }
 

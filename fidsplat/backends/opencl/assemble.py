@@ -75,7 +75,7 @@ _SECTION = re.compile(r"//@ (\w+)[ \t]*")
 _WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
 _WIDE = re.compile(r"wide(?<=\bwide)\b")
 _EFFECT_ARGUMENTS = {
-    **{name: name for name in ("project", "blend", "backdrop", "resolve", "project_backward")},
+    **{name: name for name in ("project", "emit", "blend", "backdrop", "resolve", "project_backward")},
     **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward"},
 }
 """fields of `Layout` with the arguments that effects add to these kernels"""
@@ -182,6 +182,11 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files.append(LAYOUTS["resolve_fused"].file)
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
+    # other cameras have no bounds by tile
+    keys_by_tile = {"compose_pixel", "camera_pinhole"} <= layouts.keys() and shape.lists != "ordered"
+    if keys_by_tile:
+        layouts["tile_keys"] = LAYOUTS["tile_keys"]
+        files.append(LAYOUTS["tile_keys"].file)
     if "compose_pixel" in layouts:
         files.append(LAYOUTS[f"k_buffer_{shape.schedule}"].file)
     elif shape.schedule == "lanes":
@@ -196,7 +201,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     if "external_depth" in layouts:  # after all passes
         files.append(LAYOUTS["external_depth_end"].file)
     stages = {
-        "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),
+        "lists": ("prelude", "math", *(("splat",) if keys_by_tile else ()), "bounds", *_LISTS[shape.lists]),
         "frame": [
             stage.format(shape.schedule)
             for stage in _DRAWN

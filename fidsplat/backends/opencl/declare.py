@@ -191,6 +191,7 @@ class Layout:
     bounds: tuple[Member, ...] = ()
     view: tuple[Member, ...] = ()
     project: tuple[Argument, ...] = ()
+    emit: tuple[Argument, ...] = ()
     blend: tuple[Argument, ...] = ()
     backdrop: tuple[Argument, ...] = ()
     resolve: tuple[Argument, ...] = ()

@@ -212,6 +212,7 @@ LAYOUTS: dict[str, Layout] = {
     # minimum depths of splats in blocks of pixels and in tiles, by the schedule
     "blocks_nearest": Layout("part/blocks_nearest.cl"),
     "tile_nearest": Layout("part/tile_nearest.cl"),
+    "tile_keys": Layout("part/tile_keys.cl", emit=takes("in Splat splats")),
     # several passes through a tile's list, by the schedule
     "passes_lanes": Layout("part/passes_lanes.cl"),
     "passes_group": Layout("part/passes_group.cl"),

@@ -110,10 +110,7 @@ static inline Layer no_layer(void) {
 //@ cells_arguments
                           , until
 //@ cells_occluded
-    if (until < INFINITY) {
-//@@ tile_nearest
-        if (min_depth >= until) return;
-    }
+    if (until < INFINITY && tile_nearest(*s, left, top) >= until) return;
 //@ termination_known
             && !pixels[0].layers
 //@ pass_unfinished

@@ -2,6 +2,11 @@
 // fragments are in registers, sorted by depth. A new fragment is inserted there, and the nearest is pushed out: it can nearly always be
 // composited, else it enters a queue in memory, which is short and mostly empty.
 //@ compose_types
+#ifndef TIE_IN_FRONT
+#define TIE_IN_FRONT(splat, other) true         // fragments of equal depths arrive in their order
+#define BEFORE_NEXT(z, nearest) ((z) <= (nearest))
+#endif
+#define IN_FRONT(z, splat, other_z, other) ((z) < (other_z) || ((z) == (other_z) && TIE_IN_FRONT(splat, other)))
 #define NO_SPLAT 0xFFFFFFFFu            // an unused entry
 #define IN_REGISTERS (K_BUFFER_SIZE < 3 ? K_BUFFER_SIZE : 3)
 #define QUEUE_CAPACITY (K_BUFFER_SIZE - IN_REGISTERS)
@@ -65,7 +70,7 @@ static inline uint queue_index(const KBuffer *k_buffer, uint k) {
 static inline void k_buffer_flush(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
     KBuffer *k_buffer = &pixel->k_buffer;
     Queue *queue = k_buffer->queue;
-    while (k_buffer->count > 0 && queue->z[k_buffer->head] <= nearest) {
+    while (k_buffer->count > 0 && BEFORE_NEXT(queue->z[k_buffer->head], nearest)) {
         uint at = k_buffer->head;
         k_buffer->head = queue_index(k_buffer, 1);
         k_buffer->count--;
@@ -74,7 +79,7 @@ static inline void k_buffer_flush(Pixel *pixel, wide nearest, global const Splat
 }
 
 // Enqueues a fragment that is not behind those in registers. If the queue is full, the farthest fragment of all is dropped.
-static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint splat) {
+static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint splat, global const Splat *splats) {
     KBuffer *k_buffer = &pixel->k_buffer;
     Queue *queue = k_buffer->queue;
     if (k_buffer->count == QUEUE_CAPACITY) {
@@ -89,7 +94,7 @@ static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint spl
             k_buffer->splat[k] = k_buffer->splat[k - 1];
         }
         uint last = queue_index(k_buffer, k_buffer->count - 1);
-        bool further = QUEUE_CAPACITY > 0 && queue->z[last] > z;
+        bool further = QUEUE_CAPACITY > 0 && !IN_FRONT(queue->z[last], queue->splat[last], z, splat);
         k_buffer->z[0] = further ? queue->z[last] : z;
         k_buffer->opacity[0] = further ? queue->opacity[last] : opacity;
         k_buffer->splat[0] = further ? queue->splat[last] : splat;
@@ -99,7 +104,7 @@ static inline void k_buffer_enqueue(Pixel *pixel, wide z, wide opacity, uint spl
     uint k = k_buffer->count++, at = queue_index(k_buffer, k);
     for (; k > 0; k--) {
         uint before = queue_index(k_buffer, k - 1);
-        if (queue->z[before] <= z) break;
+        if (IN_FRONT(queue->z[before], queue->splat[before], z, splat)) break;
         queue->z[at] = queue->z[before];
         queue->opacity[at] = queue->opacity[before];
         queue->splat[at] = queue->splat[before];
@@ -116,22 +121,25 @@ static inline void k_buffer_push(Pixel *pixel, wide nearest, wide z, wide opacit
     KBuffer *k_buffer = &pixel->k_buffer;
     // the new fragment may be nearer than queued ones
     k_buffer_flush(pixel, fmin(nearest, z), splats, constants);
-    bool first = z < k_buffer->z[0];
+    bool in_front[IN_REGISTERS];        // of the new fragment
+#pragma unroll
+    for (int k = 0; k < IN_REGISTERS; k++) in_front[k] = IN_FRONT(k_buffer->z[k], k_buffer->splat[k], z, splat);
+    bool first = !in_front[0];
     wide first_z = first ? z : k_buffer->z[0], first_opacity = first ? opacity : k_buffer->opacity[0];
     uint first_splat = first ? splat : k_buffer->splat[0];
 #pragma unroll
     for (int k = 0; k < IN_REGISTERS; k++) {
         int from = min(k + 1, IN_REGISTERS - 1);
-        bool moves = k + 1 < IN_REGISTERS && k_buffer->z[from] <= z, here = k_buffer->z[k] <= z;
+        bool moves = k + 1 < IN_REGISTERS && in_front[from], here = in_front[k];
         k_buffer->opacity[k] = moves ? k_buffer->opacity[from] : here ? opacity : k_buffer->opacity[k];
         k_buffer->splat[k] = moves ? k_buffer->splat[from] : here ? splat : k_buffer->splat[k];
         k_buffer->z[k] = moves ? k_buffer->z[from] : here ? z : k_buffer->z[k];
     }
     if (first_splat == NO_SPLAT) return;
-    if (k_buffer->count == 0 && first_z <= nearest)
+    if (k_buffer->count == 0 && BEFORE_NEXT(first_z, nearest))
         k_buffer_composite(pixel, first_z, first_opacity, first_splat, splats, constants);
     else
-        k_buffer_enqueue(pixel, first_z, first_opacity, first_splat);
+        k_buffer_enqueue(pixel, first_z, first_opacity, first_splat, splats);
 }
 
 // Inserts a fragment of a splat, none of whose fragments is nearer than `nearest`. place: index that gives its position in the list.

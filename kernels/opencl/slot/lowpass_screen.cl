@@ -39,10 +39,10 @@
             vfloat disc_y = fmax(fabs(y - s->disc_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
             outside &= VMASK(FMA(disc_x, disc_x, disc_y * disc_y) * filter > half_r2);
         }
+//@ cross_functions
+#define HAS_DISC(s) ((s)->disc_x < 1e17f)       // without: far away, or NaN where the lens does not image the centre
 //@ fragment_mask
-// A splat without a disc has it far away, or at NaN where the lens does not image the centre. Vectors of pixels skip it; for single
-// pixels the test costs as much as it saves.
-#define HAS_DISC(s) ((s)->disc_x < 1e17f)
+// Vectors of pixels skip splats without a disc; for single pixels the test costs as much as it saves.
 #if LANES > 1
 #define SKIPS_DISC(s) (!HAS_DISC(s))
 #else
