@@ -36,7 +36,7 @@ Render = Callable[[Camera], np.ndarray]
 
 def mixtures() -> tuple[str, ...]:
     """Names of all mixtures, the paper's first, then `fitted`."""
-    from fidsplat.markers.build import MIXTURES
+    from fidsplat.capture.quality import MIXTURES
 
     return tuple(dict.fromkeys(("paper", "fitted", *MIXTURES)))
 

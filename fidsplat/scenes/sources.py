@@ -46,7 +46,7 @@ def load_source(source: str, quality: Quality | str | None = None, progress: Pro
         return Scene(stores=(store,), camera=framing_camera(store))
     if suffix in FORMATS:
         cloud = load_splats(source, progress)
-        return Scene([cloud], camera=framing_camera(cloud))
+        return Scene((cloud,), camera=framing_camera(cloud))
     raise InputError(
         f"the source must be a scene file (.toml), a store ({SUFFIX}) or a splat file "
         f"({', '.join(FORMATS)}), got {source}"

@@ -11,6 +11,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -217,7 +218,8 @@ def stages_of(data: Mapping[str, np.ndarray], spec: FrameSpec, backend: Backend)
     keys, visible = data["keys"], data["keys"] != CULLED
     features, _ = spec.prepared()
     records = data["records"]
-    names = records.dtype.names or backend.pipeline(features).program.layout.names
+    pipeline: Any = backend.pipeline(features)
+    names = records.dtype.names or pipeline.program.layout.names  # Warp's records are rows of numbers
     fields = {name: records[name] if records.dtype.names else records[:, k] for k, name in enumerate(names)}
     height, width = spec.camera.height * spec.quality.samples, spec.camera.width * spec.quality.samples
     forms = {name: fields[name][visible].astype(np.float32) for name in _FORMS if name in fields}
