@@ -11,7 +11,7 @@ from fidsplat.accuracy.error import supports_float64
 from fidsplat.accuracy.search import SceneMeasurement
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import Sensor
-from fidsplat.render.certified_error import cutoff_of, nothing_left_out
+from fidsplat.render.certified_error import cutoff_of, ideal_quality
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.errors import InputError
@@ -52,7 +52,7 @@ def certify(
         if quality.alpha_cutoff > cutoff:
             finer = max(REFINEMENT * quality.alpha_cutoff, cutoff)
             stop = REFINEMENT * quality.transmittance_stop if finer > cutoff else 0.0
-            quality = nothing_left_out(quality, finer).with_(transmittance_stop=stop)
+            quality = ideal_quality(quality, finer).with_(transmittance_stop=stop)
             continue
         if float64 and quality.blend_precision == "float32":
             quality = quality.with_(blend_precision="float64", arithmetic="precise")

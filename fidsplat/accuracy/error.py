@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import select
-from fidsplat.render.certified_error import nothing_left_out
+from fidsplat.render.certified_error import ideal_quality
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
@@ -80,7 +80,7 @@ def full_precision(capture: Capture, renderer: Renderer) -> Capture:
     Low-pass, samples, order and first_hit stay. The device composites in float64 if it can
     (`supports_float64`); otherwise only the set-up is in float64, if supported.
     """
-    best = nothing_left_out(capture.quality, REFERENCE_CUTOFF).with_(arithmetic="precise")
+    best = ideal_quality(capture.quality, REFERENCE_CUTOFF).with_(arithmetic="precise")
     if not renderer.device.always_float64 and supports_float64(renderer, capture):
         best = best.with_(blend_precision="float64")
     return capture.with_(quality=best)

@@ -203,7 +203,7 @@ class Gallery:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.render.gallery import piece_of, write_gallery
+        from fidsplat.render.gallery import gallery_scene, write_gallery
         from fidsplat.scenes.sources import load_source
 
         if not self.sources:
@@ -211,12 +211,12 @@ class Gallery:
                 "a gallery needs at least one scene file (.toml) or splat file, e.g. examples/*.toml"
             )
         with delayed_progress() as progress:
-            total, pieces = len(self.sources), []
+            total, scenes = len(self.sources), []
             for k, source in enumerate(self.sources):
                 progress(f"reading {source}", 0.5 * k / total)
-                pieces.append(piece_of(path_of(source), load_source(source)))
+                scenes.append(gallery_scene(path_of(source), load_source(source)))
             files: list[Path] = []
-            for file in write_gallery(path_of(self.out), pieces, self.device):
+            for file in write_gallery(path_of(self.out), scenes, self.device):
                 files.append(file)
                 progress(file.name, 0.5 + 0.5 * len(files) / (total + 1))
         page = str(files[-1])

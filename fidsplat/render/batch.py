@@ -11,21 +11,21 @@ import numpy as np
 
 from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.views import Views
-from fidsplat.render.frame import Frame, Ids, check_process, numbered, refuse_numbered
+from fidsplat.render.frame import Frame, SceneIds, check_process, refuse_scene_ids, with_scene_ids
 from fidsplat.util.errors import InputError, MissingOutputError
 
 
 class FrameBatch(Mapping):
-    """Rendered views: a mapping from an output's name to a read-only NumPy array
-    (views, h, w) or (views, h, w, channels), copied from the device on first use.
+    """Rendered views: a mapping from output names to read-only NumPy arrays (views, h, w) or
+    (views, h, w, channels), which are copied from the device on first use.
 
     Names, types and units are those of Frame. Masked views are -1 in `label` and `splat_id`, and 0 in all
     other outputs. View i is bit-identical to `Renderer.render` of that view, except for stores with
     `detail_error` (`Renderer.render_batch`).
     """
 
-    def __init__(self, images: Images, views: Views, ids: Ids = None) -> None:
-        """ids: the indices that `splat_id` shows for the rendered splats."""
+    def __init__(self, images: Images, views: Views, ids: SceneIds = None) -> None:
+        """ids: scene indices of the splats on the device, for `splat_id`."""
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._views = views
         self._arrays: dict[str, np.ndarray] = {}
@@ -46,13 +46,15 @@ class FrameBatch(Mapping):
         self._check(name)
         if name not in self._arrays:
             check_process(self._process, "batch")
-            self._arrays[name] = images = numbered(name, self._images.read(name), self._ids)
+            self._arrays[name] = images = with_scene_ids(name, self._images.read(name), self._ids)
             images.flags.writeable = False  # cached
         return self._arrays[name]
 
     def device_array(self, name: str) -> Any:
-        """The images on their device, without a copy, (views, h, w) or (views, h, w, channels): by
-        OpenCL a pyopencl.array.Array, on a Warp device a wp.array, from which DLPack makes a tensor.
+        """The images on their device, without a copy, (views, h, w) or (views, h, w, channels).
+
+        On an OpenCL device it is a pyopencl.array.Array. On a Warp device it is a wp.array, which DLPack
+        converts to a tensor.
 
         The batch owns them: the next batch has other arrays.
 
@@ -61,7 +63,7 @@ class FrameBatch(Mapping):
         """
         self._check(name)
         check_process(self._process, "batch")
-        refuse_numbered(name, self._ids)
+        refuse_scene_ids(name, self._ids)
         return self._images.device_array(name)
 
     def frame(self, number: int) -> Frame:
@@ -86,7 +88,8 @@ class FrameBatch(Mapping):
     def _check(self, name: str) -> None:
         if not isinstance(name, str) or name not in self.outputs:
             raise MissingOutputError(
-                f"this batch has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+                f"an output of this batch must be one of {', '.join(self.outputs)}, got {name!r}; add it to "
+                "`outputs` when you render"
             )
 
     def __iter__(self) -> Iterator[str]:

@@ -33,13 +33,13 @@ class DifferentiableFrame(Frame):
             self.outputs = (*capture.outputs, "distortion")
 
     def backward(self, gradients: Mapping[str, Any], on_device: bool = False) -> dict[str, Any]:
-        """Differentiate a loss by the splats, the background and the camera pose.
+        """Gradients of a loss with respect to the splats, the background and the camera pose.
 
         Call it before the next frame of this device. Results are bit-identical on every run. Decisions of the
         forward pass (alpha cut-off, transmittance stop, near plane, order of splats) have no derivative.
 
         Args:
-            gradients: derivatives of the loss by outputs, float32 arrays in the shape of the output, by name:
+            gradients: derivatives of the loss with respect to the outputs, float32 arrays, by output name:
                 `rgb` (h, w, 3), `alpha` (h, w), `depth` (h, w) [1/m], `normal` (h, w, 3), `distortion`
                 (h, w). NumPy arrays, or arrays of the device (pyopencl, Warp), which are not copied.
                 Outputs without an entry have a gradient of 0.
@@ -47,29 +47,29 @@ class DifferentiableFrame(Frame):
                 valid until the next call, instead of NumPy float32.
 
         Returns:
-            Derivatives of the loss by what the cloud holds, n splats: `means` (n, 3) [1/m]; `quats` (n, 4),
+            Derivatives of the loss with respect to the n splats: `means` (n, 3) [1/m]; `quats` (n, 4),
             w x y z, not normalised; `scales` (n, 2) [1/m]; `opacities` (n,); `colors` (n, 3) or `sh`
             (n, k, 3). Furthermore `background` (3,); `pose` (6,), a rotation vector [1/rad] and a translation
             [1/m] applied after `world_to_camera`, in camera axes; `screen` (n,), the densification statistic
-            of 2DGS trainers, the norm of the derivative by the projected centre in half images. Splats that
-            are not rendered have zeros.
+            of 2DGS trainers: the norm of the derivative with respect to the projected centre, in half image
+            sizes. Splats that are not rendered have zeros.
 
         Raises:
-            InputError: the device has rendered another frame since; a gradient of an output that was not
-                rendered, that has no gradient, or of another shape or type.
+            InputError: the device has rendered another frame since; the output of a gradient was not
+                rendered or is not differentiable; a gradient has another shape or type.
             DeviceError: the device fails or lacks memory.
         """
         interrupts.check()
         flag("on_device", on_device)
         instance("gradients", gradients, Mapping, "arrays by the name of their output")
-        given = {name: _numeric(name, value) for name, value in gradients.items()}
+        given = {name: _numeric_array(name, value) for name, value in gradients.items()}
         with self._lock:
-            found = self._pipeline.backward(self._forward, given)
-            return found if on_device else {name: on_host(array) for name, array in found.items()}
+            results = self._pipeline.backward(self._forward, given)
+            return results if on_device else {name: on_host(array) for name, array in results.items()}
 
 
-def _numeric(name: str, value: Any) -> Any:
-    """A gradient by an output as it is if it is an array of real numbers, else converted or refused."""
+def _numeric_array(name: str, value: Any) -> Any:
+    """The gradient of an output as an array of real numbers; arrays on the device are not converted."""
     if value is None or (hasattr(value, "shape") and not isinstance(value, (np.ndarray, np.generic))):
         return value
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":

@@ -1,4 +1,4 @@
-"""Flights: frames of a scene along a trajectory, written as files by a run that can be resumed."""
+"""Flight: frames of a scene along a camera trajectory, written to files, with resume."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat import __version__
+from fidsplat.backends.view import NO_CAMERA
 from fidsplat.cameras import Motion, Shutter, Trajectory
 from fidsplat.capture.capture import Capture
 from fidsplat.formats import load_trajectory, save_trajectory
@@ -55,7 +56,7 @@ class Flight:
 
     def __post_init__(self) -> None:
         if self.capture.camera is None:
-            raise InputError("the scene has no camera; its size and focal lengths are needed for a flight")
+            raise InputError(NO_CAMERA)
         _ = self.path  # raises for invalid times
 
     @cached_property
@@ -85,7 +86,8 @@ class Flight:
             return digest_of(content)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise InputError(
-                f"a flight must be picklable, so that it can be resumed after a stop: {error}"
+                f"a flight must be picklable, so that it can be resumed, got {error}; use a trajectory or a "
+                "module-level function for each motion"
             ) from None
 
 
@@ -114,7 +116,7 @@ class FlightFolder:
         self.folder, self.flight, self.device = path_of(folder), flight, device
         self._source = None if source is None else os.path.relpath(source, self.folder)
         self.key = flight.key(device)
-        before = self._recorded()
+        before = self._read_record()
         if before is not None and before.get("key") != self.key and not overwrite:
             raise InputError(
                 f"{self.folder} must be empty or contain this flight, got another flight of "
@@ -130,11 +132,11 @@ class FlightFolder:
             writable_folder(self.folder / name)
         if overwrite:
             self._clear()
-        self._write(RECORD, self._facts())
+        self._write(RECORD, self._record())
         self._save_poses()
 
     def remaining(self) -> list[int]:
-        """Numbers of the frames of which a file is missing."""
+        """Numbers of the frames with missing files."""
         outputs = self.flight.capture.outputs
         return [
             k
@@ -163,31 +165,34 @@ class FlightFolder:
             yield k
 
     def previews(self) -> list[Path]:
-        """Files of the viewable images of all frames: of the first output."""
+        """Viewable image files of the first output of all frames."""
         name = self.flight.capture.outputs[0]
         return [self.file(k, name, suffixes_of(name)[-1]) for k in range(len(self.flight))]
 
     def write_sheet(self) -> Path:
-        """Write a contact sheet of twelve frames, evenly spread over the flight."""
+        """Write a contact sheet of at most twelve frames, evenly spread over the flight."""
         files = self.previews()
-        some = sorted({round(k) for k in np.linspace(0, len(files) - 1, min(len(files), _COLUMNS * _ROWS))})
-        cells = [(f"{float(self.flight.path.times[k]):.2f} s", read_image(files[k])) for k in some]
+        chosen = sorted({round(k) for k in np.linspace(0, len(files) - 1, min(len(files), _COLUMNS * _ROWS))})
+        cells = [(f"{float(self.flight.path.times[k]):.2f} s", read_image(files[k])) for k in chosen]
         rows = [cells[start : start + _COLUMNS] for start in range(0, len(cells), _COLUMNS)]
         return write_png(self.folder / SHEET, contact_sheet(rows, width=320))
 
     def write_video(self, path: str | Path, rate: float) -> Iterator[int]:
-        """Write the frames as a video; yields the number of each after it is encoded. Raises InputError
-        without the extra `video`."""
+        """Write the frames as a video; yields the number of each after it is encoded.
+
+        Raises:
+            InputError: the extra `video` is not installed.
+        """
         return write_video(path, (read_image(file) for file in self.previews()), rate)
 
     def _clear(self) -> None:
-        # frames of another flight have the same file names
+        """Delete frames of another flight, which have the same file names."""
         for name in self.flight.capture.outputs:
             for suffix in suffixes_of(name):
                 for file in (self.folder / name).glob(f"[0-9][0-9][0-9][0-9][0-9][0-9]{suffix}"):
                     file.unlink()
 
-    def _recorded(self) -> dict[str, Any] | None:
+    def _read_record(self) -> dict[str, Any] | None:
         file = self.folder / RECORD
         if not file.exists():
             return None
@@ -197,7 +202,7 @@ class FlightFolder:
             found = {}
         return found if isinstance(found, dict) else {}
 
-    def _facts(self) -> dict[str, Any]:
+    def _record(self) -> dict[str, Any]:
         path = self.flight.path
         return {
             "fidsplat": __version__,
@@ -222,8 +227,10 @@ class FlightFolder:
 
 
 def scene_of_frame(scene: Scene, image: Path) -> Scene:
-    """The scene at the camera pose and time of an image file in a flight's folder; unchanged for any other
-    image file."""
+    """The scene with the camera pose and time of a flight's frame, given an image file of that frame.
+
+    For any other image file, the scene is unchanged.
+    """
     folder = image.parent.parent
     if not image.stem.isdigit() or not (folder / RECORD).is_file():
         return scene

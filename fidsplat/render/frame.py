@@ -13,8 +13,9 @@ from fidsplat.capture.capture import Capture
 from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, MissingOutputError
 
-Ids = Callable[[], np.ndarray] | None
-"""returns the indices (n,) int32 of the rendered splats in the complete scene; None: no other indices"""
+SceneIds = Callable[[], np.ndarray] | None
+"""Function that returns, for each splat on the device, its index in the scene, (n,) int32; None if both
+indices are equal."""
 
 
 class ComputedImage(Protocol):
@@ -31,7 +32,7 @@ class ComputedImage(Protocol):
 
 
 class Frame(Mapping):
-    """A rendered frame: a mapping from an output's name to a read-only NumPy array, copied from the
+    """A rendered frame: a mapping from output names to read-only NumPy arrays, which are copied from the
     device on first use.
 
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
@@ -46,17 +47,17 @@ class Frame(Mapping):
         self,
         images: Images,
         capture: Capture,
-        ids: Ids = None,
+        ids: SceneIds = None,
         error: ComputedImage | None = None,
         index: int = 0,
     ) -> None:
-        """ids: the indices that `splat_id` shows for the rendered splats. error: the output `error`, if it is
-        requested. index: of the view in `images`."""
+        """ids: scene indices of the splats on the device, for `splat_id`. error: the output `error`, if it is
+        requested. index: position of the view in `images`."""
         self._error, self._index = error, index
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}
         self.capture = capture
-        """The capture that made it. `read_back` and `truth_of` use its camera, shutter and motion."""
+        """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""
         self.outputs = capture.outputs
         """Names of the images, in the requested order."""
 
@@ -66,7 +67,7 @@ class Frame(Mapping):
             check_process(self._process, "frame")
             computed = self._error if name == "error" else None
             image = self._images.read(name, self._index) if computed is None else computed.read()
-            self._arrays[name] = image = numbered(name, image, self._ids)
+            self._arrays[name] = image = with_scene_ids(name, image, self._ids)
             image.flags.writeable = False  # cached
         return self._arrays[name]
 
@@ -81,10 +82,10 @@ class Frame(Mapping):
         """
         self._check(name)
         check_process(self._process, "frame")
-        refuse_numbered(name, self._ids)
+        refuse_scene_ids(name, self._ids)
         if name == "error":
             raise InputError(
-                "the output 'error' must be read on the host, got device_array; take frame['error']"
+                "the output 'error' must be read on the host, got device_array; use frame['error']"
             )
         return self._images.device_array(name, self._index)
 
@@ -118,38 +119,47 @@ class Frame(Mapping):
             import torch  # type: ignore[import-not-found]
         except ImportError:
             raise InputError("to_torch needs torch, which is not installed; pip install torch") from None
-        if self._stays(name):
+        if self._is_shared(name):
             return torch.from_dlpack(self.device_array(name))
         return torch.from_numpy(self[name].copy())  # torch has no read-only tensors
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """The image of a frame with one output, for NumPy, PIL and OpenCV. Raises InputError if there are
-        several."""
-        image = self[self._only()]
+        """The image of a frame with one output, for NumPy, PIL and OpenCV.
+
+        Raises:
+            InputError: the frame has several outputs.
+        """
+        image = self[self._only_output()]
         return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
 
-    def __dlpack__(self, **words: Any) -> Any:
-        """The image of a frame with one output, for `from_dlpack` of torch, CuPy, JAX and NumPy: without a
-        copy if the backend shares arrays, else copied to the host. Raises InputError if there are several."""
-        return self._exchanged().__dlpack__(**words)
+    def __dlpack__(self, **options: Any) -> Any:
+        """The image of a frame with one output, for `from_dlpack` of torch, CuPy, JAX and NumPy.
+
+        It is not copied if the backend shares arrays; otherwise it is copied to the host.
+
+        Raises:
+            InputError: the frame has several outputs.
+        """
+        return self._exported().__dlpack__(**options)
 
     def __dlpack_device__(self) -> tuple[int, int]:
         """DLPack's device type and id of the image."""
-        return self._exchanged().__dlpack_device__()
+        return self._exported().__dlpack_device__()
 
-    def _exchanged(self) -> Any:
-        name = self._only()
-        if self._stays(name):
+    def _exported(self) -> Any:
+        """The image of the only output as an array that exports DLPack."""
+        name = self._only_output()
+        if self._is_shared(name):
             return self.device_array(name)
         return self[name].copy()  # NumPy exports no read-only arrays by DLPack
 
-    def _stays(self, name: str) -> bool:
+    def _is_shared(self, name: str) -> bool:
         """Whether the device shares an array of this image."""
         on_host = name == "error" or (name == "splat_id" and self._ids is not None)
         return self._images.shares_arrays and not on_host
 
-    def _only(self) -> str:
-        """The name of the one output."""
+    def _only_output(self) -> str:
+        """The name of the only output."""
         if len(self.outputs) != 1:
             raise InputError(
                 f"the frame must have one output, got {len(self.outputs)} ({', '.join(self.outputs)}); take "
@@ -165,15 +175,16 @@ class Frame(Mapping):
     def _repr_png_(self) -> bytes:
         """PNG for notebooks: rgb, or else the first output in false colours."""
         from fidsplat.images.files import encode_png  # here, since it imports OpenCV
-        from fidsplat.render.output_files import picture_of
+        from fidsplat.render.output_files import visualisation_of
 
         name = "rgb" if "rgb" in self.outputs else self.outputs[0]
-        return encode_png(picture_of(name, self[name]))
+        return encode_png(visualisation_of(name, self[name]))
 
     def _check(self, name: str) -> None:
         if not isinstance(name, str) or name not in self.outputs:
             raise MissingOutputError(
-                f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+                f"an output of this frame must be one of {', '.join(self.outputs)}, got {name!r}; add it to "
+                "`outputs` when you render"
             )
 
     def __iter__(self) -> Iterator[str]:
@@ -215,13 +226,13 @@ class Frame(Mapping):
         whole_number("the first row", first, 0, end)
         images.read_rows(name, first, end, into, index)
         if name == "splat_id":
-            into[first:end] = numbered(name, into[first:end], self._ids)
+            into[first:end] = with_scene_ids(name, into[first:end], self._ids)
         return into
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage: project, sort, bin, blend, resolve; error: all that the output
-        `error` takes.
+        """Milliseconds on the device by stage: project, sort, bin, blend, resolve; error: all stages of the
+        second rendering for the output `error`.
 
         On a GPU a replayed frame is rendered again to measure them, since timing each launch would slow down
         all frames. Empty if its cloud has been released.
@@ -257,9 +268,12 @@ class RowBand(Protocol):
 P = TypeVar("P", bound=RowBand)
 
 
-def stacked(parts: Iterable[P], render: Callable[[P], Frame]) -> Frame:
-    """The frame of bands of rows. They are rendered one after another, so that the device holds the splats of
-    one; each is copied to the host while the next is rendered. A single band stays on the device."""
+def stack_bands(bands: Iterable[P], render: Callable[[P], Frame]) -> Frame:
+    """Render bands of rows and stack them to one frame.
+
+    The device renders one band after another, so that it stores the splats of one band only. Each band is
+    copied to the host while the next is rendered. A single band stays on the device.
+    """
     arrays: dict[str, np.ndarray] = {}
     timings: dict[str, float] = {}
     stats: dict[str, int] = {}
@@ -267,49 +281,49 @@ def stacked(parts: Iterable[P], render: Callable[[P], Frame]) -> Frame:
 
     def finish(frame: Frame) -> None:
         frame.wait()
-        for stage, spent in frame.timings.items():
-            timings[stage] = timings.get(stage, 0.0) + spent
-        for what, number in frame.stats.items():
-            stats[what] = stats.get(what, 0) + number
+        for stage, ms in frame.timings.items():
+            timings[stage] = timings.get(stage, 0.0) + ms
+        for name, count in frame.stats.items():
+            stats[name] = stats.get(name, 0) + count
 
-    def take(frame: Frame, rows: tuple[int, int]) -> None:
+    def copy_rows(frame: Frame, rows: tuple[int, int]) -> None:
         for name in frame.outputs:
             arrays[name] = frame.read_rows(name, *rows, arrays.get(name))
 
-    for part in parts:
+    for band in bands:
         if last is not None:
             finish(last[0])
-        frame = render(part)
+        frame = render(band)
         if last is not None:
-            take(*last)
-        last = frame, part.rows
+            copy_rows(*last)
+        last = frame, band.rows
     assert last is not None  # a frame has rows
     if not arrays:
         return last[0]
     finish(last[0])
-    take(*last)
+    copy_rows(*last)
     return _host_frame(arrays, timings, stats, last[0].capture)
 
 
-def numbered(name: str, image: np.ndarray, ids: Ids) -> np.ndarray:
-    """An image of `splat_id` with indices in the complete scene; -1 is unchanged."""
+def with_scene_ids(name: str, image: np.ndarray, ids: SceneIds) -> np.ndarray:
+    """An output image; `splat_id` with device indices replaced by scene indices. -1 is unchanged."""
     if name != "splat_id" or ids is None:
         return image
     return np.append(ids(), np.int32(-1))[image]
 
 
-def refuse_numbered(name: str, ids: Ids) -> None:
+def refuse_scene_ids(name: str, ids: SceneIds) -> None:
     """Raise InputError for `splat_id` on a device if its indices must be converted on the host."""
     if name == "splat_id" and ids is not None:
         raise InputError(
-            "splat_id of a store is numbered on the host; take frame['splat_id'], which is copied there"
+            "splat_id of a store must be read on the host, got device_array; use frame['splat_id']"
         )
 
 
 def check_process(opened_by: int, what: str) -> None:
-    """Raise InputError in a fork of the process that opened it, since drivers do not work after a fork."""
+    """Raise InputError if this process is a fork of `opened_by`, since drivers do not work after a fork."""
     if opened_by != os.getpid():
         raise InputError(
-            f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "
-            "each process, and read frames before the fork"
+            f"this {what} must be used in the process that opened it ({opened_by}), got a fork of it; open a "
+            "Renderer in each process, and read frames before the fork"
         )

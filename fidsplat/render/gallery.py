@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from fidsplat import __version__
 from fidsplat.images.files import write_png
-from fidsplat.render.output_files import picture_of
+from fidsplat.render.output_files import visualisation_of
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.util.files import atomic_write, printable, read_text, writable_folder
@@ -31,8 +31,8 @@ p { color: #777; margin: 0.3rem 0 }
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
-    """A scene of a gallery."""
+class GalleryScene:
+    """A scene of a gallery, with its title and its scene file."""
 
     name: str
     """stem of its image files"""
@@ -42,15 +42,15 @@ class Piece:
     """text of the scene file; empty for splat files"""
 
 
-def piece_of(source: Path, scene: Scene) -> Piece:
-    """Read a scene file; the title is the comment of its first line."""
+def gallery_scene(source: Path, scene: Scene) -> GalleryScene:
+    """A scene with the text of its file. The title is the comment on the first line."""
     text = read_text(source, "replace") if source.suffix.lower() == ".toml" else ""
     first = text.partition("\n")[0]
     title = first.lstrip("# ").partition(". fidsplat")[0] if first.startswith("#") else source.stem
-    return Piece(source.stem, title.rstrip("."), scene, text)
+    return GalleryScene(source.stem, title.rstrip("."), scene, text)
 
 
-def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = None) -> Iterator[Path]:
+def write_gallery(folder: Path, scenes: Sequence[GalleryScene], device: str | None = None) -> Iterator[Path]:
     """Render scenes into a folder and write index.html; yields each file when it is written. Unchanged scenes
     are not rendered again.
 
@@ -64,36 +64,36 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
     writable_folder(folder)
     renderers: dict[str | None, Renderer] = {}
     parts = []
-    for piece in pieces:
-        name = device or piece.scene.device
+    for entry in scenes:
+        name = device or entry.scene.device
         if name not in renderers:
             renderers[name] = Renderer(name)
         renderer = renderers[name]
-        names = piece.scene.capture.outputs
-        key = digest_of((piece.scene.content, piece.scene.capture, renderer.device.title, __version__))
-        files = [folder / f"{piece.name[:60]}-{name}-{key}.png" for name in names]
+        names = entry.scene.capture.outputs
+        key = digest_of((entry.scene.content, entry.scene.capture, renderer.device.title, __version__))
+        files = [folder / f"{entry.name[:60]}-{name}-{key}.png" for name in names]
         if not all(file.exists() for file in files):
-            frame = renderer.render(piece.scene)
+            frame = renderer.render(entry.scene)
             for name, file in zip(frame.outputs, files, strict=True):
-                write_png(file, picture_of(name, frame[name]))
-        parts.append(_figure(piece, files, renderer.device.title))
+                write_png(file, visualisation_of(name, frame[name]))
+        parts.append(_figure(entry, files, renderer.device.title))
         yield files[0]
     with atomic_write(folder / PAGE) as stream:
         stream.write(printable(_page(parts)).encode())
     yield folder / PAGE
 
 
-def _figure(piece: Piece, files: Sequence[Path], device: str) -> str:
+def _figure(entry: GalleryScene, files: Sequence[Path], device: str) -> str:
     escape = html.escape
     first, *more = [quote(os.fsencode(file.name)) for file in files]
-    markers = ", ".join(placed.marker.spec for placed in piece.scene.markers)
-    facts = f"{len(piece.scene.splats):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
+    markers = ", ".join(placed.marker.spec for placed in entry.scene.markers)
+    facts = f"{len(entry.scene.splats):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
     images = "".join(f'<a href="{name}"><img src="{name}" loading="lazy" alt=""></a> ' for name in more)
-    text = f"<details><summary>scene file</summary><pre>{escape(piece.text)}</pre></details>"
+    text = f"<details><summary>scene file</summary><pre>{escape(entry.text)}</pre></details>"
     return (
-        f'<figure style="margin:0"><a href="{first}"><img src="{first}" alt="{escape(piece.title)}"></a>'
-        f"<figcaption>{escape(piece.title)}<p>{escape(facts)}</p></figcaption>"
-        f'<div class="more">{images}</div>{text if piece.text else ""}</figure>'
+        f'<figure style="margin:0"><a href="{first}"><img src="{first}" alt="{escape(entry.title)}"></a>'
+        f"<figcaption>{escape(entry.title)}<p>{escape(facts)}</p></figcaption>"
+        f'<div class="more">{images}</div>{text if entry.text else ""}</figure>'
     )
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.interface import Images
+from fidsplat.backends.view import NO_CAMERA
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture, output_names
 from fidsplat.capture.quality import Quality
@@ -28,20 +29,18 @@ from fidsplat.store.store import Store
 from fidsplat.util.arguments import invalid, items
 from fidsplat.util.errors import InputError
 
-_UNEVEN = 1.1
-"""largest ratio of the slowest band's time to the mean, above which bands are balanced again"""
+_MAX_IMBALANCE = 1.1
+"""maximum ratio of the slowest band's time to the mean; above it, bands are balanced again"""
 
-_AHEAD = 3
-"""frames in flight per device: one that is copied to the host, one that is rendered, and one whose chunks are
-prefetched"""
+_IN_FLIGHT = 3
+"""frames in flight per device: one is copied to the host, one rendered, and one has its chunks prefetched"""
 
 
 class SeveralDevices:
-    """Renders frames with several devices of one kind, each a band of rows; frames are bit-identical to those
-    of one device.
+    """Several devices of one kind that share each frame: every device renders a band of rows.
 
-    Bands are balanced by the times of the previous frame. Of a store, a device caches the chunks that are
-    visible in its band; a cloud in memory is copied to every device.
+    Frames are bit-identical to those of one device. Bands are balanced by the times of the previous frame. A
+    cloud in memory is copied to every device; a store's chunks are cached only where their band needs them.
 
     Args:
         devices: names as for `fs.Renderer`, e.g. ["opencl:nvidia", "opencl:nvidia-2"]; a name may be
@@ -49,7 +48,7 @@ class SeveralDevices:
         memory_budget: bytes per device.
 
     Raises:
-        InputError: no device, or devices of different kinds, whose frames are not bit-identical.
+        InputError: no device, or devices of different kinds, whose frames may differ.
         DeviceError: as `fs.Renderer`.
     """
 
@@ -65,14 +64,14 @@ class SeveralDevices:
                 f"{', '.join(sorted(titles))}; name devices of one kind"
             )
         self._shares = np.linspace(0.0, 1.0, len(names) + 1)
-        """ends of the bands as fractions of the frame's height"""
+        """borders of the bands as fractions of the frame's height, 0 and 1 included"""
         self._pool = ThreadPoolExecutor(len(names), "fidsplat-device")
 
     def __repr__(self) -> str:
         return f"SeveralDevices({', '.join(renderer.device.name for renderer in self.renderers)})"
 
     def upload(self, scene: Scene | SplatCloud | Store) -> list[ResidentCloud]:
-        """Copy a scene to all devices, for `render`."""
+        """Copy a scene to all devices."""
         return list(self._pool.map(lambda renderer: renderer.upload(scene), self.renderers))
 
     def render(
@@ -86,17 +85,19 @@ class SeveralDevices:
         errors are those of `Renderer.render`."""
         if capture is not None and not isinstance(capture, Capture | Camera):
             raise invalid("capture", "a Capture or a Camera", capture)
-        given = self._given(scene)
+        resident = self._uploaded(scene)
         camera = capture.camera if isinstance(capture, Capture) else capture
-        camera = camera or given[0].capture.camera
+        camera = camera or resident[0].capture.camera
         if camera is None:
-            raise InputError("no camera; give a Camera, or a Capture with one")
+            raise InputError(NO_CAMERA)
         names = None if outputs is None else output_names(outputs)
         bands = self._bands(camera.height)
 
         def render_band(number: int) -> tuple[Frame, float]:
             begun = time.perf_counter()
-            frame = self.renderers[number].render_band(bands[number], given[number], capture, names, quality)
+            frame = self.renderers[number].render_band(
+                bands[number], resident[number], capture, names, quality
+            )
             return frame.wait(), time.perf_counter() - begun
 
         rendered = list(self._pool.map(render_band, range(len(bands))))
@@ -114,15 +115,15 @@ class SeveralDevices:
         """Render many frames in their order, each by one device, round robin. A frame is copied to the host
         while its device renders the next. Arguments and errors: as `render`; an error, also of `captures`, is
         raised after the frames of the captures before it."""
-        given = self._given(scene)
+        resident = self._uploaded(scene)
         names = None if outputs is None else output_names(outputs)
         try:
             rest = iter(captures)
         except TypeError:
-            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
+            raise invalid("captures", "a list of Capture or Camera", captures) from None
         workers = [
             _Worker(partial(renderer.render_views, one, outputs=names, quality=quality))
-            for renderer, one in zip(self.renderers, given, strict=True)
+            for renderer, one in zip(self.renderers, resident, strict=True)
         ]
         waiting: deque[_Worker] = deque()
         failure: Exception | None = None
@@ -136,7 +137,7 @@ class SeveralDevices:
                     failure = error
                     break
                 waiting.append(worker)
-                if len(waiting) > _AHEAD * len(workers):
+                if len(waiting) > _IN_FLIGHT * len(workers):
                     yield waiting.popleft().result()
             for worker in workers:
                 worker.end()
@@ -148,8 +149,10 @@ class SeveralDevices:
         if failure is not None:
             raise failure
 
-    def _given(self, scene: Scene | SplatCloud | Store | Sequence[ResidentCloud]) -> Sequence[ResidentCloud]:
-        """A scene on all devices."""
+    def _uploaded(
+        self, scene: Scene | SplatCloud | Store | Sequence[ResidentCloud]
+    ) -> Sequence[ResidentCloud]:
+        """A scene on all devices, uploaded if necessary."""
         if isinstance(scene, Sequence):
             given = items("scene", scene, ResidentCloud, "a scene, or the result of `upload`")
         else:
@@ -162,17 +165,20 @@ class SeveralDevices:
         return given
 
     def _bands(self, height: int) -> list[tuple[int, int]]:
-        """Rows [first, end) of each device, at least one; a frame of few rows uses fewer devices."""
+        """Rows [first, end) of each device, at least one row each; small frames use fewer devices."""
         devices = min(len(self.renderers), height)
         shares = self._shares if devices == len(self.renderers) else np.linspace(0, 1, devices + 1)
-        cuts = np.round(shares * height).astype(int)
+        borders = np.round(shares * height).astype(int)
         for number in range(1, devices):
-            cuts[number] = min(max(cuts[number], cuts[number - 1] + 1), height - devices + number)
-        return list(pairwise(cuts.tolist()))
+            borders[number] = min(max(borders[number], borders[number - 1] + 1), height - devices + number)
+        return list(pairwise(borders.tolist()))
 
     def _balance(self, rows: list[int], seconds: list[float]) -> None:
-        """Move the ends of the bands to equalise their times, assuming equal times for the rows of a band."""
-        if len(rows) < len(self.renderers) or max(seconds) <= _UNEVEN * np.mean(seconds):
+        """Load balancing: move the borders of the bands to equalise their times.
+
+        All rows of a band are assumed to take the same time.
+        """
+        if len(rows) < len(self.renderers) or max(seconds) <= _MAX_IMBALANCE * np.mean(seconds):
             return
         spent = np.concatenate([[0.0], np.cumsum(seconds)])
         ends = np.concatenate([[0.0], np.cumsum(rows)]) / sum(rows)
@@ -185,7 +191,7 @@ class _Worker:
     _END = object()
 
     def __init__(self, render: Callable[[Iterator[Any]], Iterator[Frame]]) -> None:
-        """render: renders captures, as `Renderer.render_views`."""
+        """render: `Renderer.render_views` with a scene bound."""
         self._captures: SimpleQueue[Any] = SimpleQueue()
         self._frames: SimpleQueue[Frame | BaseException] = SimpleQueue()
         self._stopped = False
@@ -231,7 +237,7 @@ class _Worker:
 
 @dataclass(frozen=True)
 class _BandImages(Images):
-    """Images of bands, stacked to those of one frame."""
+    """Images of one frame, stacked from bands of rows."""
 
     frames: list[Frame]
     bands: list[tuple[int, int]]
@@ -251,8 +257,8 @@ class _BandImages(Images):
 
     @property
     def stats(self) -> dict[str, Any]:
-        """splats: of the device with the most; visible, pairs: sums over the bands, which count a splat in
-        each band where it is visible."""
+        """splats: maximum over the devices. visible, pairs: sums over the bands; a splat counts once in each
+        band in which it is visible."""
         each = [frame.stats for frame in self.frames]
         most = max(one["splats"] for one in each)
         return {"splats": most} | {name: sum(one[name] for one in each) for name in ("visible", "pairs")}

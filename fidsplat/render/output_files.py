@@ -18,7 +18,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
 from fidsplat.util.npy import load_npy
 
-_PICTURES = {
+_VISUALISATIONS = {
     "color": lambda image: image,
     "depth": colour_depth,
     "normal": colour_normals,
@@ -48,18 +48,19 @@ def save_output(
         name_of: file of an output's name and a suffix such as ".png" or "-turbo.png".
     """
     if name == "rgb" and bits == 16:
-        deep = np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 65535).astype(np.uint16)
-        return [write_png(name_of(name, ".png"), deep)]
+        image16 = np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 65535).astype(np.uint16)
+        return [write_png(name_of(name, ".png"), image16)]
     arrays = [_write_array(name_of(name, ".npy"), image)] if ".npy" in suffixes_of(name) else []
     if declared_output(name).display == "depth":
         arrays.append(write_png(name_of(name, ".png"), depth_millimetres(image)))
-    return [*arrays, write_png(name_of(name, suffixes_of(name)[-1]), picture_of(name, image))]
+    return [*arrays, write_png(name_of(name, suffixes_of(name)[-1]), visualisation_of(name, image))]
 
 
 def load_output(file: Path, shape: tuple[int, int]) -> np.ndarray:
-    """An output image (h, w) that `save_output` wrote as an array.
+    """Read an output image (h, w) that `save_output` wrote as .npy.
 
-    Raises InputError for a file that is damaged, or of an image of another shape.
+    Raises:
+        InputError: the file is damaged, or its image has another shape.
     """
     try:
         image = load_npy(file)
@@ -70,9 +71,9 @@ def load_output(file: Path, shape: tuple[int, int]) -> np.ndarray:
         raise InputError(f"cannot read {file}: {error}; remove it, and render the image again") from error
 
 
-def picture_of(name: str, image: np.ndarray) -> np.ndarray:
+def visualisation_of(name: str, image: np.ndarray) -> np.ndarray:
     """8-bit visualisation of an output image, (h, w) or (h, w, 3)."""
-    return _PICTURES[declared_output(name).display](image)
+    return _VISUALISATIONS[declared_output(name).display](image)
 
 
 def _write_array(path: Path, array: np.ndarray) -> Path:

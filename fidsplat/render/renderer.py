@@ -23,7 +23,7 @@ from fidsplat.effects.differentiable import check_gradients, with_distortion
 from fidsplat.render.batch import FrameBatch
 from fidsplat.render.certified_error import ErrorImage, ideal_of
 from fidsplat.render.differentiable_frame import DifferentiableFrame
-from fidsplat.render.frame import Frame, check_process, stacked
+from fidsplat.render.frame import Frame, check_process, stack_bands
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
@@ -32,10 +32,10 @@ from fidsplat.store.store import Store
 from fidsplat.streaming.bands import BandData
 from fidsplat.streaming.residency import Residency
 from fidsplat.util import interrupts
-from fidsplat.util.arguments import whole_number
+from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, unknown
 
-_PLAIN = Capture()
+_DEFAULT_CAPTURE = Capture()
 
 
 def _render_view(pipeline: Pipeline, data: Any, view: View) -> Images:
@@ -43,7 +43,7 @@ def _render_view(pipeline: Pipeline, data: Any, view: View) -> Images:
 
 
 def default_device() -> str:
-    """The device that is used where none is named: FIDSPLAT_DEVICE, else auto."""
+    """Default device: the environment variable FIDSPLAT_DEVICE, else `auto`."""
     return os.environ.get("FIDSPLAT_DEVICE", "").strip() or FIRST
 
 
@@ -92,10 +92,12 @@ class Renderer:
         return self.backend.info
 
     def upload(self, scene: Scene | SplatCloud | Store) -> ResidentCloud:
-        """Copy a scene's splats to the device, to render them many times. The result has the scene's capture.
-        Stores are read when a view needs them."""
+        """Copy a scene's splats to the device, to render them many times.
+
+        The result has the scene's capture. Chunks of a store are read when a view needs them.
+        """
         check_process(self._process, "Renderer")
-        capture = scene.capture if isinstance(scene, Scene) else _PLAIN
+        capture = scene.capture if isinstance(scene, Scene) else _DEFAULT_CAPTURE
         stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
         cloud = stored.splats if isinstance(stored, Scene) else stored
         if isinstance(cloud, ChunkedSplats):
@@ -117,13 +119,13 @@ class Renderer:
         labels: Any = None,
         origin: Iterable[float] = (0.0, 0.0, 0.0),
     ) -> ResidentCloud:
-        """Splats in arrays of the device, which are rendered without a copy.
+        """Use splats in arrays on the device, without a copy.
 
         Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or objects with DLPack
         (torch, CuPy, JAX); NumPy arrays are copied. With scales (n, 3) splats are 3D Gaussians, disks where
         the third is 0. Arrays are read when a frame is rendered, so a simulation may move the splats
         between frames. Quaternions need no unit length; invalid splats (a value that is not finite, a scale
-        below 0) are not rendered. `origin` (3,): world position of the means' zero.
+        below 0) are not rendered. `means` are relative to `origin` (3,), a world position.
 
         Raises:
             InputError: the backend adopts no arrays, or one has the wrong shape, type or device.
@@ -136,7 +138,7 @@ class Renderer:
         given |= {} if labels is None else {"labels": labels}
         with self._lock:
             data = self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64))
-        return ResidentCloud(self.backend, data, _PLAIN)
+        return ResidentCloud(self.backend, data, _DEFAULT_CAPTURE)
 
     def render(
         self,
@@ -155,11 +157,11 @@ class Renderer:
             outputs, quality, and by name the other parts (`CaptureParts`): replace those of the capture.
 
         Raises:
-            InputError: no camera, an unknown output or preset, a frame that is too large, a cloud uploaded
-                elsewhere.
+            InputError: no camera, an unknown output or preset, a frame that is too large, a cloud
+                uploaded by another renderer.
             DeviceError: the device fails or lacks memory.
         """
-        requested = _requested(scene, capture, outputs=outputs, quality=quality, **parts)
+        requested = _capture_of(scene, capture, outputs=outputs, quality=quality, **parts)
         return self._render(self._resident(scene), requested)
 
     def render_differentiable(
@@ -189,9 +191,9 @@ class Renderer:
 
         Raises:
             InputError: as `render`; an effect or an output without a gradient.
-            DeviceError: the device has no gradients, fails, or lacks the memory to render in one piece.
+            DeviceError: the device has no gradients, fails, or lacks the memory to render without bands.
         """
-        requested = _requested(scene, capture, outputs=outputs, quality=quality, **parts)
+        requested = _capture_of(scene, capture, outputs=outputs, quality=quality, **parts)
         resident = self._resident(scene)
         if isinstance(resident.data, Residency):
             raise InputError(
@@ -215,8 +217,9 @@ class Renderer:
         quality: Quality | str | None = None,
         progress: Callable[[float], object] | None = None,
     ) -> Frame:
-        """Render every step-th pixel in both directions, bit-identical to those pixels of `render`. Only the
-        reference does this.
+        """Render every step-th pixel in both directions, bit-identical to those pixels of `render`.
+
+        Only the device "reference" supports this.
 
         Args:
             step: 1 or more.
@@ -227,12 +230,12 @@ class Renderer:
             InputError: as `render`; the device renders complete frames only.
         """
         whole_number("step", step, 1, 2**31 - 1)
-        requested = _requested(scene, capture, outputs=outputs, quality=quality)
+        requested = _capture_of(scene, capture, outputs=outputs, quality=quality)
 
-        def render_subset(pipeline: Pipeline, data: Any, view: View) -> Images:
+        def render_pixels(pipeline: Pipeline, data: Any, view: View) -> Images:
             return self.backend.render_every(pipeline, data, view, step, progress)
 
-        return self._render(self._resident(scene), requested, render_subset)
+        return self._render(self._resident(scene), requested, render_pixels)
 
     def render_band(
         self,
@@ -242,13 +245,14 @@ class Renderer:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
     ) -> Frame:
-        """Render rows of pixels [first, end), bit-identical to those of `render`; the other rows of the frame
-        are undefined. `fs.SeveralDevices` combines such frames.
+        """Render rows of pixels [first, end), bit-identical to those of `render`.
+
+        The other rows of the frame are undefined. `fs.SeveralDevices` combines bands of several devices.
 
         Raises:
             InputError: as `render`; rows outside the frame.
         """
-        requested = _requested(scene, capture, outputs=outputs, quality=quality)
+        requested = _capture_of(scene, capture, outputs=outputs, quality=quality)
         rows = requested.camera.height if requested.camera is not None else 0
         try:
             first, end = band
@@ -272,19 +276,20 @@ class Renderer:
         next frame while the caller uses the previous one. Arguments and errors: as `render` (a motion of the
         camera replaces each camera's pose); an error is raised after the frames of the captures before it.
         """
-        outputs = None if outputs is None else output_names(outputs)  # an iterator would end with the first
+        # once for all frames: the first would exhaust an iterator
+        outputs = None if outputs is None else output_names(outputs)
         background = parts.get("background")
         if background is not None:
             parts["background"] = background_of(background)
         try:
             rest = iter(captures)
         except TypeError:
-            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
+            raise invalid("captures", "a list of Capture or Camera", captures) from None
         resident = self._resident(scene)
-        requested = (_requested(scene, one, outputs=outputs, quality=quality, **parts) for one in rest)
+        requested = (_capture_of(scene, one, outputs=outputs, quality=quality, **parts) for one in rest)
         if isinstance(resident.data, Residency):
             requested = resident.data.prefetched(requested)
-        waiting: Frame | None = None
+        previous: Frame | None = None
         failure: Exception | None = None
         while True:
             try:
@@ -294,11 +299,11 @@ class Renderer:
             except Exception as error:
                 failure = error
                 break
-            if waiting is not None:
-                yield waiting
-            waiting = frame
-        if waiting is not None:
-            yield waiting
+            if previous is not None:
+                yield previous
+            previous = frame
+        if previous is not None:
+            yield previous
         if failure is not None:
             raise failure
 
@@ -313,11 +318,11 @@ class Renderer:
     ) -> FrameBatch:
         """Render many views of one cloud at once. View i is bit-identical to `render` of that view.
 
-        The exception are stores with `Quality.detail_error` above 0: the view with the highest demand
-        selects the levels of detail of all views.
+        Stores with `Quality.detail_error` above 0 are the exception: all views use the levels of detail of
+        the view that needs the finest.
 
         Args:
-            scene: splats to render; a ResidentCloud transfers none.
+            scene: splats to render; a ResidentCloud is not uploaded again.
             captures: one Capture or Camera for each view, of one size and the same effects; or one for all
                 views. A Camera is used with the scene's own capture, as in `render`.
             poses: (views, 7) float64, camera to world: x y z in metres and a quaternion w x y z of any length
@@ -337,8 +342,8 @@ class Renderer:
         try:
             each = list(given)
         except TypeError:
-            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
-        plain = [_requested(scene, one) for one in each]
+            raise invalid("captures", "a list of Capture or Camera", captures) from None
+        plain = [_capture_of(scene, one) for one in each]
         if any("error" in one.outputs for one in plain):
             raise InputError(
                 f"the output 'error' must be rendered one capture at a time, got a batch of {len(plain)}; "
@@ -370,7 +375,7 @@ class Renderer:
         check_process(self._process, "Renderer")
         if resident.backend is not self.backend:
             raise InputError(
-                "this cloud was uploaded by another Renderer; upload it with the one that renders it"
+                "this cloud was uploaded by another Renderer; render it with that one, or upload it again"
             )
         return resident
 
@@ -385,21 +390,22 @@ class Renderer:
         features, view = prepare(resident.complete, capture)
         if band is not None:
             view = _banded(view, band)
-        plan = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None
+        ideal = ideal_of(resident.data, capture, self.backend) if "error" in capture.outputs else None
         with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
             pipeline, data = self.backend.pipeline(features), resident.data
             if not isinstance(data, Residency):
                 error, images = None, render(pipeline, data, view)
-                if plan is not None:
-                    own = plan.view if band is None else _banded(plan.view, band)
-                    error = ErrorImage(images, render(self.backend.pipeline(plan.features), data, own), plan)
+                if ideal is not None:
+                    ideal_view = ideal.view if band is None else _banded(ideal.view, band)
+                    ideal_images = render(self.backend.pipeline(ideal.features), data, ideal_view)
+                    error = ErrorImage(images, ideal_images, ideal)
                 return Frame(images, capture, error=error)
 
-            def part(one: BandData) -> Frame:
-                images = one.images or render(pipeline, one.data, one.view)
-                return Frame(images, capture, one.ids)
+            def render_band(band: BandData) -> Frame:
+                images = band.images or render(pipeline, band.data, band.view)
+                return Frame(images, capture, band.ids)
 
-            return stacked(data.bands(view, features, capture.quality, pipeline), part)
+            return stack_bands(data.bands(view, features, capture.quality, pipeline), render_band)
 
 
 def _banded(view: View, band: tuple[int, int]) -> View:
@@ -407,16 +413,16 @@ def _banded(view: View, band: tuple[int, int]) -> View:
     return replace(view, band=(band[0] * view.samples, band[1] * view.samples))
 
 
-def _requested(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
-    """The given capture or the scene's own, with the given parts replaced.
+def _capture_of(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
+    """The given capture, or by default the scene's, with the given parts replaced.
 
     Raises:
-        InputError: an unknown part, one of the wrong kind, or no camera.
+        InputError: an unknown part, a part of the wrong type, or no camera.
     """
     if not isinstance(capture, Capture):
         if capture is not None:
             parts["camera"] = capture
-        capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _PLAIN
+        capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _DEFAULT_CAPTURE
     requested = capture.with_(**parts)
     if requested.camera is None:
         raise InputError(NO_CAMERA)

@@ -13,14 +13,16 @@ from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet
-from fidsplat.render.frame import Ids
+from fidsplat.render.frame import SceneIds
 from fidsplat.streaming.residency import Residency
 from fidsplat.util.errors import InputError
 
 
 class ResidentCloud:
-    """A cloud on a renderer's device; rendering it transfers no splat. Of stores, the chunks that a view
-    needs are copied to the device when it is rendered, and cached."""
+    """A cloud on a renderer's device, which is rendered without another upload.
+
+    Of a store, only the chunks that a view needs are uploaded, when it is rendered. The device caches them.
+    """
 
     def __init__(
         self,
@@ -31,9 +33,9 @@ class ResidentCloud:
     ) -> None:
         self.backend, self.data, self._labels = backend, data, labels
         self.complete: Any = data.scene if isinstance(data, Residency) else data
-        """all splats, in memory or in stores, for which captures are prepared"""
+        """the complete scene: splats on the device, or those of stores that are only partly on the device"""
         self.capture = capture
-        """capture of the uploaded scene, which `render` uses by default"""
+        """capture of the uploaded scene, the default of `render`"""
 
     def __len__(self) -> int:
         return self.data.count
@@ -56,9 +58,9 @@ class ResidentCloud:
 
     def gather(
         self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
-    ) -> tuple[Any, Ids]:
-        """The device splats for rendering these views, and their indices in the complete scene (None if equal
-        to their own)."""
+    ) -> tuple[Any, SceneIds]:
+        """Upload the splats that these views need; returns the device data and the scene indices of its
+        splats."""
         if isinstance(self.data, Residency):
             return self.data.gather(list(views), features, qualities)
         return self.data, None

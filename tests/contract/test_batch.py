@@ -117,7 +117,7 @@ def test_a_view_as_a_frame_and_a_batch_as_arrays(renderer, cloud):
     assert copy.views == batch.views == 3
     with pytest.raises(fs.InputError, match="view must be a number from 0 to 2, got 3"):
         batch.frame(3)
-    with pytest.raises(fs.InputError, match="no 'depth'; it was rendered with rgb"):
+    with pytest.raises(fs.InputError, match="must be one of rgb, got 'depth'"):
         batch["depth"]
 
 

@@ -13,7 +13,7 @@ from brute_force import ideal
 import fidsplat as fs
 from fidsplat.effects.catalogue import CATALOGUE
 from fidsplat.render import certified_error
-from fidsplat.render.certified_error import UNLISTED, ideal_of
+from fidsplat.render.certified_error import OMITTED, ideal_of
 from fidsplat.util.errors import InputError
 
 HAZE = fs.Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -114,8 +114,8 @@ def test_an_opacity_ceiling_is_counted(renderer):
 
 
 def test_float32_rounding_is_counted(renderer):
-    """Nothing is left out of this image but digits: more than resolving and unlisted fragments explain."""
-    quality = fs.Quality(lowpass="none", transmittance_stop=0.0, alpha_cutoff=UNLISTED, arithmetic="precise")
+    """Nothing is left out of this image but digits: more than resolving and omitted fragments explain."""
+    quality = fs.Quality(lowpass="none", transmittance_stop=0.0, alpha_cutoff=OMITTED, arithmetic="precise")
     frame, off = check(renderer, needle(), HAZE, quality)
     assert off.max() > 2e-5
     assert frame["error"].max() < 5e-3
@@ -172,9 +172,7 @@ def test_markers_are_composited_by_depth_in_float64(reference):
     assert off.max() > 1e-3
     assert (frame["error"] >= off - 2e-7).all()  # `want` is float32
     assert frame["error"].max() < 1.1 * off.max()
-    with pytest.raises(
-        InputError, match=r"'error' must.* warp:cpu bounds, got coplanar groups .*order='centre'"
-    ):
+    with pytest.raises(InputError, match=r"'error' must.* on warp:cpu, got coplanar groups .*order='centre'"):
         fs.Renderer("warp:cpu").render(cloud, camera, OUTPUTS)
 
 
@@ -264,9 +262,7 @@ def test_refusals_name_what_was_requested(cloud, parts, effect, remedy):
         "spheres": lambda: spheres(9, 0.1),
     }
     capture = fs.Capture(SMALL, OUTPUTS).with_(**parts)
-    with pytest.raises(
-        InputError, match=f"warp:cpu bounds, got {effect}.*; render with .*{remedy}"
-    ) as caught:
+    with pytest.raises(InputError, match=f"on warp:cpu, got {effect}.*; render with .*{remedy}") as caught:
         fs.Renderer("warp:cpu").render(clouds[cloud](), capture)
     assert not re.search("compose_|footprint_|lowpass_|camera_|ellipsoid_|shutter_|slot", str(caught.value))
 
@@ -275,7 +271,7 @@ def test_every_effect_without_a_bound_has_words():
     """Effects of the catalogue that a scene may request, outputs and steps of sensors left out."""
     kinds = ("camera", "color", "ellipsoid", "lowpass", "compose", "footprint", "background", "shutter")
     names = {name for name in CATALOGUE if name.startswith(kinds)} | {"external_depth", "blend_double"}
-    words = {name: certified_error._requested(name)[0] for name in names - certified_error._BOUNDED}
+    words = {name: certified_error._option_of(name)[0] for name in names - certified_error._BOUNDED}
     assert {name for name, said in words.items() if said == name} == set()
 
 

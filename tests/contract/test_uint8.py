@@ -90,5 +90,5 @@ def test_the_reference_and_cached_frames_convert_on_the_host(reference):
 
 def test_a_frame_without_rgb_says_so(reference):
     camera = fs.Camera.look_at(9, 7, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
-    with pytest.raises(MissingOutputError, match="no 'rgb'"):
+    with pytest.raises(MissingOutputError, match="got 'rgb'"):
         reference.render(CLOUD, camera, outputs="depth").to_uint8()

@@ -19,7 +19,7 @@ from fidsplat.experiments.sweep import read_records
 from fidsplat.formats import load_splats, save_splats
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.images.files import read_image, read_images, write_png
-from fidsplat.render.gallery import Piece, write_gallery
+from fidsplat.render.gallery import GalleryScene, write_gallery
 from fidsplat.scenes.random_clouds import random_splats
 from fidsplat.sim import read_description
 from fidsplat.store.build import build_store
@@ -281,8 +281,8 @@ def test_pages_and_charts_of_names_that_are_not_utf8(tmp_path):
         bars(axes, [ODD, "a$\\frac$"], {ODD: [1, 2], "b": [2, 3]})
     assert "$x$" in (tmp_path / f"{ODD}.svg").read_text()
     camera = fs.Camera.look_at(8, 6, 1.0, (0, 0, -1), (0, 0, 0))
-    piece = Piece(ODD, ODD, fs.Scene([CLOUD], camera=camera), "")
-    *_, page = write_gallery(tmp_path / ODD, [piece], "reference")
+    entry = GalleryScene(ODD, ODD, fs.Scene([CLOUD], camera=camera), "")
+    *_, page = write_gallery(tmp_path / ODD, [entry], "reference")
     assert "a%FF%24x%24-rgb" in page.read_text()
 
 
