@@ -187,6 +187,7 @@ def soak(minutes: float, devices: list[str]) -> dict[str, float]:
                 status.update(
                     f"{spent / 60:.1f} min, {seed} frames, {memory[-1][1] / 2**20:.0f} MiB, {wrong} wrong"
                 )
+    memory.append((spent, _resident_bytes()))
     early, late = levels(memory, 60 * minutes)
     return {
         "minutes": round(minutes, 1),

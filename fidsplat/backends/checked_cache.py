@@ -3,7 +3,7 @@
 A damaged file crashes the driver, or changes what it computes. Before a driver first loads kernels, files
 that differ from their checksum are removed, and the driver compiles them again. When the process ends, the
 checksums of new files are recorded. A file without a checksum, of a process that was killed, is checked by
-its format alone.
+its format alone. If the record is damaged, all files are removed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
 
 _RECORD = "fidsplat-checksums.json"
+_CHECKSUM = "crc"
+"""key of the record's own checksum"""
 _watched: set[Path] = set()
 
 Entry = list[int]
@@ -48,25 +50,27 @@ def remove_damaged(folder: Path, is_loaded: Callable[[str], bool], is_whole: Cal
         is_loaded: whether the driver loads files of a name; others are not touched.
         is_whole: whether a file without a checksum is complete.
     """
-    known, valid, removed = _read(folder), {}, 0
+    record, valid, removed = _read(folder), {}, 0
+    known = record or {}
     for file in _loaded(folder, is_loaded):
         with suppress(OSError):  # another process may remove files too
             key, state, entry = file.path[len(str(folder)) + 1 :], file.stat(follow_symlinks=False), None
-            if stat.S_ISREG(state.st_mode) and (key in known or is_whole(Path(file))):
+            trusted = key in known or (record is not None and is_whole(Path(file)))
+            if stat.S_ISREG(state.st_mode) and trusted:
                 entry = _current(file.path, state, known.get(key))
             if entry is not None:
                 valid[key] = entry
             else:
                 _remove(file.path, state)
                 removed += 1
-    if valid != known:
+    if valid != record:
         _write(folder, valid)
     return removed
 
 
 def record_new(folder: Path, is_loaded: Callable[[str], bool]) -> None:
     """Record the checksums of files that have none yet."""
-    known, new = _read(folder), {}
+    known, new = _read(folder) or {}, {}
     for file in _loaded(folder, is_loaded):
         key = file.path[len(str(folder)) + 1 :]
         if key not in known and file.is_file(follow_symlinks=False):
@@ -104,22 +108,29 @@ def _remove(path: str | Path, state: os.stat_result) -> None:
         os.unlink(path)
 
 
-def _read(folder: Path) -> dict[str, Entry]:
-    """The recorded entries; none where the record is missing or damaged."""
+def _read(folder: Path) -> dict[str, Entry] | None:
+    """The recorded entries; empty without a record, None if it is damaged."""
     path = folder / _RECORD
-    with suppress(OSError):
+    try:
         state = path.lstat()
         if not stat.S_ISREG(state.st_mode):
             _remove(path, state)
-    try:
+            return None
         record = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except OSError:
         return {}
+    except ValueError:
+        return None
     if not isinstance(record, dict):
-        return {}
-    return {key: entry for key, entry in record.items() if isinstance(entry, list) and len(entry) == 4}
+        return None
+    entries = {key: entry for key, entry in record.items() if isinstance(entry, list) and len(entry) == 4}
+    return entries if record.get(_CHECKSUM, _checksum(entries)) == _checksum(entries) else None
 
 
 def _write(folder: Path, entries: dict[str, Entry]) -> None:
     with suppress(InputError), atomic_write(folder / _RECORD) as stream:  # a folder that is read-only
-        stream.write(json.dumps(entries).encode())
+        stream.write(json.dumps({**entries, _CHECKSUM: _checksum(entries)}).encode())
+
+
+def _checksum(entries: dict[str, Entry]) -> int:
+    return zlib.crc32(json.dumps(entries, sort_keys=True).encode())

@@ -161,7 +161,7 @@ def _camera(what: str, given: dict, image: np.ndarray, camera_to_world: np.ndarr
 
 def _lens(given: dict) -> Lens:
     model = given.get("camera_model", "OPENCV_FISHEYE" if given.get("is_fisheye") else "PINHOLE")
-    if model not in _LENSES:
+    if not isinstance(model, str) or model not in _LENSES:
         raise InputError(
             f"camera_model must be one of {', '.join(_LENSES)}, got {model!r}; undistort the images first"
         )

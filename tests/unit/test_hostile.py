@@ -467,6 +467,15 @@ def test_numbers_of_sog_beyond_float32(tmp_path, part, key, value):
         use_splats(file)
 
 
+@pytest.mark.parametrize("value", [[], {}, 5, None])
+def test_a_camera_model_that_is_no_text(tmp_path, value):
+    views(tmp_path)
+    said = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").write_text(json.dumps(said | {"camera_model": value}))
+    with limits(), pytest.raises(fs.InputError, match="camera_model must be one of"):
+        use_views(tmp_path)
+
+
 @pytest.mark.parametrize("link", [False, True])
 def test_views_that_repeat_one_image(tmp_path, link):
     """Each would be a copy in memory."""

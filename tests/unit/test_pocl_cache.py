@@ -150,20 +150,33 @@ def test_kernels_of_warp_are_checked_too(tmp_path):
     assert all(path.is_file() for path in folder.rglob("*.meta"))
 
 
-def test_a_damaged_record_of_checksums_is_regenerated(full_cache, tmp_path):
-    folder = tmp_path / "cache"
-    shutil.copytree(full_cache[0], folder)
-    record, files = folder / "fidsplat-checksums.json", compiled(folder)
-    for damage in (
+def flip_an_entry(path):
+    """A digit of a checksum, in JSON that stays valid."""
+    text = path.read_text()
+    at = text.index("[") + 1
+    path.write_text(text[:at] + ("1" if text[at] == "2" else "2") + text[at + 1 :])
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
         put_a_fifo,
         put_a_folder,
+        flip_an_entry,
         lambda path: path.write_text("[1"),
         lambda path: path.write_text("{"),
-    ):
-        damage(record)
-        assert remove_damaged(folder, is_loaded, is_whole) == 0
-        assert record.is_file()
-    assert compiled(folder) == files
+    ],
+)
+def test_files_of_a_damaged_record_of_checksums_are_removed(full_cache, tmp_path, damage):
+    """Whether their bits are flipped too cannot be seen."""
+    folder = tmp_path / "cache"
+    shutil.copytree(full_cache[0], folder)
+    count = sum(is_loaded(path.name) for path in folder.rglob("*"))
+    damage(folder / "fidsplat-checksums.json")
+    assert remove_damaged(folder, is_loaded, is_whole) == count
+    assert compiled(folder) == []
+    assert (folder / "fidsplat-checksums.json").read_text().startswith('{"crc"')
+    assert remove_damaged(folder, is_loaded, is_whole) == 0
 
 
 def test_new_files_get_a_checksum_when_the_process_ends(tmp_path):
