@@ -121,10 +121,11 @@ def run_command(words: list[str], line: str, page: str) -> None:
 
 
 def save_city(name: str):
-    """Save a row of splats in front of the camera, as a PLY file or a store."""
-    places = np.stack([np.linspace(-1, 1, 20), np.zeros(20), np.full(20, 3.0)], 1)
-    row = fs.SplatCloud(places, np.tile([1.0, 0, 0, 0], (20, 1)), np.full((20, 2), 0.1), np.full(20, 0.9),
-                        colors=np.full((20, 3), 0.5))  # fmt: skip
+    """Save a row of splats in front of the camera, as a PLY file or a store with levels of detail."""
+    n = 300
+    places = np.stack([np.linspace(-1, 1, n), np.zeros(n), np.full(n, 3.0)], 1)
+    row = fs.SplatCloud(places, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 2), 0.1), np.full(n, 0.9),
+                        colors=np.full((n, 3), 0.5))  # fmt: skip
     if name.endswith(".ply"):
         fs.save_ply(row, name)
     else:

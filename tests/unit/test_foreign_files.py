@@ -207,10 +207,12 @@ def test_links_of_a_robot_are_where_mujoco_has_them(tmp_path):
 
 
 def test_the_middle_of_an_image_is_the_principal_point_that_is_left_out(tmp_path):
-    write_png(tmp_path / "a.png", np.zeros((14, 21)))
+    for name in ("a.png", "b.png"):
+        write_png(tmp_path / name, np.zeros((14, 21)))
     matrix = rigid_matrix(MOVE, TURN)
     frame = {"file_path": "a.png", "transform_matrix": matrix.tolist(), "fl_x": 30.0, "fl_y": 40.0}
-    other = frame | {"cx": 9.0, "cy": 8.5, "transform_matrix": rigid_matrix((0, 0, 0), TURN).tolist()}
+    other = frame | {"file_path": "b.png", "cx": 9.0, "cy": 8.5}
+    other["transform_matrix"] = rigid_matrix((0, 0, 0), TURN).tolist()
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame, other]}))
     views = load_dataset(tmp_path, hold_out=0, random_points=5).views
     assert [(v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy) for v in views] == [
@@ -220,3 +222,20 @@ def test_the_middle_of_an_image_is_the_principal_point_that_is_left_out(tmp_path
     # 2 m before the camera, which looks along its -z
     ahead = (matrix @ [0, 0, -2, 1])[:3]
     np.testing.assert_allclose(views[0].camera.project([ahead]), [[10.5, 7]], atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [(21, 14), (14, 21)])
+def test_the_angle_of_a_camera_is_that_of_the_width(tmp_path, size):
+    """In images that are not square, as Blender and nerfstudio write it."""
+    width, height = size
+    frames = []
+    for k in range(2):
+        write_png(tmp_path / f"{k}.png", np.full((height, width), 50 * k))
+        matrix = rigid_matrix((k, 0.2, 0.5), TURN).tolist()
+        frames.append({"file_path": f"{k}.png", "transform_matrix": matrix})
+    found = {"camera_angle_x": 0.8, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(found))
+    for view in load_dataset(tmp_path, hold_out=0, random_points=5).views:
+        focal = width / 2 / np.tan(0.4)
+        np.testing.assert_allclose([view.camera.fx, view.camera.fy], focal)
+        assert (view.camera.width, view.camera.height) == size

@@ -304,3 +304,13 @@ def test_rays_of_a_raster_go_through_the_centres_of_its_samples(camera):
         row, column = np.nonzero(seen)
         np.testing.assert_allclose(back[:, 0], column + 0.5, atol=1e-4)
         np.testing.assert_allclose(back[:, 1], row + rows.top + 0.5, atol=1e-4)
+
+
+SIDES = {(90, 70): 32, (20, 64): 32, (63, 9): 16, (1500, 4): 512}
+
+
+@pytest.mark.parametrize("size", SIDES)
+def test_maps_have_a_cell_for_two_pixels_of_the_longer_side(size):
+    """The largest power of two, `CELLS` at most: with fewer cells bounds are loose and binning is slow."""
+    raster = RayRaster(Fisheye(), *size, 60.0, 60.0, size[0] / 2, size[1] / 2)
+    assert raster.map[1][4] == SIDES[size]
