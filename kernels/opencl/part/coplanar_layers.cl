@@ -62,7 +62,7 @@ static inline Layer no_layer(void) {
     pixel->layers = 0;
 //@ lanes_start
     Layers layers[BLOCKS];
-    if (!empty && splats[lists[starts[tile] - base]].group >= 0)
+    if (starts[tile] < starts[tile + 1] && splats[lists[starts[tile] - base]].group >= 0)
         for (int block = 0; block < BLOCKS; block++) layers_start(&pixels[block], layers + block);
     float layer_depths[BLOCKS + LANES] __attribute__((aligned(64)));   // of each block: behind them no fragment belongs to this pass
     const float *until = 0;                                 // these depths, once all layers are complete
