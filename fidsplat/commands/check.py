@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fidsplat.render.renderer import Renderer
-    from fidsplat.selftest.arithmetic import Arithmetic
-    from fidsplat.selftest.check import CaseResult, CheckResult
+    from fidsplat.selftest.check import CheckResult
     from fidsplat.selftest.fuzz import FuzzState
 
 
@@ -79,6 +78,7 @@ class Check:
 
     def _digests(self, renderer: "Renderer", where: "Console") -> int:
         from fidsplat.selftest import digests
+        from fidsplat.selftest.tables import digest_table
 
         expected = digests.read_table()
         found: dict[int, digests.Digest] = {}
@@ -106,20 +106,7 @@ class Check:
             name, passed = renderer.device.name, not differing
             print_json({"device": name, "passed": passed, "sha256": sums, "differing": details})
         else:
-            rows = [
-                (
-                    kind.name,
-                    f"{sum(seed not in differing for seed in own)} of {len(own)}",
-                    ", ".join(
-                        n for n in digests.OUTPUTS if any(n in differing.get(seed, ()) for seed in own)
-                    ),
-                    " ".join(str(seed) for seed in own if seed in differing),
-                )
-                for kind in digests.KINDS
-                if (own := [seed for seed in found if digests.kind_of(seed) is kind])
-            ]
-            heads = ("scenes", "identical", "outputs that differ", "seeds")
-            print_table(where, f"Digests on {renderer.device.title}", heads, rows)
+            print_table(where, *digest_table(found, differing, renderer.device.title))
             print_lines(where, f"{len(found) - len(differing)} of {len(found)} scenes are bit-identical")
         return 1 if differing else 0
 
@@ -139,63 +126,27 @@ class Check:
 
 
 def _print(result: "CheckResult", where: "Console") -> None:
-    from fidsplat.selftest.agreement import COLOR_TOLERANCE, DEPTH_TOLERANCE
+    from fidsplat.selftest.tables import arithmetic_table, case_table
 
     device = result.device
-    if result.arithmetic is not None:
-        facts = result.arithmetic
-        heads = ("function", "error [ulp]", "bound", "")
-        print_table(where, f"Arithmetic of {device.title}", heads, _ulps(facts))
-        denormals = "kept" if facts.denormals else "flushed to 0"
+    if (facts := result.arithmetic) is not None:
+        print_table(where, *arithmetic_table(facts, device.title))
+        denormals = "preserved" if facts.denormals else "flushed to 0"
         print_lines(
             where, f"float64: {'yes' if facts.float64 else 'no'}; float32 below 1.2e-38: {denormals}\n"
         )
     print_lines(where, f"Hard cases on {device.title}, {device.version}")
-    heads = ("group", "cases", "images", "colour", "uncertified", "depth", "uncertified", "verdict")
-    bounds = ("bound", "", "", "", f"{COLOR_TOLERANCE:.0e}", "", f"{DEPTH_TOLERANCE:.0e}", "")
-    print_table(where, "Largest errors", heads, [bounds, *(_row(*group) for group in result.groups.items())])
+    print_table(where, *case_table(result))
     print_lines(where, *(f"failed: {words}" for words in result.failures))
     wrong = len(result.failures)
     verdict = f"{several(wrong, 'checks')} failed" if wrong else "all checks passed"
     print_lines(where, f"{verdict}; {result.seconds:.0f} s")
 
 
-def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
-    from fidsplat.selftest.arithmetic import BOUNDS
-
-    rows = []
-    for name, ulp in facts.ulp.items():
-        bound = BOUNDS[name]
-        rows.append((name, f"{ulp:.2f}", f"{bound:g}", "ok" if ulp <= bound * 1.001 else "too large"))
-    return rows
-
-
-def _row(letter: str, results: "list[CaseResult]") -> tuple[str, ...]:
-    from fidsplat.selftest.catalogue import GROUPS
-    from fidsplat.selftest.check import rank_of
-
-    cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(one.frames for one in results))]
-    for outputs in (("rgb", "alpha"), ("depth",)):
-        for errors in ("largest", "uncertified"):
-            found = [getattr(one, errors) for one in results]
-            values = [one[name] for one in found for name in outputs if name in one]
-            cells.append(f"{max(values, key=rank_of):.0e}" if values else "-")
-    return (*cells, "ok" if all(one.passed for one in results) else "failed")
-
-
 def _print_fuzz(state: "FuzzState", renderer: "Renderer", where: "Console") -> None:
-    rows = [
-        (
-            name,
-            f"{state.uncertified[name][0]:.1e}",
-            str(state.uncertified[name][1]),
-            f"{state.largest[name][0]:.1e}",
-            str(state.largest[name][1]),
-        )
-        for name in state.largest
-    ]
-    heads = ("output", "error beyond the certificate", "seed", "error", "seed")
-    print_table(where, f"Largest errors of random scenes on {renderer.device.title}", heads, rows)
+    from fidsplat.selftest.tables import fuzz_table
+
+    print_table(where, *fuzz_table(state, renderer.device.title))
     print_lines(
         where,
         f"{state.splats:,} splats in {state.scenes:,} scenes, {state.pixels:,} pixels, "

@@ -1,0 +1,67 @@
+"""Tables of self-tests: title, heads and rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from fidsplat.selftest import digests
+from fidsplat.selftest.agreement import COLOR_TOLERANCE, DEPTH_TOLERANCE
+from fidsplat.selftest.arithmetic import BOUNDS, Arithmetic
+from fidsplat.selftest.catalogue import GROUPS
+from fidsplat.selftest.check import CaseResult, CheckResult, rank_of
+from fidsplat.selftest.fuzz import FuzzState
+
+Table = tuple[str, Sequence[str], Iterable[Sequence[object]]]
+
+
+def arithmetic_table(facts: Arithmetic, device: str) -> Table:
+    """Errors of the device's functions next to their bounds."""
+    rows = [
+        (name, f"{ulp:.2f}", f"{BOUNDS[name]:g}", "ok" if ulp <= BOUNDS[name] * 1.001 else "too large")
+        for name, ulp in facts.ulp.items()
+    ]
+    return f"Arithmetic of {device}", ("function", "error [ulp]", "bound", ""), rows
+
+
+def case_table(result: CheckResult) -> Table:
+    """Largest errors of each group of hard cases, next to their bounds."""
+    heads = ("group", "cases", "images", "colour", "uncertified", "depth", "uncertified", "verdict")
+    bounds = ("bound", "", "", "", f"{COLOR_TOLERANCE:.0e}", "", f"{DEPTH_TOLERANCE:.0e}", "")
+    return "Largest errors", heads, [bounds, *(_case_row(*group) for group in result.groups.items())]
+
+
+def _case_row(letter: str, results: list[CaseResult]) -> tuple[str, ...]:
+    cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(one.frames for one in results))]
+    for outputs in (("rgb", "alpha"), ("depth",)):
+        for errors in ("largest", "uncertified"):
+            found = [getattr(one, errors) for one in results]
+            values = [one[name] for one in found for name in outputs if name in one]
+            cells.append(f"{max(values, key=rank_of):.0e}" if values else "-")
+    return (*cells, "ok" if all(one.passed for one in results) else "failed")
+
+
+def digest_table(seeds: Iterable[int], differing: Mapping[int, Sequence[str]], device: str) -> Table:
+    """Bit-identical scenes of each kind. differing: outputs by the seeds of scenes that are not."""
+    own = {kind: [seed for seed in seeds if digests.kind_of(seed) is kind] for kind in digests.KINDS}
+    rows = [
+        (
+            kind.name,
+            f"{sum(seed not in differing for seed in own[kind])} of {len(own[kind])}",
+            ", ".join(n for n in digests.OUTPUTS if any(n in differing.get(seed, ()) for seed in own[kind])),
+            " ".join(str(seed) for seed in own[kind] if seed in differing),
+        )
+        for kind in digests.KINDS
+        if own[kind]
+    ]
+    return f"Digests on {device}", ("scenes", "identical", "outputs that differ", "seeds"), rows
+
+
+def fuzz_table(state: FuzzState, device: str) -> Table:
+    """Largest errors of random scenes with their seeds."""
+    rows = [
+        (name, *(cell for error, seed in pair for cell in (f"{error:.1e}", str(seed))))
+        for name in state.largest
+        for pair in [(state.uncertified[name], state.largest[name])]
+    ]
+    heads = ("output", "error beyond the certificate", "seed", "error", "seed")
+    return f"Largest errors of random scenes on {device}", heads, rows
