@@ -144,6 +144,16 @@ def test_times_within_the_noise_of_the_base_do_not_differ():
     assert found.verdict(found.at("hard", "samples", "2"), base) == "no difference"
 
 
+def test_a_time_at_the_limit_of_the_noise_does_not_differ():
+    records = plain_records("hard")
+    records[0].result["ratio_quartiles"] = [0.8, 1.25]
+    found = device(records)
+    assert found.noise("hard") == 0.25
+    base = found.at("hard", "base", "base")
+    assert found.verdict(found.at("hard", "alpha_cutoff", "1/1024"), base) == "more accurate"
+    assert found.verdict(found.at("hard", "alpha_cutoff", "0.0001"), base) == "slower, more accurate"
+
+
 def test_what_was_measured_twice_shows_the_noise():
     records = plain_records("hard")
     assert device(records).noise("hard") == 0.02
