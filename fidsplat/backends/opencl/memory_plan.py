@@ -169,7 +169,7 @@ def plan_of(
     chunk = CHUNK
     while chunk < _LARGE and chunk * (each + upload_bytes) < free // 64:
         chunk *= 2
-    while chunk > _MINIMUM and (chunk * (each + upload_bytes) > free // 4 or chunk > 2 * count):
+    while chunk > _MINIMUM and (chunk * (each + upload_bytes) > free // 8 or chunk > 2 * count):
         chunk //= 2
     capacity = (free - chunk * (each + upload_bytes)) // (each + SORTED)
     capacity = min(capacity, largest // record_bytes, count)
