@@ -146,8 +146,8 @@ class MeasureSettings(SweepSettings):
 class RenderSettings(MarkerSettings):
     """Device and rendering methods of an experiment."""
 
-    device: str = "opencl"
-    """Device that renders; see `fidsplat devices`."""
+    device: str | None = None
+    """D: device; see `fidsplat devices` (default: FIDSPLAT_DEVICE, or auto)"""
     mixture: tuple[str, ...] = ()
     """Mixture of Gaussians. By default all; repeat for several."""
     trained: Path | None = None

@@ -249,3 +249,10 @@ def test_images_of_another_seed_are_not_the_truth(capsys, tmp_path):
         record_images(tmp_path / "b", "raw", 0, 64)
     assert check_images(tmp_path / "b", "raw", 0) == {"seed": 0, "samples": 16}
     assert check_images(tmp_path / "b", "standard", 3) == {}
+
+
+def test_experiments_follow_the_environment_variable_of_devices(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("FIDSPLAT_DEVICE", "nonsense")
+    status, _, err = run(capsys, "localisation", "--quick", *SMALL, "-o", tmp_path)
+    assert status == 2
+    assert "unknown device 'nonsense'" in err
