@@ -63,7 +63,7 @@ def _shown_default(value: str) -> str:
 
 @rules.primitive_rule
 def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """An optional value: help shows neither `{None}` nor a default of None."""
+    """tyro's rule for options of type `T | None`: help shows neither `{None}` nor a default of None."""
     kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
     if get_origin(info.type) not in (Union, UnionType) or len(kinds) != 1:
         return None

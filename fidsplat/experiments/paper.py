@@ -1,4 +1,4 @@
-"""The paper's own figures (Tabaa and Di Caro, tables 2 to 4)."""
+"""Results of the paper (Tabaa and Di Caro, tables 2 to 4)."""
 
 TRAINING_SECONDS = {3: 423.0, 5: 392.0, 9: 386.0, 17: 371.0}
 """table 2: mean training time of 2DGS by number of views"""

@@ -48,7 +48,7 @@ def _matching(
         single = np.flatnonzero(alone_left | (np.bincount(right, minlength=n_right)[right] == 1))
         if not len(single):
             break
-        # one of the leaves of a vertex is matched to it
+        # Karp-Sipser reduction: match a vertex to one of its neighbours of degree 1
         shared = np.where(alone_left, right + n_left, left)[single]
         matched = single[np.unique(shared, return_index=True)[1]]
         of_left[left[matched]], of_right[right[matched]] = right[matched], left[matched]

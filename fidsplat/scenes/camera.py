@@ -148,7 +148,7 @@ def keyframe_tables(motion: Any, who: str, camera: bool = False) -> list[dict]:
         )
     if motion.smooth:
         raise InputError(
-            f"the motion of {who} must be piecewise screw motion to be saved, got a smooth one; sample it: "
+            f"the motion of {who} must have smooth=False to be saved, got smooth=True; sample it: "
             "motion.sampled(30)"
         )
     tables = []

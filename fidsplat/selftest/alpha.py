@@ -1,4 +1,4 @@
-"""Group D: opacity, transmittance, depth outputs, colours and background."""
+"""Self-test group D: opacity, transmittance, depth outputs, colours and background."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Group F: the device's arithmetic in ulp over the ranges that rendering uses; barriers, sorting."""
+"""Self-test group F: device arithmetic in ulp over the ranges that rendering uses; barriers, sorting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Group A: screen-space bounds, the near plane, and splats behind the camera."""
+"""Self-test group A: screen-space bounds, the near plane, and splats behind the camera."""
 
 from __future__ import annotations
 

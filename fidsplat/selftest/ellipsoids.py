@@ -1,4 +1,4 @@
-"""Group G: 3D Gaussians (docs/primitives.md)."""
+"""Self-test group G: 3D Gaussians (docs/primitives.md)."""
 
 from __future__ import annotations
 

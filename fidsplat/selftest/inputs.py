@@ -1,4 +1,4 @@
-"""Group E: broken and extreme inputs, image sizes, integer ranges, unwritten memory."""
+"""Self-test group E: broken and extreme inputs, image sizes, integer ranges, unwritten memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Group B: arithmetic of the ray-splat intersection."""
+"""Self-test group B: arithmetic of the ray-splat intersection."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Group C: depth order, ties, sort keys, and invariance under reordering."""
+"""Self-test group C: depth order, ties, sort keys, and invariance under reordering."""
 
 from __future__ import annotations
 

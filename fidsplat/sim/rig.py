@@ -157,7 +157,7 @@ class Rig:
         return RigImages(self, batches, given, poses)
 
     def outputs_of(self, camera: str) -> tuple[str, ...]:
-        """Names of a camera's output images if `render` has no `outputs`."""
+        """Names of a camera's output images, when `render` is called without `outputs`."""
         _known("camera", camera, self.cameras)
         return self.cameras[camera].outputs or self._capture.outputs
 

@@ -230,7 +230,7 @@ def group_offsets(largest: Sequence[int]) -> list[int]:
         free += last + 1
         if free > 2**31:
             raise InputError(
-                f"coplanar group ids of all clouds of a scene must be below 2^31 together, got up to {last}; "
-                "number the groups from 0"
+                f"clouds of a scene must have fewer than 2^31 coplanar groups in total, got id {last}; "
+                "number the groups of each cloud from 0"
             )
     return offsets

@@ -102,7 +102,7 @@ class BuildPlan:
 
     @property
     def rows(self) -> int:
-        """Rows of all inputs."""
+        """Number of rows of all inputs."""
         return sum(source.rows.count for source in self.sources)
 
     @cached_property

@@ -79,10 +79,12 @@ class Store(Summarised):
             rows = self._rows(own.pinned, own.splats, None)
             if wrong := _unrenderable(rows):
                 raise InputError(
-                    f"{self._folder} must have coplanar splats that can be rendered, got {wrong}"
+                    f"coplanar splats of {self._folder} must be valid, got {wrong}; build the store again"
                 )
             if (rows["coplanar_groups"] < 0).any():
-                raise InputError(f"{self._folder} must have coplanar splats with group ids of at least 0")
+                raise InputError(
+                    f"coplanar group ids of {self._folder} must be at least 0; build the store again"
+                )
 
     def __reduce__(self):
         return Store, (str(self.path.absolute()),)

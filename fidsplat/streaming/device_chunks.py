@@ -14,7 +14,7 @@ from fidsplat.store.store import Store
 
 
 class DeviceChunks(ChunkedScene):
-    """Chunks of a scene for a device, with the traits of the complete scene."""
+    """Chunks of a scene for a device's chunk cache, and the properties of the complete scene."""
 
     def __init__(self, scene: ChunkedSplats) -> None:
         self.scene, self.origin = scene, scene.origin

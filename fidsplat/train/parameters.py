@@ -107,7 +107,7 @@ class Splats:
         means, sh = values["means"][:], values["sh"][:, coefficients]
         return SplatCloud.of_checked(
             means if shared else means.copy(),
-            values["quats"].copy(),  # which are normalised in place
+            values["quats"].copy(),  # since SplatCloud normalises them in place
             self.scales,
             self.opacities,
             np.ascontiguousarray(sh) if shared else sh.copy(),

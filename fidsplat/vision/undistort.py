@@ -77,7 +77,7 @@ def undistort_masked(image: np.ndarray, camera: Camera, mask: np.ndarray) -> tup
 def _sample_positions(
     width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens
 ) -> np.ndarray:
-    """Positions x, y (2, h, w) float32 in the lens's image of each pixel of a pinhole."""
+    """Remap table for undistortion, (2, h, w) float32: x and y in the distorted image."""
     at = np.empty((2, height, width), np.float32)
     rays = np.stack([(np.arange(width) + 0.5 - cx) / fx, np.empty(width), np.ones(width)], axis=1)
     for row in range(height):  # in parts: photographs have millions of pixels

@@ -42,9 +42,9 @@ static inline vfloat attenuate(Pixel *pixel, vfloat opacity, vint mask, const Bl
     return composited;
 }
 
-typedef struct {            // gradient of the loss by one pixel
-    vfloat r, g, b;         // by the colour
-    vfloat behind;          // B above
+typedef struct {            // gradient of the loss with respect to one pixel
+    vfloat r, g, b;         // of the colour
+    vfloat behind;          // B_k of the recursion at the top of this file
 //@@ pixel_gradient
 } PixelGradient;
 

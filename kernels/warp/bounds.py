@@ -129,13 +129,13 @@ def make_bounds(screen: bool) -> SimpleNamespace:
 
     @wp.func
     def tile_rows(b: Bounds, view: View):
-        """First and last row of tiles, last excluded."""
+        """Rows of tiles [first, end)."""
         first, end = rows(b, view.height)
         return first / view.tile_h, (end + view.tile_h - 1) / view.tile_h
 
     @wp.func
     def tile_span(b: Bounds, row: int, view: View):
-        """First and last tile, last excluded, of a row of tiles. Counting and listing both ask here, so they
+        """Tiles [first, end) of a row of tiles. Counting and listing both call this function, so that they
         agree.
         """
         y0 = row * view.tile_h

@@ -15,7 +15,7 @@ from .records import BOXES, Layout
 from .splat import make_splat
 
 HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
-"""where a splat is 1/255 of its opacity"""
+"""half the squared distance at which a splat has 1/255 of its opacity"""
 
 
 @cache
@@ -47,7 +47,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
 
     @wp.func
     def column(form: wp.vec4, x: float) -> float:
-        """The part of an affine form that does not change along a column of samples."""
+        """The part of an affine form that is constant along a column of samples."""
         return fma(form[1], x, form[0])
 
     @wp.func
@@ -61,13 +61,17 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
 
     @wp.func
     def cross(s: Splat, column_u: float, column_v: float, column_d: float, x: float, y: float, view: View):
-        """x, y: the sample from the anchor; column_*: `column` of the three forms at x."""
+        """Intersection of a pinhole ray with a splat.
+
+        x, y: the sample, relative to the splat's anchor. column_*: `column` of the affine forms n_u, n_v and
+        D at x.
+        """
         nu, nv, d = fma(s.u[2], y, column_u), fma(s.v[2], y, column_v), fma(s.d[2], y, column_d)
         return meet(s, nu, nv, d, x, y, view)
 
     @wp.func
     def forms_of(s: Splat, ray: wp.vec3) -> wp.vec3:
-        """n_u, n_v and D of a ray."""
+        """The forms n_u, n_v and D of a ray."""
         r = ray - s.origin
         return wp.vec3(
             fma(s.w[0], r[2], fma(s.u[2], r[1], fma(s.u[1], r[0], s.u[0]))),
@@ -77,15 +81,15 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
 
     @wp.func
     def cross_ray(s: Splat, ray: wp.vec3, x: float, y: float, view: View):
-        """The same for the sample that has this ray."""
+        """Intersection of any ray with a splat. x, y: its sample, relative to the splat's anchor."""
         n = forms_of(s, ray)
         c = meet(s, n[0], n[1], n[2], x, y, view)
-        c.contributes = c.contributes and n[2] == n[2]  # nothing is seen without a ray
+        c.contributes = c.contributes and n[2] == n[2]  # NaN: the sample has no ray
         return c
 
     @wp.func
     def cross_slopes(s: Splat, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
-        """The same where there are boxes, with the ray's derivatives."""
+        """Intersection of a ray with a splat or a box. slopes: derivatives of the ray, for edges of boxes."""
         c = cross_ray(s, ray, x, y, view)
         if is_box(s):
             n, of_d = forms_of(s, ray), wp.vec3(s.d[1], s.d[2], s.w[2])

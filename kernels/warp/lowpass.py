@@ -7,24 +7,25 @@ import warp as wp
 
 @cache
 def make_filter(real):
-    """widened(a, b, by_x, by_y, by_depth): how a Gaussian with scaled tangents a, b is filtered, with
-    gradients by the point at its centre of the sample's column and row and of the logarithm of the depth
-    (slopes.py).
+    """widened(a, b, by_x, by_y, by_depth): low-pass filter of a Gaussian with scaled tangents a, b.
 
-    What a sample sees is a Gaussian about its ray, with a standard deviation of s = 1/2 samples across and of
-    an eighth of the depth along it. G, 3 x 2, is the derivative by (u, v) at the centre of what the two are
-    in samples, so it has the covariance s^2 (G^T G)^-1 in (u, v), and the filtered one has
-    C = 1 + s^2 (G^T G)^-1 there: with L L^T = C its tangents are (a, b) L, and its area grows by sqrt(det C).
+    by_x, by_y, by_depth: gradients with respect to the point, at the centre, of the sample's column, of its
+    row and of the logarithm of the depth (slopes.py).
+
+    The footprint of a sample is a Gaussian around its ray, with a standard deviation of s = 1/2 samples
+    across the ray and of an eighth of the depth along it. G, 3 x 2, is the derivative of column, row and
+    scaled logarithm of the depth with respect to (u, v) at the centre. The footprint thus has the covariance
+    s^2 (G^T G)^-1 in (u, v), and the filtered Gaussian C = 1 + s^2 (G^T G)^-1. With the Cholesky factor
+    L L^T = C, the tangents of the filtered Gaussian are (a, b) L, and its area is sqrt(det C) times as large.
     """
     vec3, vec4 = (wp.types.vector(n, real) for n in (3, 4))
     one = real(1.0)
     variance = real(0.25)
-    whole_depth = real(0.5 * 8.0)  # samples that it is taken for
+    whole_depth = real(0.5 * 8.0)  # scale of the logarithm of the depth: s = 1/2 is an eighth of the depth
 
     @wp.func
     def widened(a: vec3, b: vec3, by_x: vec3, by_y: vec3, by_depth: vec3):
-        """L_uu, L_vu, L_vv, and the square of the factor of the area, which with parallel rays is not
-        finite for a disk that is edge-on."""
+        """L_uu, L_vu, L_vv and det C, which is not finite for an edge-on disk with parallel rays."""
         by_u = vec3(wp.dot(by_x, a), wp.dot(by_y, a), whole_depth * wp.dot(by_depth, a))
         by_v = vec3(wp.dot(by_x, b), wp.dot(by_y, b), whole_depth * wp.dot(by_depth, b))
         minors = wp.cross(by_u, by_v)

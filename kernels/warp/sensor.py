@@ -1,4 +1,4 @@
-"""Sensor: the steps of post/ for each pixel, one after the other."""
+"""Sensor model: a kernel that applies the post-processing steps of post/ to each pixel, in order."""
 
 from functools import cache
 

@@ -208,7 +208,7 @@ def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
     ("given", "words"),
     [
         ({"captures": []}, "at least one view, got an empty captures"),
-        ({"captures": 5}, "captures is 5; it must be a list"),
+        ({"captures": 5}, "captures must be a list of Capture or Camera, got 5"),
         ({"captures": [CAMERA, "front"]}, "camera must be .* got 'front'"),
         ({"captures": [CAMERA, fs.Camera.pinhole(51, 40, 9, 9, 9, 9)]}, "same size.* 51 x 40.* of view 1"),
         ({"captures": [CAMERA, fs.Capture(CAMERA, "alpha")]}, "same outputs"),

@@ -1,6 +1,6 @@
 """OpenCL declarations of effects and outputs: additions to the records and kernel arguments of layout.py.
 
-Buffers are (channels, rows, columns) of the padded grid of samples, unless their note has another shape.
+Buffers are (channels, rows, columns) of the padded grid of samples, unless a comment states another shape.
 """
 
 from __future__ import annotations

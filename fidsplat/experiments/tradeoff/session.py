@@ -64,10 +64,10 @@ class Session:
         return reference_image(self._precise, splats, scene.capture.with_(quality=definition))
 
     def definition(self, view: str, quality: Quality) -> Quality:
-        """The base with the image definition of a quality.
+        """Quality of the reference image: the baseline with the image definition of `quality`.
 
-        3D Gaussians are projected exactly; those of the user as `quality` projects them, since captures look
-        as they did in training.
+        3D Gaussians are projected exactly. Those of the user's scenes are projected as in `quality`, since
+        trained splats depend on the projection of their trainer.
         """
         defined = {name: getattr(quality, name) for name in DEFINITION}
         ellipsoid = quality.ellipsoid if view in self._own else "exact"

@@ -68,9 +68,10 @@ def rows_of(record: Record) -> Iterator[dict[str, Any]]:
 
 
 def load(folders: Iterable[Path]) -> list[DeviceResults]:
-    """Results in folders, raw or summarised, by device, processors first.
+    """Read raw or summarised results from folders: one item per device, CPUs first.
 
-    Raises InputError for a folder without results, or with other results.
+    Raises:
+        InputError: a folder contains no results, or results of another command.
     """
     folders = list(folders)
     by_device: dict[str, list[Summary]] = {}
@@ -78,7 +79,9 @@ def load(folders: Iterable[Path]) -> list[DeviceResults]:
         records: dict[str, list[Record]] = {}
         for record in folder_records(folder, NAME):
             if "what" not in record.key:
-                raise InputError(f"{folder} holds no results of fidsplat tradeoff; give folders that do")
+                raise InputError(
+                    f"{folder} must contain results of fidsplat tradeoff, got other ones; give another folder"
+                )
             records.setdefault(record.run["device"], []).append(record)
         summaries = [summarise(own, rows_of, COLUMNS) for own in records.values()]
         summaries += [read_summary(file) for file in sorted(folder.glob("*.csv"))]

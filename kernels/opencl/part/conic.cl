@@ -6,7 +6,7 @@
 // terms cancel in q. The slack exceeds the rounding of f at any sample of the tile, here and in the per-pixel test.
 //@ blocks_functions
 #define BLOCKS_PAD 0.01f                // of distances to the low-pass disc, in samples
-#define BLOCKS_SLACK 1e-6f              // relative to the forms' terms: exceeds rounding, here and in the per-pixel test
+#define BLOCKS_SLACK 1e-6f              // relative to the terms of n_u, n_v and D: exceeds their rounding, here and in the per-pixel test
 //@ blocks_touched
     // f >= 0 in all of a block for these lower bounds of |n_u| and |n_v| and this upper bound of D
     float conic_h = (float)half_r2;

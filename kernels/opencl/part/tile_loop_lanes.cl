@@ -6,7 +6,7 @@
         length = min(end - chunk, (uint)CHUNK);
 //@@ chunk_of_layers
 //@@ tile_loop_chunk
-        int touched[CHUNK];                 // blocks of each splat
+        int touched[CHUNK];                 // bit mask of the blocks that each splat overlaps
         for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
             PREFETCH(splats + lists[min(chunk + which + PREFETCH_SPLATS, end - 1)]);

@@ -113,7 +113,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
         if (!alive) break;
         uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
         if (!unfinished) listed = 0;
-        uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // chunks up to the end of the batch
+        uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // number of chunks up to the end of the batch
         for (uint k = 0; k <= listed; k += UNROLL) {
             // evaluated in parallel, since they do not depend on transmittance; attenuation is sequential
             uint which[UNROLL];
