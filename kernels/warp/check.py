@@ -16,7 +16,7 @@ def arithmetic(
     shares: wp.array(dtype=wp.float32),
     above: wp.array(dtype=wp.float32),
     below: wp.array(dtype=wp.float32),
-    out: wp.array(dtype=wp.float32, ndim=2),  # (7, n): exp, log, division, square root, fma, fast exp, log
+    out: wp.array(dtype=wp.float32, ndim=2),  # (8, n): exp, log, division, root, fma, fast exp, log, 1 / x
 ):
     i = wp.tid()
     out[0, i] = wp.exp(exponents[i])
@@ -26,6 +26,7 @@ def arithmetic(
     out[4, i] = fma(above[i], below[i], above[i])
     out[5, i] = fast_exp(exponents[i])
     out[6, i] = fast_log(shares[i])
+    out[7, i] = 1.0 / below[i]
 
 
 @wp.kernel(enable_backward=False)

@@ -44,8 +44,8 @@ class WarpProbe(Probe):
         """Kernels of check.py."""
         workspace, n = self._workspace, len(exponents)
         single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
-        (found,) = run(workspace, "arithmetic", n, single, [np.zeros((7, n), np.float32)])
-        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
+        (found,) = run(workspace, "arithmetic", n, single, [np.zeros((8, n), np.float32)])
+        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log", "reciprocal")
         results: dict[str, np.ndarray] = dict(zip(names, found, strict=True))
         (found,) = run(workspace, "arithmetic_wide", n, [above, below], [np.zeros((3, n))])
         results |= dict(zip(("division64", "sqrt64", "log64"), found, strict=True))
