@@ -3,7 +3,7 @@
     python tools/load.py threads [--device D]     one renderer used by 16 threads; 16 renderers in 16 threads
     python tools/load.py processes [--device D]   8 processes that share one empty kernel cache
     python tools/load.py caches [--device D]      every file of a kernel cache truncated, random or empty
-    python tools/load.py soak [--minutes 120] [--devices opencl,warp:cpu,reference]
+    python tools/load.py soak [--minutes 120] [--frames 997] [--devices opencl,warp:cpu,reference]
 
 Images must be bit-identical to those of one renderer in one thread. The soak test renders random scenes with
 random effects in one process, renders them again much later, and monitors the memory.
@@ -171,7 +171,7 @@ def _random_frame(renderers: dict[str, fs.Renderer], seed: int) -> str:
     return digest(frame)
 
 
-def soak(minutes: float, devices: list[str]) -> dict[str, float]:
+def soak(minutes: float, devices: list[str], different: int = 997) -> dict[str, float]:
     """Render random frames for some minutes; returns differences and memory."""
     renderers = {device: fs.Renderer(device) for device in devices}
     first: dict[int, str] = {}
@@ -179,8 +179,8 @@ def soak(minutes: float, devices: list[str]) -> dict[str, float]:
     wrong, seed, start = 0, 0, time.monotonic()
     with Console().status("soaking") as status:
         while (spent := time.monotonic() - start) < 60 * minutes:
-            value = _random_frame(renderers, seed % 997)  # repeated after 997 frames
-            wrong += first.setdefault(seed % 997, value) != value
+            value = _random_frame(renderers, seed % different)
+            wrong += first.setdefault(seed % different, value) != value
             seed += 1
             if seed % 50 == 0:
                 memory.append((spent, _resident_bytes()))
@@ -216,10 +216,11 @@ def main() -> int:
     parser.add_argument("--device", default="opencl")
     parser.add_argument("--minutes", type=float, default=120.0)
     parser.add_argument("--devices", default="opencl,warp:cpu,reference")
+    parser.add_argument("--frames", type=int, default=997, help="different frames of a soak, each repeated")
     parser.add_argument("--json", type=Path, help="the figures as a file")
     given = parser.parse_args()
     if given.what == "soak":
-        figures = soak(given.minutes, given.devices.split(","))
+        figures = soak(given.minutes, given.devices.split(","), given.frames)
         bad = figures["frames that differ from their first rendering"] + (figures["growth in %"] > 5)
     else:
         figures = {"threads": threads, "processes": processes, "caches": caches}[given.what](given.device)
