@@ -16,7 +16,7 @@ from fidsplat.images.files import read_image, read_on_background
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.undistorted_view import undistorted_view
 from fidsplat.util.errors import InputError
-from fidsplat.util.files import from_json, read_text
+from fidsplat.util.files import from_json, path_of, read_text
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
@@ -120,7 +120,7 @@ def _divided(
 
 
 def _image(file: Path, name: str, others: set[tuple[int, int]]) -> np.ndarray:
-    candidates = [file.parent / (name + suffix) for suffix in _SUFFIXES]
+    candidates = [path_of(file.parent / (name + suffix)) for suffix in _SUFFIXES]
     image = next((one for one in candidates if one.is_file()), candidates[0])
     check_other_image(image, others)
     return read_on_background(image, _BLACK)
@@ -129,7 +129,7 @@ def _image(file: Path, name: str, others: set[tuple[int, int]]) -> np.ndarray:
 def check_other_image(image: Path, others: set[tuple[int, int]]) -> None:
     """Raise InputError if a view has the image file of another view: a short list of views could expand one
     file any number of times. others: device and inode of the images so far, extended."""
-    if not image.is_file():
+    if not path_of(image).is_file():
         return  # reported when it is read
     status = image.stat()
     if (status.st_dev, status.st_ino) in others:

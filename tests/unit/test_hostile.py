@@ -476,6 +476,18 @@ def test_a_camera_model_that_is_no_text(tmp_path, value):
         use_views(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["x" * 300, "x/" * 3000])
+def test_names_of_images_that_no_file_can_have(tmp_path, name):
+    views(tmp_path)
+    text = (tmp_path / "transforms.json").read_text()
+    (tmp_path / "transforms.json").write_text(text.replace("1.png", name))
+    colmap_text(tmp_path / "colmap")
+    (tmp_path / "colmap/sparse/0/images.txt").write_text(COLMAP["images"].replace("1.png", name))
+    for folder in (tmp_path, tmp_path / "colmap"):
+        with pytest.raises(fs.InputError, match="a file name must have at most 255 bytes"):
+            use_views(folder)
+
+
 @pytest.mark.parametrize("link", [False, True])
 def test_views_that_repeat_one_image(tmp_path, link):
     """Each would be a copy in memory."""
