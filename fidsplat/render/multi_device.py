@@ -118,7 +118,7 @@ class SeveralDevices:
         resident = self._uploaded(scene)
         names = None if outputs is None else output_names(outputs)
         try:
-            rest = iter(captures)
+            remaining = iter(captures)
         except TypeError:
             raise invalid("captures", "a list of Capture or Camera", captures) from None
         workers = [
@@ -130,7 +130,7 @@ class SeveralDevices:
         try:
             for worker in cycle(workers):
                 try:
-                    worker.submit(next(rest))
+                    worker.submit(next(remaining))
                 except StopIteration:
                     break
                 except Exception as error:

@@ -133,11 +133,11 @@ class Renderer:
         check_process(self._process, "Renderer")
         if (colors is None) == (sh is None):
             raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
-        given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-        given |= {"colors": colors} if sh is None else {"sh": sh}
-        given |= {} if labels is None else {"labels": labels}
+        arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+        arrays |= {"colors": colors} if sh is None else {"sh": sh}
+        arrays |= {} if labels is None else {"labels": labels}
         with self._lock:
-            data = self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64))
+            data = self.backend.adopt(arrays, np.asarray(tuple(origin), dtype=np.float64))
         return ResidentCloud(self.backend, data, _DEFAULT_CAPTURE)
 
     def render(
@@ -282,11 +282,11 @@ class Renderer:
         if background is not None:
             parts["background"] = background_of(background)
         try:
-            rest = iter(captures)
+            remaining = iter(captures)
         except TypeError:
             raise invalid("captures", "a list of Capture or Camera", captures) from None
         resident = self._resident(scene)
-        requested = (_capture_of(scene, one, outputs=outputs, quality=quality, **parts) for one in rest)
+        requested = (_capture_of(scene, one, outputs=outputs, quality=quality, **parts) for one in remaining)
         if isinstance(resident.data, Residency):
             requested = resident.data.prefetched(requested)
         previous: Frame | None = None
@@ -338,18 +338,17 @@ class Renderer:
             DeviceError: the device fails or lacks memory.
         """
         resident = self._resident(scene)
-        given = [captures] if isinstance(captures, (Capture, Camera)) else captures
         try:
-            each = list(given)
+            given = [captures] if isinstance(captures, (Capture, Camera)) else list(captures)
         except TypeError:
             raise invalid("captures", "a list of Capture or Camera", captures) from None
-        plain = [_capture_of(scene, one) for one in each]
-        if any("error" in one.outputs for one in plain):
+        requested = [_capture_of(scene, one) for one in given]
+        if any("error" in one.outputs for one in requested):
             raise InputError(
-                f"the output 'error' must be rendered one capture at a time, got a batch of {len(plain)}; "
-                "call render() for each capture, or leave out the output 'error'"
+                f"the output 'error' must be rendered one capture at a time, got a batch of {len(requested)}"
+                "; call render() for each capture, or leave out the output 'error'"
             )
-        views = views_of(plain, poses, groups, mask)
+        views = views_of(requested, poses, groups, mask)
         self._refuse_unknown_labels(resident, views)
         return self._render_batch(resident, views)
 

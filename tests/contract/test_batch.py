@@ -103,7 +103,7 @@ def test_a_batch_stays_on_its_device(renderer, cloud):
         on_host = array.numpy() if hasattr(array, "numpy") else array.get()
         assert np.array_equal(on_host, batch[name])
     assert set(batch.timings) >= {"project", "blend"}
-    with pytest.raises(fs.InputError, match="no 'distance'"):
+    with pytest.raises(fs.InputError, match="got 'distance'"):
         batch.device_array("distance")
 
 

@@ -341,7 +341,7 @@ def test_a_few_results_are_enough(tmp_path):
 
 def test_other_results_are_refused_by_name(tmp_path):
     write(tmp_path / "a", [Record({"category": "small"}, {}, {"device": "x"})])
-    with pytest.raises(fs.InputError, match="holds no results of fidsplat tradeoff"):
+    with pytest.raises(fs.InputError, match="must contain results of fidsplat tradeoff, got other ones"):
         load([tmp_path / "a"])
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "notes.csv").write_text("milk,bread\n1,2\n")

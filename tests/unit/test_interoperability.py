@@ -75,7 +75,7 @@ def test_a_frame_becomes_a_tensor(monkeypatch):
         "dlpack",
         "rgb there",
     )
-    with pytest.raises(fs.InputError, match="no 'depth'"):
+    with pytest.raises(fs.InputError, match="got 'depth'"):
         rendered.to_torch("depth")
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(fs.InputError, match="torch, which is not installed; pip install torch"):

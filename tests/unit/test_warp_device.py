@@ -137,7 +137,7 @@ def test_planes_are_warp_arrays_without_a_copy(renderer):
         assert array.shape == frame[name].shape
         assert array.ptr == frame.device_array(name).ptr
         assert np.array_equal(array.numpy(), frame[name])
-    with pytest.raises(KeyError, match="no 'depth'"):
+    with pytest.raises(KeyError, match="got 'depth'"):
         renderer.render(CLOUD, CAMERA).device_array("depth")
 
 
