@@ -46,7 +46,6 @@ PARSED_ONLY = {
     "check": "minutes; tests/selftest",
     "demo": "tests/unit/test_demo.py runs it",
     "experiment": "minutes; tests/experiments",
-    "store measure": "minutes; tests/unit/test_store_detail.py",
     "tradeoff": "minutes; tests/experiments",
     "train": "minutes; tests/unit/test_train_command.py",
     "view": "ends when it is stopped; tests/unit/test_viewer_*.py",
@@ -59,7 +58,10 @@ PARSED_WORDS = {
     "--ray": "a cluster",
     "city/city.toml": "a hundred frames of 1280 x 720; tests/unit/test_flights.py",
 }
-SMALLER = {"store demo": ["--splats", "20000", "--houses", "1", "--views", "0", "--markers", "2"]}
+SMALLER = {
+    "store demo": ["--splats", "20000", "--houses", "1", "--views", "0", "--markers", "2"],
+    "store measure": ["--views", "2"],
+}
 """options that make a command fast"""
 EXTRAS = {
     "experiments": ("pandas", "matplotlib", "pupil_apriltags", "flip_evaluator", "jinja2"),
@@ -72,7 +74,7 @@ EXTRAS = {
 """modules of extras; they are hidden from lines whose page does not mention the extra"""
 
 
-SLOW = {"check", "demo", "experiment", "store measure", "bench", "tradeoff", "train"}
+SLOW = {"check", "demo", "experiment", "bench", "tradeoff", "train"}
 SLOW |= {"--max-ms", "city/city.toml"}
 """of both, what ends and runs on every machine: `pytest -m exhaustive tests/unit/test_docs.py` runs it"""
 
