@@ -169,7 +169,7 @@ def crafted(folder, nodes=None, **changes):
         ("count", 0, -5, "1 to 500 splats"),
         ("count", 1, 0, "1 to 500 splats"),
         ("count", 1, 501, "1 to 500 splats"),
-        ("count", -1, 2**31 - 1, "rows, one after the other"),
+        ("count", -1, 2**31 - 1, "must have at most 16777216 splats"),
         ("first", 1, 0, "rows, one after the other"),
         ("first", 0, -1, "rows, one after the other"),
         ("first", -1, 2**62, "rows, one after the other"),
