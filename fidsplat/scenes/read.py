@@ -84,12 +84,12 @@ def read_scene(
     on_disk = [table for table in tables if table.text("file").lower().endswith(SUFFIX)]
     load = cache(lambda name: load_splats(file.parent / name, progress))
     splats, markers, total = [], [], 0
-    for table in tables:
-        if table not in on_disk:
-            splats.append(_splats(table, load))
+    for one in tables:
+        if one not in on_disk:
+            splats.append(_splats(one, load))
             total = _checked_total(file, total, splats[-1][0])
-    for table in top.tables("markers", MARKERS):
-        markers.append(_marker(table, file.parent, marker_quality, progress))
+    for one in top.tables("markers", MARKERS):
+        markers.append(_marker(one, file.parent, marker_quality, progress))
         total = _checked_total(file, total, markers[-1].marker.cloud)
     return dict(
         clouds=tuple(cloud for cloud, _ in splats),

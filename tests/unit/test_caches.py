@@ -46,15 +46,15 @@ def test_a_cache_that_cannot_be_written_is_replaced(ensure, name):
     assert said.startswith(
         "kernels are compiled again in this run: cannot write into the folder /dev/null/nowhere"
     )
-    assert said.endswith(f"; set {name} to a folder of your own with room")
+    assert said.endswith(f"; set {name} to a folder of your own with free space")
     assert Path(os.environ[name]).parent.name.startswith("fidsplat-cache-")
 
 
 def test_a_full_disk(ensure, monkeypatch):
     monkeypatch.setattr(caches.shutil, "disk_usage", lambda _: namedtuple("Usage", "free")(2**20))
     said = ensure(POCL_CACHE_DIR="/tmp", XDG_CACHE_HOME="/tmp")
-    assert "/tmp has room for 1 MB only" in said
-    assert said.endswith("set POCL_CACHE_DIR and XDG_CACHE_HOME to a folder of your own with room")
+    assert "/tmp has only 1 MB of free space" in said
+    assert said.endswith("set POCL_CACHE_DIR and XDG_CACHE_HOME to a folder of your own with free space")
 
 
 def test_folders_of_others_hold_no_kernels(ensure, tmp_path, monkeypatch):

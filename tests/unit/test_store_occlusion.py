@@ -111,8 +111,8 @@ def test_occluded_chunks_are_not_read(town, culling):
     resident = renderer.upload(town)
     for _ in renderer.render_views(resident, PATH[:2]):
         pass
-    features, view = prepare(resident.whole, fs.Capture(PATH[1]))
-    seen = select(resident.whole, [view], features)
+    features, view = prepare(resident.complete, fs.Capture(PATH[1]))
+    seen = select(resident.complete, [view], features)
     assert len(resident.data._cache._slots) < 0.95 * len(seen)
     assert resident.data.nodes < 0.95 * len(seen)
 

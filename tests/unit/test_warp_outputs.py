@@ -27,7 +27,7 @@ from . import Output
 
 
 @wp.func
-def composite(pixel: Any, attributes: Any, weight: float, color_weight: float, view: View):
+def composite(pixel: Any, attributes: Any, weight: float, view: View):
     p = pixel
     p.strongest = wp.max(p.strongest, weight)
     return p
