@@ -125,7 +125,7 @@ static inline int rect_tile(const TileRect *rect, int cell, const Bounds *b, int
 #define TEAM 64                 // work-items that share a big splat
 #define TEAMS (BIN_ITEMS / TEAM)
 #define TEAM_CELLS (8 * TEAM)   // a splat of more cells is left to the complete group,
-#define TEAM_DEFERRED 16             // up to this many of each team
+#define TEAM_DEFERRED 16        // up to this many of each team
 
 // Lists of the tiles of a band [band_first, band_end), at most `capacity` pairs.
 typedef struct {

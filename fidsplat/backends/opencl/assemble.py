@@ -168,7 +168,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     # without a pass of its own, if a pixel is one sample of one pose, and nothing but blending adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
-    files = [layout.file for layout in layouts.values() if layout.file] + _dialect(features, shape)
+    files = [layout.file for layout in layouts.values() if layout.file] + _dialect(shape, _scalars(features))
     files.append(LAYOUTS["resolve_pixel"].file)
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
         # not for mixtures of disks and 3D Gaussians, whose bounds are computed otherwise
@@ -192,7 +192,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     elif shape.schedule == "lanes":
         files.append(LAYOUTS["tile_loop_lanes"].file)
     if not layouts.keys().isdisjoint({"compose_pixel", "coplanar_layers"}):
-        files.append(LAYOUTS[f"passes_{shape.schedule}"].file)
+        files += [LAYOUTS["passes"].file, LAYOUTS[f"passes_{shape.schedule}"].file]
         files.append(LAYOUTS["blocks_nearest" if shape.schedule == "lanes" else "tile_nearest"].file)
     if "termination_depths" in layouts:  # after all passes through a list
         way = "_pixel" if "compose_pixel" in layouts else ""
@@ -227,7 +227,7 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
     layouts = layouts_of(features)
     # the forward text of slots is used again, of outputs only the derivatives
     slots = (part for slot in features.slots for part in (slot, *LAYOUTS[slot].parts))
-    files = [LAYOUTS[part].file for part in dict.fromkeys(slots)] + _dialect(features, shape)
+    files = [LAYOUTS[part].file for part in dict.fromkeys(slots)] + _dialect(shape, _scalars(features))
     files += [layout.backward_file for layout in layouts.values()]
     kernels = kernels_of(shape)
     declared = Declarations(_scalars(features), layouts, kernels=kernels)
@@ -236,14 +236,9 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
     return assembler.source({name: [stage.format(shape.schedule) for stage in stages]})
 
 
-def _dialect(features: FeatureSet, shape: DeviceShape) -> list[str]:
-    """The file of the vendor's instructions, of float32."""
-    return [dialect_file(shape)] if shape.dialect and "blend_double" not in features.slots else []
-
-
-def dialect_file(shape: DeviceShape) -> str:
-    """The file of the vendor's instructions, below kernels/opencl/."""
-    return f"dialect/{shape.dialect}.cl"
+def _dialect(shape: DeviceShape, scalars: Scalars) -> list[str]:
+    """The file of the vendor's instructions, which are for fragments in float32."""
+    return [f"dialect/{shape.dialect}.cl"] if shape.dialect and scalars.wide == "float" else []
 
 
 def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:
@@ -270,9 +265,10 @@ def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterab
         effects: files whose sections fill hooks.
     """
     numbers = {"LANES": shape.lanes, "FAST_FMA": int(shape.fast_fma), "SETUP_FP64": int(float64)}
-    declared = Declarations(Scalars("double" if float64 else "float", "float"))
+    scalars = Scalars("double" if float64 else "float", "float")
     stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
-    return Assembler(effects, declared, numbers).source({"check": stages}).text
+    files = [*effects, *_dialect(shape, scalars)]
+    return Assembler(files, Declarations(scalars), numbers).source({"check": stages}).text
 
 
 def backward_items(features: FeatureSet, shape: DeviceShape) -> int:

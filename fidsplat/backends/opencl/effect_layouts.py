@@ -214,6 +214,7 @@ LAYOUTS: dict[str, Layout] = {
     "tile_nearest": Layout("part/tile_nearest.cl"),
     "tile_keys": Layout("part/tile_keys.cl", emit=takes("in Splat splats")),
     # several passes through a tile's list, by the schedule
+    "passes": Layout("part/passes.cl"),
     "passes_lanes": Layout("part/passes_lanes.cl"),
     "passes_group": Layout("part/passes_group.cl"),
     "external_depth_end": Layout("part/external_depth_end.cl"),

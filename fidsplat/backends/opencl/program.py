@@ -14,7 +14,7 @@ from typing import Any
 import pyopencl as cl
 
 from fidsplat.backends.caches import pocl_folder
-from fidsplat.backends.opencl.assemble import Source, assemble_check, dialect_file
+from fidsplat.backends.opencl.assemble import Source, assemble_check
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl
 from fidsplat.backends.opencl.pocl_workarounds.shared_programs import shared_program
 from fidsplat.backends.opencl.pocl_workarounds.target_patch import correct_target, needs_correction
@@ -136,8 +136,6 @@ def check_kernels(
         DeviceError: compilation fails.
     """
     shape = replace(workspace.shape, lanes=lanes) if lanes else workspace.shape
-    if shape.dialect:
-        effects = (*effects, dialect_file(shape))
     built = build(workspace, assemble_check(file, shape, workspace.info.float64, effects) + text)
     load_invoker()
     return {kernel.function_name: kernel for kernel in built.all_kernels()}

@@ -1,14 +1,6 @@
 // Several passes through a tile's list, for GPUs: until all fragments and layers of all pixels are composited.
 //@ unfinished
 //@@ pass_unfinished
-//@ compose_functions
-// After the last splat of the list: composites what is left of this pass. Returns whether the pixel requires another pass.
-static inline int pass_finish(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
-    int repeats = 0;
-//@@ k_buffer_finish
-//@@ layers_finish
-    return repeats & pixel_unfinished(pixel, constants);
-}
 //@ pass
     local int repeat_pass;
     do {
