@@ -161,6 +161,9 @@ static inline uint sortable(float x) {
     return (bits & 0x80000000u) ? ~bits : (bits | 0x80000000u);
 }
 
+// Depth of a key: the inverse of `sortable`.
+static inline float key_depth(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
+
 // Ceil and floor as int, clamped to an image of `limit` pixels, since converting huge values is undefined. On CPUs without
 // PoCL's `ceil` and `floor`, which take a dozen instructions each.
 #if LANES > 1

@@ -289,12 +289,9 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
     }                                                                                       \
     barrier(fence)
 
-// Depth of a key: the inverse of `sortable`.
-static inline float depth_of(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
-
 // Bucket of a pair, monotonic in depth. fmax: where all depths are equal, or infinite, the product may be NaN.
 static inline uint bucket_of(ulong pair, float nearest, float scale) {
-    return (uint)fmin(fmax((depth_of((uint)(pair >> 32)) - nearest) * scale, 0.0f), BUCKETS - 1.0f);
+    return (uint)fmin(fmax((key_depth((uint)(pair >> 32)) - nearest) * scale, 0.0f), BUCKETS - 1.0f);
 }
 
 typedef struct {             // state of the bucket sort, in local memory
@@ -357,7 +354,7 @@ static inline bool bucket_sort(global const ulong *pairs, uint length, local ulo
     for (uint k = item; k < BUCKETS; k += SORT_ITEMS) buckets->starts[k] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     find_key_range(pairs, length, (local uint2 *)items, buckets);
-    float nearest = depth_of(buckets->lowest), scale = BUCKETS / (depth_of(buckets->highest) - nearest);
+    float nearest = key_depth(buckets->lowest), scale = BUCKETS / (key_depth(buckets->highest) - nearest);
     for (uint n = 0; n < ITEM_PAIRS; n++) {
         uint k = item + n * SORT_ITEMS;
         if (k < length) places[n] = atomic_inc(buckets->starts + bucket_of(pairs[k], nearest, scale));

@@ -102,7 +102,7 @@ static inline Layer no_layer(void) {
                 if (px < width && py + row < height)
                     atomic_max(&layer_depth, sortable(convert_float_rtp(layers_until(&pixels[row], &constants))));
             barrier(CLK_LOCAL_MEM_FENCE);
-            until = as_float((layer_depth & 0x80000000u) ? layer_depth & 0x7FFFFFFFu : ~layer_depth);
+            until = key_depth(layer_depth);
             complete = true;
         }
 //@ cells_parameters

@@ -53,9 +53,8 @@ static inline void queue_start(Queue *queue) {
 // Bits of a depth as an integer of the same order; its own inverse.
 static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFFF); }
 
-// Sort key of a depth, rounded down like depths in blocks, and its inverse.
+// Sort key of a depth, rounded down like depths in blocks.
 static inline uint rounded_key(wide depth) { return sortable((float)depth) & -CHUNK; }
-static inline wide depth_of_key(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
 
 // Rounded sort key of the minimum depth in `blocks`; keys: depths of a splat in each block.
 static inline uint min_key(const int *keys, uint blocks) {
@@ -102,7 +101,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         else
             for (; length < CHUNK && deferred_count > 0; length++) places[length] = (uint)deferred[--deferred_count];
         wide rest_nearest = read < end ? splats[lists[read]].nearest : INFINITY;
-        if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, depth_of_key((uint)(deferred[deferred_count - 1] >> 32)));
+        if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, key_depth((uint)(deferred[deferred_count - 1] >> 32)));
 //@@ chunk_of_layers_sorted
         for (uint which = 0; which < length; which++) listed[which] = lists[places[which]];
         // per splat: its blocks, and its minimum depth in each block, whose last bits hold its index in the chunk
