@@ -23,6 +23,7 @@ _HOME = {
     "Motion": "fidsplat.cameras",
     "Trajectory": "fidsplat.cameras",
     "Scene": "fidsplat.scenes",
+    "fetch_scene": "fidsplat.scenes.captured",
     "MarkerQuality": "fidsplat.capture.quality",
     "Quality": "fidsplat.capture.quality",
     "quality_within": "fidsplat.accuracy.quality_within",

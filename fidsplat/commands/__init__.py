@@ -51,6 +51,7 @@ COMMANDS = CommandTable(
     warm="devices.Warm",
     experiment="experiment.Experiment",
     gallery="render.Gallery",
+    fetch="fetch.Fetch",
     greenhouse="greenhouse.Greenhouse",
     train="train.Train",
     store="store.Store",

@@ -1,0 +1,48 @@
+"""`fidsplat fetch`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Annotated
+
+import tyro
+
+from fidsplat.commands.declarations import option
+from fidsplat.commands.options import Json
+from fidsplat.commands.output import console, delayed_progress, print_lines, report
+
+
+@dataclass
+class Fetch:
+    """Download a captured scene into the user's cache, and print its path.
+
+    The files are public captures of other authors; each has a size and a SHA-256 that are checked. Without a
+    name the command lists the scenes with author, licence and source. FIDSPLAT_SCENES names a folder or URL
+    to read the files from instead.
+
+    Examples:
+      fidsplat fetch
+      fidsplat view $(fidsplat fetch biker)
+    """
+
+    name: Annotated[tyro.conf.Positional[str | None], option("NAME", "scene to download")] = None
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.scenes.captured import captured_scenes, fetch_scene
+
+        scenes = captured_scenes()
+        if self.name is None:
+            heads = ("name", "splats", "MB", "licence", "author", "source")
+            rows = [
+                (s.name, f"{s.splats:,}", f"{s.size / 1e6:.1f}", s.licence, s.author, s.source)
+                for s in scenes.values()
+            ]
+            facts = {"scenes": [asdict(each) for each in scenes.values()]}
+            return report(self.json, facts, table=("Captured scenes", heads, rows))
+        with delayed_progress() as progress:
+            path = fetch_scene(self.name, progress)
+        scene = scenes[self.name]
+        print_lines(console(True), scene.credit)
+        facts = {"path": str(path), **{key: value for key, value in asdict(scene).items() if key != "files"}}
+        return report(self.json, facts, str(path))

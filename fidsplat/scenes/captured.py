@@ -1,0 +1,76 @@
+"""Captured scenes by name: public files, downloaded with a checksum into the user's cache."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from fidsplat.util.downloads import download
+from fidsplat.util.errors import InputError, unknown
+from fidsplat.util.files import from_json, user_cache
+
+MIRROR = "FIDSPLAT_SCENES"
+"""environment variable with a folder or URL that replaces the address of the files"""
+
+
+@dataclass(frozen=True)
+class CapturedScene:
+    """A public capture: its author and licence, and its files with sizes and checksums."""
+
+    name: str
+    title: str
+    splats: int
+    author: str
+    licence: str
+    source: str
+    url: str
+    """address of the folder of its files"""
+    open: str
+    """the file that readers open"""
+    files: dict[str, tuple[int, str]]
+    """size in bytes and SHA-256 of each file"""
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(size for size, _ in self.files.values())
+
+    @property
+    def credit(self) -> str:
+        """Title, author, licence and source, for captions."""
+        return f"{self.title} by {self.author}, {self.licence}, {self.source}"
+
+
+@cache
+def captured_scenes() -> dict[str, CapturedScene]:
+    """All captured scenes by name."""
+    table = from_json(Path(__file__).with_name("captured.json").read_bytes())
+    return {name: CapturedScene(name, **fields) for name, fields in table.items()}
+
+
+def fetch_scene(name: str, progress: Callable[[str, float], None] = lambda *_: None) -> Path:
+    """Path of a captured scene in the user's cache, downloaded on first use.
+
+    FIDSPLAT_SCENES: environment variable with a folder or URL to read the files from instead.
+
+    progress: callback of the current task and its completed share, 0 to 1.
+
+    Raises InputError for an unknown name, or if a file cannot be downloaded or differs from its checksum.
+    """
+    if name not in captured_scenes():
+        raise InputError(unknown("name of a captured scene", name, captured_scenes()))
+    scene, folder, done = captured_scenes()[name], user_cache() / "fidsplat" / "scenes", 0
+    mirror = os.environ.get(MIRROR)
+    url = scene.url if mirror is None else mirror if "://" in mirror else Path(mirror).absolute().as_uri()
+
+    def add(size: int) -> None:
+        nonlocal done
+        done += size
+        progress(f"download {name}", done / scene.size)
+
+    for file, (size, sha256) in scene.files.items():
+        download(f"{url.rstrip('/')}/{file}", folder / file, size, sha256, add)
+    return folder / scene.open

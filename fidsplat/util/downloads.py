@@ -1,0 +1,49 @@
+"""Downloads with a checksum into the user's cache."""
+
+from __future__ import annotations
+
+import hashlib
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write
+
+_BLOCK, _SECONDS = 2**18, 30
+"""bytes of a read, and seconds without data after which a download fails"""
+
+
+def download(
+    url: str, target: Path, size: int, sha256: str, progress: Callable[[int], None] = lambda _: None
+) -> Path:
+    """Download a file unless it is present, check its size and SHA-256, and return its path.
+
+    progress: callback of the number of bytes of each part read.
+
+    Raises InputError if the file cannot be read from the URL or differs from what was expected.
+    """
+    if target.is_file() and target.stat().st_size == size:
+        progress(size)
+        return target
+    found, received = hashlib.sha256(), 0
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with urllib.request.urlopen(url, timeout=_SECONDS) as source, atomic_write(target) as stream:
+            while received <= size and (block := source.read(_BLOCK)):
+                interrupts.check()
+                received += len(block)
+                found.update(block)
+                stream.write(block)
+                progress(len(block))
+            if received != size or found.hexdigest() != sha256:
+                raise InputError(
+                    f"{url} must have {size:,} bytes and the SHA-256 {sha256}, got {received:,} and "
+                    f"{found.hexdigest()}; the file has changed or a proxy has replaced it"
+                )
+    except (OSError, ValueError) as error:  # urllib's errors are OSErrors
+        reason = getattr(error, "reason", None) or error
+        raise InputError(f"cannot download {url}: {reason}; is the network reachable?") from None
+    return target
