@@ -74,6 +74,7 @@ _PLAIN = (
     *("arithmetic_precise", "arithmetic_fast"),
     # optional
     *("external_depth", "motion_groups", "shutter_exposure", "shutter_rows", "blend_double"),
+    "blend_half",
     "termination_depths",
     # steps after blending
     *("fog", "exposure", "vignetting", "noise", "gain"),

@@ -26,8 +26,8 @@ class FeatureSet:
 
     slots: tuple[str, ...]
     """One effect per kind in fixed order: camera, color, ellipsoids (optional), lowpass, stop, external depth
-    (optional), compose, footprint, background, arithmetic; then optional motion, shutter, float64 blending
-    and termination depths."""
+    (optional), compose, footprint, background, arithmetic; then optional motion, shutter, blending in
+    float16 or float64, and termination depths."""
     outputs: tuple[str, ...]
     """Sorted names of the outputs other than rgb."""
     sh_degree: int
@@ -101,8 +101,14 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     filtered = cloud.footprint == "box" or ewa_only
     lowpass = "none" if filtered else quality.lowpass
     double = quality.blend_precision == "float64"
+    half = quality.blend_precision == "float16"
     if double:
         _refuse_float64(lens, capture.foggy)
+    if half and capture.foggy:
+        raise InputError(
+            "blend_precision='float16' must have a capture without fog, whose light is summed in float32; "
+            "use blend_precision='float32'"
+        )
     flat = cloud.footprint == "gaussian" and not ellipsoid
     in_spheres = lens is None and flat and lowpass != "pixel"
     # harmonics of degree 0 do not depend on the view and are RGB colours (`SplatCloud.plain_colors`)
@@ -120,12 +126,12 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             _composing(cloud, quality.order, one_depth_each=ewa_only and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
-            # the fast functions are float32
-            f"arithmetic_{'precise' if double else quality.arithmetic}",
+            # the fast functions are float32, and as accurate as half precision requires
+            f"arithmetic_{'precise' if double else 'fast' if half else quality.arithmetic}",
             *(("motion_groups",) if capture.motion.groups else ()),
             *(("shutter_exposure",) if capture.exposed else ()),
             *(("shutter_rows",) if capture.exposed and in_spheres else ()),
-            *(("blend_double",) if double else ()),
+            *(("blend_double",) if double else ("blend_half",) if half else ()),
         ),
         outputs=tuple(sorted({*capture.outputs} - {"rgb", *COMPOSED})),
         sh_degree=sh_degree,

@@ -14,7 +14,7 @@ typedef union {
 //@@ compose_types
 typedef struct {
     vfloat t;               // transmittance in front of the next fragment
-    vfloat r, g, b;
+//@@ light_state
 //@@ state
 } Pixel;
 
@@ -24,9 +24,7 @@ typedef struct {            // uniforms of the blend stage
 
 static inline void pixel_start(Pixel *pixel) {
     pixel->t = 1.0f;
-    pixel->r = 0.0f;
-    pixel->g = 0.0f;
-    pixel->b = 0.0f;
+//@@ light_start
 //@@ start
 }
 
@@ -47,20 +45,9 @@ static inline Attributes fragment_attributes(const Splat *s, Crossing c, vfloat 
 static inline void composite(Pixel *pixel, const Attributes *attributes, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
-#if LANES == 1
-    vfloat weight = pixel->t * VSELECT((vfloat)0.0f, opacity, live);
-#else
-    vfloat full_weight = pixel->t * opacity, weight = VSELECT((vfloat)0.0f, full_weight, live);
-#endif
-    pixel->r = FMA(weight, attributes->r, pixel->r);
-    pixel->g = FMA(weight, attributes->g, pixel->g);
-    pixel->b = FMA(weight, attributes->b, pixel->b);
+//@@ light_composite
 //@@ composite
-#if LANES == 1
-    pixel->t = pixel->t - weight;
-#else       // in the order of fragments; `live` is computed in parallel
-    pixel->t = VSELECT(pixel->t, pixel->t - full_weight, live);
-#endif
+//@@ light_transmit
 }
 
 // Pixels that are not terminated.
@@ -92,9 +79,4 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
 //@@ compose
 }
 
-// Stores LANES pixels at index `at` of each channel of `raw`; a channel has `channel_stride` samples.
-#define PIXEL_STORE_BASE(pixel, raw, channel_stride, at) \
-    BLOCK_STORE((pixel)->r, raw + (at), stride); \
-    BLOCK_STORE((pixel)->g, raw + (channel_stride) + (at), stride); \
-    BLOCK_STORE((pixel)->b, raw + 2 * (channel_stride) + (at), stride); \
-    BLOCK_STORE((pixel)->t, raw + 3 * (channel_stride) + (at), stride)
+//@@ light_functions

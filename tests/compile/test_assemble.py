@@ -25,6 +25,7 @@ PLAIN = fs.Quality(lowpass="none")
 SHARED_FILES = {
     *("prelude", "math", "bounds", "project", "splat", "blend", "part/conic", "part/perspective"),
     *("part/resolve_fused", "part/resolve_pixel", "slot/arithmetic_fast", "slot/camera_pinhole"),
+    "part/blend_float",
     *("slot/color_rgb", "slot/compose_ordered"),
 }
 """kernel files of a scene without effects, on all devices"""
@@ -55,6 +56,7 @@ def test_base_text_names_no_other_effect():
         "perspective",
         "resolve_fused",
         "resolve_pixel",
+        "blend_float",
         "tile_loop_lanes",
         "color_rgb",
         "lowpass_none",
@@ -262,6 +264,7 @@ def test_no_kernel_calls_functions_without_error_bounds():
 # settings that the compile matrix (test_matrix.py) does not combine with everything
 KNOBS = {
     "double": {"quality": fs.Quality(blend_precision="float64")},
+    "half": {"quality": fs.Quality(blend_precision="float16")},
     "precise": {"quality": fs.Quality(arithmetic="precise")},
 }
 

@@ -13,7 +13,7 @@ from fidsplat.markers.mixture import fitted_templates
 TEMPLATES = files("fidsplat.markers").joinpath("templates.json")
 WRONG = {
     "arithmetic": "quick",
-    "blend_precision": "float16",
+    "blend_precision": "float8",
     "samples": 9,
     "marker": "paper",
 }

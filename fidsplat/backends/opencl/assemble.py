@@ -170,6 +170,10 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     files = [layout.file for layout in layouts.values() if layout.file] + _dialect(shape, _scalars(features))
     files.append(LAYOUTS["resolve_pixel"].file)
+    if "blend_half" not in layouts:
+        files.append(LAYOUTS["blend_float"].file)
+    elif shape.dialect:
+        files.append(f"dialect/{shape.dialect}_half.cl")
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
         # not for mixtures of disks and 3D Gaussians, whose bounds are computed otherwise
         if "lowpass_screen" in layouts and "thickness" not in layouts:
@@ -335,7 +339,8 @@ class Assembler:
         for stage in stages:
             file = f"{stage}.cl"
             body += f"#line 1 {_shown(file)}\n{self._expand(file, 1, lines_of(file))}"
-        body = with_scalars(with_constants(body, self._declared.constants), self._declared.scalars.wide)
+        body = with_packed(with_constants(body, self._declared.constants), self._declared.packed)
+        body = with_scalars(body, self._declared.scalars.wide)
         bare = _COMMENT.sub("", body)
         head = ""
         for number, value in sorted(self._defines.items()):
@@ -379,19 +384,22 @@ class Declarations:
         self.samples: tuple[Samples, ...] = ()
         self.constants: dict[str, str] = {}
         """fields of `Splat` that all splats share, and their values"""
+        self.packed: dict[str, str] = {}
+        """fields of `Splat` that records hold packed, and what reads them"""
         self._layouts = list((layouts or {}).values())
         self._outputs, self._fused, self._kernels = outputs, fused, kernels
         view, splat, bounds, moments = VIEW, SPLAT, BOUNDS, MOMENTS
         for layout in self._layouts:
             self.samples += layout.samples
             self.constants |= dict(layout.constant)
+            self.packed |= dict(layout.packed)
             view, splat = view.with_members(layout.view), splat.with_members(layout.splat)
             bounds, moments = bounds.with_members(layout.bounds), moments.with_members(layout.moments)
         # as many fields of padding as in `Moments`
         alignment = moments.alignment // 4 * scalars.dtype("real").itemsize
         fields = tuple(chain.from_iterable(one.names for one in moments.members))
         totals = Record("Totals", (Member("real", fields, "of all tiles"),), alignment)
-        records = view, splat.without(self.constants), bounds, moments, totals
+        records = view, splat.without({**self.constants, **self.packed}), bounds, moments, totals
         self.structs = {record.name: record for record in records}
 
     def arguments(self, kernel: str) -> tuple[Argument, ...]:
@@ -444,6 +452,16 @@ def with_constants(text: str, constants: Mapping[str, str]) -> str:
     names = "|".join(constants)
     text = re.sub(rf"\brecord\.(?:{names}) = [^;\n]*;", "", text)
     return re.sub(rf"\bs(?:->|\.)({names})\b", lambda read: constants[read[1]], text)
+
+
+def with_packed(text: str, packed: Mapping[str, str]) -> str:
+    """Kernel text in which fields of `Splat` that records hold packed are written to variables
+    `unpacked_NAME` and read by an expression, in which `{}` is the record."""
+    if not packed:
+        return text
+    names = "|".join(packed)
+    text = re.sub(rf"\brecord\.({names})\b", r"unpacked_\1", text)
+    return re.sub(rf"\b(s(?:->|\.))({names})\b", lambda read: packed[read[2]].format(read[1]), text)
 
 
 def _refuse_unknown_hooks(files: list[str]) -> None:

@@ -188,6 +188,8 @@ class Layout:
     splat: tuple[Member, ...] = ()
     constant: tuple[tuple[str, str], ...] = ()
     """(field of `Splat`, value): the same for all splats, so it is a constant in the kernels"""
+    packed: tuple[tuple[str, str], ...] = ()
+    """(field of `Splat`, expression that reads it): fields that `splat` replaces (`assemble.with_packed`)"""
     bounds: tuple[Member, ...] = ()
     view: tuple[Member, ...] = ()
     project: tuple[Argument, ...] = ()

@@ -135,6 +135,11 @@ LAYOUTS: dict[str, Layout] = {
     "shutter_exposure": Layout("slot/shutter_exposure.cl"),
     "shutter_rows": Layout("slot/shutter_rows.cl"),
     "blend_double": Layout(),
+    "blend_half": Layout(
+        "slot/blend_half.cl",
+        splat=(member("uint rg b1", "two halves each: r and g, b and -1"),),
+        packed=(("r", "WORDS_LOW({}rg)"), ("g", "WORDS_HIGH({}rg)"), ("b", "WORDS_LOW({}b1)")),
+    ),
     "termination_depths": Layout(
         blend=takes(
             "in uint keys", "out uint termination_depths  // of each tile: the key at which it was finished"
@@ -195,6 +200,8 @@ LAYOUTS: dict[str, Layout] = {
         splat=(member("int group", "coplanar group, -1: none"),),
         project=takes("cloud int coplanar_groups  // (n) index of the splat's group; -1: none"),
     ),
+    # colours and transmittance of a pixel, unless blend_half
+    "blend_float": Layout("part/blend_float.cl"),
     # resolving samples to pixels
     "resolve_pixel": Layout("part/resolve_pixel.cl"),
     "resolve_fused": Layout("part/resolve_fused.cl"),
