@@ -268,7 +268,7 @@ def damaged(path: Path, data: bytes | None = None) -> st.SearchStrategy[bytes]:
         inside = spoiled_npy(data)
     elif path.suffix in (".sog", ".usdz"):
         inside = spoiled_zip(data)
-    elif path.suffix == ".spz":
+    elif path.suffix == ".spz" and data[:2] == b"\x1f\x8b":
         inside = spoiled(gzip.decompress(data)).map(gzip.compress)
     elif path.suffix == ".ply":
         head, end, body = data.partition(b"end_header\n")

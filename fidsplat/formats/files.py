@@ -50,6 +50,8 @@ FORMATS = {
         "SPZ",
         load_spz,
         save_spz,
+        labels=True,
+        coplanar_groups=True,
         rounds="positions to 24 bits, rotations to 10, colours, opacities, scales and SH to 8 bits",
     ),
     ".glb": _GLTF,

@@ -1,8 +1,9 @@
 """glTF with KHR_gaussian_splatting, as .glb and .gltf: activated values in float32, without loss.
 
-Extension: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting. glTF has y up: splats are written
-unchanged below a node that rotates them by 180 degrees about x; reading applies the transforms of the parent
-nodes and the inverse rotation.
+Extension: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting, release candidate. glTF has y up,
+z forward and x to the left: splats are written unchanged below a node that rotates them by 180 degrees about
+z, as splat-transform and nianticlabs/spz convert; reading applies the transforms of the parent nodes and the
+inverse rotation.
 """
 
 from __future__ import annotations
@@ -34,8 +35,11 @@ from fidsplat.util.files import atomic_write, from_json, read_input
 from fidsplat.util.limits import check_expansion
 
 EXTENSION = "KHR_gaussian_splatting"
+_COLOR_SPACE = "srgb_rec709_display"
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_TO_GLTF = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""rotation by 180 degrees about z, its own inverse"""
 _COPIES = 3
 """copies of each value while a file is read: accessor, cloud, transformed cloud"""
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -101,11 +105,11 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
         place += len(chunk)
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "fidsplat"},
+        "asset": {"version": "2.0", "generator": "fidsplat, z forward"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": [1.0, 0.0, 0.0, 0.0]}],
+        "nodes": [{"mesh": 0, "rotation": [0.0, 0.0, 1.0, 0.0]}],
         "meshes": [{"primitives": [_primitive(list(arrays))]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -123,7 +127,7 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
 
 
 def _primitive(names: list[str]) -> dict[str, Any]:
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    splats = {"kernel": "ellipse", "colorSpace": _COLOR_SPACE}
     return {
         "mode": 0,
         "attributes": {name: k for k, name in enumerate(names)},
@@ -180,7 +184,9 @@ class _Reader:
             if scenes
             else range(len(self._document.get("nodes", [])))
         )
-        placed = [pair for root in roots for pair in self._below(root, HALF_TURN)]
+        # early files of fidsplat were rotated about x
+        axes = HALF_TURN if self._document.get("asset", {}).get("generator") == "fidsplat" else _TO_GLTF
+        placed = [pair for root in roots for pair in self._below(root, axes)]
         self._check_expansion([primitive for primitive, _ in placed])
         cloud_of_primitive: dict[int, SplatCloud] = {}  # by id of the primitive: nodes may share a mesh
         for primitive, _ in placed:
@@ -213,13 +219,20 @@ class _Reader:
         kernel = primitive["extensions"][EXTENSION].get("kernel", "ellipse")
         if kernel != "ellipse":
             raise InputError(f"{self._path}: the kernel must be ellipse, got {kernel!r}")
+        space = primitive["extensions"][EXTENSION].get("colorSpace", _COLOR_SPACE)
+        if space != _COLOR_SPACE:
+            raise InputError(f"{self._path}: the colour space must be {_COLOR_SPACE}, got {space!r}")
         attributes, prefix = primitive["attributes"], f"{EXTENSION}:"
         if primitive["extensions"][EXTENSION].get("extensions"):
             raise InputError(
                 f"{self._path}: its splats must be uncompressed, got a compression extension; export "
                 "without it"
             )
-        arrays = {name: self._array(number) for name, number in attributes.items() if name != "COLOR_0"}
+        arrays = {
+            name: self._array(number, plain=name == f"{prefix}SCALE")
+            for name, number in attributes.items()
+            if name != "COLOR_0"
+        }
         count = sum(name.startswith(f"{prefix}SH_DEGREE_") for name in arrays)
         names = [f"{prefix}SH_DEGREE_{(d := int(np.sqrt(k)))}_COEF_{k - d * d}" for k in range(count)]
         sh = np.stack([arrays[name] for name in names], axis=1)
@@ -255,8 +268,8 @@ class _Reader:
             raise InputError(f"{self._path}: its attribute {name} must hold whole numbers below 2^24")
         return values.astype(np.int32)
 
-    def _array(self, number: int) -> np.ndarray:
-        """Values (n, width) float32 of an accessor."""
+    def _array(self, number: int, plain: bool = False) -> np.ndarray:
+        """Values (n, width) float32 of an accessor; plain: integers need not be normalized."""
         accessor = self._document["accessors"][number]
         if "sparse" in accessor or "bufferView" not in accessor:
             raise InputError(f"{self._path}: accessor {number} must be dense, got a sparse one")
@@ -272,6 +285,8 @@ class _Reader:
         values = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
         if kind.kind == "f":
             return values.copy()
+        if plain and not accessor.get("normalized"):
+            return values.astype(np.float32)
         if not accessor.get("normalized"):
             raise InputError(f"{self._path}: integers of accessor {number} must be normalized")
         return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1)

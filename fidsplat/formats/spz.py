@@ -1,14 +1,17 @@
-"""SPZ, Niantic's compressed splats: reads versions 2 and 3, writes 3. Format: nianticlabs/spz, load-spz.cc.
+"""SPZ, Niantic's compressed splats: reads versions 2 to 4, writes 3 and 4. Format: nianticlabs/spz, README.
 
-Gzip of a header of 16 bytes and arrays of all splats: positions (3 x 24 bits, fixed point), opacities,
-colours and scales (a byte each), rotations (version 2: 3 bytes x, y, z; version 3: 4 bytes with the three
-smallest of x, y, z, w and the index of the omitted one), higher SH (a byte each). Axes: y up, z backward.
+Arrays of all splats: positions (3 x 24 bits, fixed point), opacities, colours and scales (a byte each),
+rotations (version 2: 3 bytes x, y, z; later: 4 bytes with the three smallest of x, y, z, w and the index of
+the omitted one), higher SH (a byte each). Axes: y up, z backward. Versions 2 and 3 are gzip of a header of 16
+bytes and the arrays. Version 4 has a header of 32 bytes, extensions (type, length, content), a table of
+sizes, and a Zstandard frame for each array.
 """
 
 from __future__ import annotations
 
 import gzip
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -17,16 +20,27 @@ import numpy as np
 from fidsplat.formats.plain import HALF_TURN, cloud_of, coefficients, content, refuse_boxes, three_scales
 from fidsplat.formats.plain import world_means as means_of
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util import zstd
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write
 from fidsplat.util.limits import check_expansion
 
 _HEAD = struct.Struct("<IIIBBBB")
+_HEAD_4 = struct.Struct("<IIIBBBBI12x")
+_SIZES, _RECORD = struct.Struct("<QQ"), struct.Struct("<II")
+_HAS_EXTENSIONS = 2
+"""flag of version 4"""
+_AXES = 0xADBE0003
+"""type of Adobe's extension with the coordinate system"""
+_TO_RDF = {0: (1, -1, -1), 1: (-1, 1, -1), 4: (1, -1, -1), 6: (1, 1, 1), 7: (-1, -1, 1)}
+"""signs of the axes by coordinate system, for systems that are rotated: unspecified, LDB, RUB, RDF, LUF"""
+_LABELS, _GROUPS = 0xF1D50001, 0xF1D50002
+"""types of our extensions: int32 of each splat in a Zstandard frame"""
 _MAGIC = 0x5053474E
 _COLOR = 0.15
 _MIN_SCALE = float(np.exp(-10.0))
 """smallest scale [m] of the format; a third scale of this size marks a disk"""
-_REST = {0: 0, 1: 3, 2: 8, 3: 15}
+_REST = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
 _FINEST, _BITS = 20, 23
 """maximum number of fractional bits, and bits of a coordinate without its sign"""
 _MAX_UNCHECKED = 2**20
@@ -36,29 +50,57 @@ _MAX_UNCHECKED = 2**20
 def load_spz(path: Path) -> SplatCloud:
     """Read an SPZ file. Raises InputError for a damaged file or another version."""
     data = content(path, (b"\x1f\x8b", b"NGSP"))
-    if data[:4] == _MAGIC.to_bytes(4, "little"):  # version 4 is not compressed by gzip
+    current = data[:4] == _MAGIC.to_bytes(4, "little")
+    version, n, degree, point, parts, extensions = (_frames if current else _gzip)(path, data)
+    means = _fixed(parts["means"]) / 2.0**point
+    quats = _first_three(parts["quats"]) if version == 2 else _smallest_three(parts["quats"])
+    scales = np.exp(parts["scales"] / 16.0 - 10.0)
+    dc = ((parts["colors"] / 255.0 - 0.5) / _COLOR).astype(np.float32)
+    rest = (parts["rest"].reshape(n, _REST[degree], 3)[:, : _REST[3]].astype(np.float32) - 128) / 128
+    if degree > 3:
+        warnings.warn(f"{path}: SH above degree 3 are left out, got degree {degree}", stacklevel=3)
+    sh = np.concatenate([dc[:, None], rest], axis=1)
+    opacities = (parts["opacities"][:, 0] / 255.0).astype(np.float32)
+    axes, labels, groups = _known(path, extensions, n)
+    cloud = cloud_of(path, means, quats, scales, opacities, sh, _MIN_SCALE, labels, groups)
+    return cloud.transformed(np.diag([*axes, 1.0]))
+
+
+def _widths(version: int, degree: int) -> dict[str, int]:
+    """Bytes of a splat in each array, in the order of the file."""
+    widths = {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "quats": 3 if version == 2 else 4}
+    return widths | {"rest": 3 * _REST[degree]}
+
+
+def _check_head(path: Path, version: int, degree: int, point: int) -> None:
+    if version not in (2, 3, 4):
         raise InputError(
-            f"{path}: the version of SPZ must be 2 or 3, got {int.from_bytes(data[4:8], 'little')}"
+            f"{path}: the version of SPZ must be 2, 3 or 4, got {version}; convert it by spz_to_ply of "
+            "nianticlabs/spz"
         )
+    if degree not in _REST or point > _BITS:
+        raise InputError(
+            f"{path}: SPZ must have SH degree 0 to 4 and at most {_BITS} fractional bits, "
+            f"got degree {degree} and {point} bits"
+        )
+
+
+def _gzip(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.ndarray], bytes]:
+    """Version, number of splats, SH degree, fractional bits and arrays (n, bytes) of versions 2 and 3."""
     try:
         head = zlib.decompressobj(31).decompress(data, _HEAD.size)
         magic, version, n, degree, point, _, _ = _HEAD.unpack(head)
     except (zlib.error, struct.error):
-        raise InputError(f"{path} is not an SPZ file: it must begin with a gzip header") from None
+        raise InputError(f"{path} is not an SPZ file: it must begin with a gzip header or NGSP") from None
     if magic != _MAGIC:
         raise InputError(f"{path} is not an SPZ file: its magic number differs")
-    if version not in (2, 3) or degree not in _REST or point > _BITS:
-        raise InputError(
-            f"{path}: SPZ must have version 2 or 3, SH degree 0 to 3 and at most {_BITS} fractional bits, "
-            f"got version {version}, degree {degree} and {point} bits"
-        )
-    widths = {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "quats": 4 if version == 3 else 3}
-    widths["rest"] = 3 * _REST[degree]
+    _check_head(path, version, degree, point)
+    widths = _widths(version, degree)
     size = _HEAD.size + n * sum(widths.values())
     if max(_MAX_UNCHECKED, len(data)) < n and size <= 1040 * len(data):
         raise InputError(f"{path}: {n} splats must have at least as many bytes, got {len(data)}")
     if size <= 1040 * len(data):  # bytes of the file and of the arrays
-        check_expansion(path, n * (sum(widths.values()) + 4 * (14 + widths["rest"])), f"{n:,} splats")
+        _check_memory(path, n, widths)
     try:
         # not more than the header declares, nor than gzip's maximum ratio of about 1040
         stream = zlib.decompressobj(31)
@@ -71,33 +113,102 @@ def load_spz(path: Path) -> SplatCloud:
     for name, width in widths.items():
         parts[name] = np.frombuffer(whole, np.uint8, n * width, place).reshape(n, width)
         place += n * width
-    means = _fixed(parts["means"]) / 2.0**point
-    quats = _smallest_three(parts["quats"]) if version == 3 else _first_three(parts["quats"])
-    scales = np.exp(parts["scales"] / 16.0 - 10.0)
-    dc = ((parts["colors"] / 255.0 - 0.5) / _COLOR).astype(np.float32)
-    rest = (parts["rest"].reshape(n, _REST[degree], 3).astype(np.float32) - 128) / 128
-    sh = np.concatenate([dc[:, None], rest], axis=1)
-    opacities = (parts["opacities"][:, 0] / 255.0).astype(np.float32)
-    return cloud_of(path, means, quats, scales, opacities, sh, _MIN_SCALE).transformed(HALF_TURN)
+    return version, n, degree, point, parts, b""
 
 
-def save_spz(cloud: SplatCloud, path: Path) -> None:
+def _check_memory(path: Path, n: int, widths: dict[str, int]) -> None:
+    check_expansion(path, n * (sum(widths.values()) + 4 * (14 + widths["rest"])), f"{n:,} splats")
+
+
+def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.ndarray], bytes]:
+    """As many values as `_gzip` returns, of version 4, and its extensions."""
+    if len(data) < _HEAD_4.size:
+        raise InputError(f"{path}: cut short: the header must have {_HEAD_4.size} bytes, got {len(data)}")
+    _, version, n, degree, point, flags, streams, table = _HEAD_4.unpack_from(data)
+    _check_head(path, version, degree, point)
+    if version != 4:
+        raise InputError(f"{path}: SPZ of version {version} must be compressed by gzip; it is damaged")
+    widths = {name: width for name, width in _widths(version, degree).items() if width}
+    if n == 0:  # empty arrays are left out
+        widths = {}
+    if streams != len(widths):
+        raise InputError(f"{path}: SPZ of degree {degree} must have {len(widths)} arrays, got {streams}")
+    place = table + streams * _SIZES.size
+    if table < _HEAD_4.size or place > len(data):
+        raise InputError(f"{path}: cut short: its table must end by byte {place}, got {len(data)} bytes")
+    _check_memory(path, n, _widths(version, degree))
+    parts = {
+        name: np.zeros((n, width), np.uint8)
+        for name, width in _widths(version, degree).items()
+        if not n or not width
+    }
+    for (name, width), (packed, size) in zip(
+        widths.items(), _SIZES.iter_unpack(data[table:place]), strict=True
+    ):
+        if size != n * width or packed > len(data) - place:
+            raise InputError(
+                f"{path}: the array {name} must expand to {n * width} bytes and end by byte {len(data)}, got "
+                f"{size} bytes and the end {place + packed}"
+            )
+        try:
+            whole = zstd.decompress(memoryview(data)[place : place + packed], size)
+        except ValueError as error:
+            raise InputError(f"{path}: the SPZ file is damaged ({name}: {error})") from None
+        parts[name] = np.frombuffer(whole, np.uint8).reshape(n, width)
+        place += packed
+    return version, n, degree, point, parts, data[_HEAD_4.size : table] if flags & _HAS_EXTENSIONS else b""
+
+
+def _known(
+    path: Path, extensions: bytes, n: int
+) -> tuple[tuple[int, int, int], np.ndarray | None, np.ndarray | None]:
+    """Signs of the axes, labels and coplanar groups of the extensions; others are skipped."""
+    axes, whole, place = _TO_RDF[0], {}, 0
+    while place < len(extensions):
+        if len(extensions) - place < _RECORD.size:
+            raise InputError(f"{path}: the SPZ file is damaged: an extension is cut short")
+        kind, length = _RECORD.unpack_from(extensions, place)
+        place += _RECORD.size
+        if length > len(extensions) - place:
+            raise InputError(f"{path}: the SPZ file is damaged: an extension is cut short")
+        value = extensions[place : place + length]
+        place += length
+        if kind == _AXES:
+            system = int.from_bytes(value, "little") if length == 4 else -1
+            if system not in _TO_RDF:
+                raise InputError(
+                    f"{path}: the coordinate system must be one of {', '.join(map(str, _TO_RDF))}, got "
+                    f"{system}; convert it to RUB (4) by nianticlabs/spz"
+                )
+            axes = _TO_RDF[system]
+        elif kind in (_LABELS, _GROUPS):
+            try:
+                whole[kind] = np.frombuffer(zstd.decompress(value, 4 * n), "<i4").astype(np.int32)
+            except ValueError as error:
+                raise InputError(f"{path}: the SPZ file is damaged (extension: {error})") from None
+    return axes, whole.get(_LABELS), whole.get(_GROUPS)
+
+
+def save_spz(cloud: SplatCloud, path: Path, version: int = 4) -> None:
     """Write an SPZ file, with as many fractional bits as the extent of the cloud allows, at most 20 (1 um).
+
+    version: 4, or 3 for older readers, which has no labels and coplanar groups.
 
     Raises InputError for boxes, splats further than 8388 km from the origin, or a file that cannot be
     written.
     """
     refuse_boxes(cloud, "an SPZ file")
+    if version not in (3, 4):
+        raise InputError(f"version of SPZ must be 3 or 4, got {version!r}")
     rotated = cloud.transformed(HALF_TURN)
     means, sh = means_of(rotated).astype(np.float64), coefficients(rotated)
     furthest = float(np.abs(means).max(initial=0.0))
     point = min(_FINEST, int(np.floor(_BITS - np.log2(max(furthest, 1e-9) * (1 + 1e-6)) - 1e-9)))
     if point < 0:
         raise InputError(f"coordinates in SPZ must be at most {2**_BITS:,} m, got {furthest:g} m")
-    degree = int(np.sqrt(sh.shape[1])) - 1
+    degree, n = int(np.sqrt(sh.shape[1])) - 1, len(cloud)
     fixed = np.rint(means * 2.0**point).astype("<i4")
     parts = [
-        _HEAD.pack(_MAGIC, 3, len(cloud), degree, point, 0, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
         _byte(rotated.opacities * 255.0),
         _byte((sh[:, 0] * _COLOR + 0.5) * 255.0),
@@ -105,8 +216,27 @@ def save_spz(cloud: SplatCloud, path: Path) -> None:
         _packed(rotated.quats),
         _byte(sh[:, 1:] * 128.0 + 128.0),
     ]
+    if version == 3:
+        head = _HEAD.pack(_MAGIC, 3, n, degree, point, 0, 0)
+        data = gzip.compress(head + b"".join(parts), mtime=0)
+    else:
+        data = _version_4(cloud, degree, point, [part for part in parts if part])
     with atomic_write(path) as stream:
-        stream.write(gzip.compress(b"".join(parts), mtime=0))
+        stream.write(data)
+
+
+def _version_4(cloud: SplatCloud, degree: int, point: int, parts: list[bytes]) -> bytes:
+    extensions = b""
+    whole = {_LABELS: cloud.labels if cloud.labels.any() else None, _GROUPS: cloud.coplanar_groups}
+    for kind, numbers in whole.items():
+        if numbers is not None:
+            value = zstd.compress(numbers.astype("<i4").tobytes())
+            extensions += _RECORD.pack(kind, len(value)) + value
+    frames = [zstd.compress(part) for part in parts]
+    flags, table = _HAS_EXTENSIONS if extensions else 0, _HEAD_4.size + len(extensions)
+    head = _HEAD_4.pack(_MAGIC, 4, len(cloud), degree, point, flags, len(parts), table)
+    sizes = [_SIZES.pack(len(frame), len(part)) for frame, part in zip(frames, parts, strict=True)]
+    return b"".join([head, extensions, *sizes, *frames])
 
 
 def _byte(values: np.ndarray) -> bytes:

@@ -73,8 +73,9 @@ def test_a_gltf_of_pygltflib_with_a_matrix_and_rows_that_interleave(tmp_path, su
     )
     document.set_binary_blob(rows.tobytes())
     document.save(str(tmp_path / f"a{suffix}"))
-    turn = HALF_TURN @ quaternion_to_matrix(TURN)
-    move = HALF_TURN @ np.add(MOVE, (0, 0, 7))
+    axes = np.diag([-1.0, -1.0, 1.0])  # glTF has x to the left, y up and z forward
+    turn = axes @ quaternion_to_matrix(TURN)
+    move = axes @ np.add(MOVE, (0, 0, 7))
     assert_placed(fs.load_splats(tmp_path / f"a{suffix}"), turn, move, 2.5)
 
 

@@ -14,6 +14,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.formats import losses
 from fidsplat.formats.files import FORMATS
+from fidsplat.formats.spz import save_spz
 from fidsplat.splats.harmonics import C0
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
 
@@ -114,7 +115,7 @@ def test_an_spz_file_word_by_word(tmp_path):
         [[1.0, 2.0, -0.5]], [[0.8, 0.0, 0.6, 0.0]], [[math.exp(-2), math.exp(-1)]], [0.2],
         sh=[[[0.0, 1.0, -1.0]] + [[0.5, 0.25, 0.0]] * 3],
     )  # fmt: skip
-    fs.save_splats(cloud, tmp_path / "a.spz")
+    save_spz(cloud, tmp_path / "a.spz", version=3)
     data = gzip.decompress((tmp_path / "a.spz").read_bytes())
     assert struct.unpack_from("<IIIBBBB", data) == (0x5053474E, 3, 1, 1, 20, 0, 0)
     places = [int.from_bytes(data[16 + 3 * i : 19 + 3 * i], "little", signed=True) / 2**20 for i in range(3)]
@@ -163,7 +164,7 @@ def test_a_glb_file_by_another_reader(tmp_path):
     means = np.frombuffer(blob, "<f4", 3 * accessor.count, view.byteOffset).reshape(-1, 3)
     np.testing.assert_array_equal(means, cloud.means)
     np.testing.assert_allclose(accessor.min, cloud.means.min(axis=0))
-    assert document.nodes[0].rotation == [1, 0, 0, 0]  # y up
+    assert document.nodes[0].rotation == [0, 0, 1, 0]  # x to the left, y up, z forward
 
 
 def test_a_usd_file_says_what_the_schema_wants(tmp_path):
@@ -213,7 +214,7 @@ def test_a_gltf_of_nodes_bytes_and_a_neighbouring_file(tmp_path):
     path = tmp_path / "a.gltf"
     path.write_text(json.dumps(document))
     cloud = fs.load_splats(path)
-    np.testing.assert_allclose(cloud.world_means(), [[2, -10, 0]], atol=1e-6)
+    np.testing.assert_allclose(cloud.world_means(), [[-2, -10, 0]], atol=1e-6)
     np.testing.assert_allclose(cloud.scales, [[0.2, 0.4]], rtol=1e-6)
     np.testing.assert_allclose(cloud.thickness, [0.6], rtol=1e-6)
     np.testing.assert_allclose(cloud.opacities, [0.2], rtol=1e-6)
@@ -281,9 +282,62 @@ def test_files_that_are_cut_short_or_something_else(tmp_path, suffix):
         fs.load_splats(path)
 
 
+def spz_4(path, **fields):
+    """A file of version 4 of two splats, with changed header fields and inserted extensions."""
+    fs.save_splats(some(count=2, degree=1), path)
+    data = path.read_bytes()
+    head = dict(zip(("magic", "version", "n", "degree", "point", "flags", "streams", "table"),
+                    struct.unpack_from("<IIIBBBBI", data), strict=True))  # fmt: skip
+    extensions = fields.pop("extensions", b"")
+    old = head["table"]
+    head |= {"table": old + len(extensions), "flags": 2 if extensions else 0} | fields
+    path.write_bytes(struct.pack("<IIIBBBBI12x", *head.values()) + extensions + data[old:])
+    return path
+
+
+def test_an_spz_file_with_extensions(tmp_path):
+    """Extensions that are not known are skipped; the coordinate system of Adobe's is applied."""
+    plain = fs.load_splats(spz_4(tmp_path / "a.spz"))
+    unknown = fs.load_splats(
+        spz_4(tmp_path / "b.spz", extensions=struct.pack("<II3s", 0x12340001, 3, b"abc"))
+    )
+    np.testing.assert_array_equal(unknown.means, plain.means)
+    axes = struct.pack("<III", 0xADBE0003, 4, 6)  # right, down, front: those of trained splats
+    turned = fs.load_splats(spz_4(tmp_path / "c.spz", extensions=axes))
+    np.testing.assert_allclose(turned.means, plain.means * [1, -1, -1])
+
+
+def test_an_spz_file_keeps_labels_and_coplanar_groups(tmp_path):
+    cloud = fs.marker("apriltag:36h11:5", size=0.16).gaussians.with_labels(7)
+    fs.save_splats(cloud, tmp_path / "a.spz")
+    again = fs.load_splats(tmp_path / "a.spz")
+    np.testing.assert_array_equal(again.labels, cloud.labels)
+    np.testing.assert_array_equal(again.coplanar_groups, cloud.coplanar_groups)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"n": 2**32 - 1}, "expand to"),
+        ({"n": 3}, "array means must expand to 27 bytes"),
+        ({"streams": 5}, "must have 6 arrays, got 5"),
+        ({"table": 2**32 - 1}, "cut short: its table must end"),
+        ({"degree": 5}, "SH degree 0 to 4"),
+        ({"version": 3}, "damaged"),
+        ({"extensions": b"abc"}, "extension is cut short"),
+        ({"extensions": struct.pack("<II", 1, 2**32 - 1)}, "extension is cut short"),
+        ({"extensions": struct.pack("<III", 0xADBE0003, 4, 2)}, "coordinate system must be one of"),
+        ({"extensions": struct.pack("<III", 0xF1D50001, 4, 2)}, "damaged"),
+    ],
+)
+def test_a_damaged_spz_file_of_version_4(tmp_path, fields, words):
+    with pytest.raises(fs.InputError, match=words):
+        fs.load_splats(spz_4(tmp_path / "a.spz", **fields))
+
+
 def test_an_spz_file_of_a_later_version(tmp_path):
-    (tmp_path / "a.spz").write_bytes(struct.pack("<4sI", b"NGSP", 4) + bytes(24))
-    with pytest.raises(fs.InputError, match=r"a\.spz: the version of SPZ must be 2 or 3, got 4"):
+    (tmp_path / "a.spz").write_bytes(struct.pack("<4sI", b"NGSP", 5) + bytes(24))
+    with pytest.raises(fs.InputError, match=r"a\.spz: the version of SPZ must be 2, 3 or 4, got 5; convert"):
         fs.load_splats(tmp_path / "a.spz")
 
 
@@ -371,7 +425,7 @@ def test_convert_says_what_it_costs(tmp_path, monkeypatch, capsys):
     said = json.loads(capsys.readouterr().out)
     assert (said["splats"], said["lost"], said["format"]) == (40, [], "glTF KHR_gaussian_splatting")
     assert said["error"]["largest"] < 1e-5
-    assert main(["convert", "a.ply", "a.spz", "--device", "reference"]) == 0
+    assert main(["convert", "a.ply", "a.splat", "--device", "reference"]) == 0
     out = capsys.readouterr().out
     assert "lost: labels (1 different)" in out
     assert "image error: largest 0." in out

@@ -25,6 +25,7 @@ from test_sim_description import ROVER, URDF, WORLD
 
 import fidsplat as fs
 from fidsplat import cli
+from fidsplat.formats.spz import save_spz
 from fidsplat.images.files import read_bits, read_image, write_png
 from fidsplat.sim import read_description
 from fidsplat.store.layout import NPY_HEADER, checksum, header_crc
@@ -343,6 +344,7 @@ INPUTS = {
     ".ply": (splats(".ply"), use_splats, "a.ply", 40),
     ".splat": (splats(".splat"), use_splats, "a.splat", 20),
     ".spz": (splats(".spz"), use_splats, "a.spz", 40),
+    "SPZ 3": (lambda folder: save_spz(cloud(), folder / "a.spz", version=3), use_splats, "a.spz", 20),
     ".glb": (splats(".glb"), use_splats, "a.glb", 40),
     ".gltf": (gltf, use_splats, "a.gltf", 40),
     ".sog": (packed_sog, use_splats, "a.sog", 40),

@@ -49,7 +49,7 @@ HOME_OF = {
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
     "viser": ("viewer.server", "viewer.guard"),
-    "zstandard": ("viewer.guard", "logs.bags"),
+    "zstandard": ("viewer.guard", "logs.bags", "util.zstd"),
     "websockets": ("viewer.guard",),
     "torch": ("render.frame", "train.torch_bridge"),
     "ray": ("remote.ray_engine",),

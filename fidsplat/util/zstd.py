@@ -1,0 +1,33 @@
+"""Zstandard frames: compression, and decompression to a known size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def compress(data: bytes) -> bytes:
+    """One frame, the same for the same bytes."""
+    return _library().ZstdCompressor(level=12).compress(data)
+
+
+def decompress(data: bytes | memoryview, size: int) -> bytes:
+    """The content of a frame of `size` bytes; nothing beyond it is expanded.
+
+    Raises ValueError for damaged data or another size.
+    """
+    library = _library()
+    try:
+        # a frame declares its own size, which the other calls would allocate unchecked
+        with library.ZstdDecompressor(max_window_size=2**27).stream_reader(bytes(data)) as stream:
+            found = stream.read(size + 1)
+    except library.ZstdError as error:
+        raise ValueError(str(error)) from None
+    if len(found) != size:
+        raise ValueError(f"a frame of {size} bytes has {'more' if len(found) > size else len(found)}")
+    return found
+
+
+def _library() -> Any:
+    import zstandard
+
+    return zstandard
