@@ -24,7 +24,7 @@ def thick(**words) -> fs.SplatCloud:
     )
 
 
-def assert_close(one, other, means=1e-5, scales=0.033, degrees=0.4, opacities=0.0021, dc=0.02):
+def assert_close(one, other, means=1e-5, scales=0.033, degrees=0.4, opacities=0.0041, dc=0.02):
     np.testing.assert_allclose(one.means, other.means, atol=means)
     np.testing.assert_allclose(np.log(three_scales(one)), np.log(three_scales(other)), atol=scales)
     np.testing.assert_allclose(one.opacities, other.opacities, atol=opacities)
