@@ -35,6 +35,8 @@ MODIFIERS = (
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
     {"setup_precision": "float32", "arithmetic": "fast"},
+    {"blend_precision": "float16"},
+    {"setup_precision": "float32", "blend_precision": "float16"},
 )
 FINEST = (
     {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0},

@@ -49,6 +49,9 @@ def certify(
         certified = float(frame["error"].max(initial=0.0))
         if certified <= error:
             break
+        if quality.blend_precision == "float16":
+            quality = quality.with_(blend_precision="float32")
+            continue
         if quality.alpha_cutoff > cutoff:
             finer = max(REFINEMENT * quality.alpha_cutoff, cutoff)
             stop = REFINEMENT * quality.transmittance_stop if finer > cutoff else 0.0

@@ -80,7 +80,8 @@ def full_precision(capture: Capture, renderer: Renderer) -> Capture:
     Low-pass, samples, order and first_hit stay. The device composites in float64 if it can
     (`supports_float64`); otherwise only the set-up is in float64, if supported.
     """
-    best = ideal_quality(capture.quality, REFERENCE_CUTOFF).with_(arithmetic="precise")
+    best = ideal_quality(capture.quality, REFERENCE_CUTOFF)
+    best = best.with_(arithmetic="precise", blend_precision="float32")
     if not renderer.device.always_float64 and supports_float64(renderer, capture):
         best = best.with_(blend_precision="float64")
     return capture.with_(quality=best)

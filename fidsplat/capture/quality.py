@@ -145,11 +145,10 @@ class Quality:
     in OpenCL. Colours differ by less than 1e-6, or by the stop if a pixel reaches it one splat earlier."""
 
     blend_precision: str = "float32"
-    """Arithmetic of fragments. `float16` sums colours and transmittance in half precision, with `arithmetic`
-    chosen to match: faster on NVIDIA's GPUs, slower elsewhere. Each fragment adds up to 2^-12 of the pixel's
-    colour to the error, and alphas below 2^-12 lose light, so combine it with an `alpha_cutoff` of 1/255.
-    `float64` computes intersection, weight and blending in float64: a reference image of the device, many
-    times slower and always precise; it needs float64 in the device and in the set-up."""
+    """Arithmetic of fragments. `float16` sums colours and transmittance in half precision, always with fast
+    arithmetic: faster on NVIDIA's GPUs, slower elsewhere; n fragments with colours up to 1 change a pixel by
+    at most (n + 3) / 2048. `float64` computes intersection, weight and blending in float64: a reference image
+    of the device, many times slower and always precise; it needs float64 in the device and in the set-up."""
 
     marker: MarkerQuality = field(default_factory=MarkerQuality)
     """Conversion of markers to splats."""

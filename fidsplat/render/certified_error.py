@@ -180,7 +180,7 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         )
     features, view = prepare(data, replace(plain, quality=quality.with_(blend_precision="float32")))
     unbounded = sorted({*features.slots} - _BOUNDED)
-    if not unbounded and quality.blend_precision == "float32":
+    if not unbounded and quality.blend_precision != "float64":
         return replace(features, outputs=("rounding",)), view
     float32_rays = any(name.startswith("background_") for name in unbounded)
     with suppress(InputError):

@@ -168,12 +168,11 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     # without a pass of its own, if a pixel is one sample of one pose, and nothing but blending adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
-    files = [layout.file for layout in layouts.values() if layout.file] + _dialect(shape, _scalars(features))
-    files.append(LAYOUTS["resolve_pixel"].file)
-    if "blend_half" not in layouts:
+    half = "blend_half" in layouts
+    files = [layout.file for layout in layouts.values() if layout.file]
+    files += [*_dialect(shape, _scalars(features), half), LAYOUTS["resolve_pixel"].file]
+    if not half:
         files.append(LAYOUTS["blend_float"].file)
-    elif shape.dialect:
-        files.append(f"dialect/{shape.dialect}_half.cl")
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
         # not for mixtures of disks and 3D Gaussians, whose bounds are computed otherwise
         if "lowpass_screen" in layouts and "thickness" not in layouts:
@@ -240,9 +239,12 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
     return assembler.source({name: [stage.format(shape.schedule) for stage in stages]})
 
 
-def _dialect(shape: DeviceShape, scalars: Scalars) -> list[str]:
-    """The file of the vendor's instructions, which are for fragments in float32."""
-    return [f"dialect/{shape.dialect}.cl"] if shape.dialect and scalars.wide == "float" else []
+def _dialect(shape: DeviceShape, scalars: Scalars, half: bool = False) -> list[str]:
+    """The files of the vendor's instructions, which are for fragments in float32, or with sums in half
+    precision."""
+    if not shape.dialect or scalars.wide != "float":
+        return []
+    return [f"dialect/{shape.dialect}.cl", *([f"dialect/{shape.dialect}_half.cl"] if half else [])]
 
 
 def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:

@@ -28,6 +28,8 @@ SLOTS = frozenset(
     | {"shutter_rows", "ellipsoids_only"}
 )
 """supported features; supported outputs and post-processing steps have a file each"""
+_SETTINGS = {"blend_half": "blend_precision='float16'", "blend_double": "blend_precision='float64'"}
+"""quality settings that request unsupported features"""
 # effects that a stage depends on; it is compiled once for all feature sets with the same
 _RECORD = (
     *("lowpass_screen", "rays", "camera_orthographic", "ray_depth"),
@@ -47,7 +49,8 @@ def known() -> frozenset[str]:
 
 def unsupported(features: FeatureSet, name: str) -> str:
     """Error message naming unsupported effects; empty if there are none. name: of the device."""
-    lacking = ", ".join(sorted({*features.slots, *features.outputs, *features.posts} - known()))
+    effects = {*features.slots, *features.outputs, *features.posts} - known()
+    lacking = ", ".join(sorted(_SETTINGS.get(name, name) for name in effects))
     return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
 
 

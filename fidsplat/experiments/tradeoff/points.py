@@ -40,7 +40,7 @@ _VALUES: dict[str, tuple[Any, ...]] = {
     "samples": (2, 3),
     "setup_precision": ("float32",),
     "arithmetic": ("fast",),
-    "blend_precision": ("float64",),
+    "blend_precision": ("float16", "float64"),
 }
 _QUICK_VALUES = _VALUES | {
     "alpha_cutoff": (1e-4, 1 / 1024, 2 / 255),
@@ -74,6 +74,7 @@ _ABLATIONS: tuple[dict[str, Any], ...] = (
     {"lowpass": "none"},
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
+    {"blend_precision": "float16"},
 )
 """constants that are changed in `EXACT`, one at a time"""
 
