@@ -20,7 +20,7 @@ class Convert:
     """Convert splats to another format, and measure the loss.
 
     Formats by ending: .ply, .splat, .spz, .glb and .gltf (KHR_gaussian_splatting), .usda, .usdc and .usd
-    (OpenUSD's ParticleField; extra usd), and .sog (read only). The command lists what the format of OUT
+    (OpenUSD's ParticleField; extra usd), .sog and meta.json (SOG). The command lists what the format of OUT
     cannot store, renders both files from the camera of `fidsplat render IN`, and prints the largest and mean
     difference of the images and their PSNR.
 

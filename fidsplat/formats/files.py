@@ -13,7 +13,7 @@ from fidsplat.formats.collect import Progress
 from fidsplat.formats.gltf import load_gltf, save_gltf
 from fidsplat.formats.ply import load_ply
 from fidsplat.formats.ply_write import save_ply
-from fidsplat.formats.sog import load_sog
+from fidsplat.formats.sog import load_sog, load_sog_folder, save_sog, save_sog_folder
 from fidsplat.formats.splat import load_splat, save_splat
 from fidsplat.formats.spz import load_spz, save_spz
 from fidsplat.formats.usd import load_usd, save_usd
@@ -39,6 +39,7 @@ class Format:
     """values stored with fewer bits than float32"""
 
 
+_SOG_ROUNDS = "positions to 16 bits, the rest to 8; SH above degree 0 to 65,536 sets"
 _USD = Format("OpenUSD ParticleField", load_usd, save_usd, labels=True, coplanar_groups=True)
 _GLTF = Format("glTF KHR_gaussian_splatting", load_gltf, save_gltf, labels=True, coplanar_groups=True)
 FORMATS = {
@@ -59,13 +60,17 @@ FORMATS = {
     ".usda": _USD,
     ".usdc": _USD,
     ".usd": _USD,
-    ".sog": Format("SOG", load_sog, None),
+    ".sog": Format("SOG", load_sog, save_sog, rounds=_SOG_ROUNDS),
 }
 """formats by suffix"""
+NAMED = {"meta.json": Format("SOG", load_sog_folder, save_sog_folder, rounds=_SOG_ROUNDS)}
+"""formats by file name"""
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """The format of a file by its suffix. Raises InputError for an unknown one."""
+    """The format of a file by its name or suffix. Raises InputError for an unknown one."""
+    if (named := NAMED.get(path_of(path).name.lower())) is not None:
+        return named
     suffix = path_of(path).suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"{path}: {unknown('suffix of a splat file', suffix, FORMATS)}")
@@ -73,7 +78,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
 
 
 def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
-    """Read a splat file: .ply, .splat, .spz, .glb, .gltf, .usda, .usdc, .usd or .sog.
+    """Read a splat file: .ply, .splat, .spz, .glb, .gltf, .usda, .usdc, .usd, .sog or meta.json.
 
     progress: callback of the current task and its completed share, 0 to 1, for PLY.
 

@@ -307,6 +307,12 @@ def decode_rgb(content: bytes) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+def encode_webp(image: np.ndarray) -> bytes:
+    """Lossless WebP of an image (h, w, 4) uint8 RGBA; colours of transparent pixels may change."""
+    quality = [cv2.IMWRITE_WEBP_QUALITY, 101]
+    return cv2.imencode(".webp", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA), quality)[1].tobytes()
+
+
 def decode_rgba(data: bytes, name: str) -> np.ndarray:
     """Decode an image file's content to (h, w, 4) uint8 RGBA, alpha 255 where it has none.
 

@@ -10,7 +10,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.capture.quality import Quality
 from fidsplat.formats.collect import Progress
-from fidsplat.formats.files import FORMATS, load_splats
+from fidsplat.formats.files import FORMATS, NAMED, load_splats
 from fidsplat.scenes.scene import Scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.layout import SUFFIX
@@ -44,12 +44,12 @@ def load_source(source: str, quality: Quality | str | None = None, progress: Pro
     if suffix == SUFFIX:
         store = Store(source)
         return Scene(stores=(store,), camera=framing_camera(store))
-    if suffix in FORMATS:
+    if suffix in FORMATS or Path(source).name.lower() in NAMED:
         cloud = load_splats(source, progress)
         return Scene((cloud,), camera=framing_camera(cloud))
     raise InputError(
         f"the source must be a scene file (.toml), a store ({SUFFIX}) or a splat file "
-        f"({', '.join(FORMATS)}), got {source}"
+        f"({', '.join([*FORMATS, *NAMED])}), got {source}"
     )
 
 

@@ -7,8 +7,10 @@ import zipfile
 import cv2
 import numpy as np
 import pytest
+from test_formats import some
 
 import fidsplat as fs
+from fidsplat.formats.sog import _clustered
 
 
 def picture(kind: str, side: int) -> bytes:
@@ -73,7 +75,8 @@ def test_a_sog_file_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"version": 1}, "the version of SOG must be 2, got 1"),
+        ({"version": 3}, "the version of SOG must be 1 or 2, got 3; convert it by splat-transform"),
+        ({"version": 1}, r"damaged \(KeyError"),
         ({"count": 5}, "l.webp must have a pixel for each of 5 splats, got 4"),
         ({"sh0": {}}, r"damaged \(KeyError"),
         ({"q.webp": None}, "lacks q.webp"),
@@ -106,6 +109,58 @@ def test_damaged_sog_files(tmp_path, changes, words):
     (tmp_path / "a.sog").write_bytes((tmp_path / "a.sog").read_bytes()[:-30])
     with pytest.raises(fs.InputError, match="is not a SOG file: its zip is damaged"):
         fs.load_splats(tmp_path / "a.sog")
+
+
+def test_a_sog_folder_of_version_1(tmp_path):
+    """Equidistant values between limits in place of code books, and logits in place of opacities."""
+    limits = lambda n: {"mins": [-2.0] * n, "maxs": [3.0] * n}  # noqa: E731
+    scalar = {"mins": -1.0, "maxs": 1.0}
+    _, palette = sog(tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path)
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    del meta["version"], meta["count"]
+    meta["means"]["shape"] = [2, 3]
+    meta["scales"] = limits(3) | {"files": ["s.webp"]}
+    meta["sh0"] = limits(4) | {"files": ["c.webp"]}
+    meta["shN"] = scalar | {"files": ["p.webp", "n.webp"]}
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    cloud = fs.load_splats(tmp_path / "meta.json")
+    np.testing.assert_array_equal(cloud.means, fs.load_splats(tmp_path / "a.sog").means)
+    np.testing.assert_allclose(np.log(cloud.scales[0]), -2 + 5 * np.array([64, 96]) / 255, rtol=1e-5)
+    np.testing.assert_allclose(cloud.sh[0, 0], -2 + 5 * np.array([128, 0, 255]) / 255, rtol=1e-5)
+    np.testing.assert_allclose(cloud.opacities[0], 1 / (1 + math.exp(2 - 5 * 51 / 255)), rtol=1e-5)
+    np.testing.assert_allclose(cloud.sh[0, 1:], palette[1, 3:6, :3] / 255.0 * 2 - 1, atol=1e-6)
+    for name in ("../a.sog", "/etc/hostname", "\0", "none.webp"):
+        meta["quats"]["files"] = [name]
+        (tmp_path / "meta.json").write_text(json.dumps(meta))
+        with pytest.raises(fs.InputError, match=r"must be in its folder|cannot read"):
+            fs.load_splats(tmp_path / "meta.json")
+
+
+@pytest.mark.parametrize("name", ["b.sog", "meta.json"])
+def test_sog_files_that_are_written(tmp_path, name):
+    cloud = some(count=300, degree=3)
+    fs.save_splats(cloud, tmp_path / name)
+    again = fs.load_splats(tmp_path / name)
+    np.testing.assert_allclose(again.means, cloud.means, rtol=2e-3, atol=2e-4)
+    np.testing.assert_allclose(np.log(again.scales), np.log(cloud.scales), atol=0.05)
+    np.testing.assert_array_equal(np.asarray(again.thickness) == 0, np.asarray(cloud.thickness) == 0)
+    np.testing.assert_allclose(again.opacities, cloud.opacities, atol=0.002)
+    np.testing.assert_allclose(again.sh, cloud.sh, atol=0.03)
+    assert np.abs((again.quats * cloud.quats).sum(1)).min() > 1 - 1e-4
+    written = (tmp_path / name).read_bytes()
+    fs.save_splats(cloud, tmp_path / name)
+    assert (tmp_path / name).read_bytes() == written
+
+
+def test_a_palette_of_sh_has_at_most_65536_entries(monkeypatch):
+    monkeypatch.setattr("fidsplat.formats.sog.MAX_ENTRIES", 64)
+    vectors = np.random.default_rng(3).normal(size=(1000, 9))
+    means, labels = _clustered(vectors)
+    assert len(means) == 64
+    assert np.bincount(labels).min() >= 15
+    assert ((vectors - means[labels]) ** 2).mean() < 0.6 * vectors.var()
 
 
 @pytest.mark.parametrize("way", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])

@@ -65,6 +65,10 @@ def splats(suffix):
     return make
 
 
+def splats_folder(folder):
+    fs.save_splats(cloud(), folder / "meta.json")
+
+
 def gltf(folder):
     """The same splats as a GLB, with its buffer beside it."""
     fs.save_splats(cloud(), folder / "a.glb")
@@ -348,6 +352,7 @@ INPUTS = {
     ".glb": (splats(".glb"), use_splats, "a.glb", 40),
     ".gltf": (gltf, use_splats, "a.gltf", 40),
     ".sog": (packed_sog, use_splats, "a.sog", 40),
+    "SOG folder": (splats_folder, use_splats, "meta.json", 30),
     ".usda": (splats(".usda"), use_splats, "a.usda", 3),
     ".usdc": (splats(".usdc"), use_splats, "a.usdc", 3),
     "scene": (scene, use_scene, "a.toml", 40),
