@@ -6,8 +6,8 @@
 Each scene of `random_scenes.py` is rendered with every candidate and compared with the image at full
 precision, in float64 (`fidsplat.accuracy.error.reference_renderer`). Costs are medians of interleaved frames
 of the scenes of TIMED, of processor time on CPUs. In a second round, the Pareto front is rendered with every
-set of MODIFIERS and with FINEST; the new Pareto front is written. Settings that the device lacks are left
-out. Entries of other kinds of devices stay.
+set of MODIFIERS (and OF_GPUS) and with FINEST; the new Pareto front is written. Settings that the device
+lacks are left out. Entries of other kinds of devices stay.
 """
 
 from __future__ import annotations
@@ -35,9 +35,13 @@ MODIFIERS = (
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
     {"setup_precision": "float32", "arithmetic": "fast"},
-    {"blend_precision": "float16"},
-    {"setup_precision": "float32", "blend_precision": "float16"},
 )
+OF_GPUS = tuple(
+    {**setup, **more}
+    for setup in ({}, {"setup_precision": "float32"})
+    for more in ({"arithmetic": "approximate"}, {"blend_precision": "float16"})
+)
+"""further modifiers, which are not faster on CPUs"""
 FINEST = (
     {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0},
     {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0, "blend_precision": "float64"},
@@ -107,7 +111,8 @@ def main() -> int:
     plain = measure(grid)
     plain = plain.of(plain.pareto_front())
     say(f"{len(plain.candidates)} of {len(grid)} are on the front")
-    modifiers = [more for more in MODIFIERS if supports(renderer, scenes[0], more)]
+    modifiers = (*MODIFIERS, *(OF_GPUS if renderer.device.kind == "gpu" else ()))
+    modifiers = [more for more in modifiers if supports(renderer, scenes[0], more)]
     finest = [settings for settings in FINEST if supports(renderer, scenes[0], settings)]
     combined = [settings | more for settings in plain.candidates for more in modifiers]
     both = measure(plain.candidates + combined + finest)

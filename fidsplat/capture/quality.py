@@ -17,7 +17,7 @@ STOP_RULES = ("inclusive", "exclusive")
 ELLIPSOID = ("exact", "ewa", "ewa_antialiased")
 ORDERS = ("auto", "pixel", "centre")
 SETUP_PRECISIONS = ("float64", "float32")
-ARITHMETIC = ("precise", "fast")
+ARITHMETIC = ("precise", "fast", "approximate")
 BLEND_PRECISIONS = ("float32", "float16", "float64")
 MAX_SAMPLES = 8
 MIXTURES = ("exact", "fitted", "paper", "facets")
@@ -142,13 +142,16 @@ class Quality:
     arithmetic: str = "fast"
     """Exponentials and logarithms of blending. `fast`: polynomials, within 2.3 ulp for exponentials and 1.1
     for logarithms, bit-identical on devices with fused multiply-adds. `precise`: the device library's, 3 ulp
-    in OpenCL. Colours differ by less than 1e-6, or by the stop if a pixel reaches it one splat earlier."""
+    in OpenCL. Colours differ by less than 1e-6, or by the stop if a pixel reaches it one splat earlier.
+    `approximate`: as `fast`, but exponentials by NVIDIA's GPUs through OpenCL, within 1e-6; images are no
+    longer bit-identical to those of other devices."""
 
     blend_precision: str = "float32"
-    """Arithmetic of fragments. `float16` sums colours and transmittance in half precision, always with fast
-    arithmetic: faster on NVIDIA's GPUs, slower elsewhere; n fragments with colours up to 1 change a pixel by
-    at most (n + 3) / 2048. `float64` computes intersection, weight and blending in float64: a reference image
-    of the device, many times slower and always precise; it needs float64 in the device and in the set-up."""
+    """Arithmetic of fragments. `float16` sums colours and transmittance in half precision, always with
+    approximate arithmetic: faster on NVIDIA's GPUs, slower elsewhere; n fragments with colours up to 1 change
+    a pixel by at most (n + 3) / 2048. `float64` computes intersection, weight and blending in float64: a
+    reference image of the device, many times slower and always precise; it needs float64 in the device and in
+    the set-up."""
 
     marker: MarkerQuality = field(default_factory=MarkerQuality)
     """Conversion of markers to splats."""

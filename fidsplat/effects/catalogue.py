@@ -71,7 +71,7 @@ _PLAIN = (
     *("footprint_gaussian", "footprint_box", "footprint_mixed"),
     *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
     *("background_constant", "background_gradient", "background_panorama"),
-    *("arithmetic_precise", "arithmetic_fast"),
+    *("arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"),
     # optional
     *("external_depth", "motion_groups", "shutter_exposure", "shutter_rows", "blend_double"),
     "blend_half",

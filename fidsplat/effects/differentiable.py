@@ -12,7 +12,7 @@ DIFFERENTIABLE = frozenset(
     (
         *("camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen"),
         *("stop_inclusive", "stop_exclusive", "compose_ordered", "footprint_gaussian"),
-        *("background_constant", "arithmetic_precise", "arithmetic_fast"),
+        *("background_constant", "arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"),
     )
 )
 """effects with a backward pass"""

@@ -126,8 +126,8 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             _composing(cloud, quality.order, one_depth_each=ewa_only and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
-            # the fast functions are float32, and as accurate as half precision requires
-            f"arithmetic_{'precise' if double else 'fast' if half else quality.arithmetic}",
+            # the other functions are float32; half precision requires no better ones than the approximate
+            f"arithmetic_{'precise' if double else 'approximate' if half else quality.arithmetic}",
             *(("motion_groups",) if capture.motion.groups else ()),
             *(("shutter_exposure",) if capture.exposed else ()),
             *(("shutter_rows",) if capture.exposed and in_spheres else ()),

@@ -178,7 +178,10 @@ def _prepared(data: Any, capture: Capture, quality: Quality, backend: Backend) -
         raise InputError(
             f"the output 'error' must have a set-up in float64, which {info.name} lacks; use another device"
         )
-    features, view = prepare(data, replace(plain, quality=quality.with_(blend_precision="float32")))
+    bounded = quality.with_(blend_precision="float32")
+    if bounded.arithmetic == "approximate":
+        bounded = bounded.with_(arithmetic="fast")
+    features, view = prepare(data, replace(plain, quality=bounded))
     unbounded = sorted({*features.slots} - _BOUNDED)
     if not unbounded and quality.blend_precision != "float64":
         return replace(features, outputs=("rounding",)), view

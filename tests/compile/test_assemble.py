@@ -309,3 +309,18 @@ def test_only_pinhole_frames_of_several_poses_are_culled_by_spheres():
 def test_pipelines_are_compiled_once(renderer):
     features = select(COLORS, fs.Capture(quality=PLAIN))
     assert renderer.backend.pipeline(features) is renderer.backend.pipeline(features)
+
+
+def test_half_precision_and_approximate_arithmetic_add_their_instructions_of_a_dialect_only():
+    ptx = gpu_shape(dialect="ptx")
+    for quality, added in (
+        ({}, set()),
+        ({"arithmetic": "approximate"}, {"ex2.approx"}),
+        ({"blend_precision": "float16"}, {"ex2.approx", "fma.rn.f16x2"}),
+    ):
+        features = select(COLORS, fs.Capture(quality=PLAIN.with_(**quality)))
+        text = assemble(features, ptx).text
+        assert {word for word in ("ex2.approx", "fma.rn.f16x2") if word in text} == added
+        portable = assemble(features, GROUP).text
+        assert "asm(" not in portable
+        assert ("vstore_half_rte" in portable) == ("blend_precision" in quality)

@@ -170,7 +170,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     half = "blend_half" in layouts
     files = [layout.file for layout in layouts.values() if layout.file]
-    files += [*_dialect(shape, _scalars(features), half), LAYOUTS["resolve_pixel"].file]
+    files += [*_dialect(shape, _scalars(features), features.slots), LAYOUTS["resolve_pixel"].file]
     if not half:
         files.append(LAYOUTS["blend_float"].file)
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
@@ -230,7 +230,8 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
     layouts = layouts_of(features)
     # the forward text of slots is used again, of outputs only the derivatives
     slots = (part for slot in features.slots for part in (slot, *LAYOUTS[slot].parts))
-    files = [LAYOUTS[part].file for part in dict.fromkeys(slots)] + _dialect(shape, _scalars(features))
+    files = [LAYOUTS[part].file for part in dict.fromkeys(slots)]
+    files += _dialect(shape, _scalars(features), features.slots)
     files += [layout.backward_file for layout in layouts.values()]
     kernels = kernels_of(shape)
     declared = Declarations(_scalars(features), layouts, kernels=kernels)
@@ -239,12 +240,13 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
     return assembler.source({name: [stage.format(shape.schedule) for stage in stages]})
 
 
-def _dialect(shape: DeviceShape, scalars: Scalars, half: bool = False) -> list[str]:
-    """The files of the vendor's instructions, which are for fragments in float32, or with sums in half
-    precision."""
+def _dialect(shape: DeviceShape, scalars: Scalars, slots: Iterable[str] = ()) -> list[str]:
+    """The files of the vendor's instructions, which are for fragments in float32: those of all frames, then
+    those of the slots that have some."""
     if not shape.dialect or scalars.wide != "float":
         return []
-    return [f"dialect/{shape.dialect}.cl", *([f"dialect/{shape.dialect}_half.cl"] if half else [])]
+    own = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
+    return [f"dialect/{shape.dialect}{suffix}.cl" for suffix in ("", *(own[n] for n in slots if n in own))]
 
 
 def kernels_of(shape: DeviceShape) -> Mapping[str, tuple[Argument, ...]]:

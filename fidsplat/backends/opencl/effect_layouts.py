@@ -120,6 +120,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "arithmetic_precise": Layout("slot/arithmetic_precise.cl"),
     "arithmetic_fast": Layout("slot/arithmetic_fast.cl"),
+    "arithmetic_approximate": Layout("slot/arithmetic_fast.cl"),  # without a dialect
     "motion_groups": Layout(
         "slot/motion_groups.cl",
         project=takes("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),

@@ -23,7 +23,8 @@ SLOTS = frozenset(
     | {"compose_ordered", "compose_pixel", "compose_coplanar", "compose_coplanar_pixel"}
     | {"footprint_gaussian", "footprint_box", "footprint_mixed"}
     | {"background_constant", "background_gradient", "background_panorama"}
-    | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure", "external_depth"}
+    | {"arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"}
+    | {"motion_groups", "shutter_exposure", "external_depth"}
     # without effect on images
     | {"shutter_rows", "ellipsoids_only"}
 )
@@ -79,6 +80,8 @@ class _Needs:
         # rays of other lenses have a length of 1
         if "camera_brown_conrady" in effects and measured:
             effects.add("rays_length")
+        if "arithmetic_approximate" in effects:
+            effects.add("arithmetic_fast")
         if "compose_coplanar_pixel" in effects:
             effects |= {"compose_coplanar", "compose_pixel"}
         with_depth = {"compose_pixel", "compose_coplanar", "external_depth"}

@@ -39,7 +39,7 @@ _VALUES: dict[str, tuple[Any, ...]] = {
     "lowpass": ("pixel", "none"),
     "samples": (2, 3),
     "setup_precision": ("float32",),
-    "arithmetic": ("fast",),
+    "arithmetic": ("fast", "approximate"),
     "blend_precision": ("float16", "float64"),
 }
 _QUICK_VALUES = _VALUES | {
@@ -74,6 +74,7 @@ _ABLATIONS: tuple[dict[str, Any], ...] = (
     {"lowpass": "none"},
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
+    {"arithmetic": "approximate"},
     {"blend_precision": "float16"},
 )
 """constants that are changed in `EXACT`, one at a time"""

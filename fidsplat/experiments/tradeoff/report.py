@@ -51,6 +51,7 @@ CONSTANTS = (
     Constant("alpha is clamped to 0.99", "3DGS, 2DGS, gsplat", ABLATION, "opacity_ceiling 0.99"),
     Constant("projection in float32", "3DGS, 2DGS, gsplat, our `fast`", ABLATION, "setup_precision float32"),
     Constant("exponentials by polynomials", "our `standard`, `fast`", ABLATION, "arithmetic fast"),
+    Constant("exponentials by GPU instructions", "3DGS, gsplat, HiGS", ABLATION, "arithmetic approximate"),
     Constant("colours and transmittance in float16", "HiGS", ABLATION, "blend_precision float16"),
     Constant("**`gsplat`**: gsplat's constants together", "gsplat, 2DGS", PRESET, "gsplat"),
     Constant("**`fast`**: 2/255, T = 1/256, float32 set-up", "ours", PRESET, "fast"),

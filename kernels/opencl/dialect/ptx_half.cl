@@ -1,4 +1,4 @@
-// Pairs of halves in a register of NVIDIA's GPUs (slot/blend_half.cl), and their exponential.
+// Pairs of halves in a register of NVIDIA's GPUs (slot/blend_half.cl).
 //@ dialect
 typedef uint half_pair;
 static inline half_pair ptx_half_pair(float low, float high) {
@@ -37,11 +37,3 @@ static inline float ptx_half_high(half_pair pair) {
 #define HALF_BY_HIGH(a, b) ptx_half_by_high(a, b)
 #define HALF_LOW(pair) ptx_half_low(pair)
 #define HALF_HIGH(pair) ptx_half_high(pair)
-
-// Within 2^-20 of e^x for the opacities that a half can hold; 0 below the smallest float.
-static inline float ptx_fast_exp(float x) {
-    float y;
-    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x * 1.44269504f));
-    return y;
-}
-#define FAST_EXP(x) ptx_fast_exp(x)

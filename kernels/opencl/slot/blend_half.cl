@@ -56,10 +56,6 @@ static inline uint pack_halves(float low, float high) {
 #define COLOR_WORDS
 #endif
 static inline float within_half(float color) { return clamp(color, -65504.0f, 65504.0f); }     // their range
-#ifdef FAST_EXP
-#undef EXP
-#define EXP FAST_EXP
-#endif
 //@ splat_view
     wide unpacked_r, unpacked_g, unpacked_b;
 //@ project

@@ -1,0 +1,10 @@
+// Exponential of NVIDIA's GPUs instead of a polynomial: relative error at most 1e-6 for opacities above 1e-5; 0 below the smallest normal
+// float.
+//@ arithmetic
+static inline float ptx_exp(float x) {
+    float y;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x * 1.44269504f));
+    return y;
+}
+#undef EXP
+#define EXP ptx_exp
