@@ -27,6 +27,7 @@ class Convert:
     Examples:
       fidsplat convert room.ply room.spz
       fidsplat convert tag.ply tag.usda --json
+      fidsplat convert city.fss city/lod-meta.json   a store as streamed SOG
     """
 
     source: Annotated[tyro.conf.Positional[str], option("IN", "splat file to read")]
@@ -40,7 +41,11 @@ class Convert:
         import fidsplat as fs
         from fidsplat.formats import losses, save_splats
         from fidsplat.formats.files import check_writable
+        from fidsplat.formats.sog_streamed import META
+        from fidsplat.store.layout import SUFFIX
 
+        if Path(self.source).suffix == SUFFIX and Path(self.target).name == META:
+            return self._export()
         known = check_writable(self.target)
         source, target = Path(self.source), Path(self.target)
         if source.exists() and target.exists() and source.samefile(target):
@@ -63,6 +68,16 @@ class Convert:
             apart = f"image error: largest {error['largest']:.2g}, mean {error['mean']:.2g}"
             lines.append(f"{apart}; {psnr}")
         return report(self.json, facts, *lines)
+
+    def _export(self) -> int:
+        import fidsplat as fs
+        from fidsplat.store.streamed import export_streamed
+
+        new_file(self.target, self.overwrite)
+        store = fs.Store(self.source)
+        export_streamed(store, Path(self.target))
+        facts = {"source": self.source, "target": self.target, "format": "streamed SOG", "splats": len(store)}
+        return report(self.json, facts, f"{len(store):,} splats as streamed SOG: {self.target}")
 
 
 def image_error(before, after, device: str | None) -> dict[str, float]:

@@ -14,6 +14,7 @@ from fidsplat.formats.gltf import load_gltf, save_gltf
 from fidsplat.formats.ply import load_ply
 from fidsplat.formats.ply_write import save_ply
 from fidsplat.formats.sog import load_sog, load_sog_folder, save_sog, save_sog_folder
+from fidsplat.formats.sog_streamed import META, load_streamed
 from fidsplat.formats.splat import load_splat, save_splat
 from fidsplat.formats.spz import load_spz, save_spz
 from fidsplat.formats.usd import load_usd, save_usd
@@ -63,7 +64,10 @@ FORMATS = {
     ".sog": Format("SOG", load_sog, save_sog, rounds=_SOG_ROUNDS),
 }
 """formats by suffix"""
-NAMED = {"meta.json": Format("SOG", load_sog_folder, save_sog_folder, rounds=_SOG_ROUNDS)}
+NAMED = {
+    "meta.json": Format("SOG", load_sog_folder, save_sog_folder, rounds=_SOG_ROUNDS),
+    META: Format("streamed SOG", load_streamed, None),
+}
 """formats by file name"""
 
 
@@ -104,7 +108,10 @@ def check_writable(path: str | os.PathLike[str]) -> Format:
     known = format_of(path)
     if known.save is None:
         others = ", ".join(suffix for suffix, other in FORMATS.items() if other.save is not None)
-        raise InputError(f"{path}: {known.name} is read only; write {others}")
+        raise InputError(
+            f"{path}: {known.name} must be written from a store (`fidsplat store build`), got splats; write "
+            f"{others}"
+        )
     return known
 
 

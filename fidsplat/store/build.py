@@ -15,7 +15,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -26,10 +26,11 @@ from fidsplat.store.layout import NODE, Header, npy_header, write_nodes
 from fidsplat.store.merge import REDUCTION, merged
 from fidsplat.store.sources import Source, open_sources, splats_of
 from fidsplat.store.staging import clear, refuse_existing, staged, store_folder
+from fidsplat.store.streamed import import_streamed, is_streamed
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback, settings_with
 from fidsplat.util.errors import InputError, bytes_words
-from fidsplat.util.files import atomic_write, from_json, read_input
+from fidsplat.util.files import atomic_write, from_json, path_of, read_input
 
 _SAVE_EVERY = 16
 """parts of the work after which progress is saved"""
@@ -50,7 +51,8 @@ def build_store(
 
     Args:
         inputs: PLY files of any size, which are read in parts; files of other formats, which are loaded; or
-            `Source` objects.
+            `Source` objects. One streamed SOG (lod-meta.json) keeps its chunks and levels of detail, without
+            settings.
         out: the store's folder; its name ends with .fss.
         settings: `BuildSettings`; None: the defaults. `changes` are settings by name: chunk, memory, levels,
             sh_degree, colors.
@@ -65,9 +67,14 @@ def build_store(
     folder = store_folder(out)
     refuse_existing(folder, overwrite)
     settings = settings_with(BuildSettings, settings, changes)
+    progress = progress or (lambda words, share: None)
+    if is_streamed(inputs):
+        one = inputs if isinstance(inputs, (str, os.PathLike)) else inputs[0]
+        import_streamed(path_of(cast("str", one)), folder, progress)
+        return folder
     plan = plan_build(open_sources(inputs), settings)
     with staged(folder) as part:
-        _Build(plan, part, progress or (lambda words, share: None)).run()
+        _Build(plan, part, progress).run()
     return folder
 
 

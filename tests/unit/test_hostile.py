@@ -25,6 +25,7 @@ from test_sim_description import ROVER, URDF, WORLD
 
 import fidsplat as fs
 from fidsplat import cli
+from fidsplat.formats.sog_streamed import save_streamed
 from fidsplat.formats.spz import save_spz
 from fidsplat.images.files import read_bits, read_image, write_png
 from fidsplat.sim import read_description
@@ -67,6 +68,11 @@ def splats(suffix):
 
 def splats_folder(folder):
     fs.save_splats(cloud(), folder / "meta.json")
+
+
+def streamed(folder):
+    part = [cloud()]
+    save_streamed(folder / "lod-meta.json", [(np.array(cloud().bounds()), [part, part])], 2)
 
 
 def gltf(folder):
@@ -353,6 +359,7 @@ INPUTS = {
     ".gltf": (gltf, use_splats, "a.gltf", 40),
     ".sog": (packed_sog, use_splats, "a.sog", 40),
     "SOG folder": (splats_folder, use_splats, "meta.json", 30),
+    "streamed SOG": (streamed, use_splats, "lod-meta.json", 30),
     ".usda": (splats(".usda"), use_splats, "a.usda", 3),
     ".usdc": (splats(".usdc"), use_splats, "a.usdc", 3),
     "scene": (scene, use_scene, "a.toml", 40),
