@@ -44,9 +44,10 @@ class Render(RenderInput):
     {outputs}
 
     Quality: standard, fast, reference, gsplat or surfel, then settings of fs.Quality as key=value; settings
-    without a preset change standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file use
-    marker.mixture, marker.levels, marker.density, marker.growth and marker.template of the quality where the
-    file does not state them.
+    without a preset change standard: fast,samples=2,alpha_cutoff=1e-3. On NVIDIA's GPUs through OpenCL,
+    arithmetic=approximate saves time at an error of 1e-6, and blend_precision=float16 at one of 0.01.
+    Markers of a scene file use marker.mixture, marker.levels, marker.density, marker.growth and
+    marker.template of the quality where the file does not state them.
 
     Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
     (docs/scene-files.md) and can be combined.
