@@ -27,6 +27,7 @@ class Convert:
     Examples:
       fidsplat convert room.ply room.spz
       fidsplat convert tag.ply tag.usda --json
+      fidsplat convert scene.toml scene.html         one page that renders it offline, in a browser
       fidsplat convert city.fss city/lod-meta.json   a store as streamed SOG
     """
 
@@ -46,6 +47,8 @@ class Convert:
 
         if Path(self.source).suffix == SUFFIX and Path(self.target).name == META:
             return self._export()
+        if Path(self.target).suffix.lower() == ".html":
+            return self._page()
         known = check_writable(self.target)
         source, target = Path(self.source), Path(self.target)
         if source.exists() and target.exists() and source.samefile(target):
@@ -68,6 +71,18 @@ class Convert:
             apart = f"image error: largest {error['largest']:.2g}, mean {error['mean']:.2g}"
             lines.append(f"{apart}; {psnr}")
         return report(self.json, facts, *lines)
+
+    def _page(self) -> int:
+        from fidsplat.scenes.sources import load_source
+        from fidsplat.viewer.scene_page import VERSION, save_page
+
+        new_file(self.target, self.overwrite)
+        with delayed_progress() as progress:
+            scene = load_source(self.source, progress=progress)
+        save_page(scene, self.target, Path(self.source).stem)
+        size = Path(self.target).stat().st_size
+        facts = {"source": self.source, "target": self.target, "format": "HTML", "bytes": size}
+        return report(self.json, facts, f"{size:,} bytes, with PlayCanvas Engine {VERSION}: {self.target}")
 
     def _export(self) -> int:
         import fidsplat as fs

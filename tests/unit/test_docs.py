@@ -57,6 +57,7 @@ PARSED_WORDS = {
     "--max-ms": "times the machine",
     "--plants-from": "made by an experiment",
     "--ray": "a cluster",
+    "scene.html": "needs npm; tests/unit/test_scene_page.py",
     "city/city.toml": "a hundred frames of 1280 x 720; tests/unit/test_flights.py",
 }
 SMALLER = {

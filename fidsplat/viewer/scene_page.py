@@ -1,0 +1,158 @@
+"""Self-contained HTML page of a scene: splats and markers as SOG, rendered by the PlayCanvas Engine."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import os
+import shutil
+import tarfile
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.formats.ply_write import save_ply
+from fidsplat.formats.sog import save_sog
+from fidsplat.scenes.scene import Scene
+from fidsplat.splats.cloud import SplatCloud
+from fidsplat.util import interrupts
+from fidsplat.util.errors import InputError
+from fidsplat.util.files import atomic_write, path_of, read_input, user_cache
+
+ENGINE = "FIDSPLAT_PLAYCANVAS"
+"""environment variable with the path of a playcanvas.min.js that replaces the downloaded one"""
+VERSION = "2.23.3"
+_FILES = {
+    "build/playcanvas.min.js": "fea87830de8d74b71fe3ef6c7ce1e04a5aa60c5e9976da06b866774ea9ae9711",
+    "LICENSE": "42fa51ddd556be151a29f381fb97ee975825dcc454e805ea3ea9c079cca04d34",
+}
+"""files of the npm package and their SHA-256"""
+_GLTF_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
+_SIGHT = np.diag([1.0, -1.0, -1.0, 1.0])
+"""from a camera with y down and z forward to one with y up and z backward"""
+
+
+def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat") -> None:
+    """Write a scene as one HTML file that renders it offline, with WebGL 2, from its camera.
+
+    The scene's lens, shutter, sensor and fog are left out, and markers and boxes are Gaussians; motions are
+    those of time 0.
+
+    Raises InputError for a scene without camera or splats, if the engine cannot be obtained, or for a file
+    that cannot be written.
+    """
+    if scene.camera is None:
+        raise InputError("a scene for a page must have a camera; add a [camera] table")
+    parts = [store.cloud() for store in scene.stores] + list(scene.clouds)
+    marked = [placed.marker.gaussians.transformed(placed.pose) for placed in scene.markers]
+    files = {}
+    with tempfile.TemporaryDirectory() as folder:
+        # markers without loss: 8 bits of a scale would show as seams
+        for name, clouds, save in (("scene.sog", parts, save_sog), ("markers.ply", marked, save_ply)):
+            if clouds := [cloud for cloud in clouds if len(cloud)]:
+                save(SplatCloud.concatenate(clouds), Path(folder, name))
+                files[name] = base64.b64encode(Path(folder, name).read_bytes()).decode("ascii")
+    if not files:
+        raise InputError("a scene for a page must have splats or markers, got none")
+    means = np.concatenate([cloud.world_means() for cloud in parts + marked])
+    engine, licence = engine_files()
+    clear = scene.background if isinstance(scene.background, tuple) else (0.0, 0.0, 0.0)
+    view = _view(means, scene.camera) | {
+        "clear": [float(value) for value in clear] + [1.0],
+        "splats": files,
+        "note": f"{title}: drag to turn, right button to move, wheel for the distance",
+    }
+    color = "rgb({},{},{})".format(*(round(255 * min(max(float(value), 0.0), 1.0)) for value in clear))
+    page = Template(Path(__file__).with_name("scene_page.html").read_text("utf-8")).substitute(
+        title=html.escape(title),
+        licence=licence.replace("--", "- -"),
+        background=color,
+        engine=_in_script(engine),
+        view=_in_script(json.dumps(view)),
+    )
+    with atomic_write(path) as stream:
+        stream.write(page.encode())
+
+
+def _in_script(text: str) -> str:
+    """Text that does not end a script element."""
+    return text.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+
+
+def _view(means: np.ndarray, camera: Camera) -> dict[str, Any]:
+    """Pose, field of view and clipping of a camera, in PlayCanvas' axes."""
+    world_to_camera = np.asarray(camera.world_to_camera, np.float64)
+    pose = _GLTF_AXES @ np.linalg.inv(world_to_camera) @ _SIGHT
+    depths = means @ world_to_camera[2, :3] + world_to_camera[2, 3]
+    front = depths[depths > 0]
+    middle = float(np.median(front)) if len(front) else 1.0
+    far = 10 * float(np.abs(depths).max(initial=middle)) + middle
+    return {
+        "pose": pose.T.ravel().tolist(),
+        "fov": float(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
+        "distance": middle,
+        "near": max(middle / 1000, far * 1e-6),
+        "far": far,
+    }
+
+
+def engine_files(run: Callable[[list[str]], str] | None = None) -> tuple[str, str]:
+    """Source and licence of the PlayCanvas Engine, from the user's cache, or from npm on first use.
+
+    Raises InputError if npm is missing or the files differ from their checksums.
+    """
+    if (own := os.environ.get(ENGINE)) is not None:
+        engine = path_of(own)
+        licence = engine.with_name("LICENSE")
+        text = read_input(licence).decode() if licence.is_file() else "MIT, https://playcanvas.com"
+        return read_input(engine).decode("utf-8", "replace"), text
+    folder = user_cache() / "fidsplat" / f"playcanvas-{VERSION}"
+    if not all((folder / Path(name).name).is_file() for name in _FILES):
+        _obtain(folder, run or _npm)
+    engine, licence = (_checked(folder / Path(name).name, name).decode() for name in _FILES)
+    return engine, licence
+
+
+def _checked(file: Path, name: str) -> bytes:
+    data = read_input(file)
+    found = hashlib.sha256(data).hexdigest()
+    if found != _FILES[name]:
+        raise InputError(f"{file} must have the SHA-256 {_FILES[name]}, got {found}; remove it")
+    return data
+
+
+def _obtain(folder: Path, run: Callable[[list[str]], str]) -> None:
+    with tempfile.TemporaryDirectory() as temporary:
+        words = ["pack", "--silent", "--pack-destination", temporary, f"playcanvas@{VERSION}"]
+        archive = Path(temporary, run(words).strip())
+        folder.mkdir(parents=True, exist_ok=True)
+        with tarfile.open(archive) as members:
+            for name, expected in _FILES.items():
+                member = members.extractfile(f"package/{name}")
+                data = b"" if member is None else member.read()
+                found = hashlib.sha256(data).hexdigest()
+                if found != expected:
+                    raise InputError(f"{name} of playcanvas must have the SHA-256 {expected}, got {found}")
+                with atomic_write(folder / Path(name).name) as stream:
+                    stream.write(data)
+
+
+def _npm(words: list[str]) -> str:
+    """Output of npm."""
+    program = shutil.which("npm")
+    if program is None:
+        raise InputError(
+            f"an HTML page needs the PlayCanvas Engine {VERSION}, which npm downloads once; install npm, "
+            f"or set {ENGINE} to the path of its playcanvas.min.js"
+        )
+    done = interrupts.run([program, *words])
+    if done.returncode != 0:
+        raise InputError(f"npm cannot download playcanvas {VERSION}: {done.stderr.strip()[-300:]}")
+    return done.stdout
