@@ -1,5 +1,5 @@
-"""Make images of the docs: docs/images/demo.jpg and, with a captured scene, real-scene.jpg and
-ellipsoids.jpg.
+"""Make images of the docs: docs/images/demo.jpg and captured.jpg, and with a captured scene real-scene.jpg
+and ellipsoids.jpg.
 
 python benchmarks/docs_images.py [biker.compressed.ply]
 """
@@ -30,8 +30,11 @@ def save(sheet: Path, name: str) -> None:
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-m", "fidsplat", "demo", "--out", folder], check=True)
+        subprocess.run(
+            [sys.executable, "-m", "fidsplat", "demo", "--captured", "playbot", "--out", folder], check=True
+        )
         save(Path(folder) / "contact-sheet.png", "demo.jpg")
+        save(Path(folder) / "playbot.png", "captured.jpg")
         for scene in sys.argv[1:]:
             script = str(HERE / "real_scene.py")
             subprocess.run([sys.executable, script, scene, "-o", folder], check=True)

@@ -56,6 +56,7 @@ class Demo:
     Examples:
       fidsplat demo
       fidsplat demo --mixture fitted --out soft
+      fidsplat demo --captured playbot                  and markers in a captured scene
       fidsplat demo --out images --json
       fidsplat demo views -o yard                       the scene as a data set for training
     """
@@ -66,6 +67,9 @@ class Demo:
     device: Device = None
     mixture: str = "exact"
     """NAME: mixture of the markers: exact, fitted, facets or paper"""
+    captured: str | None = None
+    """NAME: also render markers in a captured scene of `fidsplat fetch`, downloaded on first use: biker or
+    playbot"""
     json: Json = False
 
     def run(self) -> int:
@@ -73,7 +77,7 @@ class Demo:
 
         where = console(self.json)
         with where.status("starting") as status:
-            result = run_demo(self.out, self.device, status.update, self.mixture)
+            result = run_demo(self.out, self.device, status.update, self.mixture, self.captured)
         if self.json:
             print_json(result.as_dict())
         else:

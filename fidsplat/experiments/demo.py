@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.experiments.captured_demo import run_captured
 from fidsplat.formats import save_ply
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.visualize import (
@@ -88,6 +89,7 @@ def run_demo(
     device: str | None = None,
     progress: Callable[[str], None] = lambda text: None,
     mixture: str = "exact",
+    captured: str | None = None,
 ) -> DemoResult:
     """Run the demo and write its images, scene and results into the folder ``out``.
 
@@ -97,6 +99,7 @@ def run_demo(
         progress: called with the name of each step.
         mixture: mixture of the markers; scene.ply has `fitted` instead of `exact`, since PLY files have no
             boxes.
+        captured: name of a captured scene that is rendered with markers too, see `fetch_scene`.
 
     Raises InputError when the folder cannot be written or for an unknown mixture, DeviceError when the device
     cannot be used.
@@ -130,11 +133,20 @@ def run_demo(
         files.append(write_png(f"{stem}-detection.png", outlined))
         columns[view] = (outlined, images["depth"], images["normal"])
     files.append(write_png(folder / "contact-sheet.png", _sheet(columns)))
+    marker_splats = {p.marker.spec: len(p.marker.cloud) for p in scene.markers}
+    if captured is not None:
+        views, splats, image = run_captured(captured, renderer, folder, progress)
+        files.append(image)
+        marker_splats = splats | marker_splats
+        for one in views:
+            sightings += [Sighting(one.name, reading) for reading in one.readings]
+            unexpected += one.others
+            frame_ms[one.name], visible[one.name] = one.frame_ms, one.visible
 
     result = DemoResult(
         device=renderer.device.title,
         background_splats=sum(len(cloud) for cloud in scene.clouds),
-        marker_splats={p.marker.spec: len(p.marker.cloud) for p in scene.markers},
+        marker_splats=marker_splats,
         sightings=sightings,
         unexpected=unexpected,
         frame_ms=frame_ms,

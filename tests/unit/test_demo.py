@@ -8,6 +8,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.experiments import demo
+from fidsplat.experiments.captured_demo import run_captured
+from fidsplat.experiments.demo import Sighting
 from fidsplat.images.files import read_image
 from fidsplat.worlds.yard import demo_scene
 
@@ -105,3 +107,16 @@ def test_the_demo_has_disks_boxes_and_3d_gaussians(scene):
     cloud = scene.cloud()
     assert (cloud.footprint, cloud.ellipsoids) == ("mixed", "some")
     assert 0.05 < np.mean(cloud.thickness[cloud.labels == 0] > 0) < 0.2
+
+
+def test_the_demo_has_markers_in_a_captured_scene(tmp_path, monkeypatch):
+    """A single splat stands for the capture, which would be downloaded."""
+    blob = fs.SplatCloud([[0, -1.6, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [0.9], colors=[[1, 0, 0]])
+    fs.save_splats(blob, tmp_path / "blob.ply")
+    monkeypatch.setattr("fidsplat.experiments.captured_demo.fetch_scene", lambda *_: tmp_path / "blob.ply")
+    for name in ("biker", "playbot"):
+        views, splats, image = run_captured(name, fs.Renderer("opencl"), tmp_path)
+        assert image.name == f"{name}.png"
+        assert set(splats) == {"apriltag:36h11:5", "qr:fidsplat"}
+        assert all(Sighting(view.name, reading).passed for view in views for reading in view.readings)
+        assert not any(view.others for view in views)
