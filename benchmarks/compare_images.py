@@ -101,7 +101,10 @@ def frames() -> dict[str, dict[str, Any]]:
             "quality": preset,
             "scene": grouped,
         }
-    for words in ("setup_precision=float32", "arithmetic=precise", "blend_precision=float64"):
+    for words in (
+        *("setup_precision=float32", "arithmetic=precise", "arithmetic=approximate"),
+        *("blend_precision=float16", "blend_precision=float64"),
+    ):
         found[words] = {"camera": pinhole, "quality": words, "outputs": OUTPUTS}
     found |= {f"sensor {words}": {"camera": pinhole, "sensor": one} for words, one in _sensors().items()}
     for k in range(12):
