@@ -2,7 +2,7 @@
 
     python benchmarks/compare_images.py COMMIT [--device D] [--only WORDS]
 
-Renders 144 small frames (every lens, output, effect, preset and mixture, some within small memory budgets)
+Renders 146 small frames (every lens, output, effect, preset and mixture, some within small memory budgets)
 with both trees, each tree in its own process, and prints the names of the frames that differ. With cold
 caches on two cores this takes about three minutes for each tree.
 """
