@@ -66,6 +66,9 @@ def test_streamed_sog_of_splat_transform(exported, tmp_path):
     splat_transform.converted(path.parent / "1_0/meta.json", tmp_path / "level.ply")
     level = read_streamed(path).load(1)
     assert len(fs.load_splats(tmp_path / "level.ply")) == sum(len(cloud) for _, cloud in level)
+    if splat_transform.version() >= 3:  # earlier versions do not read streamed SOG
+        splat_transform.converted(path, tmp_path / "all.ply")
+        np.testing.assert_array_equal(fs.load_splats(tmp_path / "all.ply").means, fs.load_splats(path).means)
 
 
 @pytest.mark.parametrize(
