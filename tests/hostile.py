@@ -28,6 +28,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 import fidsplat as fs
+from fidsplat.util import zstd
 from fidsplat.util.errors import LONGEST
 
 SECONDS = 10
@@ -254,6 +255,24 @@ def spoiled_zip(draw: st.DrawFn, data: bytes) -> bytes:
     return stream.getvalue()
 
 
+@st.composite
+def spoiled_frames(draw: st.DrawFn, data: bytes) -> bytes:
+    """An SPZ file of version 4 with a damaged array in a valid frame, or changed sizes in its table."""
+    streams, table = data[15], int.from_bytes(data[16:20], "little")
+    sizes = [struct.unpack_from("<QQ", data, table + 16 * k) for k in range(streams)]
+    place, frames = table + 16 * streams, []
+    for packed, size in sizes:
+        frames.append((zstd.decompress(data[place : place + packed], size), size))
+        place += packed
+    number = draw(st.integers(0, streams - 1))
+    content, size = frames[number]
+    content = draw(st.one_of(spoiled(content), st.just(bytes(draw(st.sampled_from([0, 2**24]))))))
+    frames[number] = (content, draw(st.sampled_from([size, len(content), 2**40, 2**64 - 1])))
+    packed = [zstd.compress(content) for content, _ in frames]
+    rows = [struct.pack("<QQ", len(frame), size) for frame, (_, size) in zip(packed, frames, strict=True)]
+    return b"".join([data[:table], *rows, *packed])
+
+
 def damaged(path: Path, data: bytes | None = None) -> st.SearchStrategy[bytes]:
     """Contents of a damaged file, by the ending of its name. data: its contents; default those of the file."""
     data = path.read_bytes() if data is None else data
@@ -270,6 +289,8 @@ def damaged(path: Path, data: bytes | None = None) -> st.SearchStrategy[bytes]:
         inside = spoiled_zip(data)
     elif path.suffix == ".spz" and data[:2] == b"\x1f\x8b":
         inside = spoiled(gzip.decompress(data)).map(gzip.compress)
+    elif path.suffix == ".spz":
+        inside = spoiled_frames(data)
     elif path.suffix == ".ply":
         head, end, body = data.partition(b"end_header\n")
         inside = spoiled_text(head.decode()).map(lambda text: text + end + body)

@@ -33,6 +33,8 @@ class Convert:
 
     source: Annotated[tyro.conf.Positional[str], option("IN", "splat file to read")]
     target: Annotated[tyro.conf.Positional[str], option("OUT", "splat file to write")]
+    spz_version: int = 4
+    """3|4: version of SPZ; 3 is for older readers and has no labels and coplanar groups"""
     no_images: Annotated[bool, switch("do not render and compare both files", "--no-pictures")] = False
     device: Device = None
     overwrite: Overwrite = False
@@ -43,6 +45,7 @@ class Convert:
         from fidsplat.formats import losses, save_splats
         from fidsplat.formats.files import check_writable
         from fidsplat.formats.sog_streamed import META
+        from fidsplat.formats.spz import save_spz
         from fidsplat.store.layout import SUFFIX
 
         if Path(self.source).suffix == SUFFIX and Path(self.target).name == META:
@@ -57,7 +60,10 @@ class Convert:
         with delayed_progress() as progress:
             cloud = fs.load_splats(self.source, progress)
         lost = losses(cloud, self.target)
-        save_splats(cloud, self.target)
+        if target.suffix.lower() == ".spz":
+            save_spz(cloud, target, self.spz_version)
+        else:
+            save_splats(cloud, self.target)
         sizes = [Path(name).stat().st_size for name in (self.source, self.target)]
         facts: dict[str, Any] = {"source": self.source, "target": self.target, "format": known.name}
         facts |= {"splats": len(cloud), "bytes": sizes, "lost": lost, "error": None}

@@ -157,6 +157,8 @@ def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
                 place += 8 + length
         except struct.error:
             version, size, chunks = 0, 0, {}
+        if version not in (0, 2):
+            raise InputError(f"{path}: the version of binary glTF must be 2, got {version}; export it again")
         if version != 2 or size > len(data) or _JSON not in chunks:
             raise InputError(f"{path}: truncated, or not binary glTF of version 2")
         text, binary = bytes(chunks[_JSON]), chunks.get(_BIN)
@@ -225,8 +227,8 @@ class _Reader:
         attributes, prefix = primitive["attributes"], f"{EXTENSION}:"
         if primitive["extensions"][EXTENSION].get("extensions"):
             raise InputError(
-                f"{self._path}: its splats must be uncompressed, got a compression extension; export "
-                "without it"
+                f"{self._path}: its splats must be uncompressed, got a compression extension; "
+                "export without it, or convert the SPZ or SOG file that it was made of"
             )
         arrays = {
             name: self._array(number, plain=name == f"{prefix}SCALE")

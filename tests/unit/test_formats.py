@@ -430,5 +430,7 @@ def test_convert_says_what_it_costs(tmp_path, monkeypatch, capsys):
     assert main(["convert", "a.ply", "b.splat", "--no-pictures"]) == 0
     assert "pictures" not in capsys.readouterr().out
     assert Path("b.splat").stat().st_size == 40 * 32
+    assert main(["convert", "a.ply", "a.spz", "--spz-version", "3", "--no-pictures"]) == 0
+    assert Path("a.spz").read_bytes()[:2] == b"\x1f\x8b"  # gzip
     assert main(["convert", "a.ply", "a.xyz"]) == 2
     assert "unknown suffix of a splat file '.xyz'" in capsys.readouterr().err
