@@ -24,6 +24,7 @@ from fidsplat.images.visualize import (
 from fidsplat.render.output_files import save_output
 from fidsplat.render.renderer import Renderer
 from fidsplat.scenes import Scene
+from fidsplat.scenes.captured import fetch_scene
 from fidsplat.util.files import atomic_write, writable_folder
 from fidsplat.vision.readback import Reading, read_back
 from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views
@@ -106,6 +107,9 @@ def run_demo(
     """
     begun = time.perf_counter()
     folder = writable_folder(out)
+    if captured is not None:
+        progress(f"fetching the captured scene {captured}")
+        fetch_scene(captured)  # first, since it may fail
     progress("making three markers and their scene")
     scene = demo_scene(mixture=mixture)
     progress("opening the device")

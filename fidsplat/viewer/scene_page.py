@@ -34,6 +34,8 @@ _FILES = {
     "LICENSE": "42fa51ddd556be151a29f381fb97ee975825dcc454e805ea3ea9c079cca04d34",
 }
 """files of the npm package and their SHA-256"""
+MAX_SPLATS = 8_000_000
+"""splats of a page: a browser holds its file as one text of at most half a gigabyte"""
 _GLTF_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 _SIGHT = np.diag([1.0, -1.0, -1.0, 1.0])
 """from a camera with y down and z forward to one with y up and z backward"""
@@ -50,6 +52,12 @@ def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat
     """
     if scene.camera is None:
         raise InputError("a scene for a page must have a camera; add a [camera] table")
+    count = sum(map(len, (*scene.stores, *scene.clouds)))
+    if count > MAX_SPLATS:
+        raise InputError(
+            f"a page must have at most {MAX_SPLATS:,} splats, got {count:,}; write streamed SOG "
+            "(lod-meta.json) of a store"
+        )
     parts = [store.cloud() for store in scene.stores] + list(scene.clouds)
     marked = [placed.marker.gaussians.transformed(placed.pose) for placed in scene.markers]
     files = {}

@@ -65,12 +65,15 @@ def test_a_page_has_engine_licence_and_splats(scene, tmp_path, monkeypatch, caps
     assert "already exists" in capsys.readouterr().err
 
 
-def test_a_page_needs_a_camera_and_splats(tmp_path):
+def test_a_page_needs_a_camera_and_splats(scene, tmp_path, monkeypatch):
     with pytest.raises(fs.InputError, match="must have a camera"):
         scene_page.save_page(fs.Scene(), tmp_path / "a.html")
     camera = fs.Camera.look_at(32, 24, 1.0, (0, 0, -1), (0, 0, 0))
     with pytest.raises(fs.InputError, match="must have splats or markers"):
         scene_page.save_page(fs.Scene(camera=camera), tmp_path / "a.html")
+    monkeypatch.setattr(scene_page, "MAX_SPLATS", 0)
+    with pytest.raises(fs.InputError, match="must have at most 0 splats, got 1"):
+        scene_page.save_page(fs.Scene.load(scene), tmp_path / "a.html")
 
 
 def test_the_engine_is_checked(tmp_path, monkeypatch):
