@@ -15,7 +15,10 @@ from fidsplat.effects.catalogue import CATALOGUE
 BACKEND = "opencl"
 SPLATS = random_splats(40, 21, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
 CAMERA = fs.Camera.pinhole(*SIZE, 30.0, 30.0, 18.0, 11.0)
-ELSEWHERE = {"distortion", "overdraw", "rounding", "termination_depths", "arithmetic_approximate", "blend_half"}
+ELSEWHERE = {
+    *("distortion", "overdraw", "rounding", "termination_depths"),
+    *("arithmetic_approximate", "blend_half"),
+}
 """tests/contract/test_gradients.py has the first two, test_error_output.py the third,
 tests/unit/test_store_occlusion.py the fourth, and test_quality_settings.py the others"""
 
