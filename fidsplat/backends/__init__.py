@@ -1,4 +1,4 @@
-"""Backends: things that open a device and draw splats on it. `registry` knows them by name."""
+"""Backends: implementations of the renderer for a kind of device. `registry` opens a device by its name."""
 
 from fidsplat.backends.registry import devices, open_backend
 

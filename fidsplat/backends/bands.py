@@ -1,6 +1,7 @@
-"""Splitting of a frame into bands by cost: tiles by their splat lists, rows by their splats.
+"""Splitting of a frame into bands of bounded cost, for frames that exceed the memory budget.
 
-A frame that exceeds the memory budget is rendered band by band, with the same image.
+The cost of a tile is the length of its splat list; the cost of a row is its number of splats. A frame that is
+rendered band by band has the same image.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ import numpy as np
 
 
 def split_by_cost(costs: np.ndarray, capacity: int, start: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Ranges (first, end, cost) of consecutive items with a total cost of at most `capacity` each.
+    """Split consecutive items into ranges (first, end, cost) with a total cost of at most `capacity` each.
 
     A range has at least one item, whatever its cost.
 
     Args:
-        costs: (k,) costs of the items from number `start` on.
+        costs: (k,) costs of k items, the first of which has the number `start`.
     """
     ends = np.cumsum(costs, dtype=np.int64)
     first, done = 0, 0

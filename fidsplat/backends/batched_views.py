@@ -1,4 +1,4 @@
-"""Views that are rendered together: their uniforms, stacked."""
+"""Views that are rendered together in one batch, with their uniforms in stacked arrays."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _FIRST.flags.writeable = False
 class ViewBatch:
     """Views of one size that are rendered together; a single view is a batch of one.
 
-    v views are rendered, of `total`: the others are masked out. g groups of splats move, those of the labels
-    of `view.groups`; index 0 of the poses is for all other splats.
+    v of `total` views are rendered; the others are masked out. g groups of splats move: the splats with the
+    labels in `view.groups`. Index 0 of the poses is for all other splats.
     """
 
     view: View
-    """the first view, with all that the views have in common"""
+    """the first view; its values hold for all views unless a field below replaces them"""
     rotation: np.ndarray
     """(g + 1, v, 3, 3) float64, world to camera"""
     translation: np.ndarray
@@ -35,13 +35,13 @@ class ViewBatch:
     eye: np.ndarray
     """(g + 1, v, 3) float64 metres"""
     numbers: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """(v,) or (v, k) float64: numbers of the camera that differ, by their names in View"""
+    """(v,) or (v, k) float64: camera parameters that differ between views, by their names in View"""
     batch_indices: np.ndarray = field(default_factory=lambda: _FIRST)
     """(v,) uint32: position of each view in the batch"""
     total: int = 1
-    """views of the batch, with those that are masked out"""
+    """number of views of the batch, including masked-out views"""
     views: tuple[View, ...] = ()
-    """the views, unless they are poses of `view`"""
+    """the views, unless they differ from `view` in their poses only"""
     stacked: bool = True
     """whether views differ in poses and `numbers` only; otherwise they are rendered one by one"""
 
@@ -51,7 +51,7 @@ class ViewBatch:
 
     @property
     def is_single(self) -> bool:
-        """Whether it is one view."""
+        """Whether the batch has only one view."""
         return self.total == 1 == len(self)
 
     @property
@@ -61,7 +61,7 @@ class ViewBatch:
 
     @staticmethod
     def single(view: View) -> ViewBatch:
-        """A batch of one."""
+        """A batch of one view."""
         if view.groups:
             return _stacked((view,), {}, _FIRST, 1)
         poses = view.rotation[None, None], view.translation[None, None], view.eye[None, None]
@@ -69,7 +69,7 @@ class ViewBatch:
 
     @staticmethod
     def of(views: Sequence[View], batch_indices: np.ndarray, total: int) -> ViewBatch:
-        """A batch of these views, at least one."""
+        """A batch of one or more views."""
         first = views[0]
         labels = [label for label, _ in first.groups]
         for view in views:
@@ -96,12 +96,12 @@ class ViewBatch:
         batch_indices: np.ndarray,
         total: int,
     ) -> ViewBatch:
-        """One view from v poses, bit-identical to `View.of` of each.
+        """A batch of one camera in v poses, bit-identical to a `View.of` for each pose.
 
         Args:
-            origin: (3,) of the cloud.
+            origin: (3,) origin of the cloud.
             poses: (v, 4, 4) camera to world; None: the pose of `view`.
-            groups: by label, in their order: (v, 4, 4) motion of the world.
+            groups: (v, 4, 4) motion of each group in world coordinates, by label.
         """
         count = len(batch_indices)
         if poses is None:
@@ -129,7 +129,7 @@ class ViewBatch:
         return ViewBatch(view, *arrays, batch_indices=batch_indices, total=total)
 
     def part(self, first: int, end: int) -> ViewBatch:
-        """The rendered views [first, end); one of them if they are not stacked."""
+        """The rendered views [first, end) as a batch; a single view if their uniforms are not stacked."""
         indices = self.batch_indices[first:end].copy()
         if end - first == 1:
             return replace(ViewBatch.single(self.one(first)), batch_indices=indices, total=self.total)
@@ -145,7 +145,7 @@ class ViewBatch:
         )
 
     def one(self, number: int) -> View:
-        """A rendered view."""
+        """One of the rendered views, by its number."""
         if self.views:
             return self.views[number]
         own = {name: _plain(each[number]) for name, each in self.numbers.items()}

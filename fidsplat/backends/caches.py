@@ -1,4 +1,4 @@
-"""Folders for the caches of drivers (PoCL, pyopencl, Warp), if their own cannot be written.
+"""Replacement folders for the kernel caches of PoCL, pyopencl and Warp, if their own cannot be written.
 
 Without a cache folder PoCL lists no device or refuses to compile, and pyopencl's caches fail.
 """
@@ -18,7 +18,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import user_cache, writable_folder
 
 MIN_FREE = 2**25
-"""bytes, several times the size of a frame's kernels"""
+"""minimum free space in bytes: several times the size of a frame's kernels"""
 
 
 def pocl_folder() -> Path:

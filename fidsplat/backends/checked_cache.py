@@ -23,11 +23,11 @@ from fidsplat.util.files import atomic_write
 
 _RECORD = "fidsplat-checksums.json"
 _CHECKSUM = "crc"
-"""key of the record's own checksum"""
+"""key under which the record stores its own checksum"""
 _watched: set[Path] = set()
 
 Entry = list[int]
-"""checksum, bytes, time of the last change in ns, inode; while the last three are unchanged the file is not
+"""checksum, size in bytes, modification time in ns, inode; while the last three are unchanged the file is not
 read"""
 
 
@@ -81,7 +81,7 @@ def record_new(folder: Path, is_loaded: Callable[[str], bool]) -> None:
 
 
 def _current(path: str, state: os.stat_result, entry: Entry | None) -> Entry | None:
-    """The entry of a file as it is; None if it differs from a known entry."""
+    """The entry that describes a file now; None if it contradicts the recorded entry."""
     identity = [state.st_size, state.st_ctime_ns, state.st_ino]
     if entry is not None and entry[1:] == identity:
         return entry

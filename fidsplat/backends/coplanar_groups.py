@@ -1,4 +1,4 @@
-"""Dense indices of coplanar groups, by which devices sort and distinguish them."""
+"""Conversion of coplanar group ids to dense indices 0, 1, 2, ... for devices."""
 
 from __future__ import annotations
 

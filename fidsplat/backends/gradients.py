@@ -1,4 +1,4 @@
-"""Shared by backends with derivatives: checks of gradients, and images with the frame that made them."""
+"""Code shared by backends with derivatives: differentiable images, and checks of gradient arrays."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ NOT_THE_LAST = (
 
 
 class CapacityExceeded(Exception):
-    """A frame was submitted without waiting for its counts, and exceeded the capacity of its lists."""
+    """Error: a frame that was submitted without waiting for its pair count exceeded the capacity of its
+    lists."""
 
 
 class DifferentiableImages:
-    """Output images with the frame that made them, for `backward`."""
+    """Output images together with their frame's data on the device, which `backward` needs."""
 
     frame: Any
     images: Images
@@ -34,11 +35,11 @@ class DifferentiableImages:
 
     @property
     def last(self) -> bool:
-        """Whether the device has started no other frame since."""
+        """Whether this is the device's latest frame, so that `backward` is possible."""
         return self.frame.workspace.frames == self._number
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy an image to the host, as `Images.read`."""
+        """Copy an image to the host."""
         return self.images.read(name, index)
 
     @property
@@ -48,18 +49,18 @@ class DifferentiableImages:
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """Numbers of splats, visible splats and pairs."""
+        """Number of splats, of visible splats, and of pairs of a splat and a tile."""
         return self.images.stats
 
 
 def gradient_shape(name: str, view: View) -> tuple[int, ...]:
-    """The shape of an output's gradient, equal to that of its image."""
+    """The shape of the gradient with respect to an output: the shape of its image."""
     channels = IMAGES[name].channels
     return (view.height, view.width) if channels == 1 else (view.height, view.width, channels)
 
 
 def check_shape(name: str, given: tuple[int, ...], view: View) -> None:
-    """Raise InputError unless a gradient has its output's shape."""
+    """Raise InputError unless the gradient with respect to an output has the shape of the output's image."""
     if tuple(given) != gradient_shape(name, view):
         raise InputError(
             f"the gradient of {name} must have the shape {gradient_shape(name, view)}, got {tuple(given)}"
@@ -67,9 +68,9 @@ def check_shape(name: str, given: tuple[int, ...], view: View) -> None:
 
 
 def on_host(array: Any) -> np.ndarray:
-    """A device array as a float32 NumPy array that later frames do not overwrite."""
+    """Copy a device array to a float32 NumPy array that later frames do not overwrite."""
     if hasattr(array, "get"):
         return np.asarray(array.get(), np.float32)
-    if hasattr(array, "numpy"):  # of a wp.array on the CPU that is its own memory
+    if hasattr(array, "numpy"):  # on the CPU, numpy() of a wp.array shares its memory
         return np.array(array.numpy(), np.float32)
     return np.asarray(array, np.float32)

@@ -27,26 +27,26 @@ class DeviceInfo:
     """Description of a device."""
 
     name: str
-    """Value of `device=` that opens this device."""
+    """value of `device=` that opens this device"""
     title: str
     platform: str
     version: str
     kind: str
-    """cpu, gpu or other"""
+    """`cpu`, `gpu` or `other`"""
     compute_units: int
     memory_bytes: int
     largest_allocation_bytes: int
     float64: bool
     usable: bool
     reason: str
-    """Why it cannot be used; empty if it can. For a usable device, a remark (may be empty)."""
+    """why the device cannot be used; for a usable device, a remark (may be empty)"""
     always_float64: bool = False
-    """whether it computes everything in float64: slow, and the reference for other devices"""
+    """whether the device is the reference renderer, which computes everything in float64"""
 
 
 @dataclass(frozen=True)
 class DeviceTraits:
-    """Optional capabilities of a device."""
+    """Optional capabilities of a device, with the methods of Backend that need them."""
 
     caches_chunks: bool = False
     """`Backend.chunk_cache`"""
@@ -67,7 +67,7 @@ class Rates:
     """Measured peak rates of a device, per second."""
 
     copy_bytes: float
-    """bytes read and bytes written by a copy, together"""
+    """bytes read plus bytes written by a copy"""
     fma: float
     """float32 multiply-adds"""
     exp: float
@@ -77,14 +77,14 @@ class Rates:
 
 
 class ResidentData(ABC):
-    """A cloud on a device, with the `CloudTraits`."""
+    """A cloud on a device, with the properties (`CloudTraits`) that select its kernels."""
 
     count: int
-    """splats"""
+    """number of splats"""
     origin: np.ndarray
     """(3,) float64 metres: world position of the means' zero"""
     memory_bytes: int
-    """device memory that it takes; 0 where the device reads the host's own arrays"""
+    """device memory of the cloud; 0 if the device reads the host's arrays"""
     sh_degree: int
     has_coplanar_groups: bool
     footprint: str
@@ -103,20 +103,20 @@ class Chunk:
     """Consecutive splats of a scene."""
 
     key: Hashable
-    """the same for the same splats, wherever they are placed"""
+    """cache key: equal for chunks with the same splats, even if their poses differ"""
     count: int
     load: Callable[[], Mapping[str, np.ndarray]]
-    """their arrays by the names of a cloud's, float32 or int32; `coplanar_groups` by dense
-    indices"""
+    """arrays of the splats, float32 or int32, named like the arrays of a SplatCloud; `coplanar_groups` holds
+    dense indices"""
     pose: np.ndarray | None = None
-    """(16,) float64: placement, the rotation by rows, the position of the means' zero [m], and the
-    quaternion; None: not moved"""
+    """(16,) float64: placement of the chunk: the rotation matrix by rows, the position of the means' zero
+    [m], and the rotation as a quaternion; None: not moved"""
     first: int = 0
-    """row of those arrays at which its `count` splats start"""
+    """first row of the chunk's `count` splats in these arrays"""
 
 
 class ChunkedScene(ABC):
-    """A scene divided into chunks, with the `CloudTraits` of all of it."""
+    """A scene divided into chunks, with the `CloudTraits` of the complete scene."""
 
     origin: np.ndarray
     """(3,) float64 metres: world position of the means' zero"""
@@ -127,7 +127,7 @@ class ChunkedScene(ABC):
 
     @abstractmethod
     def distinct(self, applies_poses: bool) -> int:
-        """Number of keys of its chunks. applies_poses: whether the device applies `Chunk.pose`."""
+        """Number of different chunk keys. applies_poses: whether the device applies `Chunk.pose`."""
 
 
 class ChunkCache(ABC):
@@ -136,12 +136,12 @@ class ChunkCache(ABC):
     applies_poses: bool
     """whether the device applies `Chunk.pose`; else it must be None"""
     memory_bytes: int
-    """device memory that it takes"""
+    """device memory of the cache"""
 
     @abstractmethod
     def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> ResidentData:
-        """Concatenate chunks on the device, loading those that are not cached. first_id: `splat_id` of the
-        first splat."""
+        """Concatenate chunks into one cloud on the device; load chunks that are not cached. first_id:
+        `splat_id` of the first splat."""
 
     @abstractmethod
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
@@ -156,13 +156,14 @@ class Images(ABC):
     """
 
     views: int = 1
-    """with those that are masked out"""
+    """number of views, including masked-out views"""
     timings: Mapping[str, float]
-    """milliseconds on the device by stage, in their order; of several views the sums"""
+    """milliseconds on the device by stage, in the order of the stages; summed over views"""
     stats: Mapping[str, int]
-    """splats of the cloud; visible and pairs, of several views the sums"""
+    """number of splats of the cloud; of visible splats and of pairs of a splat and a tile, summed over
+    views"""
     shares_arrays: bool = False
-    """whether arrays of `device_array` can be exchanged by DLPack"""
+    """whether the arrays of `device_array` support DLPack"""
 
     @abstractmethod
     def read(self, name: str, index: int | None = None) -> np.ndarray:
@@ -170,16 +171,16 @@ class Images(ABC):
         with an index the image of this view, (h, w) or (h, w, channels)."""
 
     def read_float64(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy images to the host in float64, not rounded where they were computed so."""
+        """Copy images to the host in float64; unrounded if the device computes in float64."""
         return self.read(name, index).astype(np.float64)
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray | None:
-        """Copy an image of floats in [0, 1] to the host in 8 bits, converted by the device with the bits of
-        `to_uint8` (fidsplat/images/files.py); None where the device does not convert."""
+        """Convert an image of floats in [0, 1] to 8 bits on the device, bit-identical to `to_uint8`
+        (fidsplat/images/files.py), and copy it to the host; None if the device does not convert."""
         return None
 
     def empty(self, name: str) -> np.ndarray:
-        """A host array for the image of one view."""
+        """A host array of the shape and type of one view's image, with undefined contents."""
         return np.empty_like(self.read(name, 0))
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray, index: int = 0) -> None:
@@ -188,14 +189,14 @@ class Images(ABC):
             into[first:end] = self.read(name, index)[first:end]
 
     def device_array(self, name: str, index: int | None = None) -> Any:
-        """The images as an array of the device, in the shape of `read`; no copy."""
+        """The images as a device array in the shape that `read` returns, without a copy."""
         raise InputError(
-            f"device_array({name!r}) needs a device that shares its arrays, as Warp devices do; "
+            f"device_array({name!r}) needs a device that shares its arrays, such as a Warp device; "
             "render with device='warp:cuda' or 'warp:cpu', or take frame[name], which is copied to the host"
         )
 
     def wait(self) -> None:  # noqa: B027 (optional)
-        """Wait until the device has rendered them."""
+        """Wait until the device has rendered the images."""
 
 
 class HostImages(Images):
@@ -216,7 +217,7 @@ class HostImages(Images):
         return self.read_float64(name, index).astype(declared_output(name).dtype)
 
     def read_float64(self, name: str, index: int | None = None) -> np.ndarray:
-        """The arrays as they were computed; integers too."""
+        """The arrays in their own type, float64 or integers."""
         return self.arrays[name] if index is None else self.arrays[name][index]
 
 
@@ -224,7 +225,8 @@ class SeparateImages(Images):
     """Images of views that were rendered one after another."""
 
     def __init__(self, images: Mapping[int, Images], batch: ViewBatch, splats: int) -> None:
-        """images: of the views that were rendered, by their position in the batch. splats: in the cloud."""
+        """images: images of each rendered view by its position in the batch. splats: number of splats in the
+        cloud."""
         self._images, self.views, self._size, self._splats = images, batch.total, batch.size, splats
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
@@ -254,7 +256,7 @@ class SeparateImages(Images):
 
 
 def summed(counts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Sums of mappings from names to numbers."""
+    """Add up mappings from names to numbers, name by name."""
     sums: dict[str, Any] = {}
     for each in counts:
         for name, value in each.items():
@@ -270,13 +272,13 @@ class Pipeline(ABC):
         """Render one view of an uploaded cloud."""
 
     def render(self, resident: Any, views: ViewBatch) -> Images:
-        """Render several views, each bit-identical to itself alone. By default one after another."""
+        """Render several views, each bit-identical to rendering it alone. By default one after another."""
         each = enumerate(views.batch_indices.tolist())
         rendered = {index: self.render_view(resident, views.one(number)) for number, index in each}
         return SeparateImages(rendered, views, resident.count)
 
     def fits(self, resident: Any, view: View) -> bool:
-        """Whether the frame fits the memory budget without rendering the cloud in chunks."""
+        """Whether the frame fits the memory budget without dividing the cloud into chunks."""
         return True
 
     def trace(self, resident: Any, view: View) -> dict[str, np.ndarray]:
@@ -292,8 +294,8 @@ class GradientPipeline(ABC):
         """Render one view of an uploaded cloud, bit-identical to `Pipeline.render`, and retain what
         `backward` needs until the device renders another frame.
 
-        waits: until it is known that the buffers were large enough. If they were not, `backward` may raise
-        CapacityExceeded, and nothing of the frame counts.
+        waits: whether to wait until it is known that the buffers were large enough. Without waiting,
+        `backward` may raise CapacityExceeded; then the frame must be discarded.
 
         Raises:
             DeviceError: the device runs out of memory or fails; or the frame needs bands or chunks, which
@@ -302,44 +304,45 @@ class GradientPipeline(ABC):
 
     @abstractmethod
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, Any]:
-        """Gradients of a loss with respect to splats, background and pose, from those by output images.
+        """Gradients of a loss with respect to splats, background and pose, from its gradients with respect to
+        the output images.
 
         Steps (the alpha cut-off, the transmittance stop, the near plane, the order of splats) have no
         derivative: they are constants of the frame.
 
         Args:
             images: the result of the last `forward` on this device.
-            gradients: by the names of outputs (rgb, alpha, depth, normal, distortion), float32 arrays of
-                their shape, of the device or NumPy's; missing ones are 0.
+            gradients: float32 arrays by the names of outputs (rgb, alpha, depth, normal, distortion), in the
+                shapes of their images, as device or NumPy arrays; 0 for missing names.
 
         Returns:
             Device arrays in the cloud's shapes and units: `means` (n, 3), `quats` (n, 4), `scales` (n, 2),
-            `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3), with respect to the stored values, also of
-            quaternions that are not normalised; `screen` (n,), the norm of the gradient by the projected
-            centre in units of half images (the densification statistic of 2DGS trainers, their dL_dmean2D);
+            `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3), with respect to the stored values
+            (quaternions need not be normalised); `screen` (n,), the norm of the gradient with respect to the
+            projected centre in units of half images (dL_dmean2D of 2DGS trainers, for densification);
             `background` (3,); `pose` (6,): rotation vector [1 / rad] and translation [1 / m] of a motion
             after world_to_camera, in the camera's axes. Splats that are not rendered have zeros. The arrays
             are bit-identical on every run and valid until the next call.
 
         Raises:
-            CapacityExceeded: the buffers of a frame that was not waited for were too small; the next is
-                given larger ones.
-            InputError: another frame has been rendered since, or a gradient is of no output or has a wrong
-                shape.
+            CapacityExceeded: `forward` did not wait, and the buffers were too small; the next frame has
+                larger buffers.
+            InputError: another frame has been rendered since, or a gradient names an unknown output or has
+                the wrong shape.
             DeviceError: the device runs out of memory or fails.
         """
 
     def backward_to_tiles(self, images: Any, gradients: Mapping[str, Any]) -> Any:
-        """Gradients in the form that `TrainingKernels.step` of the device accepts; by default those of
+        """Gradients in the form that `TrainingKernels.step` of the device accepts; by default the result of
         `backward`."""
         return self.backward(images, gradients)
 
 
 class TrainingKernels(ABC):
-    """The work of a training step around the frame (`fidsplat.train`), on device arrays.
+    """Device kernels of a training step other than rendering: loss, optimiser, densification, noise.
 
-    Its state is n splats before their activations, float32: `means` (n, 3), `log_scales` (n, 2), `quats`
-    (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's running means of each as `first_NAME` and `second_NAME`;
+    The state is n splats before their activation functions, float32: `means` (n, 3), `log_scales` (n, 2),
+    `quats` (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's moments of each as `first_NAME` and `second_NAME`;
     `gradient_sums` (n,) and `visible_counts` (n,), the statistics of densification.
     """
 
@@ -348,48 +351,56 @@ class TrainingKernels(ABC):
 
     @abstractmethod
     def load_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
-        """Set the ground truth: images (h, w, 3) uint8 with their masks (h, w) bool."""
+        """Copy the ground truth to the device: images (h, w, 3) uint8, each with a mask (h, w) bool or
+        None."""
 
     @abstractmethod
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Set these arrays; missing ones are unchanged."""
+        """Set arrays of the state by their names; others are unchanged."""
 
     @abstractmethod
     def read(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """Copy the arrays of these names to the host, all by default."""
+        """Copy arrays of the state to the host; all by default."""
 
     @abstractmethod
     def gather_rows(self, rows: np.ndarray, remaining: int) -> None:
-        """Replace the splats by the rows (m,) uint32 of them; from row `remaining` on without moments."""
+        """Keep or duplicate splats: row i of the new state is row `rows[i]` (m,) uint32 of the old one.
+        Moments are zeroed from row `remaining` on."""
 
     @abstractmethod
     def write(self, arrays: Mapping[str, np.ndarray], first: int) -> None:
-        """Overwrite the last rows of these arrays, from row `first` on."""
+        """Overwrite arrays of the state from row `first` to their end."""
 
     @abstractmethod
     def clear(self, names: Sequence[str]) -> None:
-        """Fill these arrays with zeros."""
+        """Fill arrays of the state with zeros."""
 
     @abstractmethod
     def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
-        """The splats as a cloud to render, with SH of this degree; it changes as they do."""
+        """The splats as a cloud to render, with SH up to `degree`; it shares the state, so that steps change
+        it."""
 
     @abstractmethod
     def loss(
         self, images: Any, view: int, dssim_weight: float
     ) -> tuple[Callable[[], tuple[float, float]], Any]:
-        """Compare a frame with the ground truth of a view, by its number. Returns what waits for the loss and
-        the mean squared difference, to be called before `late` more frames, and the gradient of the loss
-        (h, w, 3) as a device array that is valid until the next call."""
+        """Compare a frame with the ground truth of view number `view`.
+
+        Returns:
+            A function that waits for the loss and the mean squared difference and returns them, to be called
+            before `max_pending_losses` more frames; and the gradient of the loss (h, w, 3), a device array
+            that is valid until the next call.
+        """
 
     @abstractmethod
     def normal_loss_gradients(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
-        """Gradients of `fidsplat.train.losses.normal_loss` by `depth` and `normal`, times the weight, as
-        device arrays that are valid until the next call."""
+        """Gradients of `fidsplat.train.losses.normal_loss` with respect to `depth` and `normal`, times the
+        weight, as device arrays that are valid until the next call."""
 
     @abstractmethod
     def accumulate_statistics(self, taken: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add screen gradients and visibility to their sums. taken: from `backward_to_tiles`."""
+        """Add the frame's screen gradients and visibility to `gradient_sums` and `visible_counts`. taken: the
+        result of `backward_to_tiles`."""
 
     @abstractmethod
     def step(
@@ -403,18 +414,20 @@ class TrainingKernels(ABC):
         """Apply a step of Adam.
 
         Args:
-            taken: from `GradientPipeline.backward_to_tiles`.
-            sizes: step sizes of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest`.
-            numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
+            taken: the result of `GradientPipeline.backward_to_tiles`.
+            sizes: learning rates of `means`, `scales`, `quats`, `logits`, `sh` (degree 0) and `rest` (higher
+                degrees).
+            numbers: `beta1`, `beta2`, `epsilon`, `root` (square root of 1 - beta2^step); `scale_penalty` and
                 `opacity_penalty`, added to the gradients; `sparse`: 1 where splats on which the frame does
                 not depend are left unchanged.
-            camera: unless None, `accumulate_statistics` comes first.
+            camera: if given, statistics are accumulated first, as by `accumulate_statistics`.
         """
 
     @abstractmethod
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
-        """Add noise to the means within their disks, `size` times their variance, less where the opacity is
-        above `threshold`. words: the seed's low and high word, the iteration, the purpose."""
+        """Add MCMC noise to the means: random steps in the plane of each disk with `size` times its variance,
+        reduced by a sigmoid of this `slope` for opacities above `threshold`. words: low and high word of the
+        seed, iteration, purpose of the random numbers."""
 
 
 class Backend(ABC):
@@ -423,14 +436,14 @@ class Backend(ABC):
     info: DeviceInfo
     traits: DeviceTraits = DeviceTraits()
     shape: Any = None
-    """build constants of its kernels: sizes of tiles, methods of sorting"""
+    """build constants of the kernels, such as the tile size and the sorting method"""
     pair_budget: int = 2**30 - 1
-    """maximum number of splat-tile pairs that are listed at once; tests lower it"""
+    """maximum number of pairs of a splat and a tile in the tile lists at once; tests lower it"""
     memory_bytes: int = 0
     """device memory of scratch buffers; clouds and finished images are not included"""
 
     def lacks(self, requirement: str, remedy: str) -> str:
-        """Error message of an operation that the device does not offer."""
+        """Error message for an operation that the device does not support."""
         return f"device must {requirement}, got {self.info.name}; {remedy}"
 
     @abstractmethod
@@ -443,7 +456,7 @@ class Backend(ABC):
         device's own.
 
         Raises:
-            DeviceError: what is `unsupported`; or the compiler fails.
+            DeviceError: the device does not support a feature, or the compiler fails.
         """
 
     def render_every(
@@ -468,8 +481,8 @@ class Backend(ABC):
         raise InputError(self.lacks("have a memory budget", f"leave out memory_budget={budget}"))
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> ResidentData:
-        """A cloud of arrays (`means`, `quats`, ...) that are on the device, without a copy. Raises InputError
-        for arrays that cannot be used."""
+        """Make a cloud of arrays (`means`, `quats`, ...) that are already on the device, without a copy.
+        Raises InputError for arrays that cannot be used."""
         raise InputError(self.lacks("adopt arrays", "use a Warp device, or a SplatCloud"))
 
     def chunk_cache(self, scene: ChunkedScene, rows: int) -> ChunkCache:
@@ -481,8 +494,8 @@ class Backend(ABC):
         raise DeviceError(self.lacks("report termination depths", "render without occlusion culling"))
 
     def copy_tiles(self, images: Any, other: Any, tiles: np.ndarray) -> None:
-        """Copy tiles (rows, columns) bool of another frame of the same view into a frame, and add its counts.
-        Pixels must not have samples in more than one tile."""
+        """Copy the tiles selected by a mask (rows, columns) bool from another frame of the same view into a
+        frame, and add its counts. All samples of a pixel must be in one tile."""
         raise DeviceError(self.lacks("copy tiles", "render without occlusion culling"))
 
     def differentiate(self, features: FeatureSet, shape: Any = None) -> GradientPipeline:
@@ -495,11 +508,11 @@ class Backend(ABC):
         raise DeviceError(self.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
 
     def compile_in_background(self, features: FeatureSet) -> None:  # noqa: B027 (optional)
-        """Start to compile `differentiate` of these features in the background, where the device can.
-        `differentiate` waits for it and raises its errors."""
+        """Start to compile the derivatives of these features in the background, if the device supports it.
+        `differentiate` waits for the compiler and raises its errors."""
 
     def training(self) -> TrainingKernels:
-        """Compiled training kernels, without splats. Raises DeviceError where the compiler fails."""
+        """Compiled training kernels, without splats. Raises DeviceError if the compiler fails."""
         raise DeviceError(self.lacks("have kernels for training", "train in NumPy"))
 
     def release_scratch(self) -> None:
@@ -515,17 +528,21 @@ class Backend(ABC):
         raise DeviceError(self.lacks("have a probe", "use an OpenCL or Warp device"))
 
     def shapes(self, kind: str) -> dict[str, Any]:
-        """Other build constants, by name, for tests.
+        """Alternative build constants by name, with which tests compile the same features.
 
-        kind: `tiles`, other tile sizes, bit-identical; `schedule`, the schedule of a GPU (on a GPU: other
-        tiles), equal but for rounding; `listing`, the tile-binning strategies under the schedule of a GPU
-        where the device has several; `sorting`, all methods of binning and sorting; `arithmetic`, ways of
-        compiling the functions of `Probe.arithmetic`: fused or not, in vectors or one by one; `k_buffer`,
-        smaller k-buffers, bit-identical; `tape`, fewer fragments stored for the backward pass, with
-        bit-identical gradients.
+        kind: what the alternatives change:
+            `tiles`: the tile size; images are bit-identical.
+            `schedule`: the assignment of work to threads as on a GPU (on a GPU: the tile size); images differ
+                by rounding.
+            `listing`: the tile-binning strategy, with the schedule of a GPU.
+            `sorting`: the method of binning and sorting.
+            `arithmetic`: the compilation of the functions of `Probe.arithmetic`: with or without fused
+                multiply-adds, with or without vectors.
+            `k_buffer`: the size of the k-buffer; images are bit-identical.
+            `tape`: the number of fragments stored for the backward pass; gradients are bit-identical.
         """
         return {}
 
     def pieces(self, shape: Any) -> int:
-        """Number of pieces into which sorts divide their input."""
+        """Number of pieces into which the counting sorts divide their input."""
         return 1

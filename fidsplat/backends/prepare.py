@@ -1,4 +1,4 @@
-"""Features to compile and uniforms of the view, from a cloud and a capture."""
+"""Preparation of a frame: the features to compile and the view's uniforms, from a cloud and a capture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fidsplat.util.errors import InputError
 
 
 class Origined(CloudTraits, Protocol):
-    """Properties of a cloud that select kernels, and its origin."""
+    """A cloud with the properties that select kernels, and an origin."""
 
     @property
     def origin(self) -> np.ndarray:
@@ -29,11 +29,11 @@ class Origined(CloudTraits, Protocol):
 
 _Prepared = tuple[FeatureSet, View]
 _prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[Origined, _Prepared]] = WeakKeyDictionary()
-"""of captures in which nothing moves: a motion's functions may return other poses the next time"""
+"""cached for static captures only: the functions of a motion may return other poses next time"""
 
 
 def prepare(cloud: Origined, capture: Capture) -> _Prepared:
-    """The features that a capture of a cloud requires, and its view; cached for resident clouds.
+    """Return the features that a capture of a cloud requires, and its view; cached for resident clouds.
 
     Raises:
         InputError: no camera, an unknown output, effects that exclude each other, a frame that is too large,
@@ -50,10 +50,10 @@ def prepare(cloud: Origined, capture: Capture) -> _Prepared:
 
 
 def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]:
-    """The features that the views of a batch require, and the views that are rendered.
+    """Return the features that the views of a batch require, and the batch of rendered views.
 
     Raises:
-        InputError: as `prepare`; views with different effects.
+        InputError: as for `prepare`, or the views have different effects.
     """
     rendered = views.active
     indices = np.array(rendered, np.uint32)
@@ -79,10 +79,10 @@ def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]
 
 
 def view_of(capture: Capture, origin: np.ndarray) -> View:
-    """The view of a capture: at its shutter's time, with `sub_frames` if it is made of several poses.
+    """The view of a capture at the time of its shutter, with `sub_frames` if the shutter needs several poses.
 
     Raises:
-        InputError: as View.of; a pose that is not rigid.
+        InputError: as for `View.of`, or a pose is not rigid.
     """
     camera, motion, shutter = capture.camera, capture.motion, capture.shutter
     if motion.is_still:
@@ -107,7 +107,7 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
 
 
 def _moved(view: View, motion: np.ndarray, origin: np.ndarray) -> View:
-    """The view of splats that are moved by a motion (4, 4) of the world."""
+    """The view for splats that are moved by a rigid motion (4, 4) in world coordinates."""
     turn, move = motion[:3, :3], motion[:3, 3]
     rotation = view.rotation @ turn
     translation = view.translation + rotated(view.rotation, rotated(turn, origin) + move - origin)

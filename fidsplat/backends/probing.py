@@ -1,4 +1,4 @@
-"""Access to an open device for tests: single functions, single stages, and poisoned memory."""
+"""Interface for tests of an open device: single functions, single stages, and poisoned memory."""
 
 from __future__ import annotations
 
@@ -11,29 +11,35 @@ import numpy as np
 
 
 class Probe(ABC):
-    """Small kernels compiled as the stages are, single stages on made-up input, and poisoned memory."""
+    """Access for tests: small kernels compiled like the stages, stages on artificial input, poisoned
+    memory."""
 
     fuses: bool
     """whether the device fuses multiply-adds where requested"""
 
     @abstractmethod
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
-        """a b - a b; a b + a; a b - a b of thirds in the precision of the set-up; a b - (a b), fused: each
-        (n,), from a, b (n,) float32."""
+        """Evaluate expressions that a compiler may contract to fused multiply-adds, from a, b (n,) float32.
+
+        Returns:
+            Four arrays (n,): a b - a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in the precision of the set-up;
+            fma(a, b, -(a b)).
+        """
 
     @abstractmethod
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
-        """x != x, isnan, fails every comparison, isinf; each (n,) int32, from x (n,) float32."""
+        """Test x (n,) float32 for NaN and infinity in four ways, each (n,) int32: x != x, isnan, every
+        comparison is false, isinf."""
 
     @abstractmethod
     def arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Results of the device's functions, float32 ones as in the stages.
+        """Evaluate the device's mathematical functions, compiled as in the stages.
 
         Args:
-            exponents, shares, above, below: (n,) float64, n a multiple of 16; they are rounded to float32
-                for float32 functions.
+            exponents, shares, above, below: (n,) float64 arguments, n a multiple of 16; rounded to float32
+                for functions in float32.
 
         Returns:
             (n,) float32: `exp` of exponents, `log` of shares, `division` above / below, `sqrt` of below,
@@ -51,7 +57,8 @@ class Probe(ABC):
 
     @abstractmethod
     def scan(self, pipeline: Any, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-        """Prefix sums of list lengths (n,) uint32, modulo 2^32, (n + 1,) uint32; and the total in 64 bits."""
+        """Run the prefix sum of the tile lists on lengths (n,) uint32: sums modulo 2^32, (n + 1,) uint32, and
+        the total in 64 bits."""
 
     @abstractmethod
     def boxes(self, pipeline: Any, trace: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -60,4 +67,4 @@ class Probe(ABC):
 
     @abstractmethod
     def poisoned(self) -> AbstractContextManager[None]:
-        """A context in which all memory that a frame allocates is first filled with 0xFF: NaN, or -1."""
+        """A context in which the memory that a frame allocates is first filled with 0xFF (NaN, or -1)."""

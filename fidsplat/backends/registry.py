@@ -1,5 +1,6 @@
-"""Devices by name. A family of devices is a module with `devices()` and `open_device(selector)`, imported on
-first use.
+"""Registry of devices: opens and lists them by name.
+
+A family of devices is a module with `devices()` and `open_device(selector)`, imported on first use.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ FAMILIES = {
     "warp": "fidsplat.backends.warp",
     "reference": "fidsplat.backends.reference",
 }
-"""modules of the families; a further entry adds a family in this process"""
+"""module of each family; further entries add families"""
 
 FIRST = "auto"
-"""the best device of the first family in `ORDER` that has a usable one"""
+"""name that opens the best device of the first family in `ORDER` that has a usable device"""
 ORDER = ("opencl", "warp")
 
 _STARTED_BY: dict[str, int] = {}
-"""family: the process in which its driver was first used"""
+"""id of the process in which the driver of each family was first used"""
 
 
 def open_backend(name: str) -> Backend:
@@ -48,7 +49,7 @@ def open_backend(name: str) -> Backend:
 
 
 def devices() -> list[DeviceInfo]:
-    """Every device that can be opened here, and why the others cannot.
+    """List all devices: those that can be opened, and those that cannot, with the reason.
 
     Raises:
         DeviceError: a fork has made a driver unusable, or a limit of the process is too low for drivers.
@@ -59,7 +60,8 @@ def devices() -> list[DeviceInfo]:
 
 
 def _open_first() -> Backend:
-    """The best device of the first family of ORDER that has a usable one. Warns of families without one."""
+    """Open the best device of the first family in `ORDER` that has a usable one; warn about skipped
+    families."""
     reasons = []
     for family in ORDER:
         _prepare(family)
@@ -75,7 +77,7 @@ def _open_first() -> Backend:
 
 
 def _prepare(family: str, selector: str = "") -> None:
-    """Check that a family's driver can be entered, and provide folders for its caches."""
+    """Check that a family's driver can be used in this process, and provide folders for its caches."""
     if family == "reference":
         return
     if (family, selector.lower()) != ("warp", "cpu"):  # it has no driver
@@ -89,7 +91,7 @@ def _check_driver(family: str) -> None:
     started = _STARTED_BY.setdefault(family, os.getpid())
     if started != os.getpid():
         raise DeviceError(
-            f"{family} was started by process {started}, of which this one is a fork, and its driver "
-            "does not survive that; open the first Renderer in the workers, or start them by "
+            f"the driver of {family} must be first used in the process that renders, got a fork of process "
+            f"{started}, which used it before; open the first Renderer in the workers, or start them with "
             "multiprocessing.get_context('spawn')"
         )

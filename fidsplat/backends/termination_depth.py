@@ -1,10 +1,9 @@
 """Termination depths: the depth at which blending of each tile stopped, for occlusion culling.
 
 Blending walks a tile's list of splats by sort key until all pixels of the tile are opaque. The device
-stores that key (part/termination_depth_*.cl). A splat with a larger key cannot change the tile, since
-the list up to that key is the same with or without it. A frame of some of the splats is therefore
-bit-identical to that of all, if the key of each other splat is larger than the termination depths of all
-tiles that it can touch. This holds for every output and order.
+stores that key (part/termination_depth_*.cl). A splat with a larger key cannot change the tile: the list up
+to that key is the same with or without it. So a splat can be left out, with a bit-identical frame, if its key
+is larger than the termination depth of every tile that it can touch. This holds for every output and order.
 """
 
 from __future__ import annotations
@@ -19,21 +18,22 @@ class TerminationDepths:
     """Depth at which blending of each tile of a frame stopped."""
 
     depths: np.ndarray
-    """(rows, columns) float32 metres, of sort keys; infinite where a tile is not opaque"""
+    """(rows, columns) float32: sort key in metres; infinite for tiles that are not opaque"""
     tile: tuple[int, int]
     """rows and columns of samples in a tile"""
 
     def within(self, tiles: np.ndarray) -> TerminationDepths:
-        """The depths of the selected tiles (rows, columns) bool; -inf, so nothing visible, in the others."""
+        """A copy with -inf (nothing visible) in all tiles except those of a mask (rows, columns) bool."""
         return replace(self, depths=np.where(tiles, self.depths, np.float32(-np.inf)))
 
     def replaced(self, tiles: np.ndarray, other: TerminationDepths) -> TerminationDepths:
-        """A copy with the depths of the selected tiles (rows, columns) bool from another frame."""
+        """A copy with the depths of another frame in the tiles of a mask (rows, columns) bool."""
         return replace(self, depths=np.where(tiles, other.depths, self.depths))
 
     @staticmethod
     def of_keys(keys: np.ndarray, tile: tuple[int, int]) -> TerminationDepths:
-        """Depths of the kernels' sortable keys (rows, columns) uint32; all bits set: not terminated."""
+        """Convert the kernels' sortable keys (rows, columns) uint32; a key with all bits set: not
+        terminated."""
         bits = np.where(keys & 0x80000000, keys ^ np.uint32(0x80000000), ~keys).astype(np.uint32)
         depths = bits.view(np.float32).copy()
         depths[(keys == 0xFFFFFFFF) | np.isnan(depths)] = np.inf

@@ -17,7 +17,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.util.errors import InputError
 
 FAR_EYE = 1e9
-"""metres: distance of the eye of a parallel projection"""
+"""metres: distance of the eye that gives view-dependent colours in a parallel projection"""
 NO_CAMERA = "no camera: pass camera=fs.Camera... or give the scene a [camera] table"
 MAX_GRID = 32767
 """Largest side of the sample grid: anchors and rows are stored in 16 bits."""
@@ -25,8 +25,8 @@ _NO_SENSOR = Sensor()
 
 
 def rotated(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """The product of each matrix (..., 3, 3) and its vector (..., 3), never -0. Its rounding is the same on
-    every processor; that of `@` depends on BLAS."""
+    """Multiply each matrix (..., 3, 3) with its vector (..., 3); never returns -0. Rounding is the same on
+    every processor, unlike with `@`, which depends on BLAS."""
     return (matrices * vectors[..., None, :]).sum(axis=-1) + 0.0
 
 
@@ -38,14 +38,13 @@ class View:
     """
 
     width: int
-    """samples"""
+    """width of the sample grid"""
     height: int
-    """samples"""
+    """height of the sample grid"""
     samples: int
-    """per pixel and axis"""
+    """samples per pixel along each axis"""
     focal_x: float
-    """samples per unit of x / z of a pinhole, per radian of a panorama, per metre of parallel rays; fx of a
-    camera is in pixels"""
+    """samples per unit of x / z (pinhole), per radian (panorama) or per metre (parallel rays)"""
     focal_y: float
     center_x: float
     """samples: principal point"""
@@ -55,8 +54,8 @@ class View:
     translation: np.ndarray
     """(3,) metres: the cloud's origin in the camera frame"""
     eye: np.ndarray
-    """(3,) metres: the camera's centre relative to the cloud's origin, world axes; far behind it for parallel
-    rays"""
+    """(3,) metres: the camera's centre relative to the cloud's origin, in world axes; for parallel rays a
+    point far behind the camera"""
     near: float
     far: float
     log_cut: float
@@ -64,30 +63,32 @@ class View:
     ceiling: float
     stop: float
     background: tuple[float, float, float]
-    """with fog, its colour"""
+    """background colour; with fog, the fog's colour"""
     first_light: float
-    """transmittance behind a first hit"""
+    """transmittance at which the first hit (`depth_first`) is taken"""
     sensor: Sensor = _NO_SENSOR
     fog_density: float = 0.0
-    """1 / metres"""
+    """fog density per metre"""
     surroundings: Gradient | Panorama | None = None
-    """a background that is not one colour"""
+    """a background that is a gradient or a panorama"""
     external_depth: ExternalDepth | None = None
-    """an opaque surface among the splats"""
+    """external depth image: an opaque surface among the splats"""
     raster: RayRaster | None = None
-    """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
+    """rays of the samples for a camera with a lens; None for a pinhole and for parallel rays"""
     along_ray: bool = False
-    """whether near, far, sort keys and depths are distances from the camera's centre; else along z"""
+    """whether depths (also near, far, sort keys) are distances from the camera's centre; else z
+    coordinates"""
     slopes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """limits of -x, x, -y, y at z = 1, to which EWA clamps the point of its derivatives"""
+    """limits of -x, x, -y, y at z = 1: EWA clamps the point at which it linearises to them"""
     parallel: bool = False
     """whether all rays are parallel to z; focal_x and focal_y are samples per metre then"""
     groups: tuple[tuple[int, View], ...] = ()
     """(label, view of its splats), for moving groups of splats"""
     sub_frames: tuple[SubFrame, ...] = ()
-    """the sub-frames of an exposure; none for a single pose"""
+    """sub-frames of an exposure; empty for a single pose"""
     band: tuple[int, int] | None = None
-    """rows of samples [first, end) that are rendered, bit-identical to the complete frame; None: all"""
+    """rows of samples [first, end) that are rendered, bit-identical to those of the complete frame; None:
+    all"""
 
     @property
     def lens(self) -> Lens | None:
@@ -98,7 +99,8 @@ class View:
 
     @property
     def row_rotations(self) -> np.ndarray:
-        """(h, 3, 3) world to camera, for each row of pixels that of the pose which normals show there."""
+        """(h, 3, 3) rotation from world to camera for each row of pixels: that of the sub-frame whose normals
+        the row shows."""
         rotations = np.tile(self.rotation, (self.height // self.samples, 1, 1))
         for sub_frame in self.sub_frames:
             if sub_frame.middle:
@@ -119,11 +121,11 @@ class View:
         )
 
     def uniform(self, name: str) -> tuple[Any, ...]:
-        """Numbers of an effect, by the name of their group."""
+        """Uniforms of an effect, by the name of their group."""
         around = self.surroundings
         match name:
             case "ray" if self.along_ray or self.parallel:
-                # depths are distances already: rays of a length of 1 per metre of depth
+                # depths are distances already: a ray is 1 m long per metre of depth
                 return math.inf, math.inf, 0.0, 0.0
             case "ray":
                 return self.focal_x, self.focal_y, self.center_x, self.center_y
@@ -144,7 +146,7 @@ class View:
                 return self.sensor.uniform(name)
 
     def array(self, name: str) -> np.ndarray:
-        """An array of an effect, by its name: float32, but int32 labels."""
+        """An array of an effect by its name: int32 for labels, else float32."""
         if self.external_depth is not None and name.startswith("external_"):
             return getattr(self.external_depth, name.removeprefix("external_"))
         if name == "row_rotations":
@@ -155,8 +157,8 @@ class View:
 
     @classmethod
     def of(cls, capture: Capture, origin: np.ndarray, camera: Camera | None = None) -> View:
-        """The view of a capture's camera, or of another in its place, for a cloud whose means are relative to
-        `origin` (3,). Nothing moves in it.
+        """The view of a capture's camera, or of `camera` instead, for a cloud whose means are relative to
+        `origin` (3,). Motions are ignored.
 
         Raises:
             InputError: there is no camera, or the sample grid is too large.
@@ -224,15 +226,15 @@ class View:
 
 @dataclass(frozen=True)
 class SubFrame:
-    """One pose of a frame with a shutter."""
+    """Sub-frame: one pose of a frame with a shutter."""
 
     view: View
-    """restricted to its rows"""
+    """the view at this pose, restricted to the sub-frame's rows"""
     top: int
-    """its first row of samples in the frame"""
+    """first row of samples of the sub-frame in the frame"""
     weight: float
-    """in the mean of the sub-frames of its rows"""
+    """weight in the mean of all sub-frames of the same rows"""
     first: bool
-    """whether it is the first of its rows"""
+    """whether it is the first sub-frame of its rows"""
     middle: bool
-    """whether outputs other than rgb and alpha show it: the sub-pose n // 2 of n"""
+    """whether outputs other than rgb and alpha show this sub-frame: number n // 2 of n"""
