@@ -204,6 +204,23 @@ class Camera(PickledByFields):
         pose[:3, 3] = -pose[:3, :3] @ position
         return replace(self, world_to_camera=pose, position=position)
 
+    def with_size(self, width: int, height: int) -> "Camera":
+        """The same camera with another number of pixels.
+
+        The horizontal field of view and the shape of pixels stay; rows are added or cut off around the
+        principal point. A panorama is scaled in both directions.
+
+        Raises:
+            InputError: a size out of range.
+        """
+        width, height = _size("width", width), _size("height", height)
+        x = width / self.width
+        y = height / self.height if isinstance(self.lens, Equirectangular) else x
+        cy = height / 2 + (self.cy - self.height / 2) * y
+        return replace(
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=cy
+        )
+
     @property
     def matrix(self) -> np.ndarray:
         """Intrinsic matrix K (3, 3) float64."""

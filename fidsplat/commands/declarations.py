@@ -38,7 +38,7 @@ rules = ConstructorRegistry()
 _UNSET = "unset"
 _PLACEHOLDERS = {int: "N", float: "X", str: "TEXT", Path: "DIR"}
 """placeholders of values in help, by type; settings have no paths but folders"""
-_PLACEHOLDER = re.compile(r"[A-Z]+([.|,][A-Za-z0-9.]*)*")
+_PLACEHOLDER = re.compile(r"[A-Z]+([.|,][A-Za-z0-9.]*| [A-Z])*")
 """placeholders in docstrings: `FILE.mp4: text`"""
 _Description: Any = type(tyro.conf.arg())
 
@@ -187,6 +187,6 @@ def _field_docstrings(kind: type) -> dict[str, str]:
                 found.pop(field.target.id, None)
                 if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
                     words = " ".join(str(text.value.value).split()).removesuffix(".")
-                    lower = words[1:2].islower() or words[1:2] == " "
+                    lower = words[1:2].islower() or (words[1:2] == " " and not words[2:3].isupper())
                     found[field.target.id] = words[0].lower() + words[1:] if lower else words
     return found

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Json, Overwrite, RayAddress, Workers, check_workers, writable_file
 from fidsplat.commands.output import console, report, show_progress
-from fidsplat.commands.scenes import RenderInput
+from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ class Fly(RenderInput):
     """FILE.mcap|BAG: also write a ROS 2 log of images, intrinsics and poses (extra: logs)"""
     coco: str | None = None
     """FILE.json: also write the markers in each image as COCO annotations"""
+    size: Size = None
     ray: RayAddress = None
     workers: Workers = None
     overwrite: Overwrite = False
@@ -86,7 +87,7 @@ class Fly(RenderInput):
         path = None
         if self.trajectory is not None:
             path = load_trajectory(self.trajectory, self.file_rate, self.smooth)
-        scene = self.load()
+        scene = self.load(size=self.size)
         path = path or _camera_motion(self.source, scene, self.smooth)
         times = path.sampled(self.rate).times if self.times is None else _parse_times(self.times)
         flight = Flight(scene, path, times, scene.capture.with_(outputs=self.outputs, quality=self.quality))

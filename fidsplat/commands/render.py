@@ -6,7 +6,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, Annotated
@@ -16,8 +16,9 @@ import tyro
 from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, check_request
 from fidsplat.commands.output import console, delayed_progress, report
-from fidsplat.commands.scenes import RenderInput
+from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.effects.catalogue import outputs_help
+from fidsplat.scenes.sources import StartPose
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import path_of, writable_folder
 
@@ -35,7 +36,8 @@ _OTHER_IMAGES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gi
 class Render(RenderInput):
     """Render a scene file, a splat file or a store to images.
 
-    A splat file has no camera: it is framed from -z in 1280 x 720 pixels. With -o OUT.png the colour image is
+    A splat file has no camera: it is framed as a whole, with the up axis that `fidsplat info` guesses.
+    --up, --position, --look-at and --size set the camera of any scene. With -o OUT.png the colour image is
     OUT.png and other outputs are OUT-depth.png and so on. Any other OUT is a folder for rgb.png, depth.png
     and so on. Depth is written as .npy (metres), .png (16-bit millimetres) and -turbo.png (colours), labels,
     ids and counts as .npy and .png (colours).
@@ -56,6 +58,7 @@ class Render(RenderInput):
       fidsplat render scene.toml
       fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
       fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
+      fidsplat render room.ply --up 0 0 1 --position -2 0 1.5 --look-at 0 0 1 --size 1920 1080
       fidsplat render tag.ply -o tag.png --device reference --quality gsplat
       fidsplat render scene.toml --device reference --every 8      every 8th pixel, in a 64th of the time
       fidsplat render scene.toml --max-error 1e-3        measures qualities first and caches the result
@@ -70,6 +73,8 @@ class Render(RenderInput):
     """T: use the most accurate quality that takes at most T milliseconds per frame"""
     every: int | None = None
     """N: render every Nth pixel in both directions as a smaller image (device reference only)"""
+    pose: StartPose = field(default_factory=StartPose)
+    size: Size = None
     json: Json = False
 
     def run(self) -> int:
@@ -83,7 +88,7 @@ class Render(RenderInput):
             with _option_names():
                 check_bounds(self.max_error, self.max_ms)
         name_of = _file_names(self.out, path_of(self.source))
-        scene = self.load()
+        scene = self.load(self.pose, self.size)
         with _scene_key(self.source, "render.outputs", self.outputs is None):
             check_request(scene.outputs, None)
         named = _scene_key(self.source, "render.device", self.device is None and scene.device is not None)

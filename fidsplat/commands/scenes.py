@@ -10,6 +10,7 @@ import tyro
 from fidsplat.commands.declarations import option
 from fidsplat.commands.options import MemoryBudget, check_request
 from fidsplat.commands.output import delayed_progress
+from fidsplat.scenes.sources import OWN_POSE, StartPose
 from fidsplat.util.arguments import Names
 from fidsplat.util.errors import InputError
 
@@ -36,12 +37,15 @@ class SceneInput:
     """output images; `fidsplat render --help` lists them (default: the scene's, or rgb)"""
     quality: SceneQuality = None
 
-    def load(self) -> Scene:
-        """The scene, with a progress bar when loading takes long. Raises InputError."""
+    def load(self, pose: StartPose = OWN_POSE, size: tuple[int, int] | None = None) -> Scene:
+        """The scene, with a progress bar when loading takes long. Raises InputError.
+
+        pose, size: of the camera, instead of the scene's.
+        """
         from fidsplat.scenes.sources import load_source
 
         with delayed_progress() as progress:
-            return load_source(self.source, self.quality, progress)
+            return load_source(self.source, self.quality, progress, pose, size)
 
 
 @dataclass
@@ -56,6 +60,10 @@ class RenderInput(SceneInput):
         check_request(self.outputs, self.quality)
 
 
+Size = Annotated[
+    tuple[int, int] | None,
+    option("WIDTH HEIGHT", "pixels of the image (default: the scene's; for a splat file 1280 720)"),
+]
 UserScenes = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     option("SCENE.toml|FILE.ply", "your own scene instead of --scenes; repeat for several"),

@@ -12,6 +12,7 @@ from fidsplat.commands.declarations import option
 from fidsplat.commands.options import MemoryBudget
 from fidsplat.commands.output import console, delayed_progress, print_lines
 from fidsplat.commands.scenes import SceneDevice, SceneQuality
+from fidsplat.scenes.sources import OWN_POSE, StartPose
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
@@ -44,6 +45,7 @@ class View:
       fidsplat view                                                      the demo's scene
       fidsplat view scene.toml
       fidsplat view room.ply --port 9000 --device opencl:nvidia
+      fidsplat view map.ply --up 0 0 1 --position 0 -5 2 --look-at 0 0 1
       fidsplat view fidsplat-flight
       fidsplat view yard.training.npz --trajectory yard/sparse/0       a training, and its cameras
     """
@@ -54,6 +56,7 @@ class View:
     ] = None
     trajectory: str | None = None
     """FILE: poses to show as keyframes (docs/formats.md#trajectories), e.g. a flight's trajectory.tum"""
+    pose: StartPose = field(default_factory=StartPose)
     page: PageSettings = field(default_factory=PageSettings)
     device: SceneDevice = None
     quality: SceneQuality = None
@@ -68,7 +71,7 @@ class View:
         path = None if target.trajectory is None else load_trajectory(target.trajectory)
         where = console(True)
         with delayed_progress() as progress:
-            scene = target.scene(self.quality, progress)
+            scene = target.scene(self.quality, progress, self.pose)
         file = Path(target.source) if target.source.lower().endswith(".toml") else None
         reload = None if target.training is None else target.training.reload
         with where.status("compiling"):
@@ -113,17 +116,17 @@ class Target:
     """file of the poses shown as keyframes"""
     training: Training | None = None
 
-    def scene(self, quality: str | None, progress: Progress) -> Scene:
-        """The scene, at a quality that replaces its own if one is given."""
+    def scene(self, quality: str | None, progress: Progress, pose: StartPose = OWN_POSE) -> Scene:
+        """The scene, at a quality and from a pose that replace its own if they are given."""
         from fidsplat.scenes.sources import load_source
         from fidsplat.worlds.yard import demo_scene
 
         changes = {} if quality is None else {"quality": quality}
-        if self.training is not None:
-            return self.training.scene
-        if self.source:
-            return replace(load_source(self.source, quality, progress), **changes)
-        return replace(demo_scene(), **changes)
+        if self.source and self.training is None:
+            return replace(load_source(self.source, quality, progress, pose), **changes)
+        scene = replace(demo_scene(), **changes) if self.training is None else self.training.scene
+        assert scene.camera is not None
+        return replace(scene, camera=pose.applied(scene.camera))
 
 
 def find_checkpoint(source: Path) -> Path | None:

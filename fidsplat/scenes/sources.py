@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,21 +14,71 @@ from fidsplat.formats.collect import Progress
 from fidsplat.formats.files import FORMATS, NAMED, load_splats
 from fidsplat.scenes.scene import Scene
 from fidsplat.splats.cloud import SplatCloud
+from fidsplat.splats.statistics import guess_up
 from fidsplat.store.layout import SUFFIX
+from fidsplat.store.partial_cloud import PartialCloud, concatenated
 from fidsplat.store.store import Store
 from fidsplat.util.errors import InputError
 
 WIDTH, HEIGHT, FOV_X = 1280, 720, math.radians(60.0)
+ELEVATION = math.radians(15.0)
 MARGIN = 1.1
 REACH = 1.5
 """standard deviations of a splat that must be visible; with 3, faint tails would set the camera's distance"""
+CHUNKS = 32
+"""largest number of chunks of a store that its up axis is guessed from"""
 MANY = 10_000
 """captured scenes have strays far away: a cloud of this many is framed without the outermost 1 % of its
 splats"""
 
 
-def load_source(source: str, quality: Quality | str | None = None, progress: Progress | None = None) -> Scene:
+@dataclass(frozen=True)
+class StartPose:
+    """Pose of the camera: options of commands that render one view."""
+
+    up: tuple[float, float, float] | None = None
+    """X Y Z: direction that points up in the image (default: the camera's own; for a splat file the guess of
+    `fidsplat info`)"""
+    position: tuple[float, float, float] | None = None
+    """X Y Z: centre of projection in metres (default: the camera's own)"""
+    look_at: tuple[float, float, float] | None = None
+    """X Y Z: point in the middle of the image (default: the direction stays; for a splat file the middle of
+    the scene)"""
+
+    def __post_init__(self) -> None:
+        for name in ("up", "position", "look_at"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value).all() and (np.any(value) or name != "up")):
+                requirement = "three finite numbers" + (", not all 0" if name == "up" else "")
+                raise InputError(f"camera {name} must be {requirement}, got {value}")
+
+    def applied(self, camera: Camera, middle=None) -> Camera:
+        """The camera at this pose. middle: (3,) default of `look_at` with a position."""
+        if self == OWN_POSE:
+            return camera
+        rotation = camera.world_to_camera[:3, :3]
+        position = camera.position if self.position is None else self.position
+        target = middle if self.look_at is None else self.look_at
+        target = np.add(position, rotation[2]) if target is None else target
+        return camera.with_pose(
+            position=position, target=target, up=-rotation[1] if self.up is None else self.up
+        )
+
+
+OWN_POSE = StartPose()
+"""the camera's own pose"""
+
+
+def load_source(
+    source: str,
+    quality: Quality | str | None = None,
+    progress: Progress | None = None,
+    pose: StartPose = OWN_POSE,
+    size: tuple[int, int] | None = None,
+) -> Scene:
     """Load a scene file, or a splat file or store with a camera that frames it.
+
+    pose, size: replace those of the camera; size is (width, height) in pixels.
 
     Raises:
         InputError: another kind of file; a scene without a camera.
@@ -40,26 +91,58 @@ def load_source(source: str, quality: Quality | str | None = None, progress: Pro
                 f"{source} must have a [camera] table; add one with width, height, fov_x_deg, position, "
                 "look_at"
             )
-        return scene
+        camera = scene.camera if size is None else scene.camera.with_size(*size)
+        return replace(scene, camera=pose.applied(camera))
     if suffix == SUFFIX:
         store = Store(source)
-        return Scene(stores=(store,), camera=framing_camera(store))
+        return Scene(stores=(store,), camera=framing_camera(store, pose, size))
     if suffix in FORMATS or Path(source).name.lower() in NAMED:
         cloud = load_splats(source, progress)
-        return Scene((cloud,), camera=framing_camera(cloud))
+        return Scene((cloud,), camera=framing_camera(cloud, pose, size))
     raise InputError(
         f"the source must be a scene file (.toml), a store ({SUFFIX}) or a splat file "
         f"({', '.join([*FORMATS, *NAMED])}), got {source}"
     )
 
 
-def framing_camera(cloud: SplatCloud | Store) -> Camera:
-    """A camera on the -z side, y down, with all splats in view; 1280 x 720 pixels, 60 degrees wide."""
+def framing_camera(
+    cloud: SplatCloud | Store, pose: StartPose = OWN_POSE, size: tuple[int, int] | None = None
+) -> Camera:
+    """A camera with all splats in view, 60 degrees wide, by default 1280 x 720 pixels.
+
+    It views the scene with its up axis upwards and x to the right, where possible; from 15 degrees above if
+    the pose names the up axis, or level areas show it, and else horizontally: from -z for y down.
+    """
+    width, height = (WIDTH, HEIGHT) if size is None else size
+    guess = guess_up(_sampled(cloud))
+    up = guess.direction if pose.up is None else np.array(pose.up)
     low, high = _extent(cloud)
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-6)
-    tangent = math.tan(FOV_X / 2)
-    away = MARGIN * max(half[0] / tangent, half[1] / (tangent * HEIGHT / WIDTH)) + half[2]
-    return Camera.look_at(WIDTH, HEIGHT, FOV_X, middle - [0, 0, away], middle, near=min(0.01, away / 100))
+    ahead = np.cross(
+        up, (0.0, 1.0, 0.0) if np.abs(up[1:]).max() < 1e-6 * np.abs(up).max() else (1.0, 0.0, 0.0)
+    )
+    ahead /= max(np.linalg.norm(ahead), 1e-300)
+    if guess.ground or pose.up is not None:
+        ahead -= math.tan(ELEVATION) * up / max(np.linalg.norm(up), 1e-300)
+    start = Camera.look_at(width, height, FOV_X, middle - ahead, middle, up)
+    corners = half * np.stack(np.meshgrid(*([-1, 1],) * 3), -1).reshape(-1, 3)
+    corners = corners @ start.world_to_camera[:3, :3].T
+    tangent = math.tan(FOV_X / 2) * np.array([1.0, height / width])
+    away = (MARGIN * np.abs(corners[:, :2]) / tangent - corners[:, 2:]).max()
+    position = middle - away * start.world_to_camera[2, :3]
+    camera = Camera.look_at(width, height, FOV_X, position, middle, up, near=min(0.01, away / 100))
+    return pose.applied(camera, middle)
+
+
+def _sampled(cloud: SplatCloud | Store) -> SplatCloud:
+    """The cloud, or some chunks of a store."""
+    if not isinstance(cloud, Store):
+        return cloud
+    chunks = np.flatnonzero(np.tile(cloud.nodes["level"] == 0, cloud.instances))
+    if not len(chunks):
+        return SplatCloud.empty()
+    some = chunks[np.linspace(0, len(chunks) - 1, min(len(chunks), CHUNKS)).astype(int)]
+    return PartialCloud.of(concatenated([cloud.load(int(number)) for number in some]), cloud)
 
 
 def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,26 @@ SHARES = (1, 50, 99)
 """percent"""
 FLAT = 0.94
 """cosine of 20 degrees, the largest angle between an axis and the normal of a level splat"""
+GROUND, FRONTAL = 0.2, 0.95
+"""shares of the area: level areas of at least GROUND define the up axis; above FRONTAL, facing z, they are a
+marker"""
+SAMPLE = 100_000
+"""largest number of splats that the up axis is guessed from"""
+
+
+class Up(NamedTuple):
+    """A guess of the up axis."""
+
+    axis: str
+    """for example `-y`"""
+    reason: str
+    ground: bool
+    """whether it follows from level areas"""
+
+    @property
+    def direction(self) -> np.ndarray:
+        """(3,) unit vector."""
+        return (1.0 if self.axis[0] == "+" else -1.0) * np.eye(3)["xyz".index(self.axis[1])]
 
 
 def describe(cloud: SplatCloud) -> dict[str, Any]:
@@ -30,7 +50,7 @@ def describe(cloud: SplatCloud) -> dict[str, Any]:
     extent = inner[1] - inner[0]
     front = np.array([*inner.mean(0)[:2], inner[0, 2]])
     front[np.abs(front) < 1e-9 * extent.max()] = 0.0  # rounding errors of a mean
-    up, why = guess_up(cloud)
+    up, why, _ = guess_up(cloud)
     axis = "xyz".index(up[1])
     scales = cloud.scales.astype(np.float64)
     return facts | {
@@ -47,21 +67,37 @@ def describe(cloud: SplatCloud) -> dict[str, Any]:
     }
 
 
-def guess_up(cloud: SplatCloud) -> tuple[str, str]:
-    """The up axis, for example "-y", and the reason: away from the level areas, or along a side that is by
-    far the longest."""
-    level = np.abs(quaternion_to_matrix(cloud.quats)[:, :, 2]) > FLAT
-    area = cloud.scales.prod(1).astype(np.float64) * cloud.opacities
-    area = (
-        np.minimum(area, np.percentile(area, 99)) + 1e-30
-    )  # a few huge splats of a sky must not count as ground
-    low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0)
-    shares, sides = area @ level / area.sum(), np.sort(high - low)
+def guess_up(cloud: SplatCloud) -> Up:
+    """The up axis of a cloud, from a sample of its splats.
+
+    Away from the level areas, if they are a share of `GROUND` and twice that of any vertical area; else along
+    y or z if it is by far the longest side. Else -y, the axis of markers and of most captures.
+    """
+    if not len(cloud):
+        return Up("-y", "no splats", False)
+    some = slice(None, None, -(-len(cloud) // SAMPLE))
+    scales, means = cloud.scales[some].astype(np.float64), cloud.means[some].astype(np.float64)
+    normals = quaternion_to_matrix(cloud.quats[some])[:, :, 2]
+    if cloud.thickness is not None:  # a 3D Gaussian is flat along its shortest axis
+        scales = np.column_stack([scales, cloud.thickness[some]])
+        thin = scales.argmin(1)
+        normals = quaternion_to_matrix(cloud.quats[some])[np.arange(len(thin)), :, thin]
+        scales = np.sort(scales, 1)[:, 1:]
+    level = np.abs(normals) > FLAT
+    area = scales.prod(1) * cloud.opacities[some]
+    # a few huge splats of a sky must not count as ground
+    area = np.minimum(area, np.percentile(area, 99)) + 1e-30
+    low, high = np.percentile(means, (0.5, 99.5), axis=0)
+    shares, sides = area @ level / area.sum(), high - low
     axis = int(np.argmax(shares))
-    if shares[axis] < 0.5 and sides[2] > 1.5 * sides[1]:
-        axis = int(np.argmax(high - low))
-        return ("+x", "-y", "+z")[axis], "the longest side"
-    some = level[:, axis] if level[:, axis].any() else np.ones(len(cloud), bool)
-    place = np.clip(cloud.means[some, axis], low[axis], high[axis])
-    below = np.average(place, weights=area[some]) <= (low[axis] + high[axis]) / 2
-    return ("+" if below else "-") + "xyz"[axis], f"{100 * shares[axis]:.0f} % of the area is level"
+    if shares[2] > FRONTAL:
+        return Up("-y", "all splats face z, like those of a marker", False)
+    if shares[axis] >= max(GROUND, 2 * np.sort(shares)[1]):
+        place = np.clip(means[level[:, axis], axis], low[axis], high[axis])
+        below = np.average(place, weights=area[level[:, axis]]) <= (low[axis] + high[axis]) / 2
+        reason = f"{100 * shares[axis]:.0f} % of the area is level"
+        return Up(("+" if below else "-") + "xyz"[axis], reason, True)
+    axis = int(np.argmax(sides))
+    if axis > 0 and sides[axis] > 1.5 * np.sort(sides)[1]:
+        return Up(("+x", "-y", "+z")[axis], "the longest side", False)
+    return Up("-y", "no level areas", False)

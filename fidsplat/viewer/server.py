@@ -204,10 +204,10 @@ class Viewer:
         pose, start = np.linalg.inv(camera.world_to_camera), self.server.initial_camera
         start.position = pose[:3, 3]
         start.look_at = pose[:3, 3] + pose[:3, 2] * _distance(scene, pose)
-        start.up = -pose[:3, 1]
+        start.up = up = _upright(pose)
         start.fov = float(2 * np.arctan(camera.height / 2 / camera.fy)) if camera.lens is None else 1.0
         start.near, start.far = max(camera.near, 1e-3), min(camera.far, 1e4)
-        self.server.scene.set_up_direction(-pose[:3, 1])
+        self.server.scene.set_up_direction(up)
 
     # actions of the buttons (`Actions`)
 
@@ -388,6 +388,15 @@ def _viewpoint(camera: Any) -> Viewpoint:
         max(1, camera.image_height),
         max(away, 1e-3),
     )
+
+
+def _upright(pose: np.ndarray) -> np.ndarray:
+    """Axis of rotation of the page: the axis of the scene that points up in an image without roll, so that a
+    camera that looks down rotates about the vertical; else the camera's own up direction."""
+    up = -pose[:3, 1]
+    axes = [axis for axis in (*np.eye(3), *-np.eye(3)) if abs(axis @ pose[:3, 0]) < 1e-6]
+    best = max(axes, key=lambda axis: axis @ up, default=up)
+    return best if best @ up > 0.1 else up
 
 
 def _distance(scene: Scene, pose: np.ndarray) -> float:
