@@ -1,4 +1,5 @@
-"""Bits of the tags predefined by OpenCV's aruco module: four AprilTag families and all ArUco families."""
+"""Bits of the tags predefined by OpenCV's aruco module, four AprilTag families and all ArUco families, and of
+AprilTag 3."""
 
 from functools import cache
 from typing import NamedTuple
@@ -6,17 +7,19 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from fidsplat.util.errors import InputError
+from fidsplat.images import apriltag3
+from fidsplat.images.family_names import foreign_family
+from fidsplat.util.errors import InputError, did_you_mean
 
 
 class Family(NamedTuple):
-    """A tag family: modules along one edge of the code (border included), and the number of its ids."""
+    """A tag family: modules along one edge of the code (all data and border), and the number of its ids."""
 
     size: int
     count: int
 
 
-_APRILTAG = ("16h5", "25h9", "36h10", "36h11")
+_APRILTAG = ("16h5", "25h9", "36h10", "36h11", *apriltag3.LAYOUTS)
 _ARUCO = (
     *(f"{n}x{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
     "original",
@@ -42,41 +45,55 @@ def families(kind: str | None = None) -> dict[str, Family]:
 
 
 def parse_family(text: str) -> tuple[str, str]:
-    """Split "apriltag:36h11", or just "36h11", into (kind, family).
+    """Split "apriltag:36h11", or just "36h11", "tag36h11" or "DICT_APRILTAG_36h11", into (kind, family).
 
     Raises InputError with a list of the families for an unknown name.
     """
-    kind, colon, name = str(text).rpartition(":")
+    kind, colon, name = str(text).lower().rpartition(":")
+    foreign = foreign_family(name)
+    if foreign is not None and kind in ("", foreign[0]):
+        kind, name = foreign
+        colon = ":"
     for known, names in _KINDS.items():
         if name in names and (not colon or kind == known):
             return known, name
     known = "; ".join(f"{k}: {', '.join(names)}" for k, names in _KINDS.items())
-    raise InputError(f"unknown tag family {text!r}; known are {known}")
+    hint = did_you_mean(name, families())
+    raise InputError(f"unknown tag family {text!r}{hint}; known are {known}")
 
 
 def dictionary_bits(kind: str, family: str, tag_id: int) -> np.ndarray:
     """The modules of one tag, (size, size) uint8, 1 = dark, its one-module black border included.
 
-    Row 0 is the top of the image that ``cv2.aruco.generateImageMarker`` prints.
+    Row 0 is the top of the image that ``cv2.aruco.generateImageMarker`` prints. Round and recursive tags have
+    modules without paper, 255.
 
     Raises InputError for an unknown family or an id outside it.
     """
-    if kind not in _KINDS or family not in _KINDS[kind]:
-        parse_family(f"{kind}:{family}")
+    kind, family = parse_family(f"{kind}:{family}")
     size, count = _family(kind, family)
     if not 0 <= tag_id < count:
         raise InputError(f"{kind}:{family} ids must be 0 to {count - 1}, got {tag_id}")
+    if family in apriltag3.LAYOUTS:
+        return apriltag3.tag_bits(family, tag_id)
     printed = cv2.aruco.generateImageMarker(predefined(kind, family), int(tag_id), size, borderBits=BORDER)
     return (printed == 0).astype(np.uint8)
 
 
 @cache
 def predefined(kind: str, family: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a known family."""
+    """OpenCV's dictionary of a known family.
+
+    Raises InputError for a family of AprilTag 3, which OpenCV lacks.
+    """
+    if family in apriltag3.LAYOUTS:
+        raise InputError(f"the family must be one of OpenCV's dictionaries, got {kind}:{family}; e.g. 36h11")
     prefix = "DICT_APRILTAG_" if kind == "apriltag" else "DICT_ARUCO_" if "x" not in family else "DICT_"
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, (prefix + family).upper()))
 
 
 def _family(kind: str, name: str) -> Family:
+    if name in apriltag3.LAYOUTS:
+        return Family(apriltag3.LAYOUTS[name].size, len(apriltag3.codes(name)))
     dictionary = predefined(kind, name)
     return Family(dictionary.markerSize + 2 * BORDER, len(dictionary.bytesList))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fidsplat.images.family_names import canonical_family
 from fidsplat.markers.spec import Kind, Spec
 from fidsplat.util.errors import InputError
 
@@ -40,7 +41,7 @@ def _parse(text: str, head: str, rest: str) -> BoardSpec:
     smallest = 2 if kind == "charuco" else 1
     if not (smallest <= columns <= MAX_TAGS and smallest <= rows <= MAX_TAGS):
         raise InputError(f"{text!r}: columns and rows must be from {smallest} to {MAX_TAGS}")
-    return BoardSpec(text=text, kind=kind, family=found[3].lower(), columns=columns, rows=rows)
+    return BoardSpec(text=text, kind=kind, family=canonical_family(found[3]), columns=columns, rows=rows)
 
 
 def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
@@ -61,13 +62,14 @@ def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
 def _bits(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
     """Modules of a board: tags, with the chessboard of ChArUco (top left square dark), or AprilGrid's corner
     squares."""
-    from fidsplat.images.tag_dictionaries import dictionary_bits, families, parse_family
+    from fidsplat.images.tag_dictionaries import dictionary_bits, families, parse_family, predefined
 
     kind, family = parse_family(spec.family or "")
     if kind != "apriltag" and spec.kind == "aprilgrid":
         raise InputError(
             f"the family of an AprilGrid must be AprilTags, got {spec.text!r}; e.g. {_EXAMPLES['aprilgrid']}"
         )
+    predefined(kind, family)  # refuses families that board detectors lack
     side, known = families(kind)[family]
     places, step = tag_places(spec, side), side + GAP
     if len(places) > known:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from fidsplat.capture.quality import MarkerQuality
+from fidsplat.images.apriltag3 import HOLE
 from fidsplat.markers.facets import count_facets, facet_cloud
 from fidsplat.markers.kinds import bits_of, kind_of, parse_spec
 from fidsplat.markers.mixture import (
@@ -78,11 +79,12 @@ class Marker(PickledByFields):
     payload: str | None
     """text of a QR code, path of an image or an SVG drawing; None for tags and boards"""
     bits: np.ndarray
-    """(h, w) uint8, 1 = dark, the code without quiet zone; indices of `palette` for drawings"""
+    """(h, w) uint8, 1 = dark, 255 = no paper, the code without quiet zone; indices of `palette` for
+    drawings"""
     quiet_zone: int
     """modules of white around the code"""
     size: float
-    """edge of the code in metres; its width if it is not square"""
+    """edge of the code in metres; its width if it is not square; of the border for AprilTag 3"""
     mixture: str
     """"exact", "fitted", "facets", "paper", or "refined" (`fidsplat.train.refine`)"""
     quality: MarkerQuality
@@ -113,6 +115,8 @@ class Marker(PickledByFields):
     """time from the spec to the cloud"""
     max_splats: int = MAX_SPLATS
     """maximum number of splats"""
+    outside: int = 0
+    """modules of the code on each side of the square that `size` and `corners` measure"""
 
     def __repr__(self) -> str:
         return (
@@ -122,7 +126,7 @@ class Marker(PickledByFields):
     @property
     def module(self) -> float:
         """Metres per module."""
-        return self.size / self.bits.shape[1]
+        return self.size / (self.bits.shape[1] - 2 * self.outside)
 
     @cached_property
     def gaussians(self) -> SplatCloud:
@@ -162,10 +166,10 @@ class Marker(PickledByFields):
 
     @property
     def corners(self) -> np.ndarray:
-        """(4, 3) float64 metres, the code's outer corners as printed: top left, top right, bottom right,
-        bottom left.
+        """(4, 3) float64 metres, the code's outer corners as printed, of AprilTag 3 its border's: top left,
+        top right, bottom right, bottom left.
         """
-        h, w = self.bits.shape
+        h, w = np.array(self.bits.shape) - 2 * self.outside
         x, y = w * self.module / 2, h * self.module / 2
         return np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
 
@@ -227,12 +231,12 @@ def marker(
     palette = np.array(parsed.colors or ((1, 1, 1), (0, 0, 0)), np.float32)
     if chosen.mixture == "facets":
         refuse_more(spec, count_facets(grid.shape), max_splats)
-    elif len(palette) == 2:
+    elif len(palette) == 2 and grid.max() <= 1:
         refuse_more(spec, minimum_rectangles(grid) * each, max_splats, "at least ")
     progress("components", 0.0)
     labels, components = label_components(grid)
     progress("rectangles", 0.0)
-    printed = _printed(grid, parsed, quiet, size / bits.shape[1], palette)
+    printed = _printed(grid, parsed, quiet, size / (bits.shape[1] - 2 * parsed.outside), palette)
     boxes, values, angles, regions = printed.boxes, printed.values, printed.angles, printed.regions
     if regions is not None:
         components = sum(len(region.geoms) for region in regions)
@@ -270,6 +274,7 @@ def marker(
         cloud=cloud,
         seconds=time.perf_counter() - start,
         max_splats=max_splats,
+        outside=parsed.outside,
     )
 
 
@@ -280,7 +285,10 @@ def _quiet_zone(spec: str, parsed: Spec, bits: np.ndarray, modules: int | None) 
         raise InputError(
             f"{spec} must have at most {MAX_MODULES} modules a side, got {bits.shape[1]} x {bits.shape[0]}"
         )
-    width = kind_of(parsed).quiet_zone if modules is None else modules
+    round_tag = bits.size > 0 and bits[0, 0] == HOLE
+    width = kind_of(parsed).quiet_zone * (not round_tag) if modules is None else modules
+    if round_tag and width != 0:
+        raise InputError(f"the quiet zone of a round tag must be 0, got {width!r} for {spec}")
     return whole_number("the quiet zone", width, 0, longest // 2)
 
 
@@ -288,6 +296,7 @@ def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette:
     """Rectangles of a marker: the partition of its modules, or the cover of a drawing's shapes."""
     if parsed.regions is None:
         boxes = partition_colors(grid)
+        boxes = boxes[grid[boxes[:, 1], boxes[:, 0]] != HOLE]
         return Printed(grid, boxes, grid[boxes[:, 1], boxes[:, 0]], None, None, module, palette)
     from fidsplat.markers.cover import cover_all  # here, since it imports shapely
     from fidsplat.markers.shapes import with_margin

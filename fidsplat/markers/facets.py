@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fidsplat.images.apriltag3 import HOLE
 from fidsplat.markers.printing import Printed, Progress
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.errors import InputError
@@ -53,6 +54,10 @@ def facet_cloud(spec: str, printed: Printed, progress: Progress) -> SplatCloud:
     x, width, depth_x, slope_x = np.tile(across, down.shape[1])
     y, tall, depth_y, slope_y = np.repeat(down, across.shape[1], axis=1)
     value = printed.grid[np.floor(y + rows / 2).astype(int), np.floor(x + columns / 2).astype(int)]
+    paper = value != HOLE
+    x, width, depth_x, slope_x, y, tall, depth_y, slope_y, value = (
+        each[paper] for each in (x, width, depth_x, slope_x, y, tall, depth_y, slope_y, value)
+    )
     means = np.column_stack([x, y, depth_x + depth_y]) * printed.module
     scales = (
         SIGMA * printed.module * np.column_stack([width * np.hypot(1, slope_x), tall * np.hypot(1, slope_y)])

@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fidsplat.images.family_names import foreign_family
 from fidsplat.markers import boards, images, qr, svg, tags
 from fidsplat.markers.spec import Kind, Spec
 from fidsplat.util.arguments import instance, invalid
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import InputError, did_you_mean
 
 _kinds = {kind.name: kind for module in (tags, qr, images, svg, boards) for kind in module.KINDS}
 
@@ -35,8 +36,9 @@ def kind_of(spec: Spec) -> Kind:
 
 
 def parse_spec(text: str) -> Spec:
-    """Parse a marker spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png,
-    svg:FILE.svg, charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11.
+    """Parse a marker spec: apriltag:36h11:5 or tag36h11:5, aruco:4x4_50:7 or DICT_4X4_50:7, qr:TEXT,
+    qr-v22-L:TEXT, image:FILE.png, svg:FILE.svg, charuco:7x5:4x4_50, gridboard:5x7:4x4_50,
+    aprilgrid:6x6:36h11.
 
     A QR spec may omit the version (default the smallest for the text) or the level (L).
 
@@ -49,8 +51,13 @@ def parse_spec(text: str) -> Spec:
     if not colon:
         raise InputError(f"a marker spec must be one of {_forms()}, got {text!r}")
     kind = _named(head)
+    foreign = foreign_family(head) if kind is None else None
+    if foreign is not None:
+        head, rest = foreign[0], f"{foreign[1]}:{rest}"
+        kind = _kinds[head]
     if kind is None:
-        raise InputError(f"unknown kind of marker {head.lower()!r}; write {_forms()}")
+        hint = did_you_mean(head, _kinds)
+        raise InputError(f"unknown kind of marker {head.lower()!r}{hint}; write {_forms()}")
     return kind.parse(text, head, rest)
 
 

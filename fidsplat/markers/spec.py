@@ -28,6 +28,8 @@ class Spec:
     """QR text, or the path of an image or an SVG drawing"""
     colors: tuple[tuple[float, float, float], ...] | None = None
     """RGB of the values 0, 1, ... once modules are made; None: white and black"""
+    outside: int = 0
+    """modules of the code on each side of the square that `size` measures: data bits of AprilTag 3"""
     regions: tuple[MultiPolygon, ...] | None = None
     """region of each value for drawings with slanted or curved edges, in modules from the top left; else
     None"""
@@ -48,6 +50,6 @@ class Kind:
     InputError"""
     bits: Callable[[Any], tuple[Spec, np.ndarray]]
     """called with the result of `parse`; returns it with the family, and the modules without quiet zone, (h,
-    w) uint8, 1 = dark or an index of the spec's colours; raises InputError"""
+    w) uint8, 1 = dark or an index of the spec's colours, 255 = no paper (a hole); raises InputError"""
     is_file: bool = False
     """whether the part after the colon is a file name, relative to the scene file"""

@@ -19,6 +19,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
+from fidsplat.images.apriltag3 import HOLE
 from fidsplat.markers import Marker
 from fidsplat.render.renderer import Renderer
 from fidsplat.splats.cloud import SplatCloud
@@ -128,8 +129,9 @@ class _Sheet:
 
     def __init__(self, made: Marker, leak: float) -> None:
         self._leak, self._shape = leak, np.array(made.grid.shape)
-        self._colors = np.pad(made.palette[made.grid].astype(np.float64), ((1, 1), (1, 1), (0, 0)))
-        self._inside = np.pad(np.ones(made.grid.shape, bool), 1)
+        self._inside = np.pad(made.grid != HOLE, 1)
+        values = np.where(made.grid == HOLE, 0, made.grid)
+        self._colors = np.pad(made.palette[values].astype(np.float64), ((1, 1), (1, 1), (0, 0)))
 
     def camera(self, rng: np.random.Generator) -> Camera:
         """A camera with a random tilt axis and a random sub-pixel shift."""

@@ -51,12 +51,17 @@ def unknown(what: str, name: object, known: Iterable[str], within: str = "", lik
         likeness: minimum similarity of the suggestion, 0 to 1.
     """
     names = list(known)
-    near = difflib.get_close_matches(str(name)[:100].lower(), names, 1, likeness)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    hint = did_you_mean(name, names, likeness)
     shown = repr(within + name if isinstance(name, str) else name)
     listed = (repr(name) if ", " in name else name for name in names)
     valid = f"known: {', '.join(listed)}" if names else "none is known here"
     return f"unknown {what} {shown}{hint}; {valid}"
+
+
+def did_you_mean(name: object, known: Iterable[str], likeness: float = 0.6) -> str:
+    """The nearest known name as a question in brackets, after a space; empty if none is similar."""
+    near = difflib.get_close_matches(str(name)[:100].lower(), list(known), 1, likeness)
+    return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def bytes_words(size: float) -> str:

@@ -25,7 +25,7 @@ _COARSE_MODULE = 4.0  # pixels: smallest module after downsampling
 # the code spans [-1, 1]: well-conditioned parameters
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)
 _LARGEST_MODULE = 64  # samples of the pattern for each module
-_QUIET = 1  # width of the quiet zone in the model, in modules
+_QUIET = 1  # width in modules of the surroundings in the model, in the other color than the code's corners
 
 
 def align(
@@ -36,7 +36,7 @@ def align(
     Args:
         grey: (h, w) uint8.
         corners: (4, 2) pixel coordinates TL, TR, BR, BL of the code's outer edge, within half a module.
-        bits: (n, n) uint8, 1 = dark, without quiet zone.
+        bits: (n, n) uint8, 1 = dark, without quiet zone; light corners: the surroundings are dark.
         unsure: indices of corners of which one may be wrong by two modules; if the fit from the given corners
             does not converge, a grid search for each of them follows.
 
@@ -127,7 +127,9 @@ class _Model:
         # as wide as the distance between the samples of a pixel, so that the model changes continuously with
         # the position of an edge along the rows.
         k = int(np.clip(np.ceil(_POINTS * module), 1, _LARGEST_MODULE))
-        self.pattern = np.kron(1 - np.pad(bits, _QUIET), np.ones((k, k))).astype(np.float32)
+        self.pattern = np.kron(
+            1 - np.pad(bits, _QUIET, constant_values=1 - bits[0, 0]), np.ones((k, k))
+        ).astype(np.float32)
         n = bits.shape[0]
         # [-1, 1] to OpenCV's indices of the pattern's samples; index 0 is the centre of the first
         half, shift = k * n / 2, k * (n / 2 + _QUIET) - 0.5

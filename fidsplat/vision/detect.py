@@ -1,4 +1,5 @@
-"""Detection of AprilTag, ArUco and QR codes by OpenCV's aruco module and zxing-cpp.
+"""Detection of AprilTag, ArUco and QR codes by OpenCV's aruco module, the AprilTag library (families of
+AprilTag 3) and zxing-cpp.
 
 `align` refines the corners by the edges of the decoded code.
 """
@@ -10,11 +11,13 @@ import cv2
 import numpy as np
 import zxingcpp
 
+from fidsplat.images.apriltag3 import HOLE, LAYOUTS, outside
 from fidsplat.images.files import pixels_of
 from fidsplat.images.tag_dictionaries import dictionary_bits, parse_family, predefined
 from fidsplat.util.arguments import invalid, items
 from fidsplat.util.errors import InputError
 from fidsplat.vision.align import align, fit
+from fidsplat.vision.apriltag_library import read_tags
 
 # One family for each common grid; a random dark square decodes as a tag of them less than once in 300 times.
 # 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or have more false positives: only on request.
@@ -93,6 +96,13 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
 def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
     """Tags of one family, sorted by id."""
     found: list[Detection] = []
+    if family in LAYOUTS:
+        ring = outside(family)
+        for number, corners in read_tags(grey, family):
+            inner = dictionary_bits(kind, family, number)[ring:-ring, ring:-ring]
+            better = align(grey, corners, inner * (inner != HOLE))
+            found.append(Detection(kind, family, number, None, corners if better is None else better))
+        return sorted(found, key=lambda tag: tag.id or 0)
     loose: list[Detection] = []
     # OpenCV's AprilTag method finds tags whose white margin is crossed by a thin dark line, which breaks the
     # contours of the first method. At half size it costs no more; the first method finds the small tags.
@@ -148,8 +158,10 @@ def _known(tag: Detection, found: Iterable[Detection]) -> bool:
 
 
 def _same_place(one: Detection, other: Detection) -> bool:
-    edge = np.linalg.norm(one.corners - np.roll(one.corners, 1, 0), axis=1).max()
-    return bool(np.linalg.norm(one.corners.mean(0) - other.corners.mean(0)) < 0.25 * edge)
+    edge, second = (np.linalg.norm(t.corners - np.roll(t.corners, 1, 0), axis=1).max() for t in (one, other))
+    # a tag in the hole of a recursive tag is less than half as large
+    alike = 0.5 < edge / max(second, 1e-9) < 2
+    return bool(alike and np.linalg.norm(one.corners.mean(0) - other.corners.mean(0)) < 0.25 * edge)
 
 
 def _qr_codes(grey: np.ndarray) -> list[Detection]:

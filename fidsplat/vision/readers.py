@@ -5,13 +5,11 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from itertools import product
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +17,7 @@ import zxingcpp
 
 from fidsplat.images.tag_dictionaries import predefined
 from fidsplat.util.errors import InputError
+from fidsplat.vision.apriltag_library import read_tags
 from fidsplat.vision.detect import QR_ONLY, corners_of
 
 # scale factors of the image and additional factors of its height that are tried for zxing-cpp: all heights at
@@ -28,9 +27,6 @@ ENLARGE = (1.0, 2.0)
 # minimum intersection over union with the code
 MIN_OVERLAP = 0.5
 _MARGIN = 16  # margin in pixels around the foreground
-
-_idle: dict[str, deque] = {}
-"""AprilTag detectors that no thread uses, by family"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,27 +64,8 @@ def _aruco(grey: np.ndarray, target: Target) -> Attempt:
 
 def _pupil(grey: np.ndarray, target: Target) -> Attempt:
     """The AprilTag library at full resolution. It reports only decoded tags."""
-    idle = _idle.setdefault(target.family, deque())
-    try:
-        detector = idle.pop()  # one image at a time: a detector has scratch memory
-    except IndexError:
-        detector = _pupil_detector("tag" + target.family)
-    found: Any = detector.detect(grey)  # a list, in spite of the annotation
-    read = any(tag.tag_id == target.id for tag in found)
-    idle.append(detector)
+    read = any(number == target.id for number, _ in read_tags(grey, target.family))
     return Attempt(read, read)
-
-
-def _pupil_detector(family: str):
-    import pupil_apriltags  # type: ignore[import-not-found]  # of the extra `experiments`
-
-    class Detector(pupil_apriltags.Detector):
-        # the library frees the family before the detector that uses it, which can crash: one detector for
-        # each thread is never freed
-        def __del__(self) -> None:
-            pass
-
-    return Detector(families=family, nthreads=1, quad_decimate=1.0)
 
 
 def _cv2_qr(grey: np.ndarray, target: Target) -> Attempt:

@@ -31,9 +31,8 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
     away.
     """
     marker = placed.marker
-    rows, columns = marker.bits.shape
-    margin = min(MARGIN, marker.quiet_zone)
-    corners = marker.corners * [1 + 2 * margin / columns, 1 + 2 * margin / rows, 1.0]
+    margin = min(MARGIN, marker.quiet_zone) * marker.module
+    corners = marker.corners + margin * np.sign(marker.corners)
     points = corners @ placed.pose[:3, :3].T + placed.pose[:3, 3]
     if camera.lens is None or isinstance(camera.lens, Orthographic):
         depth = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]

@@ -73,7 +73,8 @@ def test_every_dictionary(kind):
         made = marker(f"{kind}:{family}:{count - 1}")
         assert made.bits.shape == (size, size)
         assert np.array_equal(made.bits, dictionary_bits(kind, family, count - 1))
-        assert made.grid.shape == (size + 2, size + 2)
+        assert made.grid.shape == (size + 2 * made.quiet_zone,) * 2
+        assert made.quiet_zone == (0 if family.startswith("circle") else 1)
         with pytest.raises(InputError, match=f"0 to {count - 1}"):
             marker(f"{kind}:{family}:{count}")
 

@@ -1,0 +1,16 @@
+"""Spellings of tag families in other projects: `tag36h11` of AprilTag, `DICT_4X4_50` of OpenCV."""
+
+import re
+
+
+def canonical_family(name: str) -> str:
+    """A family's name in lower case, and in our spelling if it is another project's."""
+    foreign = foreign_family(name)
+    return name.lower() if foreign is None else foreign[1]
+
+
+def foreign_family(name: str) -> tuple[str, str] | None:
+    """Kind and family of another project's name: ("apriltag", "36h11") of "tag36h11"; None for other
+    names."""
+    found = re.fullmatch(r"(tag|dict_apriltag_|dict_aruco_|dict_)(\w+)", name.lower())
+    return found and ("apriltag" if "tag" in found[1] else "aruco", found[2])
