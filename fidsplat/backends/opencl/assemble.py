@@ -43,7 +43,7 @@ _LISTS = {
     "tiled": ("tile_lists",),
     "local": ("tile_lists", "tile_lists_local"),
 }
-"""stages of the program `lists`, by the way of listing"""
+"""stages of the program `lists`, by tile-binning strategy"""
 _DRAWN = (
     "prelude",
     "math",
@@ -56,8 +56,8 @@ _DRAWN = (
     "schedule/{}",
     "resolve",
 )
-"""stages of the program `frame`, with the schedule of the device; only splats that are listed in
-order are packed"""
+"""stages of the program `frame`, with the device's schedule; visible splats are packed only under the
+strategy `ordered`"""
 _GRADIENTS = (
     *("prelude", "math", "splat", "bounds", "moments", "blend_backward"),
     *("schedule/{}_cells", "schedule/{}_backward", "set_up_backward", "project_backward"),
@@ -71,7 +71,7 @@ _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
 _SECTION = re.compile(r"//@ (\w+)[ \t]*")
-# both begin with a word itself, which re finds 20 times as fast as a boundary
+# both patterns begin with a literal, which `re` finds 20 times as fast as a word boundary
 _WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
 _WIDE = re.compile(r"wide(?<=\bwide)\b")
 _EFFECT_ARGUMENTS = {
@@ -86,9 +86,9 @@ class Text:
     """A program's text."""
 
     listing: str
-    """with comments, to be read"""
+    """with comments, for readers"""
     compiled: str
-    """the same without them, line for line"""
+    """without comments, with the same line numbers"""
 
 
 @dataclass
@@ -96,23 +96,23 @@ class Source:
     """Flat kernel sources with their declarations for the host."""
 
     programs: dict[str, Text]
-    """by their names"""
+    """programs by their names"""
     records: dict[str, np.dtype]
     """structs of the texts, as NumPy types"""
     arguments: dict[str, tuple[Argument, ...]]
-    """of each kernel of the texts"""
+    """arguments of each kernel"""
     samples: tuple[Samples, ...]
     """sample buffers of the effects"""
     scalars: Scalars
 
     @property
     def listing(self) -> str:
-        """All programs, to be read."""
+        """The text of all programs with comments."""
         return "".join(program.listing for program in self.programs.values())
 
     @property
     def text(self) -> str:
-        """All programs as they are compiled, one after the other."""
+        """The text of all programs as it is compiled."""
         return "".join(program.compiled for program in self.programs.values())
 
     @property
@@ -142,8 +142,8 @@ class Source:
 
 
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
-    """The layouts of all effects and of the parts that they require, in the order in which their text is put
-    together: effects of which there is one of each kind, parts, outputs, steps on rgb."""
+    """Layouts of all effects and of the parts that they require, in the order of their text: slots (one
+    effect of each kind), parts, outputs, post-processing steps."""
     chosen = [*features.slots, *features.outputs, *features.posts]
     parts: set[str] = set()
     todo = chosen.copy()
@@ -165,7 +165,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         DeviceError: an effect's file fills a hook that no file has.
     """
     layouts = layouts_of(features)
-    # without a pass of its own, if a pixel is one sample of one pose, and nothing but blending adds to it
+    # blend and resolve are fused if a pixel has one sample of one pose, and only blending adds to it
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in layouts and separate.isdisjoint(layouts)
     half = "blend_half" in layouts
@@ -174,7 +174,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     if not half:
         files.append(LAYOUTS["blend_float"].file)
     if shape.schedule == "lanes" and "camera_pinhole" in layouts:
-        # not for mixtures of disks and 3D Gaussians, whose bounds are computed otherwise
+        # not for mixtures of disks and 3D Gaussians, whose bounds are computed in another way
         if "lowpass_screen" in layouts and "thickness" not in layouts:
             files.append(LAYOUTS["cull_frustum"].file)
         if "lowpass_pixel" in layouts and "thickness" not in layouts:
@@ -228,7 +228,7 @@ def assemble_step(features: FeatureSet, shape: DeviceShape) -> Source:
 
 def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape) -> Source:
     layouts = layouts_of(features)
-    # the forward text of slots is used again, of outputs only the derivatives
+    # the backward pass needs the forward text of slots, but only the derivatives of outputs
     slots = (part for slot in features.slots for part in (slot, *LAYOUTS[slot].parts))
     files = [LAYOUTS[part].file for part in dict.fromkeys(slots)]
     files += _dialect(shape, _scalars(features), features.slots)
@@ -241,8 +241,8 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
 
 
 def _dialect(shape: DeviceShape, scalars: Scalars, slots: Iterable[str] = ()) -> list[str]:
-    """The files of the vendor's instructions, which are for fragments in float32: those of all frames, then
-    those of the slots that have some."""
+    """Files with a vendor's instructions, for fragments in float32: first for all frames, then for the slots
+    that have such a file."""
     if not shape.dialect or scalars.wide != "float":
         return []
     own = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
@@ -266,11 +266,11 @@ def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> Source:
 
 
 def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterable[str] = ()) -> str:
-    """The text of a file below kernels/opencl/ that tests a device, after prelude.cl and math.cl.
+    """The text of a test kernel file below kernels/opencl/, preceded by prelude.cl and math.cl.
 
     Args:
-        file: empty for the two alone.
-        effects: files whose sections fill hooks.
+        file: empty for prelude.cl and math.cl only.
+        effects: effect files whose sections fill the hooks.
     """
     numbers = {"LANES": shape.lanes, "FAST_FMA": int(shape.fast_fma), "SETUP_FP64": int(float64)}
     scalars = Scalars("double" if float64 else "float", "float")
@@ -280,16 +280,16 @@ def assemble_check(file: str, shape: DeviceShape, float64: bool, effects: Iterab
 
 
 def backward_items(features: FeatureSet, shape: DeviceShape) -> int:
-    """Work-items that walk a chunk of a tile's list back. Half as many with outputs other than rgb, which
-    keep more per pixel: with distortion, 256 would exceed the 48 KiB of local memory of NVIDIA's OpenCL."""
+    """Work-items of the backward pass over a chunk of a tile's list. Outputs other than rgb need more local
+    memory per pixel and have half as many: with distortion, 256 would exceed NVIDIA's 48 KiB."""
     if shape.schedule == "lanes":
         return 1
     return min(shape.tile_width * shape.tile_height, 128 if features.outputs else 256)
 
 
 def backward_chunk(features: FeatureSet, shape: DeviceShape) -> int:
-    """Splats of a tile's list that are walked forward and then back: on GPUs a column of a splat's pixels for
-    each work-item, on CPUs the minimum, for splats that cover the tile."""
+    """Splats of a tile's list that are evaluated forward and then backward at once: on GPUs a column of a
+    splat's pixels for each work-item; on CPUs the minimum number, for splats that cover the complete tile."""
     if shape.schedule == "lanes":
         return shape.tape
     return backward_items(features, shape) // shape.tile_width
@@ -324,14 +324,14 @@ class Assembler:
     """Assembles programs from stage files; effects' files and declarations fill their hooks."""
 
     def __init__(self, files: Iterable[str], declared: Declarations, defines: Mapping[str, int]) -> None:
-        """files: of the effects, below kernels/opencl/, in the order in which they fill a hook."""
+        """files: effect files below kernels/opencl/, in the order in which they fill a hook."""
         self._sections = {file: sections_of(file) for file in files if file}
         self._declared, self._defines = declared, defines
         self._used: dict[str, list[str]] = {"struct": [], "arguments": []}
         """names of the structs and kernels of the texts"""
 
     def source(self, programs: Mapping[str, Iterable[str]]) -> Source:
-        """The programs of these stages, by their names."""
+        """Assemble programs from their stages, by the names of the programs."""
         declared = self._declared
         texts = {name: self._program(name, stages) for name, stages in programs.items()}
         records = {name: declared.structs[name].dtype(declared.scalars) for name in self._used["struct"]}
@@ -373,7 +373,7 @@ class Assembler:
 
 
 class Declarations:
-    """The declarations of layout.py together with those of the chosen effects."""
+    """The declarations of layout.py merged with those of the chosen effects."""
 
     def __init__(
         self,
@@ -383,13 +383,13 @@ class Declarations:
         fused: bool = False,
         kernels: Mapping[str, tuple[Argument, ...]] = KERNELS,
     ) -> None:
-        """fused: blending resolves, with the arguments of both."""
+        """fused: whether the blend kernel also resolves, with the arguments of both."""
         self.scalars = scalars
         self.samples: tuple[Samples, ...] = ()
         self.constants: dict[str, str] = {}
         """fields of `Splat` that all splats share, and their values"""
         self.packed: dict[str, str] = {}
-        """fields of `Splat` that records hold packed, and what reads them"""
+        """packed fields of `Splat`, with the expressions that read them"""
         self._layouts = list((layouts or {}).values())
         self._outputs, self._fused, self._kernels = outputs, fused, kernels
         view, splat, bounds, moments = VIEW, SPLAT, BOUNDS, MOMENTS
@@ -399,7 +399,7 @@ class Declarations:
             self.packed |= dict(layout.packed)
             view, splat = view.with_members(layout.view), splat.with_members(layout.splat)
             bounds, moments = bounds.with_members(layout.bounds), moments.with_members(layout.moments)
-        # as many fields of padding as in `Moments`
+        # as many padding fields as in `Moments`
         alignment = moments.alignment // 4 * scalars.dtype("real").itemsize
         fields = tuple(chain.from_iterable(one.names for one in moments.members))
         totals = Record("Totals", (Member("real", fields, "of all tiles"),), alignment)
@@ -439,18 +439,18 @@ class Declarations:
 
 @cache
 def _shown(file: str) -> str:
-    """The file name for `#line`: the path below kernels/, or the name of a file from elsewhere."""
+    """The file name for `#line`: the path below kernels/, or the plain name of another file."""
     return f'"{Path(file).name}"' if Path(file).is_absolute() else f'"opencl/{file}"'
 
 
 def with_scalars(text: str, wide: str = "float") -> str:
-    """Kernel text in which the type `wide` and its constants are those of C."""
+    """Replace the type `wide` and its constants in kernel text by a C type."""
     return _WIDE.sub(wide, _WIDE_CONSTANT.sub(r"\1" if wide == "double" else r"\1f", text))
 
 
 def with_constants(text: str, constants: Mapping[str, str]) -> str:
-    """Kernel text in which fields of `Splat` that no record holds are read as their values, and not
-    written."""
+    """Replace fields of `Splat` that are constant by their values in kernel text, and remove writes to
+    them."""
     if not constants:
         return text
     names = "|".join(constants)
@@ -459,8 +459,8 @@ def with_constants(text: str, constants: Mapping[str, str]) -> str:
 
 
 def with_packed(text: str, packed: Mapping[str, str]) -> str:
-    """Kernel text in which fields of `Splat` that records hold packed are written to variables
-    `unpacked_NAME` and read by an expression, in which `{}` is the record."""
+    """Replace packed fields of `Splat` in kernel text: writes go to variables `unpacked_NAME`, reads use an
+    expression, in which `{}` is the record."""
     if not packed:
         return text
     names = "|".join(packed)

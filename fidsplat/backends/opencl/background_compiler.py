@@ -14,17 +14,17 @@ from fidsplat.util.errors import FidsplatError
 
 
 class BackgroundCompiler:
-    """Compiles programs one after another in threads; drivers compile without Python's lock.
+    """Compiles programs one after another in background threads; drivers release the GIL while compiling.
 
-    A thread ends after its program: a process that ends meanwhile, by Ctrl-C for example, waits for it.
+    Each thread compiles one program: a process that exits meanwhile, after Ctrl-C for example, waits for it.
     """
 
     def __init__(self) -> None:
         self._threads: dict[Hashable, threading.Thread] = {}
 
     def begin(self, key: Hashable, compile: Callable[[], object]) -> None:
-        """Start to compile. An error is ignored here: the program is compiled again when it is needed, which
-        raises the error."""
+        """Start to compile. Errors are ignored here: the program is compiled again when it is needed, and the
+        error is raised then."""
         if key in self._threads:
             return
         # not in the thread: `build` changes the filters of all threads

@@ -1,4 +1,4 @@
-"""Device buffers: a pool that reuses them from frame to frame, and the rays of lenses."""
+"""Device buffers: a pool that reuses scratch buffers between frames, and buffers for the rays of lenses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class DeviceBuffer(cl.Buffer):
 
 
 def token_of(buffer: cl.Buffer) -> object:
-    """The identity of a buffer. A sub-buffer has another one each time."""
+    """The identity token of a buffer. A sub-buffer has a new one at each call."""
     return buffer.token if type(buffer) is DeviceBuffer else object()
 
 
@@ -40,7 +40,7 @@ class BufferPool:
         self._context = context
         self._device = device
         self._is_host = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
-        """whether its memory is the host's"""
+        """whether the device shares the host's memory"""
         self._buffers: dict[str, cl.Buffer] = {}
         self._arrays: dict[str, Array] = {}
         self._contents: dict[str, weakref.ref[np.ndarray]] = {}
@@ -56,17 +56,17 @@ class BufferPool:
         return self._buffers[name].size if name in self._buffers else 0
 
     def known(self, name: str) -> cl.Buffer | None:
-        """The scratch buffer of that name, unchanged."""
+        """The scratch buffer of that name; None if there is none."""
         return self._buffers.get(name)
 
     def lease(self, name: str, size: int, larger: bool = False) -> cl.Buffer:
         """A buffer that belongs to the caller until `give_back`. larger: whether it may have more bytes."""
-        # removed before its size is compared: images that are released meanwhile may give back others
+        # removed from the list first: the garbage collector may give back other buffers at any time
         spare = self._spare.get(name, [])
         while spare:
             buffer = spare.pop()
             if buffer.size == max(size, _MINIMUM) or (larger and buffer.size > size):
-                return buffer  # otherwise it is of a frame of another size, and is released
+                return buffer  # a buffer of another size belonged to frames of another size, and is released
         return self.fresh(name, size)
 
     def give_back(self, buffers: list[tuple[str, cl.Buffer]]) -> None:
@@ -78,17 +78,17 @@ class BufferPool:
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of the scratch buffers, and of leased ones that were given back."""
+        """Bytes of the scratch buffers and of given-back buffers."""
         size = 0
-        # copied first: images that are released meanwhile give back theirs
+        # copied first: the garbage collector may give back buffers at any time
         for buffers in [list(self._buffers.values()), *self._spare.values()]:
             for buffer in buffers.copy():
                 size += buffer.size
         return size
 
     def make_way(self, kind: Hashable, size: int, splats: int = 0) -> None:
-        """Before a frame: release the buffers of other kinds of frames, if they take more than `size` bytes.
-        Frames of one kind have buffers of the same sizes, or smaller ones for fewer splats."""
+        """Before a frame: release the buffers of other kinds of frames if they take more than `size` bytes.
+        Frames of one kind have equal buffer sizes, or smaller ones for fewer splats."""
         if kind == self._kind and splats <= self._splats:
             return
         if self.memory_bytes > size:
@@ -96,7 +96,7 @@ class BufferPool:
         self._kind, self._splats = kind, splats
 
     def forget_zeros(self) -> None:
-        """After a failure: the contents of zero-filled buffers are unknown."""
+        """Mark the contents of zero-filled buffers as unknown, after a failure."""
         self._zeroed.clear()
         self.state = object()
 
@@ -110,8 +110,8 @@ class BufferPool:
         self.state = object()
 
     def put(self, queue: cl.CommandQueue, name: str, array: np.ndarray) -> tuple[cl.Buffer, cl.Event | None]:
-        """A scratch buffer with these contents, and the event of the copy; does not wait. A read-only array,
-        such as a panorama, is not copied again if it was copied there last."""
+        """Copy an array to a scratch buffer without waiting; returns the buffer and the event of the copy. A
+        read-only array, such as a panorama, is not copied again if the buffer holds it already."""
         content = self._contents.get(name)
         if content is not None and content() is array:
             return self._buffers[name], None
@@ -134,8 +134,8 @@ class BufferPool:
         return buffer
 
     def array(self, queue: cl.CommandQueue, name: str, shape: tuple[int, ...]) -> Array:
-        """A scratch buffer as an array of float32. The array object is reused: to make one takes the host
-        longer than to submit a kernel."""
+        """A scratch buffer as a float32 array. The array object is cached: creating one takes the host longer
+        than submitting a kernel."""
         buffer = self.scratch(name, 4 * math.prod(shape))
         known = self._arrays.get(name)
         if known is None or known.base_data is not buffer or known.shape != shape or known.queue is not queue:
@@ -151,7 +151,7 @@ class BufferPool:
         return self._buffers[name]
 
     def fresh(self, name: str, size: int) -> cl.Buffer:
-        """A new buffer, which the pool does not hold.
+        """A new buffer outside the pool.
 
         Raises:
             DeviceError: the device cannot allocate that much at once.
@@ -165,18 +165,18 @@ class BufferPool:
         try:
             flags = cl.mem_flags.READ_WRITE
             if self._is_host:
-                # otherwise PoCL allocates memory at the first use, and crashes there if none is left
+                # PoCL otherwise allocates the memory at the first use, and crashes if none is left
                 flags |= cl.mem_flags.ALLOC_HOST_PTR
             buffer = DeviceBuffer(self._context, flags, max(size, _MINIMUM))
             if self._is_host and size >= _LARGE:
-                # random accesses to records otherwise miss the processor's address cache
+                # without large pages, random accesses to records miss the TLB
                 self._request_large_pages(buffer)
             return buffer
         except cl.Error as error:
             raise DeviceError(f"no memory for {name} ({bytes_words(size)}): {error}") from error
 
     def _request_large_pages(self, buffer: cl.Buffer) -> None:
-        """Advise the system on a buffer's memory, which stays the device's."""
+        """Advise the system to use large pages for the memory of a buffer."""
         queue = cl.CommandQueue(self._context)  # a separate queue, which does not wait for others
         memory, _ = cl.enqueue_map_buffer(
             queue, buffer, cl.map_flags.WRITE, 0, (buffer.size,), np.dtype(np.uint8)
@@ -186,7 +186,7 @@ class BufferPool:
 
 
 class RayBuffers:
-    """The buffers `rays`, `ray_map` and so on (kernels/opencl/slot) of lenses in use."""
+    """The buffers `rays`, `ray_map` and so on (kernels/opencl/slot) of the lenses in use."""
 
     def __init__(self, pool: BufferPool, queue: cl.CommandQueue) -> None:
         self._pool, self._queue = pool, queue
@@ -195,7 +195,8 @@ class RayBuffers:
         )
 
     def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
-        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: also for boxes."""
+        """Buffers by name, for a sample grid padded to rows x columns. slopes: add the derivatives of rays,
+        which boxes need."""
         sizes = self._held.setdefault(raster, {})
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
@@ -216,7 +217,7 @@ class RayBuffers:
 
     @staticmethod
     def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:
-        """Bytes of the buffers of one frame's rasters, for grids that are padded to whole tiles."""
+        """Bytes of the ray buffers of a frame, for sample grids padded to complete tiles."""
         rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
         one = next(iter(rasters))
         each = 36 if slopes else 12

@@ -23,12 +23,12 @@ from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.workspace import Workspace
 
 _SHARE = 4
-"""the cache takes at most this fraction of the memory budget"""
+"""maximum fraction of the memory budget for the cache"""
 _GATHERED = 3
-"""and a gathered cloud at most this one, unless it is streamed"""
+"""maximum fraction of the memory budget for a gathered cloud that is not streamed"""
 _FIRST_SLOTS = 16
 _LAUNCH = 1 << 15
-"""most chunks of a launch: the limit of every device for its second dimension"""
+"""maximum number of chunks of a launch: the smallest limit of any device for the second dimension"""
 _NOWHERE = 0xFFFFFFFF
 
 
@@ -37,14 +37,14 @@ class Copies:
     """Parameters of the kernels that copy rows of cached chunks."""
 
     pieces: cl.Buffer
-    """as `gather_chunks.cl` reads them"""
+    """parameters in the layout of `gather_chunks.cl`"""
     poses: cl.Buffer | None
     count: int
-    """chunks"""
+    """number of chunks"""
     rows: int
-    """of the largest chunk"""
+    """number of rows of the largest chunk"""
     evictions: int
-    """evictions before it was made"""
+    """number of evictions before these parameters were made; later ones make them stale"""
 
 
 class OpenCLChunkCache(ChunkCache):
@@ -59,7 +59,7 @@ class OpenCLChunkCache(ChunkCache):
         self._size = 0
         self._free: list[int] = []
         self._slots: OrderedDict[Hashable, int] = OrderedDict()
-        """of each chunk, least recently used first"""
+        """slot of each cached chunk by its key, least recently used first"""
         self.token = object()
         """identity that can be compared without keeping the cache alive"""
         self._evictions = 0
@@ -67,9 +67,9 @@ class OpenCLChunkCache(ChunkCache):
         self._rendered: set[Hashable] = set()
         self._lock = threading.RLock()
         self._queue = cl.CommandQueue(workspace.context)
-        """for transfers while a frame is rendered"""
+        """queue of transfers that run while a frame is rendered"""
         self._last: cl.Event | None = None
-        """the last copy out of slots"""
+        """event of the last copy out of slots"""
         program = build(
             workspace, kernel_text("store/gather_chunks.cl"), f"-DINSTANCED={int(self.applies_poses)}"
         )
@@ -81,7 +81,7 @@ class OpenCLChunkCache(ChunkCache):
         return self._size * self._rows * sum(self.widths.values())
 
     def gather(self, chunks: Sequence[Chunk], first_id: int = 0) -> GatheredChunks:
-        """Concatenate chunks on the device, when a frame reads their arrays."""
+        """Concatenate chunks on the device, lazily: an array is copied when a frame first reads it."""
         with self._lock:
             self._rendered = {chunk.key for chunk in chunks}
             if not self.widths:
@@ -90,7 +90,7 @@ class OpenCLChunkCache(ChunkCache):
 
     def prefetch(self, chunks: Sequence[Chunk]) -> None:
         """Prefetch chunks of the next frame, as far as capacity allows."""
-        requested = {chunk.key for chunk in chunks}  # these do not evict each other
+        requested = {chunk.key for chunk in chunks}  # requested chunks must not evict each other
         for chunk in chunks:
             with self._lock:
                 if chunk.key in self._slots or not self.widths:
@@ -105,7 +105,8 @@ class OpenCLChunkCache(ChunkCache):
         self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer, known: Copies | None
     ) -> Copies | None:
         """Copy rows of chunks into an array, on the queue of frames. spans: (k, 3) first row of each chunk,
-        its destination, and the number of rows. known: the result for the same rows of another array."""
+        its destination, and the number of rows. known: result of this method for the same rows of another
+        array."""
         with self._lock, self.workspace.failing("copying splats"):
             if known is not None and known.evictions == self._evictions:
                 self._launch(name, known, target)
@@ -124,7 +125,7 @@ class OpenCLChunkCache(ChunkCache):
                 self._last.wait()
 
     def _rounds(self, chunks: Sequence[Chunk]) -> Iterator[tuple[int, int]]:
-        """Ranges of chunks that fit the slots at once."""
+        """Split chunks into ranges that fit the slots at once."""
         most, first, keys = self._max_slots, 0, set()
         for number, chunk in enumerate(chunks):
             keys.add(chunk.key)
@@ -134,7 +135,7 @@ class OpenCLChunkCache(ChunkCache):
         yield first, len(chunks)
 
     def _copies(self, chunks: Sequence[Chunk], spans: np.ndarray) -> Copies:
-        """Cache the chunks, and return the parameters of their copies."""
+        """Load chunks into slots, and return the parameters of their copies."""
         slots = self._cached(chunks)
         table = np.full((len(chunks), 4), _NOWHERE, np.uint32)
         begins = np.array([chunk.first for chunk in chunks])
@@ -212,7 +213,8 @@ class OpenCLChunkCache(ChunkCache):
 
     @property
     def _slot_bytes(self) -> int:
-        """Bytes of a slot in all arrays, and once more in the widest, which exists twice while it grows."""
+        """Bytes of a slot in all arrays, plus those in the widest array, which exists twice while it
+        grows."""
         return self._rows * (sum(self.widths.values()) + max(self.widths.values()))
 
     @property
@@ -229,7 +231,7 @@ class OpenCLChunkCache(ChunkCache):
             buffer = self.workspace.pool.fresh(f"chunks of {name}", size * self._rows * width)
             if self._size:
                 used = self._size * self._rows * width
-                # one by one: if the next allocation fails, this array is still complete
+                # arrays grow one by one: if an allocation fails, the others are still complete
                 cl.enqueue_copy(self._queue, buffer, self._arrays[name], byte_count=used).wait()
             self._arrays[name] = buffer
         self._free += range(size - 1, self._size - 1, -1)
@@ -257,12 +259,12 @@ class GatheredChunks(ResidentData):
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
         self.count = int(self._ends[-1])
         self.capacity = _rounded_up(self.count)
-        """splats for which frames have buffers; the next view, with about as many, reuses them"""
+        """splats for which frames have buffers; rounded up, so that the next view reuses the buffers"""
         self.origin, self.sh_degree, self.footprint = whole.origin, whole.sh_degree, whole.footprint
         self.has_coplanar_groups = whole.has_coplanar_groups
         self.ellipsoids = whole.ellipsoids
         self.cached_frames: dict[Hashable, Any] = {}
-        """frames that are replayed, by their kind"""
+        """cached frames for replay, by their kind"""
         self.immutable = True
         self.buffer_key = cache.token
         self.coherent = True
@@ -270,14 +272,15 @@ class GatheredChunks(ResidentData):
         self._leased: list[tuple[str, cl.Buffer]] = []
         weakref.finalize(self, workspace.pool.give_back, self._leased)
         self._copies: tuple[int, int, Copies | None] = (0, 0, None)
-        """parameters of the last copy, of splats [first, end)"""
+        """parameters of the last copy, with its splats [first, end)"""
         total, widest = self.capacity * sum(cache.widths.values()), self.capacity * max(cache.widths.values())
         self.streamed = (
             total > workspace.memory_budget // _GATHERED or widest > workspace.device.max_mem_alloc_size
         )
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """Bytes that stay on the device, with the full cache, and bytes per splat that each frame copies."""
+        """Bytes that stay on the device, including the full cache, and bytes per splat that each frame
+        copies."""
         read, stays = {*names, *self._buffers}, self._cache.reserved_bytes
         each = sum(self._width(name) for name in read)
         return (stays, each) if self.streamed else (stays + self.capacity * each, 0)
@@ -295,7 +298,7 @@ class GatheredChunks(ResidentData):
             self._fill(name, first, end, buffer)
             return buffer
         if name not in self._buffers:
-            # the last view's, if it is large enough: allocating memory takes as long as filling it
+            # the buffer of the previous view is reused if large enough: allocating takes as long as filling
             label = f"the splats' {name}"
             whole = self._workspace.pool.lease(label, self.capacity * width, larger=True)
             self._leased.append((label, whole))

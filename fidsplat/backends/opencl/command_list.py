@@ -11,11 +11,11 @@ from fidsplat.backends.opencl.buffers import token_of
 from fidsplat.backends.opencl.program import Program
 
 _UNKNOWN = object()
-"""the mark of an argument that is not bound, or whose binding was interrupted"""
+"""mark of an argument that is not bound, or whose binding was interrupted"""
 
 
 class Command:
-    """One kernel launch: a kernel object of its own, its size, and the arguments that are bound to it."""
+    """One kernel launch: its own kernel object with bound arguments, and its size."""
 
     __slots__ = ("_marks", "_types", "group", "kernel", "name", "size", "stage")
 
@@ -28,7 +28,7 @@ class Command:
         self.group: tuple[int, ...] = ()
 
     def bind(self, index: int, value: Any) -> None:
-        """Set an argument unless it already has this value: setting one takes the host longer than comparing.
+        """Set an argument unless it already has this value: comparing is faster than setting.
 
         A buffer is recognised by its identity token, so that the list keeps no buffer alive.
         """
@@ -46,7 +46,7 @@ class Command:
 
 
 class _NamedArgument:
-    """The places of one argument in all commands, and the value that was set there last."""
+    """The positions of one argument in all commands, and its last value."""
 
     __slots__ = ("mark", "places")
 
@@ -69,10 +69,10 @@ class CommandList:
         self._commands: list[Command] = []
         self._reusable: dict[str, list[Command]] = {}
         self._used: dict[str, int] = {}
-        """launches of each kernel in this recording"""
+        """number of launches of each kernel in this recording"""
         self._named: dict[str, _NamedArgument] = {}
         self.key: Any = None
-        """what the recording is valid for, set by its owner when it is complete; `clear` resets it"""
+        """key for which the complete recording is valid, set by its owner; `clear` resets it"""
 
     @property
     def stages(self) -> list[str]:
@@ -122,7 +122,7 @@ class CommandList:
         values: Sequence[Any],
         stage: str = "",
     ) -> cl.Event:
-        """Append a launch as `record`, and submit it."""
+        """Append a launch, and submit it."""
         command = self.record(kernel, size, group, values, stage)
         return cl.enqueue_nd_range_kernel(queue, command.kernel, size, group)
 
@@ -141,7 +141,7 @@ class CommandList:
             argument.mark = mark
 
     def submit(self, queue: cl.CommandQueue, first: int = 0, end: int | None = None) -> list[cl.Event]:
-        """Enqueue the commands [first, end) in their order, by default all."""
+        """Enqueue the commands [first, end) in order; by default all."""
         return [
             cl.enqueue_nd_range_kernel(queue, command.kernel, command.size, command.group)
             for command in self._commands[first:end]

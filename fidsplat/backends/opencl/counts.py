@@ -13,7 +13,7 @@ COUNTS = 4
 TALLIES = 8
 """counters of the buffer `tallies`, as in prelude.cl"""
 VISIBLE, PAIRS, BIG = 0, 2, 6
-"""of which: visible splats, pairs (two words), big splats"""
+"""number of these counters with totals: visible splats, pairs (two words), big splats"""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Counts:
 
     @staticmethod
     def of_tallies(words: np.ndarray) -> Counts:
-        """From the counters (views, TALLIES) of `tallies`; `big` is the first view's."""
+        """Convert the counters (views, TALLIES) of `tallies`; `big` is that of the first view."""
         pairs = int(words[0, PAIRS]) | int(words[0, PAIRS + 1]) << 32
         return Counts(int(words[0, BIG]), pairs, int(words[:, VISIBLE].sum(dtype=np.int64)))
 
@@ -51,7 +51,8 @@ class Capacity:
     pairs: int
 
     def holds(self, counts: Counts) -> bool:
-        """Whether the frame is complete; otherwise its lists are empty and it must be rendered again."""
+        """Whether the counts fit the capacity; otherwise the frame has empty lists and must be rendered
+        again."""
         return counts.big <= self.big and counts.pairs <= self.pairs
 
 
@@ -61,6 +62,5 @@ def read_stats(queue: cl.CommandQueue, counts: cl.Buffer, last: cl.Event, splats
 
 
 def enlarged(pairs: int, budget: int) -> int:
-    """Capacity of lists that must grow: a view with more pairs than the last one is often followed by one
-    with still more."""
+    """New capacity of lists that must grow, with a margin: the next view often has still more pairs."""
     return max(pairs, min(pairs * 9 // 8, budget))

@@ -1,5 +1,6 @@
-"""Elements of kernel declarations, and their translation to C text and NumPy types. layout.py has the
-declarations, effect_layouts.py those of effects.
+"""Elements of kernel declarations, and their translation to C text and NumPy types.
+
+layout.py has the declarations of the stages, effect_layouts.py those of effects.
 """
 
 from __future__ import annotations
@@ -116,10 +117,10 @@ class Argument:
     ctype: str
     name: str
     access: Access
-    """of a buffer: `in` if the kernel only reads it; empty for a number"""
+    """access to a buffer: `in` if the kernel only reads it, else `out`; empty for a number"""
     source: Source = "stage"
-    """Origin of the value: the launch or the frame, the cloud, a uniform of the view (`View.uniform`), or an
-    array of the view (`View.array`)."""
+    """source of the value: the launch or frame, the cloud, a uniform of the view (`View.uniform`), or an
+    array of the view (`View.array`)"""
     uniform: tuple[str, int] = ("", 0)
     """group of uniforms, and index in it"""
     note: str = ""
@@ -134,13 +135,12 @@ class Argument:
 
 
 def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
-    """Parse declarations of arguments; tuples of arguments are inserted as they are.
+    """Parse declarations of kernel arguments; tuples of arguments are inserted unchanged.
 
-    A declaration is a type, the names of arguments of this type, and a note after `//`. Without another word
-    it declares numbers that the stage passes (`int width height`). A word before the type declares buffers:
-    `in` buffers of the stage that the kernel only reads (`in float raw  // 4 channels`), `out` buffers that
-    it writes, `cloud` arrays with a row for each splat, `array` arrays of the view, which are copied to the
-    device for the frame.
+    A declaration is a type, the names of arguments of this type, and a note after `//`: `int width height`
+    declares two numbers. A word before the type declares buffers instead: `in`, buffers of the stage that the
+    kernel only reads (`in float raw  // 4 channels`); `out`, buffers that it writes; `cloud`, arrays with a
+    row for each splat; `array`, arrays of the view, which are copied to the device for the frame.
     """
     found: list[Argument] = []
     for one in declared:
@@ -156,7 +156,7 @@ def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
 
 
 def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, ...]:
-    """Arguments for all numbers of a group of uniforms (`View.uniform`), in its order."""
+    """Arguments for all numbers of a group of uniforms (`View.uniform`), in the order of the group."""
     words = [declaration.split() for declaration in declarations]
     named = [(ctype, name) for ctype, *names in words for name in names]
     return tuple(
@@ -167,29 +167,29 @@ def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, 
 
 @dataclass(frozen=True)
 class Samples:
-    """A sample buffer of an effect, channel by channel, from the blend stage to the resolve stage."""
+    """A sample buffer of an effect, written by the blend stage and read by the resolve stage."""
 
     ctype: str
     name: str
     channels: int = 1
     note: str = ""
     averaged: bool = False
-    """whether sub-frames are averaged (light); otherwise the middle sub-frame's values are taken"""
+    """whether sub-frames are averaged, as for colours; otherwise the middle sub-frame is used"""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """OpenCL declaration of an effect: its additions to records and to kernel arguments."""
+    """Declaration of an effect: its kernel file, and its additions to records and kernel arguments."""
 
     file: str = ""
     """file below kernels/opencl/; empty: none"""
     parts: tuple[str, ...] = ()
-    """other layouts that it requires: parts, or outputs whose samples it reads"""
+    """names of other required layouts: parts, or outputs whose samples it reads"""
     splat: tuple[Member, ...] = ()
     constant: tuple[tuple[str, str], ...] = ()
-    """(field of `Splat`, value): the same for all splats, so it is a constant in the kernels"""
+    """(field of `Splat`, value): fields that are equal for all splats and become constants in the kernels"""
     packed: tuple[tuple[str, str], ...] = ()
-    """(field of `Splat`, expression that reads it): fields that `splat` replaces (`assemble.with_packed`)"""
+    """(field of `Splat`, expression that reads it): packed fields (`assemble.with_packed`)"""
     bounds: tuple[Member, ...] = ()
     view: tuple[Member, ...] = ()
     project: tuple[Argument, ...] = ()
@@ -205,7 +205,7 @@ class Layout:
     blend_backward: tuple[Argument, ...] = ()
     project_backward: tuple[Argument, ...] = ()
     behind: tuple[tuple[str, str], ...] = ()
-    """(camera or another slot, part): with that slot, the part replaces this one"""
+    """(camera or another slot, part): with that slot, the part replaces this layout"""
 
 
 def output_argument(output: Output) -> Argument:

@@ -38,7 +38,9 @@ _NO_PATCH_NEEDED = (
     "a newer PoCL (Debian: pocl-opencl-icd; conda: pocl) or Intel's runtime for CPUs needs no patch "
     "(docs/backends.md)"
 )
-_PATCHED = f"PoCL 3.0 mistakes this processor, and is patched in memory where it is used; {_NO_PATCH_NEEDED}"
+_PATCHED = (
+    f"PoCL 3.0 does not recognise this processor and is patched in memory when used; {_NO_PATCH_NEEDED}"
+)
 _NO_PLATFORM = (
     "no OpenCL platform found; install a CPU one with: pip install 'pyopencl[pocl]' "
     "(GPUs bring theirs with the driver; its path belongs in a file under /etc/OpenCL/vendors)"
@@ -51,15 +53,15 @@ def devices() -> list[DeviceInfo]:
 
 
 def open_device(selector: str = "") -> OpenCLBackend:
-    """The best usable device that the selector matches: GPU before CPU, PoCL with a patch last.
+    """Open the best usable device that matches a selector: GPUs before CPUs, patched PoCL last.
 
     Args:
-        selector: `cpu` or `gpu`; part of a platform's name; part of a GPU's name or vendor if no platform has
-            it; or, with a number at its end, what follows `opencl:` in the list of `devices`.
+        selector: `cpu` or `gpu`; part of a platform's name; part of a GPU's name or vendor if no platform
+            matches; or a name from the list of `devices` without `opencl:`, such as `pocl2`.
 
     Raises:
         DeviceError: no OpenCL at all, or none of the devices can be used.
-        UnknownDeviceError: nothing matches the selector.
+        UnknownDeviceError: no device matches the selector.
     """
     found = _named_devices()
     if not found:
@@ -105,10 +107,10 @@ class OpenCLBackend(Workspace, Backend):
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
         self._background = BackgroundCompiler()
         self._own: tuple[DeviceShape, dict[FeatureSet, OpenCLPipeline]] = self.shape, {}
-        """pipelines for the device's default shape by requested features; looked up before all others"""
+        """pipelines with the device's default shape, by requested features"""
 
     def upload(self, cloud: SplatCloud) -> Resident:
-        """The cloud in device buffers."""
+        """Copy a cloud to device buffers; a CPU reads the host's arrays."""
         return Resident(self, cloud)
 
     def chunk_cache(self, scene: ChunkedScene, rows: int) -> OpenCLChunkCache:
@@ -124,8 +126,7 @@ class OpenCLBackend(Workspace, Backend):
         images.copy_tiles(other, tiles)
 
     def unsupported(self, features: FeatureSet) -> str:
-        """Reason why the features cannot be rendered: float64 blending on a device without float64. Empty if
-        they can."""
+        """Error message if the features need float64 and the device has none; else empty."""
         if self.info.float64 or "blend_double" not in features.slots:
             return ""
         return (
@@ -137,7 +138,8 @@ class OpenCLBackend(Workspace, Backend):
         """The stages compiled for these features; `shape` replaces the device's own build constants (tests).
 
         Raises:
-            DeviceError: compilation fails, with the log in the message, or the features are `unsupported`.
+            DeviceError: the device does not support a feature, or compilation fails (the message has the
+                log).
         """
         if shape is None and self._own[0] is self.shape and (known := self._own[1].get(features)) is not None:
             return known
@@ -186,7 +188,7 @@ class OpenCLBackend(Workspace, Backend):
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes of scratch buffers and of released images in the buffer pool."""
+        """Bytes of the buffer pool: scratch buffers and buffers of released images."""
         return self.pool.memory_bytes
 
     def release_scratch(self) -> None:
@@ -202,11 +204,11 @@ class OpenCLBackend(Workspace, Backend):
         return OpenCLProbe(self)
 
     def shapes(self, kind: str) -> dict[str, DeviceShape]:
-        """Other build constants, by name, for tests."""
+        """Alternative build constants by name, for tests."""
         return other_shapes(self.shape, kind)
 
     def pieces(self, shape: DeviceShape) -> int:
-        """Chunks of the sorts."""
+        """Number of pieces into which the counting sorts divide their input."""
         return shape.chunks
 
 
@@ -242,8 +244,8 @@ def _name_of(device: cl.Device) -> str:
 
 
 def _matching(devices: Iterable[cl.Device], selector: str) -> list[cl.Device]:
-    """Devices that a selector matches. The name of a processor is not compared: every driver for it repeats
-    that name, so `intel` would match PoCL."""
+    """Devices that match a selector. Names of CPUs are not compared: `intel` would match PoCL on an Intel
+    CPU."""
     devices = list(devices)
     if selector in ("cpu", "gpu"):
         return [each for each in devices if each.type & getattr(cl.device_type, selector.upper())]
@@ -258,9 +260,9 @@ def _matching(devices: Iterable[cl.Device], selector: str) -> list[cl.Device]:
 
 def _why_unusable(device: cl.Device) -> str:
     if not device.available:
-        return "the driver says that it is not available"
+        return "the driver reports it as unavailable"
     if not device.compiler_available:
-        return "it has no compiler for OpenCL C"
+        return "it has no OpenCL C compiler"
     if not device.endian_little:
         return "it is big-endian"
     if is_pocl(device) and (why := linker.why_no_linker()):
@@ -300,7 +302,7 @@ def _shape(device: cl.Device) -> DeviceShape:
     """Build constants for this device."""
     fast_fma = bool(device.single_fp_config & cl.device_fp_config.FMA)
     if device.type & cl.device_type.CPU:
-        fast_fma |= "fma" in processor_flags()  # which Intel's runtime does not report
+        fast_fma |= "fma" in processor_flags()  # Intel's runtime does not report it
         lanes = 16 if device.native_vector_width_float >= 16 else 8
         return cpu_shape(lanes, device.max_compute_units, fast_fma)
     dialect = "ptx" if device.platform.name == "NVIDIA CUDA" else ""

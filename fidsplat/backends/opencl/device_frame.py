@@ -25,7 +25,7 @@ from fidsplat.effects.catalogue import Output
 
 @dataclass(init=False)
 class FrameBuffers:
-    """Buffers with the names of the kernel arguments; each exists once its stage has allocated it.
+    """Buffers of a frame, named like the kernel arguments; None until their stage has allocated them.
 
     v views, n splats, t tiles of all views, s samples of all views.
     """
@@ -33,14 +33,14 @@ class FrameBuffers:
     view: cl.Buffer
     """records `View` (groups + 1, v)"""
     moving: cl.Buffer
-    """number and labels of the groups that move"""
+    """number of moving groups, then their labels"""
     """sort keys of the coplanar groups (groups, v)"""
     splats: cl.Buffer
     """records `Splat` (v, n)"""
     keys: cl.Buffer
     """sort keys by depth (v, n) uint32"""
     windows: cl.Buffer
-    """tiles that a splat touches (v, n) uint2, or its place in `big`"""
+    """tiles that a splat touches (v, n) uint2, or its index in `big`"""
     tallies: cl.Buffer
     """counters, then the length of each tile's list (8 + t) uint32"""
     big: cl.Buffer
@@ -52,13 +52,13 @@ class FrameBuffers:
     starts: cl.Buffer
     """start of each tile's list (t + 1) uint32"""
     cursors: cl.Buffer
-    """next free place in each tile's list (t) uint32"""
+    """next free position in each tile's list (t) uint32"""
     pairs: cl.Buffer
     """unsorted lists: depth key and splat (capacity) uint2"""
     lists: cl.Buffer
     """splats of each tile in depth order (capacity) uint32"""
     counts: cl.Buffer
-    """words of `Counts`"""
+    """counts of pairs and splats, as `Counts` reads them"""
     raw: cl.Buffer
     """samples (4, s) float32: r, g, b, transmittance"""
     batch_indices: cl.Buffer
@@ -69,7 +69,8 @@ class FrameBuffers:
 
 @dataclass
 class Rendered:
-    """Buffers and events of a submitted frame, without the cloud and scratch buffers of `DeviceFrame`."""
+    """Buffers and events of a submitted frame; unlike `DeviceFrame` it keeps no cloud and scratch buffers
+    alive."""
 
     queue: cl.CommandQueue
     leased: list[tuple[str, cl.Buffer]]
@@ -80,14 +81,14 @@ class Rendered:
     stages: list[str] | None = None
     """of the launches; None on a queue without profiling"""
     uploads: list[cl.Event] | None = None
-    """kept until the device has read the arrays"""
+    """keeps the cloud's arrays alive until the device has read them"""
 
     def buffer(self, name: str) -> cl.Buffer:
         """A leased buffer."""
         return dict(self.leased)[name]
 
     def done(self) -> list[cl.Event]:
-        """Events that another queue waits for before it reads the images."""
+        """Events that another queue must wait for before it reads the images."""
         self.queue.flush()
         return [self.events[-1]]
 
@@ -101,7 +102,7 @@ class Rendered:
 
 
 class DeviceFrame:
-    """One frame, or several views that are rendered together, while its stages are submitted."""
+    """State of a frame, or of several views rendered together, while its stages are submitted."""
 
     def __init__(
         self,
@@ -118,30 +119,30 @@ class DeviceFrame:
         """
         Args:
             commands: records the launches.
-            replay_queue: the queue of a frame that is recorded for replay: on a GPU the host does not wait
-                for its counts.
+            replay_queue: queue of frames that are recorded for replay; on a GPU the host does not wait for
+                their counts.
             pair_limit: largest capacity of the lists of a recorded frame; 0 for no limit.
         """
         self.workspace, self.commands, self.shape = workspace, commands, shape
         self.resident, self.plan = resident, plan
         self.batch, self.views = views, len(views)
         self.view = view = views.view
-        """the view, or the common properties of the views"""
+        """the view; in a batch, the first view"""
         self.waits = replay_queue is None or shape.lists == "ordered"
         """whether the host waits for the counts"""
         self.pair_limit, self.pool = pair_limit, workspace.pool
         self.queue = workspace.switch_to(workspace.queue) if replay_queue is None else replay_queue
         self.source = commands.program.source
-        """of the program whose kernels are launched"""
+        """arguments of the program whose kernels are launched"""
         workspace.frames += 1
         self.tiles_x = -(-view.width // shape.tile_width)
         self.tiles_y = -(-view.height // shape.tile_height)
         self.tiles = self.views * self.tiles_x * self.tiles_y
-        """of all views, one view after the other"""
+        """number of tiles of all views; the tiles of a view are consecutive"""
         self.stride = self.tiles_x * shape.tile_width
         self.rows = self.tiles_y * shape.tile_height
         self.first_tile, self.end_tile = 0, self.tiles
-        """tiles of the rows that are requested"""
+        """tiles of the requested rows"""
         if view.band is not None and shape.lists == "ordered" and self.views == 1:
             self.first_tile = view.band[0] // shape.tile_height * self.tiles_x
             self.end_tile = -(-view.band[1] // shape.tile_height) * self.tiles_x
@@ -155,22 +156,22 @@ class DeviceFrame:
         self.samples = RAW, *self.source.samples
         """buffers of values per sample, which the blend stage writes"""
         self.is_sub_frame = False
-        """whether it is one pose of a frame with a shutter, which resolves the samples of all"""
+        """whether this is one pose of a frame with a shutter; the complete frame resolves its samples"""
         self.events: list[cl.Event] = []
         self.stages: list[str] = []
         """of the launches"""
         self.arrays: dict[str, np.ndarray] = {}
-        """arrays that were copied to the device for this view"""
+        """arrays copied to the device for this view"""
         self.uploads: list[cl.Event] = []
         self.leased: list[tuple[str, cl.Buffer]] = []
         self.counted_launches = 0
         """launches after which the counts are complete"""
         self.counted: cl.Event | None = None
-        """completes when the device has counted the pairs, where the host did not wait"""
+        """completes when the device has counted the pairs, if the host did not wait"""
         self.in_bands = False
         """whether its lists exceeded the pair budget"""
         self.pairs = 0
-        """pairs that were listed; the capacity of the lists where the host did not wait"""
+        """number of listed pairs; the capacity of the lists if the host did not wait"""
         self.stats: Callable[[], dict[str, int]] = dict
 
     def sub_frame(self, view: View) -> DeviceFrame:
@@ -191,15 +192,15 @@ class DeviceFrame:
         return Capacity(self.numbers["big_capacity"], self.pairs)
 
     def count_pairs(self) -> int | None:
-        """The number of pairs; None if they exceeded the capacity, so that the frame is empty. Waits until
-        the device has counted, not until it has rendered."""
+        """The number of pairs; None if it exceeded the capacity, so that the frame is empty. Waits until the
+        device has counted, not until it has rendered."""
         if self.counted is None:
             return self.pairs
         counts = self.read_counts(self.counted)
         return counts.pairs if self.capacity.holds(counts) else None
 
     def read_counts(self, counted: cl.Event) -> Counts:
-        """The counts as the launch `counted` leaves them, while later stages run."""
+        """Read the counts after the launch `counted`, while later stages run."""
         self.queue.flush()
         return Counts.read(self.workspace.side_queue, self.buffers.counts, [counted])
 
@@ -212,9 +213,9 @@ class DeviceFrame:
         views: int = 1,
         **given: Any,
     ) -> cl.Event:
-        """Submit a kernel with at least `items` work-items for each view; kernels check their index.
+        """Submit a kernel with at least `items` work-items per view; kernels check their index.
 
-        Arguments are `given`, or buffers and numbers of the frame, or numbers and arrays of its view.
+        An argument's value is taken from `given`, from the frame, or from its view, in this order.
         """
         size = tuple([-(-count // side) * side for count, side in zip(items, group, strict=True)])
         if views > 1:
@@ -227,12 +228,12 @@ class DeviceFrame:
         return event
 
     def discard_launches(self) -> None:
-        """Start the frame again."""
+        """Discard all recorded launches, to start the frame again."""
         self.commands.clear()
         self.events, self.stages = [], []
 
     def value(self, argument: Argument) -> Any:
-        """The value of a kernel argument that is not given with the launch."""
+        """The value of a kernel argument, from the frame or its view."""
         name = argument.name
         for values in (vars(self.buffers), self.named, self.numbers):
             if name in values:
@@ -243,7 +244,7 @@ class DeviceFrame:
         return self.put(name, self.view.array(name))
 
     def take(self, name: str, size: int) -> cl.Buffer:
-        """Bind a scratch buffer, which the next frame overwrites."""
+        """Bind a scratch buffer; the next frame overwrites it."""
         return self.bind(name, self.pool.scratch(name, size))
 
     def lease(self, name: str, size: int) -> cl.Buffer:
@@ -293,7 +294,8 @@ class DeviceFrame:
         self.put("batch_indices", self.batch.batch_indices)
 
     def put_view(self, row: int, end: int) -> None:
-        """Copy the uniforms of the projection for the requested ones of rows of samples [row, end)."""
+        """Copy the projection's uniforms to the device, for the requested rows within rows of samples [row,
+        end)."""
         if self.view.raster is not None:
             self.put_rays()
         arrays = projection_arrays(self.batch, self.source, row, end)
@@ -306,7 +308,7 @@ class DeviceFrame:
         return Rendered(self.queue, self.leased, self.stats, self.events, stages, self.uploads)
 
     def put_rays(self) -> None:
-        """Bind the rays of a lens, and its map from directions to samples."""
+        """Bind the ray buffers of a lens, and its map from directions to samples."""
         assert self.view.raster is not None
         slopes = self.source.takes("blend", "ray_slopes")
         self.named |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)

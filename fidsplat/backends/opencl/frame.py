@@ -23,7 +23,7 @@ _GRID = (16, 4)
 """work-group of kernels over pixels or samples"""
 _UNLIMITED = 2**32 - 1
 _NEVER = np.full(1, 0xFFFFFFFF, np.uint32)
-"""termination depth of a tile that is not rendered"""
+"""termination depth of tiles that are not rendered"""
 
 
 def render(frame: DeviceFrame) -> None:
@@ -52,7 +52,7 @@ def allocate_samples(frame: DeviceFrame) -> None:
 
 
 def render_sorted(frame: DeviceFrame) -> None:
-    """The stages on a CPU: the host waits for the number of pairs, and sizes the lists by it."""
+    """Run the stages on a CPU: the host waits for the number of pairs, and allocates the lists."""
     count, big = frame.resident.count, 0
     frame.put_view(0, frame.rows)
     while True:
@@ -72,8 +72,8 @@ def render_sorted(frame: DeviceFrame) -> None:
 
 
 def render_tiled(frame: DeviceFrame) -> None:
-    """The stages on a GPU: all are submitted with the capacity of the last frames. If that was too little,
-    the lists are empty, and the stages are submitted again."""
+    """Run the stages on a GPU: all are submitted with the list capacity of previous frames. If it was too
+    small, the lists are empty, and the stages are submitted again."""
     frame.put_view(0, frame.rows)
     frame.lease("counts", 4 * COUNTS)
     capacity = tiling.pair_capacity(frame.workspace)
@@ -97,8 +97,7 @@ def render_tiled(frame: DeviceFrame) -> None:
 
 
 def complete_tiled(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None:
-    """Wait for the counts, and render again with the buffers that the frame requires if it has exceeded
-    `capacity`."""
+    """Wait for the counts; if they exceed `capacity`, render again with larger buffers."""
     counts = frame.read_counts(counted)
     while counts.big > frame.numbers["big_capacity"]:
         tiling.project_and_count(frame, counts.big)
@@ -118,8 +117,8 @@ def complete_tiled(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None
 
 
 def render_in_chunks(frame: DeviceFrame) -> None:
-    """The stages under a small memory budget: the cloud is projected in chunks, and only visible splats are
-    stored. If these exceed the capacity, the cloud is projected again for each band of rows of tiles."""
+    """Run the stages under a small memory budget: project the cloud in chunks and store only visible splats.
+    If these exceed the capacity, the cloud is projected again for each band of tile rows."""
     rows = [(frame.first_tile // frame.tiles_x, frame.end_tile // frame.tiles_x)]
     visible = pairs = 0
     while rows:

@@ -1,4 +1,4 @@
-"""Frames with derivatives: the stages of frame.py, and the kernels of the program `gradients`."""
+"""Differentiable frames: the stages of frame.py, then the backward kernels of the program `gradients`."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
 from fidsplat.util.errors import DeviceError, InputError
 
-_GROUP = 64  # RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_ITEMS of the kernels
+_GROUP = 64  # work-group size: RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_ITEMS of the kernels
 _F32 = np.dtype(np.float32)
-_ZERO = np.zeros(1, np.uint32)  # of floats too
+_ZERO = np.zeros(1, np.uint32)  # also zeroes floats
 
 
 class OpenCLDifferentiable(DifferentiableImages):
@@ -55,7 +55,7 @@ class OpenCLDifferentiable(DifferentiableImages):
         return Array(self.frame.queue, shape, np.dtype(IMAGES[name].dtype), data=buffer)
 
     def device_buffer(self, name: str) -> tuple[cl.Buffer, tuple[int, ...]]:
-        """The buffer of an image, and its shape; faster than an array."""
+        """The buffer of an image, and its shape; faster than making an array."""
         return self.frame.named[f"{name}_out"], gradient_shape(name, self.frame.view)
 
 
@@ -77,7 +77,7 @@ class TileGradients:
         self._of, self._images, self._frame = of, images, frame
 
     def gradients(self) -> dict[str, Any]:
-        """The result of `OpenCLGradients.backward`."""
+        """Sum over tiles; returns the result of `OpenCLGradients.backward`."""
         with self._last():
             return self._of.sum_tiles(self._frame)
 
@@ -86,7 +86,8 @@ class TileGradients:
         self._of.compile_step()
 
     def step(self, given: Mapping[str, Any]) -> None:
-        """Submit kernels/opencl/project_step.cl. given: its arguments other than those of the frame."""
+        """Submit an optimiser step (kernels/opencl/project_step.cl). given: arguments that are not the
+        frame's."""
         with self._last():
             self._of.step(self._frame, given)
 
@@ -99,9 +100,9 @@ class TileGradients:
 class OpenCLGradients(GradientPipeline):
     """Compiled stages with their derivatives.
 
-    A training run renders thousands of frames that differ in numbers only. So frames are replayed
-    (`OpenCLPipeline.replay_complete`), and so are the kernels of the backward pass while their buffers stay
-    the same.
+    A training run renders thousands of frames that differ only in numeric arguments. Command lists are
+    therefore replayed: those of frames (`OpenCLPipeline.replay_complete`), and those of the backward pass
+    while its buffers stay the same.
     """
 
     def __init__(self, pipeline: OpenCLPipeline) -> None:
@@ -114,15 +115,15 @@ class OpenCLGradients(GradientPipeline):
             for name in GRADIENT_OUTPUTS
             if any(one.name == f"by_{name}" for one in arguments["blend_backward"])
         ]
-        """outputs whose gradients the kernels read"""
+        """outputs that have gradients"""
         self._cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
         self._pair_limit = 0
-        """capacity of the lists of frames whose counts the host does not wait for"""
+        """list capacity of frames for whose counts the host does not wait"""
         self._tile_commands, self._sum_commands = CommandList(self.program), CommandList(self.program)
         self._step_commands: CommandList | None = None
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
-        """Render one frame. waits: for its counts, as GPUs need not after the first differentiated frame."""
+        """Render one frame. waits: whether to wait for its counts; GPUs need not after the first frame."""
         pipeline = self._pipeline
         with pipeline.workspace.lock:
             if waits or not self._pair_limit:
@@ -147,7 +148,7 @@ class OpenCLGradients(GradientPipeline):
             return TileGradients(self, images, frame)
 
     def _backward_frame(self, forward: DeviceFrame) -> DeviceFrame:
-        """The frame with the buffers of gradients, and with launches of the program `gradients`."""
+        """A copy of the frame that launches kernels of the program `gradients` and has their buffers."""
         frame = copy(forward)
         frame.commands, frame.source = self._tile_commands, self.source
         frame.take("splat_slots", 4 * frame.resident.count)
@@ -156,7 +157,7 @@ class OpenCLGradients(GradientPipeline):
         return frame
 
     def _submit_to_tiles(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
-        """Submit the kernels up to the sums over tiles: again, if only numbers and some buffers differ."""
+        """Submit the kernels up to the sums over tiles; replays their command list if possible."""
         self._bind_gradients(frame, gradients)
         reserved = frame.take("reserved", 8)
         cl.enqueue_fill_buffer(frame.queue, reserved, _ZERO, 0, 8)
@@ -176,7 +177,7 @@ class OpenCLGradients(GradientPipeline):
         commands.key = self._key(frame)
 
     def _key(self, frame: DeviceFrame) -> Any:
-        """Equal if two backward passes use the same buffers; None if the host waited for the counts."""
+        """Key of the backward pass's command list: its buffers; None if the host waited for the counts."""
         if frame.counted is None:
             return None
         count, size = frame.resident.count, (frame.view.width, frame.view.height)
@@ -206,8 +207,9 @@ class OpenCLGradients(GradientPipeline):
         frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
-        """Size of the record `Tape` (schedule/lanes_backward.cl): light and opacity of each pixel for a
-        chunk's splats, two words for each of eight times as many splats, one more word; in whole vectors."""
+        """Size of the record `Tape` (schedule/lanes_backward.cl), rounded up to vectors: transmittance and
+        opacity of each pixel for a chunk of splats, two words for each of eight times as many splats, one
+        more word."""
         shape = self._pipeline.shape
         chunk, vector = backward_chunk(self._pipeline.features, shape), 4 * shape.lanes
         words = 2 * 8 * chunk + 1
@@ -239,7 +241,7 @@ class OpenCLGradients(GradientPipeline):
             self._step_commands = CommandList(Program(self._pipeline.workspace, source))
 
     def step(self, frame: DeviceFrame, given: Mapping[str, Any]) -> None:
-        """One step of Adam from the sums over tiles. given: arguments that are not those of the frame."""
+        """Submit a step of Adam from the sums over tiles. given: arguments that are not the frame's."""
         commands, count = self._step_commands, frame.resident.count
         assert commands is not None  # `compile_step`
         given = {**given, "count": count}
@@ -256,15 +258,15 @@ class OpenCLGradients(GradientPipeline):
         frame.stages.append("project backward")
 
     def _check_capacity(self, frame: DeviceFrame) -> None:
-        """Raise CapacityExceeded if the lists were too small: they are empty then, and gradient buffer
-        offsets exceed the buffers. The device is busy meanwhile."""
+        """Raise CapacityExceeded if the lists were too small: then they are empty, and gradient buffer
+        offsets exceed the buffers. The host checks this while the device is busy."""
         if (pairs := frame.count_pairs()) is None:
             raise CapacityExceeded
-        if self._pair_limit < pairs * 9 // 8:  # seldom: frames with another limit are recorded again
+        if self._pair_limit < pairs * 9 // 8:  # changed seldom: frames with another limit are recorded again
             self._pair_limit = pairs * 5 // 4
 
     def _bind_gradients(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
-        """Bind the gradients by the outputs as arguments of the kernels."""
+        """Bind the gradients with respect to the outputs as kernel arguments."""
         for name in self._by_outputs:
             shape, given = gradient_shape(name, frame.view), gradients.get(name)
             if given is None:
@@ -284,7 +286,7 @@ class OpenCLGradients(GradientPipeline):
                 frame.put(f"by_{name}", np.ascontiguousarray(given, np.float32))
 
     def _allocate_results(self, frame: DeviceFrame) -> dict[str, Array]:
-        """Arrays for the gradients, the same in every call."""
+        """Arrays for the gradients, reused by every call."""
         count, features = frame.resident.count, self._pipeline.features
         shapes: dict[str, tuple[int, ...]] = {
             **{"means": (count, 3), "quats": (count, 4), "scales": (count, 2), "opacities": (count,)},

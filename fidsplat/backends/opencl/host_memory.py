@@ -16,9 +16,9 @@ import numpy as np
 import pyopencl as cl
 
 _MINIMUM = 1 << 18
-"""bytes from which memory is locked: smaller images are copied as fast to any memory"""
+"""minimum bytes of locked memory: smaller images are copied as fast to ordinary memory"""
 _MAXIMUM = 1 << 30
-"""bytes that are locked at once; further images are in ordinary memory"""
+"""maximum bytes that are locked at once; further images use ordinary memory"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +44,12 @@ class _ArrayMemory:
 
 
 class HostMemory:
-    """Arrays to which a device copies."""
+    """Allocator of host arrays as targets of copies from a device."""
 
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
         self.locks = not device.type & cl.device_type.CPU
-        """whether memory is locked: a CPU copies to any memory in the same time"""
+        """whether to lock memory; on a CPU it saves no time"""
         self._requested: set[int] = set()
         """capacities that were requested before"""
         self._spare: dict[int, list[_LockedBuffer]] = {}
@@ -68,12 +68,12 @@ class HostMemory:
         if memory is None:
             return np.empty(shape, dtype)
         base = _ArrayMemory(memory, shape, dtype)
-        # arrays are released at any point of any thread: the finalizer takes no lock
+        # the finalizer takes no lock, as the garbage collector may run it at any time in any thread
         weakref.finalize(base, self._spare.setdefault(capacity, []).append, memory).atexit = False
         return np.asarray(base)
 
     def _acquire(self, capacity: int) -> _LockedBuffer | None:
-        """An unused or new buffer; None if there should be none."""
+        """An unused or new locked buffer; None for ordinary memory."""
         if capacity not in self._requested:
             self._requested.add(capacity)
             return None
@@ -92,7 +92,7 @@ class HostMemory:
         try:
             buffer = cl.Buffer(self._context, flags.READ_WRITE | flags.ALLOC_HOST_PTR, capacity)
             mapped, _ = cl.enqueue_map_buffer(queue, buffer, access, 0, (capacity,), np.dtype(np.uint8))
-        except cl.Error:  # the system locks no more
+        except cl.Error:  # the system refuses to lock more memory
             self.locks = False
             return None
         self._locked += capacity
@@ -100,7 +100,7 @@ class HostMemory:
 
 
 def _capacity(size: int) -> int:
-    """Bytes that are locked for an array: at most a quarter more, so that images of varying size, as in a
-    viewer, share buffers."""
+    """Capacity in bytes of an array's buffer: rounded up by at most a quarter, so that images of varying
+    size, as in a viewer, reuse buffers."""
     step = 1 << max(size.bit_length() - 3, 0)
     return -(-size // step) * step

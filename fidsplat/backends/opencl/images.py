@@ -48,7 +48,7 @@ def lease_images(
         )
     leased = []
     for output in outputs:
-        name = f"{output.name} of views"  # single frames do not reuse the buffers of batches
+        name = f"{output.name} of views"  # another pool name, as single frames must not reuse batch buffers
         buffer = workspace.pool.lease(name, bytes_of[output.name])
         leased.append((name, buffer))
         if len(views) < views.total:
@@ -71,7 +71,7 @@ class OpenCLImages(Images):
         leased: list[tuple[str, cl.Buffer]] | None = None,
         replay: Replay | None = None,
     ) -> None:
-        """leased: the images of a batch; None if they belong to the one frame in `rendered`."""
+        """leased: image buffers of a batch; None if the images belong to the single frame in `rendered`."""
         self._workspace, self._splats, self._outputs = workspace, splats, outputs
         self._view = view = views if isinstance(views, View) else views.view
         if isinstance(views, ViewBatch):
@@ -82,7 +82,7 @@ class OpenCLImages(Images):
         self._batch = None if leased is None else dict(zip(outputs, leased, strict=True))
         self._timings: dict[str, float] = {}
         self._copied: list[Rendered] = []
-        """frames from which tiles were copied, without buffers"""
+        """frames from which tiles were copied; without their buffers"""
         self._leased = [*(leased or ())]
         for one in rendered:
             self._leased += one.leased
@@ -104,18 +104,18 @@ class OpenCLImages(Images):
         return images
 
     def empty(self, name: str) -> np.ndarray:
-        """A host array for the image of one view, in memory that copies fast."""
+        """A host array for the image of one view, in page-locked memory if possible."""
         return self._workspace.host_memory.empty(self._shape(name), self._outputs[name].dtype)
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray, index: int = 0) -> None:
-        """Copy only pixel rows [first, end). Raises DeviceError as `read`."""
+        """Copy only pixel rows [first, end). Raises DeviceError if the device has failed."""
         if first < end:
             self._copy(name, into[first:end], (index * len(into) + first) * into[:1].nbytes)
 
     def _copy(self, name: str, into: np.ndarray, offset: int) -> None:
         with self._workspace.failing(f"rendering {name}"):
             after = self._done()
-            # not on the queue of frames, where it would wait for the next one
+            # on another queue than frames, where the copy would wait for the next frame
             queue, image = self._workspace.read_queue, self._buffer(name)
             cl.enqueue_copy(queue, into, image, src_offset=offset, wait_for=after)
 
@@ -135,7 +135,8 @@ class OpenCLImages(Images):
         return [event for one in self.complete() for event in one.done()]
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray | None:
-        """Copy an image in 8 bits; None of a batch. Raises DeviceError as `read`."""
+        """Copy an image converted to 8 bits; None for a batch. Raises DeviceError if the device has
+        failed."""
         if self._batch is not None:
             return None
         with self._workspace.failing(f"rendering {name}"):
@@ -149,20 +150,19 @@ class OpenCLImages(Images):
 
         shape, dtype = (self.views, *self._shape(name)), np.dtype(self._outputs[name].dtype)
         buffer: Any = cl.MemoryObject.from_int_ptr(self._buffer(name).int_ptr)
-        # an array or a part of it keeps these images, so that the pool does not reuse their buffers
+        # the array and its views keep these images alive, so that the pool does not reuse their buffers
         buffer.images = self
         return Array(self._workspace.queue, shape, dtype, data=buffer)
 
     def wait(self) -> None:
-        """Wait until the device has rendered them. Raises DeviceError as `read`."""
+        """Wait until the device has rendered the images. Raises DeviceError if it has failed."""
         with self._workspace.failing("rendering"):
             for one in self.complete():
                 one.queue.finish()
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds by stage. A replayed frame is rendered once more, with profiling, when they are first
-        read."""
+        """Milliseconds by stage. For a replayed frame the first call renders it once more, with profiling."""
         with self._workspace.failing("rendering"):
             rendered = self.complete()
             if self._replay is not None and rendered[0].stages is None:
@@ -173,7 +173,7 @@ class OpenCLImages(Images):
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """splats of the cloud; visible and pairs of all views."""
+        """Number of splats of the cloud, and of visible splats and pairs of all views."""
         with self._workspace.failing("rendering"):
             stats = summed(one.stats() for one in self.complete())
             stats = {"splats": 0, "visible": 0, "pairs": 0} | stats | {"splats": self._splats}
@@ -190,7 +190,7 @@ class OpenCLImages(Images):
         return self._rendered
 
     def termination_depths(self) -> TerminationDepths:
-        """Termination depths of a frame with that effect. Raises DeviceError as `read`."""
+        """Termination depths of a frame with that effect. Raises DeviceError if the device has failed."""
         with self._workspace.failing("rendering"):
             (height, width), view = self._tile, self._view
             keys = np.empty((-(-view.height // height), -(-view.width // width)), np.uint32)
@@ -200,7 +200,7 @@ class OpenCLImages(Images):
         return TerminationDepths.of_keys(keys, self._tile)
 
     def copy_tiles(self, other: OpenCLImages, tiles: np.ndarray) -> None:
-        """Copy tiles of another frame of the same view. Raises DeviceError as `read`."""
+        """Copy tiles of another frame of the same view. Raises DeviceError if the device has failed."""
         with self._workspace.failing("rendering"):
             after, copied = [*self._done(), *other._done()], None
             for output in self._outputs.values():
@@ -216,7 +216,7 @@ class OpenCLImages(Images):
                         **{"src_pitches": pitches, "dst_pitches": pitches, "wait_for": after},
                     )
             if copied is not None:
-                copied.wait()  # the next frame may be rendered into the buffers of the other
+                copied.wait()  # the next frame may overwrite the buffers of `other`
             (rendered,) = other.complete()
             self._copied.append(replace(rendered, leased=[], stats=partial(dict, rendered.stats())))
 

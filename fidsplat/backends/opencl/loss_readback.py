@@ -8,7 +8,7 @@ import pyopencl as cl
 from fidsplat.backends.opencl.workspace import Workspace
 
 SLOTS = 16
-"""losses whose sums are stored until they are read"""
+"""maximum number of unread losses"""
 
 
 class LossReadback:
@@ -24,21 +24,21 @@ class LossReadback:
         self._words = np.empty((SLOTS, size // 4), np.float32)
         self._next = 0
         self._last: cl.Event | None = None
-        """completes with the sums of the last loss, and so after those before it"""
+        """event of the last loss's sums; the queue is in order, so earlier losses are complete too"""
         self._unread: set[int] = set()
 
     def take(self) -> tuple[int, cl.Buffer]:
-        """The next slot and its buffer, reused every `SLOTS` losses."""
+        """The next slot and its buffer; slots are reused after `SLOTS` losses."""
         self._next = (self._next + 1) % SLOTS
         return self._next, self._slots[self._next]
 
     def submitted(self, slot: int, event: cl.Event) -> None:
-        """Note the event that completes with the sums of a slot."""
+        """Store the event that completes with the sums of a slot."""
         self._last = event
         self._unread.add(slot)
 
     def read(self, slot: int) -> np.ndarray:
-        """The three sums (3,) float64 of a slot; all unread slots are copied together."""
+        """Read the three sums (3,) float64 of a slot; all unread slots are copied together."""
         if slot in self._unread:
             after = None if self._last is None else [self._last]
             cl.enqueue_copy(self._workspace.side_queue, self._words, self._buffer, wait_for=after)

@@ -1,4 +1,4 @@
-"""The memory plan: how frames and batches fit the memory budget.
+"""The memory plan: how a frame or batch is divided to fit the memory budget.
 
 A frame is rendered at once if its buffers fit. If only its pairs of splats and tiles exceed the budget, it is
 listed and blended in bands of tiles (tiling.py). As the last resort the cloud is projected in chunks, of
@@ -24,21 +24,21 @@ from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError, bytes_words
 
 CHUNK = 1 << 20
-"""most splats of a chunk; a power of two, so that parts of every array start at aligned addresses"""
+"""maximum splats of a chunk; a power of two, so that parts of every array start at aligned addresses"""
 _LARGE = 1 << 23
-"""most splats of a chunk that takes a small part of the memory: fewer launches"""
+"""maximum splats of a chunk that takes a small part of the memory; larger than above, for fewer launches"""
 _MINIMUM = 1 << 10
 KEYS, WINDOWS, SORTED = 4, 8, 16
-"""bytes per splat of sort keys, of tile windows, and of keys and indices while they are sorted"""
+"""bytes per splat: of sort keys; of tile windows; of keys and indices during the sort"""
 MIN_BIG = 1 << 12
 """initial capacity for big splats"""
 SMALL = 1 << 14
 """bytes for uniforms, counts and moving groups"""
 PART_BYTES = {"cpu": 1 << 28}
-"""bytes of the views of a part of a batch, without their images, by kind of device: more is no faster"""
+"""maximum bytes of a part of a batch without images, by kind of device; larger parts are not faster"""
 OTHER_PART_BYTES = 1 << 31
 _PART_SAMPLES = 1 << 30
-"""samples of the views of a part; kernels number them in 32 bits, several channels of them"""
+"""maximum samples of a part of a batch; kernels use 32-bit indices for several channels of samples"""
 _OF_CAMERAS = {"ray", "vignette_center"}
 """groups of uniforms that differ between cameras"""
 
@@ -52,7 +52,7 @@ class MemoryPlan:
     capacity: int
     """visible splats of one band that are stored, if in chunks"""
     total: int
-    """bytes in total, with the cloud; more only if there are more than `MIN_BIG` big splats"""
+    """total bytes including the cloud; exceeded only with more than `MIN_BIG` big splats"""
 
 
 class Part(NamedTuple):
@@ -85,17 +85,17 @@ class MemoryPlanner:
         return -(-view.width // self._shape.tile_width) * -(-view.height // self._shape.tile_height)
 
     def frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
-        """The plan of one view. reserved: bytes of other buffers.
+        """Plan one view. reserved: bytes of other buffers.
 
         Raises:
-            DeviceError: the budget does not hold the frame in any way.
+            DeviceError: the frame exceeds the budget even when divided.
         """
         shape = self._shape
         stays, upload = resident.bytes_for(self._source.cloud_arrays)
         samples, tables = self._samples_and_tables(view)
         fixed = reserved + stays + SMALL + tables
         fixed += MIN_BIG * (4 + self._source.records["Bounds"].itemsize)
-        # sub-frames have samples of their own
+        # each sub-frame has its own samples
         fixed += 4 * samples * self._channels * (2 if view.sub_frames else 1)
         fixed += self._image_bytes(view)
         for name in self._source.view_arrays:
@@ -109,7 +109,7 @@ class MemoryPlanner:
         return plan_of(resident.capacity, record, upload, fixed, shape.lists, budget, largest)
 
     def parts(self, resident: Resident, views: ViewBatch) -> Iterator[Part]:
-        """The parts of a batch."""
+        """Divide a batch into parts that are rendered together."""
         count, others = len(views), (views.total - 1) * self._image_bytes(views.view)
         if not count:
             return
@@ -126,7 +126,7 @@ class MemoryPlanner:
         free = min(self._device.memory_budget - plan.total + each, self._device.largest_buffer)
         most = min(free, PART_BYTES.get(self._device.info.kind, OTHER_PART_BYTES)) // each
         most = max(1, min(most, _PART_SAMPLES // samples))
-        # parts of equal size have buffers of equal size
+        # parts of equal size, so that they reuse buffers
         parts = -(-count // most)
         for first, end in pairwise(count * k // parts for k in range(parts + 1)):
             yield Part(first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * each))
@@ -148,16 +148,16 @@ class MemoryPlanner:
 def plan_of(
     count: int, record_bytes: int, upload_bytes: int, fixed_bytes: int, lists: str, budget: int, largest: int
 ) -> MemoryPlan:
-    """The memory plan for `count` splats.
+    """Plan a frame of `count` splats.
 
     Args:
-        record_bytes: of a splat's record.
-        upload_bytes: per splat, where each frame copies the cloud to the device; else 0.
-        fixed_bytes: sample buffers, outputs, tables, and the cloud if it stays on the device.
-        budget: bytes of everything together. largest: bytes of the largest buffer.
+        record_bytes: bytes of a splat's record.
+        upload_bytes: bytes per splat that each frame copies to the device; 0 if the cloud stays there.
+        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it stays on the device.
+        budget: maximum total bytes. largest: maximum bytes of one buffer.
 
     Raises:
-        DeviceError: the budget does not even hold the frame.
+        DeviceError: `fixed_bytes` exceed the budget.
     """
     direct = count * (record_bytes + KEYS + WINDOWS + (SORTED if lists == "ordered" else 0))
     pairs = budget // 8

@@ -1,4 +1,4 @@
-"""Large pages of memory, on systems that have them."""
+"""Large memory pages, on systems that support them."""
 
 import ctypes
 import mmap
@@ -11,7 +11,7 @@ def large_pages(address: int, size: int) -> bool:
         address, size: in bytes; rounded inwards to complete pages.
 
     Returns:
-        Whether the system accepted. Contents are unchanged in any case.
+        Whether the system accepted. Memory contents are unchanged.
     """
     advice = getattr(mmap, "MADV_HUGEPAGE", None)  # only on Linux
     first = -(-address // mmap.PAGESIZE) * mmap.PAGESIZE

@@ -29,20 +29,20 @@ from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError
 
 _KINDS = 32
-"""kinds of frames that are cached for a cloud"""
+"""maximum number of kinds of frames that are cached for a cloud"""
 _RASTERS = 4
-"""lenses among them: as many as `raster_of` caches"""
+"""maximum number of different lenses among them: as many as `raster_of` caches"""
 
 
 @dataclass
 class CachedFrame:
-    """A kind of frame that was rendered before, for a cloud."""
+    """Cache entry: a kind of frame of a cloud that was rendered before."""
 
     plan: MemoryPlan
     kind: tuple[Any, ...]
     """for `BufferPool.make_way`"""
     raster: RayRaster | None
-    """of the lens, whose rays stay on the device as long"""
+    """raster of the lens; it keeps the lens's rays on the device"""
     recorded: RecordedFrame | None = None
 
 
@@ -57,17 +57,17 @@ class OpenCLPipeline(Pipeline):
         shape: DeviceShape,
         other: Callable[[FeatureSet, DeviceShape], OpenCLPipeline],
     ) -> None:
-        """other: returns the pipeline of another shape."""
+        """other: function that returns the pipeline with another shape."""
         self.workspace, self.source, self.features, self.shape = workspace, source, features, shape
         self.program = Program(workspace, source)
         self.outputs = {output.name: output for output in features.images}
         self._commands = CommandList(self.program)
-        """of frames that are not replayed"""
+        """command list of frames that are not replayed"""
         self._planner = MemoryPlanner(workspace, source, features, shape)
         self._other = other
 
     def render_view(self, resident: Resident, view: View) -> OpenCLImages:
-        """Render one view. A frame of a kind that was rendered before is replayed; a GPU is not waited for.
+        """Render one view. Frames of a kind that was rendered before are replayed; on a GPU without waiting.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
@@ -81,7 +81,7 @@ class OpenCLPipeline(Pipeline):
                 return self._listing("local").render_view(resident, view)
             plan = self._planner.frame(resident, view)
             if plan.chunk and self.shape.lists != "ordered":
-                # chunks are rendered by one strategy only: where memory is short, sorting is fastest
+                # frames in chunks use only this strategy, which is fastest with little memory
                 return self._listing("ordered").render_view(resident, view)
             frame = self._render_planned(resident, view, plan)
             complete = not (plan.chunk or frame.in_bands or view.sub_frames or view.band)
@@ -90,7 +90,7 @@ class OpenCLPipeline(Pipeline):
             return self._images(view, [frame.rendered()], resident)
 
     def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
-        """Render views, as many at once as memory holds. Raises DeviceError as `render_view`."""
+        """Render views, as many at once as memory allows. Raises DeviceError if the device fails."""
         if views.is_single:
             return self.render_view(resident, views.one(0))
         workspace, rendered = self.workspace, []
@@ -110,17 +110,17 @@ class OpenCLPipeline(Pipeline):
             return self._images(views, rendered, resident, leased)
 
     def fits(self, resident: Resident, view: View) -> bool:
-        """Whether the frame is rendered at once; otherwise the cloud is projected for each of its parts."""
+        """Whether the frame is rendered without dividing the cloud into chunks."""
         try:
             return not self._planner.frame(resident, view).chunk
-        except DeviceError:  # too little memory for any part of it
+        except DeviceError:  # too little memory even for a divided frame
             return False
 
     def render_complete(self, resident: Resident, view: View) -> DeviceFrame:
-        """One frame with all that its stages leave on the device until the next frame.
+        """Render one frame and return its buffers, which are valid until the next frame.
 
         Raises:
-            DeviceError: as `render`; or the frame does not fit the memory budget at once.
+            DeviceError: the device fails, or the frame exceeds the memory budget without chunks or bands.
         """
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
@@ -134,10 +134,10 @@ class OpenCLPipeline(Pipeline):
             return frame
 
     def replay_complete(self, resident: Resident, view: View, pair_limit: int) -> DeviceFrame:
-        """`render_complete` without waiting for the counts: `DeviceFrame.count_pairs` returns whether the
-        buffers sufficed. A frame of a kind that was rendered before is replayed.
+        """Render one frame without waiting for its counts, and return its buffers. `DeviceFrame.count_pairs`
+        checks later whether they sufficed. Frames of a kind that was rendered before are replayed.
 
-        pair_limit: largest capacity of the lists.
+        pair_limit: maximum capacity of the lists.
         """
         if self.shape.lists == "ordered" or not resident.count:
             return self.render_complete(resident, view)
@@ -154,7 +154,7 @@ class OpenCLPipeline(Pipeline):
             workspace.pool.make_way(kind, workspace.memory_budget - plan.total, resident.capacity)
             if plan.chunk or not tiling.pair_capacity(workspace):
                 return self.render_complete(resident, view)
-            resident.cached_frames.pop(key, None)  # an interrupt leaves a part of a recording
+            resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
             commands = CommandList(self.program) if recorded is None else recorded.commands
             frame = self._frame(resident, view, plan, commands, queue, pair_limit)
             frame.lease_images(self.features.images)
@@ -167,13 +167,13 @@ class OpenCLPipeline(Pipeline):
         return self._images(frame.view, [frame.rendered()], frame.resident)
 
     def render_again(self, resident: Resident, view: View) -> Rendered:
-        """A frame whose replay exceeded its capacity, with the buffers that it requires."""
+        """Render a frame whose replay exceeded its capacity again, with larger buffers."""
         with self.workspace.rendering():
             return self._render_planned(resident, view, self._planner.frame(resident, view)).rendered()
 
     def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
-        """The next frame of a kind; None if it exceeds the capacity, or the buffers of the last frame were
-        released."""
+        """Replay a cached frame for another view; None if it exceeds the capacity, or scratch buffers were
+        replaced."""
         workspace, recorded, waits = self.workspace, cached.recorded, self.shape.lists == "ordered"
         workspace.pool.make_way(cached.kind, workspace.memory_budget - cached.plan.total, resident.capacity)
         if not waits and not tiling.pair_capacity(workspace):
@@ -186,7 +186,7 @@ class OpenCLPipeline(Pipeline):
                 return None
         else:
             commands = CommandList(self.program) if recorded is None else recorded.commands
-            cached.recorded = None  # an interrupt leaves a part of a recording
+            cached.recorded = None  # after an interrupt the recording may be incomplete
             frame = self._frame(resident, view, cached.plan, commands, queue)
             frame.lease_images(self.features.images)
             render(frame)
@@ -222,8 +222,8 @@ class OpenCLPipeline(Pipeline):
         view: View,
         plan: MemoryPlan,
     ) -> DeviceFrame:
-        """A frame with the buffers that it requires."""
-        # buffers of other kinds of frames are released; those of its own kind are part of the plan
+        """Render a frame according to its memory plan."""
+        # release the buffers of other kinds of frames; buffers of this kind are part of the plan
         free = self.workspace.memory_budget - plan.total
         self.workspace.pool.make_way(self._buffer_kind(resident, view, plan), free, resident.capacity)
         frame = self._frame(resident, view, plan, self._commands)
@@ -232,12 +232,12 @@ class OpenCLPipeline(Pipeline):
         return frame
 
     def _buffer_kind(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
-        """Frames of one kind have buffers of the same sizes."""
+        """Key of frames that have buffers of the same sizes."""
         alike = resident.buffer_key if not plan.chunk else None
         return self, view.width, view.height, alike or (resident.capacity, plan)
 
     def _cache(self, resident: Resident, key: tuple[Any, ...], frame: DeviceFrame) -> None:
-        """Replay the next frame of this kind."""
+        """Cache the command list of a frame, so that the next one of its kind is replayed."""
         cached, raster = resident.cached_frames, frame.view.raster
         if raster is not None:
             rasters = {each.raster for each in cached.values()} - {None, raster}
@@ -249,7 +249,7 @@ class OpenCLPipeline(Pipeline):
         cached[key] = CachedFrame(frame.plan, kind, raster)
 
     def _key(self, view: View) -> tuple[Any, ...]:
-        """Key of frames that differ in numbers only."""
+        """Key of frames that differ only in numeric arguments."""
         labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
         return self, view.width, view.height, view.raster, labels, budgets
 
@@ -270,11 +270,11 @@ class OpenCLPipeline(Pipeline):
         return self._other(self.features, replace(self.shape, lists=lists))
 
     def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
-        """The pipeline that bins a part of a batch in the shortest time."""
+        """The pipeline with the fastest tile-binning strategy for a part of a batch."""
         if self.shape.lists != "tiled":
             return self
         if plan.chunk:
-            return self._listing("ordered")  # as `render`
+            return self._listing("ordered")  # as for single views in chunks
         few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
         return self._listing("local") if few or resident.coherent else self
 

@@ -23,7 +23,7 @@ from fidsplat.util.errors import DeviceError
 def evaluate(
     workspace: Workspace, text: str, inputs: Sequence[np.ndarray], outputs: Sequence[np.dtype | type]
 ) -> list[np.ndarray]:
-    """Run `kernel void probe(...)` of `text`, compiled as the stages are: after prelude.cl and math.cl.
+    """Compile `text` like the stages, after prelude.cl and math.cl, and run its kernel `probe`.
 
     One work-item per element: inputs are arrays (n,) of one length, outputs the types of arrays (n,). The
     kernel's arguments are the pointers to the inputs, then to the outputs. A device without float64 has
@@ -69,7 +69,7 @@ def contents(workspace: Workspace, buffer: cl.Buffer) -> np.ndarray:
 
 
 def buffer_of(workspace: Workspace, array: np.ndarray) -> cl.Buffer:
-    """An array in a buffer of its own."""
+    """Copy an array to a new buffer."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
     return cl.Buffer(workspace.context, flags, hostbuf=np.ascontiguousarray(array))
 
@@ -109,8 +109,8 @@ class OpenCLProbe(Probe):
         return self._workspace.shape.fast_fma
 
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
-        """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
-        (n,), from a, b (n,) float32."""
+        """Evaluate a b - a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in the set-up's precision; fma(a, b, -(a b)):
+        each (n,), from a, b (n,) float32."""
         real = np.float64 if self._workspace.info.float64 else np.float32
         types = (np.float32, np.float32, real, np.float32)
         return evaluate(self._workspace, CONTRACTION, (a, b, a), types)
@@ -122,7 +122,7 @@ class OpenCLProbe(Probe):
     def arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Kernels of check/arithmetic.cl."""
+        """Run the kernels of check/arithmetic.cl."""
         workspace, n = self._workspace, len(exponents)
         kernels = check_kernels(workspace, "check/arithmetic.cl", effects=("slot/arithmetic_fast.cl",))
 

@@ -23,14 +23,14 @@ from fidsplat.util import interrupts
 from fidsplat.util.errors import DeviceError
 
 in_background = threading.local()
-"""`on` in compile threads whose parent has set the warning filters, which are shared by all threads"""
+"""`on` in compile threads: the parent thread has set the warning filters, which all threads share"""
 
 
 class _InvokerCache(dict[Any, Any]):
     """pyopencl's cache of the Python code that sets arguments, in memory.
 
-    pyopencl's own is a database of code without checksums, which crashes when it is damaged.
-    Making the code takes less than a millisecond per kernel.
+    pyopencl's own cache is a database of code without checksums; a damaged one crashes the process. Making
+    the code takes less than a millisecond per kernel.
     """
 
     store_if_not_present = dict.setdefault
@@ -50,22 +50,21 @@ def build_options(device: cl.Device) -> list[str]:
     version, target = device.version, device.version
     if needs_correction(version):
         target = correct_target(device.int_ptr, version)
-    # the target's name is part of pyopencl's cache key, since PoCL's version string is the same for all
-    # processors
+    # make the processor's name part of pyopencl's cache key: PoCL's version string does not contain it
     target = "".join(c if c.isalnum() else "_" for c in target)
     options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
     rounds = device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
     if rounds and not is_pocl(device):
-        # images are then bit-identical; PoCL needs no option for it
+        # for bit-identical images; PoCL needs no option
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     if device.platform.name == "NVIDIA CUDA":
-        # the projection uses up to 120
+        # the projection kernel uses up to 120 registers
         options.append("-cl-nv-maxrregcount=128")
     return options
 
 
 def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
-    """A program from OpenCL C.
+    """Compile OpenCL C text.
 
     Raises:
         DeviceError: compilation fails; the message has the log.
@@ -99,7 +98,7 @@ class Program:
 
 
 def _compiled(workspace: Workspace, source: Source) -> dict[str, cl.Program]:
-    """The program of each kernel of a source.
+    """Compile a source; returns the program of each kernel.
 
     PoCL's cache may return a program without kernels if another process is writing the entry, or was killed
     while writing it. A retry with another option uses another cache entry.
@@ -125,8 +124,7 @@ def _compiled(workspace: Workspace, source: Source) -> dict[str, cl.Program]:
 def check_kernels(
     workspace: Workspace, file: str = "", text: str = "", lanes: int = 0, effects: Sequence[str] = ()
 ) -> dict[str, cl.Kernel]:
-    """Kernels of a file below kernels/opencl/ or of a text, compiled after prelude.cl and math.cl like the
-    stages of a frame.
+    """Compile a file below kernels/opencl/ or a text after prelude.cl and math.cl, like the stages.
 
     Args:
         lanes: SIMD width; 0 for the device's default.

@@ -1,8 +1,8 @@
-"""Frames that are replayed: the command list of one frame, submitted again for the next of its kind.
+"""Frame replay: the command list of a frame is submitted again for the next frame of its kind.
 
-Frames of a kind run the same kernels with the same arguments, except for their output images and the numbers
-of their views. Setting these takes the host a fraction of the time of planning a frame. On a GPU nothing
-waits for the device. On a CPU the host reads the counts before the lists are written, as in `render_sorted`.
+Frames of a kind run the same kernels; only output images and numbers of the view differ. Setting these is
+much faster for the host than planning a frame. On a GPU the host does not wait for the device. On a CPU it
+reads the counts before the lists are written, as in `render_sorted`.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from fidsplat.backends.opencl.uniforms import numbers_of, projection_arrays
 from fidsplat.backends.view import View
 
 _VIEWS = 256
-"""views whose uniforms are cached"""
+"""maximum number of views whose uniforms are cached"""
 _VIEWS_BYTES = 1 << 26
-"""bytes of their arrays, such as external depth images"""
+"""maximum bytes of cached arrays of views, such as external depth images"""
 _UPLOADS = 64
-"""copies to the device that may be under way before the host waits for the first"""
+"""maximum number of pending copies to the device"""
 _ZERO = np.zeros(1, np.uint32)
 
 
 class RecordedFrame:
-    """The command list of a frame, and the arguments that differ from view to view. It references no cloud,
-    which caches it (`Resident.cached_frames`)."""
+    """The command list of a frame, and the arguments that differ between views. The cloud caches it
+    (`Resident.cached_frames`), so it must not reference the cloud."""
 
     def __init__(self, frame: DeviceFrame) -> None:
         self.workspace, self.commands, self.capacity = frame.workspace, frame.commands, frame.capacity
         self.state = frame.pool.state
-        """of the scratch buffers to which the kernels are bound"""
+        """`BufferPool.state` of the bound scratch buffers"""
         self._waits = frame.waits
         """whether the host waits for the counts of each frame"""
         self._rows, self._tallies = frame.rows, frame.pool.size("tallies")
@@ -53,16 +53,16 @@ class RecordedFrame:
         self._views: dict[int, tuple[View, dict[str, np.ndarray], dict[str, Any]]] = {
             id(frame.view): (frame.view, frame.arrays, numbers_of(frame.view, frame.source))
         }
-        """views that were rendered, with their arrays and numbers"""
+        """rendered views with their arrays and numbers"""
         self._bytes = 0
-        """of those arrays"""
+        """bytes of these arrays"""
         self._uploads: deque[cl.Event] = deque(frame.uploads, maxlen=_UPLOADS)
         self._leases = [(name, buffer.size) for name, buffer in frame.leased]
         self._scratch = [name for name in frame.bound if name not in dict(frame.leased)]
 
     def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
-        """Bind the uniforms of a view. Returns whether the command list can be submitted: not after a scratch
-        buffer was replaced."""
+        """Bind the uniforms of a view. Returns False if a scratch buffer was replaced, so that the command
+        list is invalid."""
         pool = self.workspace.pool
         if pool.state is not self.state:
             return False
@@ -72,15 +72,15 @@ class RecordedFrame:
             self._view, self._arrays = view, arrays
         for name, array in self._arrays.items():
             _, event = pool.put(queue, name, array)
-            if event is not None:  # frames of other kinds use the same buffers
+            if event is not None:  # the buffer was overwritten by frames of other kinds
                 self._uploads.append(event)
         if not self._waits:
-            pool.zeroed("tallies", self._tallies, queue)  # frames of other kinds leave theirs
+            pool.zeroed("tallies", self._tallies, queue)  # frames of other kinds do not clear it
         return pool.state is self.state
 
     def submit(self, queue: cl.CommandQueue, splats: int) -> Rendered | None:
-        """Render the view that is bound, of a cloud of so many splats. None if it exceeds the capacity, where
-        the host waits for its counts."""
+        """Render the bound view of a cloud with this many splats. None if the host waits for the counts and
+        they exceed the capacity."""
         commands, pool = self.commands, self.workspace.pool
         leased = [(name, pool.lease(name, size)) for name, size in self._leases]
         commands.set(dict(leased))
@@ -105,7 +105,8 @@ class RecordedFrame:
         return Rendered(queue, leased, partial(counts.stats, splats), events, self._stages)
 
     def _enlarge_lists(self, counts: Counts) -> bool:
-        """Bind larger lists, where the host waits for the counts. Returns whether they suffice."""
+        """Bind larger lists if needed; used where the host waits for the counts. Returns whether they
+        suffice."""
         if counts.big > self.capacity.big or counts.pairs > self.workspace.pair_budget:
             return False
         pairs = enlarged(counts.pairs, self.workspace.pair_budget)
@@ -114,8 +115,7 @@ class RecordedFrame:
         return True
 
     def render(self, frame: DeviceFrame) -> None:
-        """Replay as a frame of the view that is bound, with the buffers that its stages leave for
-        derivatives."""
+        """Replay the bound view, and bind its buffers to `frame` for the backward pass."""
         rendered = self.submit(frame.queue, frame.resident.count)
         assert rendered is not None  # on CPUs frames with derivatives are not replayed
         frame.leased, events = rendered.leased, rendered.events
@@ -133,20 +133,20 @@ class RecordedFrame:
         own = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
         for name in self._source.view_arrays:
             own[name] = view.array(name)
-        # an array that views share, a panorama say, is counted once
+        # count arrays that views share, such as a panorama, once
         size = sum(array.nbytes for name, array in own.items() if array is not self._arrays.get(name))
         if len(self._views) >= _VIEWS or self._bytes + size > _VIEWS_BYTES:
             self._views.clear()
             self._bytes = 0
         self._bytes += size
-        # the view is kept alive, so that no other has its id
+        # keep the view alive, so that no other view has its id
         learned = view, self._arrays | own, numbers_of(view, self._source)
         self._views[id(view)] = learned
         return learned
 
 
 class Replay:
-    """A frame that was replayed on a GPU: its capacity is checked when it is first read."""
+    """A frame replayed on a GPU; its capacity is checked when it is first read."""
 
     def __init__(
         self,
@@ -155,27 +155,27 @@ class Replay:
         view: View,
         render_again: Callable[[Resident, View], Rendered],
     ) -> None:
-        """render_again: renders the view with the buffers that it requires."""
+        """render_again: function that renders the view with sufficient buffers."""
         self._recorded, self._view, self._render_again = recorded, view, render_again
         self._number = recorded.workspace.frames
         self._resident: Resident | None = resident
         self._timed = weakref.ref(resident)
 
     def overflow(self, rendered: Rendered) -> Rendered | None:
-        """The frame rendered again, if its counts exceed the capacity; None if it is complete."""
+        """Render the frame again if its counts exceed the capacity; None if it is complete."""
         resident, workspace = self._resident, self._recorded.workspace
         if resident is None:
             return None
-        queue, after = rendered.queue, None  # faster than a queue that waits for another
-        if workspace.frames != self._number:  # without waiting for frames that were submitted since
+        queue, after = rendered.queue, None  # faster than waiting from another queue
+        if workspace.frames != self._number:  # later frames were submitted: do not wait for them
             queue, after = workspace.read_queue, rendered.done()
         counts = Counts.read(queue, rendered.buffer("counts"), after)
         again = None if self._recorded.capacity.holds(counts) else self._render_again(resident, self._view)
-        self._resident = None  # the cloud is held until the check only
+        self._resident = None  # release the cloud, which is no longer needed
         return again
 
     def timings(self) -> dict[str, float]:
-        """Milliseconds by stage, of another replay with profiling; empty if the cloud was released."""
+        """Milliseconds by stage, from another replay with profiling; empty if the cloud was released."""
         resident, recorded, workspace = self._timed(), self._recorded, self._recorded.workspace
         if resident is None:
             return {}

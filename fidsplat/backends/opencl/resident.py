@@ -20,21 +20,21 @@ from fidsplat.splats.harmonics import color_range
 from fidsplat.util.errors import DeviceError
 
 _VECTOR = 16
-"""bytes of the vectors that kernels read of arrays"""
+"""alignment in bytes of the vectors in which kernels read arrays"""
 
 
 class Resident(ResidentData):
     """A SplatCloud on the device.
 
-    A CPU reads the cloud's own arrays, without a copy. Other devices have copies: of labels and colours when
-    a frame first reads them, and of clouds that exceed half of the memory budget a chunk at a time for every
-    frame (`streamed`).
+    A CPU reads the host's arrays without a copy. Other devices have copies; labels and colours are copied
+    when a frame first reads them. A cloud that exceeds half of the memory budget is `streamed`: every frame
+    copies it to the device, a chunk at a time.
     """
 
     def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
         self._workspace = workspace
         self.count = self.capacity = len(cloud)
-        """splats, and splats for which frames have buffers"""
+        """number of splats, and number for which frames have buffers"""
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
         self.has_coplanar_groups = cloud.coplanar_groups is not None
@@ -55,15 +55,15 @@ class Resident(ResidentData):
         plain = cloud.plain_colors
         if plain is not None:
             self._arrays["colors"] = plain
-        elif cloud.sh is not None:  # always: a cloud has one of the two
+        elif cloud.sh is not None:  # always true: a cloud has colours or SH
             self._arrays["sh"] = cloud.sh
         self._buffers: dict[str, cl.Buffer] = {}
         self.cached_frames: dict[Hashable, Any] = {}
-        """frames of the cloud that are replayed, by their kind"""
+        """cached frames for replay, by their kind"""
         self.immutable = True
-        """whether its arrays never change; otherwise a frame cannot be rendered again later"""
+        """whether the arrays never change, so that a frame can be rendered again later"""
         self.buffer_key: object = None
-        """key under which clouds share buffers"""
+        """key of clouds that may share buffers"""
         self.coherent = False
         """whether consecutive splats are close to each other, as in stores"""
         total = self.count * self._bytes_of(self._arrays)
@@ -95,8 +95,8 @@ class Resident(ResidentData):
         return size
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """Memory of the cloud in a frame that reads these arrays: bytes that stay on the device, and bytes
-        per splat that each frame copies there."""
+        """Memory of these arrays: bytes that stay on the device, and bytes per splat that each frame
+        copies."""
         if self._shared:
             return 0, 0
         if self.streamed:
@@ -126,7 +126,7 @@ class Resident(ResidentData):
         return whole.get_sub_region(first * row, (end - first) * row)
 
     def _array(self, name: str) -> np.ndarray:
-        """The array on the host; ids are made when a frame first reads them."""
+        """The array on the host; splat ids are made when a frame first reads them."""
         if name == "splat_ids" and name not in self._arrays:
             self._arrays[name] = np.arange(self.count, dtype=np.int32)
         return self._arrays[name]
@@ -148,8 +148,8 @@ class Resident(ResidentData):
 
 
 def _finish(process: int, *queues: cl.CommandQueue) -> None:
-    """Wait for kernels that may be reading the host's arrays, before these are released. Queues of the
-    process from which this one was forked are not touched."""
+    """Wait for kernels that may be reading the host's arrays, before these are released. Does nothing in a
+    fork."""
     if process == os.getpid():
         for queue in queues:
             with suppress(cl.Error):

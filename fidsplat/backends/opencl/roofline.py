@@ -1,4 +1,4 @@
-"""Times the kernels of kernels/opencl/check/roofline.cl: the peak rates of a device."""
+"""Measurement of a device's peak rates for the roofline, with kernels/opencl/check/roofline.cl."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ _GROUP = 64
 
 
 def measure_rates(workspace: Workspace) -> Rates:
-    """The best of several launches each, with the vectors that the blend stage uses. Under a second.
+    """Measure peak rates: the best of several launches each, with the vector width of the blend stage. Takes
+    less than a second.
 
     Raises:
         DeviceError: the device cannot compile or run the kernels.
@@ -37,7 +38,7 @@ def measure_rates(workspace: Workspace) -> Rates:
 
 
 def _copy_rate(workspace: Workspace, kernel: cl.Kernel) -> float:
-    """Bytes per second, read and written together; the buffers exceed every cache."""
+    """Bytes per second of a copy, read plus written; the buffers exceed every cache."""
     size = 2**29 if workspace.info.kind == "gpu" else 2**27
     share = min(workspace.info.largest_allocation_bytes, workspace.info.memory_bytes) // 8
     size = min(size, share) // (16 * _GROUP) * 16 * _GROUP
@@ -49,7 +50,7 @@ def _copy_rate(workspace: Workspace, kernel: cl.Kernel) -> float:
 
 
 def _operation_rate(workspace: Workspace, kernel: cl.Kernel, a: float, b: float) -> float:
-    """Results per second."""
+    """Results per second of a kernel."""
     # a GPU needs many work-items to hide its latencies; on a CPU a few groups per core are plenty
     groups = workspace.info.compute_units * (32 if workspace.info.kind == "gpu" else 4)
     items = groups * _GROUP

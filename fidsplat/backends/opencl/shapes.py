@@ -1,4 +1,4 @@
-"""Build constants of the kernels for a device, their changes by a frame's features, and others for tests."""
+"""Build constants of the kernels, by device and by the features of a frame."""
 
 from __future__ import annotations
 
@@ -12,29 +12,31 @@ class DeviceShape:
     """Build constants that follow from the kind of device, not from the scene."""
 
     schedule: str
-    """`lanes` (a tile per work-item, vectors across pixels) or `group` (a work-group per tile)."""
+    """`lanes` (CPUs: a work-item renders a tile, in vectors of pixels) or `group` (GPUs: a work-group renders
+    a tile)"""
     lists: str
-    """`ordered` (sort the splats by depth, then list them per tile in that order), `tiled` (list them per
-    tile, then sort each list) or `local` (as `tiled`, of many views of few tiles, and of stores)."""
+    """tile-binning strategy (tiling.py): `ordered` (sort the splats by depth, then append them to tile
+    lists), `tiled` (append to tile lists, then sort each list) or `local` (like `tiled`, with counters in
+    local memory, for many small views and for stores)"""
     lanes: int
     tile_width: int
     tile_height: int
     chunks: int
-    """pieces of the counting sorts (`ordered`)"""
+    """number of pieces of the counting sorts (`ordered`)"""
     radix_bits: int
-    """of the depth sort (`ordered`)"""
+    """bits per pass of the depth sort (`ordered`)"""
     scan_items: int
     fast_fma: bool
     k_buffer_size: int
-    """fragments of a pixel that are sorted by depth at once (k-buffer), at most 254, or 31 in `group`"""
+    """size of the k-buffer: fragments of a pixel that are sorted by depth at once; at most 254, or 31 in
+    `group`"""
     rows: int = 2
-    """pixels of a column that a work-item blends (`group`)"""
+    """pixels that a work-item blends, one below the other (`group`)"""
     tape: int = 1024
     """capacity of the tape (`lanes`): splats of a tile whose fragments the forward pass stores for the
     backward pass, 2 KiB each for each core; longer lists are evaluated twice"""
     dialect: str = ""
-    """a file of kernels/opencl/dialect/ with instructions of a vendor; without one kernels are portable, with
-    the same bits"""
+    """file of kernels/opencl/dialect/ with a vendor's instructions; empty: portable, bit-identical kernels"""
 
     @property
     def pair_bytes(self) -> int:
@@ -60,20 +62,20 @@ def gpu_shape(scan_items: int = 1024, fast_fma: bool = True, dialect: str = "") 
 def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
     """`shape` with the tiles and the schedule that these features require."""
     if "blend_double" in features.slots and shape.schedule == "lanes":
-        # float64 is not vectorised
+        # float64 kernels are not vectorised
         shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
     if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.slots):
-        # the k-buffer takes the registers of a second pixel
+        # the k-buffer needs the registers of a second pixel
         shape = replace(shape, rows=1)
     return shape
 
 
 def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
-    """Other build constants, by name, for tests: `Backend.shapes`."""
+    """Alternative build constants by name, for tests (`Backend.shapes`)."""
     if kind == "schedule":
         return {"groups": _groups(own, 16 if own.schedule == "lanes" else 8)}
     if kind == "k_buffer":
-        # fewer fragments than groups keep in registers, and a little more
+        # a little more than the fragments that groups keep in registers
         few = replace(_groups(own, 8), k_buffer_size=1), replace(_groups(own, 8), k_buffer_size=4)
         return {
             **{f"own, k-buffer of {size}": replace(own, k_buffer_size=size) for size in (1, 3)},
@@ -101,6 +103,6 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
 
 
 def _groups(own: DeviceShape, side: int) -> DeviceShape:
-    """The schedule of a GPU in tiles of side x side."""
+    """The schedule of a GPU with tiles of side x side pixels."""
     groups = replace(own, schedule="group", tile_width=side, tile_height=side)
     return replace(groups, lists="tiled", lanes=1, scan_items=64, k_buffer_size=8)

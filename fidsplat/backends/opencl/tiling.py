@@ -25,16 +25,16 @@ from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.util.errors import DeviceError
 
 LOCAL_TILES = 4096
-"""most tiles of a view that are counted in local memory (as in tile_lists_local.cl)"""
+"""maximum tiles of a view that are counted in local memory (as in tile_lists_local.cl)"""
 _GROUP_SPLATS = 4096
 """splats per work-group of the strategy `local`"""
 _ITEMS = 256
-"""BIN_ITEMS and SORT_ITEMS"""
+"""work-group size: BIN_ITEMS and SORT_ITEMS of the kernels"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
 class TileBand(NamedTuple):
-    """Tiles [first, end) that are listed together, and their pairs."""
+    """Tiles [first, end) that are listed together, and their number of pairs."""
 
     first: int
     end: int
@@ -42,7 +42,7 @@ class TileBand(NamedTuple):
 
 
 def allocate_tallies(frame: DeviceFrame, words: int, big: int = 0) -> None:
-    """Zeroed counters, and buffers for at least `big` big splats."""
+    """Allocate zeroed counters, and buffers for at least `big` big splats."""
     capacity = max(big * 5 // 4, frame.pool.size("big") // 4, MIN_BIG)
     frame.numbers["big_capacity"] = capacity
     frame.take("big", 4 * capacity)
@@ -55,13 +55,13 @@ def allocate_tallies(frame: DeviceFrame, words: int, big: int = 0) -> None:
 
 
 def project(frame: DeviceFrame, first: int, end: int) -> None:
-    """Records, sort keys and tile windows of splats [first, end)."""
+    """Project splats [first, end): write their records, sort keys and tile windows."""
     count, size = end - first, _splat_capacity(frame, end - first)
     frame.take("splats", size * frame.source.records["Splat"].itemsize)
     frame.take("keys", KEYS * size)
     windows = frame.take("windows", WINDOWS * size)
     if frame.view.band is not None and size:
-        # the kernel writes no window for splats outside the band: an empty window, of no big splat
+        # the kernel writes no window for splats outside the band, so windows are first set to empty
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOWS * size)
     if count:
         arrays = {name: frame.resident.part(name, first, end) for name in frame.source.cloud_arrays}
@@ -69,12 +69,12 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
 
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:
-    """Elements of buffers per splat and view; those of a complete cloud are reused by larger clouds."""
+    """Number of elements of a buffer with one per splat and view; for a complete cloud it is rounded up."""
     resident = frame.resident
     return frame.views * (resident.capacity if count == resident.count else count)
 
 
-# on CPUs: sort by depth, then list
+# on CPUs: sort by depth, then append to tile lists
 
 
 def sort_by_depth(frame: DeviceFrame, count: int) -> None:
@@ -96,18 +96,18 @@ def sort_by_depth(frame: DeviceFrame, count: int) -> None:
 
 
 def count_pairs(frame: DeviceFrame, count: int) -> Counts:
-    """Length of each tile's list; waits for the totals."""
+    """Count the length of each tile's list; waits for the totals."""
     views = frame.views
     table = frame.take("bin table", 4 * frame.tiles * frame.shape.chunks)
     frame.launch("bin", "bin_count", (frame.shape.chunks,), (1,), views, table=table, count=count)
-    # one list of all views' tiles: those of the second view follow those of the first
+    # tiles of all views are numbered consecutively, view after view
     frame.buffers.starts = _prefix_sums(frame, "bin", table, frame.tiles // views, PAIRS, 1)
     frame.counted_launches = len(frame.events)
     return Counts.of_tallies(frame.read("tallies", np.uint32, (views, TALLIES)))
 
 
 def sorted_bands(frame: DeviceFrame, first: int, end: int, pairs: int) -> Iterable[TileBand]:
-    """Tiles [first, end) in as many bands as the pair budget requires."""
+    """Split tiles [first, end) into as many bands as the pair budget requires."""
     budget = frame.workspace.pair_budget
     if pairs <= budget:
         return [TileBand(first, end, pairs)]
@@ -120,7 +120,7 @@ def tile_pairs(frame: DeviceFrame) -> np.ndarray:
 
 
 def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
-    """Write the lists of a band, from splats that are sorted."""
+    """Write the tile lists of a band, from sorted splats."""
     allocated, budget = frame.pool.size("lists") // 4, frame.workspace.pair_budget
     size = enlarged(band.pairs, budget) if 0 < allocated < band.pairs else band.pairs
     frame.take("lists", 4 * size)
@@ -132,8 +132,8 @@ def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
 def _prefix_sums(
     frame: DeviceFrame, stage: str, table: cl.Buffer, bins: int, slot: int, lists: int
 ) -> cl.Buffer:
-    """Turn the views' tables of counts into positions in `lists` lists, one for each view or one for all.
-    Returns the start of each bin (lists, all bins of the list + 1)."""
+    """Prefix sums over tables of counts. lists: 1 for a single list of all views, or the number of views.
+    Returns the start of each bin (lists, bins of a list + 1)."""
     views, items = frame.views, frame.shape.scan_items
     totals = frame.take(f"{stage} totals", 4 * bins * views)
     each = bins * views // lists
@@ -144,20 +144,20 @@ def _prefix_sums(
     return starts
 
 
-# on CPUs with a small memory budget: project in chunks, and store the visible splats only
+# on CPUs with a small memory budget: project in chunks, and store only the visible splats
 
 
 class Packed(NamedTuple):
     """Splats of a band of rows, projected in chunks."""
 
     count: int
-    """an estimate where it exceeds the capacity"""
+    """number of splats; an estimate if it exceeds the capacity"""
     visible: int
-    """of the complete frame, as far as chunks were projected"""
+    """counts of the complete frame over the chunks projected so far"""
 
 
 def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
-    """Project in chunks, and pack the visible splats of rows of tiles [top, end)."""
+    """Project in chunks, and pack the visible splats of tile rows [top, end)."""
     height, plan = frame.shape.tile_height, frame.plan
     frame.put_view(top * height, end * height)
     big = 0
@@ -176,7 +176,8 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> Packed:
 
 
 def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Packed, int]:
-    """The splats found, and the number of big ones; ends early where either exceeds its capacity."""
+    """Project and pack chunks until one of the capacities is exceeded; returns the splats and the number of
+    big splats."""
     count, chunk, chunks = frame.resident.count, frame.plan.chunk, frame.shape.chunks
     out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
     total = visible = 0
@@ -200,7 +201,7 @@ def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Pack
 
 
 def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple[int, int]]:
-    """Rows of tiles [top, end), which show `count` splats, in bands that fit the capacity if splats are
+    """Split tile rows [top, end) with `count` splats into bands that fit the capacity if the splats are
     spread evenly."""
     capacity = frame.plan.capacity
     if end - top == 1:
@@ -213,11 +214,11 @@ def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple
     return list(pairwise(cuts))
 
 
-# on GPUs: list, then sort each list
+# on GPUs: append to tile lists, then sort each list
 
 
 def pair_capacity(workspace: Workspace) -> int:
-    """Pairs that the buffers of the last frames hold."""
+    """Capacity in pairs of the buffers of the last frames."""
     pool = workspace.pool
     return min(pool.size("lists") // 4, pool.size("pairs") // 8, workspace.pair_budget)
 
@@ -233,7 +234,7 @@ def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
 
 
 def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
-    """Start of each tile's list; all lists are empty if there are more pairs than `capacity`."""
+    """Compute the start of each tile's list; all lists are empty if there are more pairs than `capacity`."""
     items = frame.shape.scan_items
     frame.take("starts", 4 * (frame.tiles + 1))
     frame.take("cursors", 4 * frame.tiles)
@@ -263,7 +264,7 @@ def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band:
 
 
 def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
-    """All tiles, in as many bands as the pair budget requires."""
+    """Split all tiles into as many bands as the pair budget requires."""
     budget = frame.workspace.pair_budget
     if pairs <= budget:
         return [TileBand(0, frame.tiles, pairs)]
@@ -281,5 +282,5 @@ def launch_local(frame: DeviceFrame, kernel: str, **given: Any) -> None:
 
 
 def _big_groups(frame: DeviceFrame) -> int:
-    """Work-groups that share the splats of many tiles."""
+    """Number of work-groups for the splats that touch many tiles."""
     return 4 * frame.workspace.device.max_compute_units

@@ -1,5 +1,4 @@
-"""Training kernels: loss, Adam, densification and noise on the device; no array of splats or pixels passes
-through the host."""
+"""Training kernels: loss, Adam, densification and noise on the device, without copies to the host."""
 
 from __future__ import annotations
 
@@ -23,24 +22,24 @@ from fidsplat.util.errors import DeviceError
 
 _GROUP = 64
 _MARGIN, _MARGIN_ROWS = 16, 5
-"""zeros around an image: floats of a row, and rows"""
+"""zero margin around an image: in floats of a row, and in rows"""
 _PANEL, _STRIP = 128, 64
-"""values of a row, and rows, of a work-item on CPUs (kernels/opencl/train/loss_strips.cl)"""
+"""values of a row and number of rows per work-item on CPUs (kernels/opencl/train/loss_strips.cl)"""
 _SUMS, _SUMMED = 512, 128
 """work-groups of the loss sums, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
 _EACH_ROWS = 4
-"""rows per work-item of its passes over columns (EACH_ROWS there)"""
+"""rows per work-item of the vertical passes (EACH_ROWS of kernels/opencl/train/loss.cl)"""
 _MOMENTS = ("first_", "second_")
-"""prefixes of Adam's moments"""
+"""name prefixes of Adam's moments"""
 _STEP_NUMBERS = (
     *("beta1", "beta2", "rest1", "rest2", "root", "epsilon", "scale_penalty", "opacity_penalty"),
     *(f"size_{name}" for name in ("means", "scales", "quats", "logits", "sh", "rest")),
 )
-"""numbers of a step of Adam (kernels/opencl/project_step.cl)"""
+"""numeric arguments of a step of Adam (kernels/opencl/project_step.cl)"""
 
 
 class _Target(NamedTuple):
-    """The image of a view on the device."""
+    """Ground truth of a view on the device."""
 
     image: cl.Buffer
     mask: cl.Buffer
@@ -54,7 +53,7 @@ Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
 
 
 class ResidentArrays(ResidentData):
-    """Splats in training as a cloud to render: disks without labels and coplanar groups."""
+    """Splats in training as a cloud to render; disks without labels and coplanar groups."""
 
     has_coplanar_groups, footprint, ellipsoids = False, "gaussian", "none"
     streamed = immutable = coherent = False
@@ -88,7 +87,7 @@ class ResidentArrays(ResidentData):
 class OpenCLTraining(TrainingKernels):
     """Training kernels of an OpenCL device."""
 
-    max_pending_losses = SLOTS // 2 - 1  # a frame that exceeds its capacity is compared twice
+    max_pending_losses = SLOTS // 2 - 1  # a frame that exceeds its capacity uses two slots
 
     def __init__(self, workspace: Workspace, lanes: int = 0) -> None:
         """lanes: vector width; 0 for the device's own."""
@@ -98,17 +97,17 @@ class OpenCLTraining(TrainingKernels):
         source = assemble_training(lanes, workspace.info.float64, workspace.shape.fast_fma)
         self._program = Program(workspace, source)
         self._commands = CommandList(self._program)
-        """of kernels that are not replayed"""
+        """command list of kernels that are not replayed"""
         self._bound: dict[str, Any] = {}
         """buffers and numbers of the splats by kernel argument"""
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._count = 0
         self._resident: tuple[int, ResidentArrays] | None = None
-        """SH degree and cloud"""
+        """SH degree of the last rendered cloud, and the cloud"""
         self._targets: list[_Target] = []
         self._loss_images: tuple[tuple[int, int], cl.Buffer] | None = None
         self._sums: dict[int, LossReadback] = {}
-        """by number of work-groups"""
+        """loss readback by number of work-groups"""
         self._version = object()
         """a new object whenever the buffers of the splats change"""
         self._replayed: dict[str, CommandList] = {}
@@ -279,13 +278,13 @@ class OpenCLTraining(TrainingKernels):
         self._step(taken, given | {"move": 1, "sparse": int(numbers["sparse"])}, camera, origin)
 
     def _step(self, taken: Any, given: Mapping[str, Any], camera: Camera | None, origin: np.ndarray) -> None:
-        taken.compile_step()  # takes seconds once; an interrupt there leaves the statistics unchanged
+        taken.compile_step()  # takes seconds; first, so that an interrupt leaves the statistics unchanged
         if camera is not None:
             self._count_visible(camera, origin)
         taken.step({**self._bound, **given, "counted": int(camera is not None)})
 
     def _count_visible(self, camera: Camera, origin: np.ndarray) -> None:
-        """Count the visible splats before the step."""
+        """Add the visible splats to `visible_counts`."""
         if (cached := self._cameras.get(camera)) is None or cached[0] is not origin:
             cached = self._cameras[camera] = origin, _camera_arguments(camera, origin)
         given = cached[1]
@@ -299,7 +298,7 @@ class OpenCLTraining(TrainingKernels):
 
     @property
     def _queue(self) -> cl.CommandQueue:
-        """The queue of frames with derivatives, after all work on other queues."""
+        """The queue of differentiable frames, ordered after all work on other queues."""
         return self._workspace.switch_to(self._workspace.queue)
 
     def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
@@ -317,7 +316,7 @@ class OpenCLTraining(TrainingKernels):
     def _one(
         self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
     ) -> Launch:
-        """A launch with the given arguments, and those of the splats."""
+        """A launch with given arguments and the arrays of the splats."""
         every = {**self._bound, "count": self._count, **given}
         return kernel, size, group, [every[one.name] for one in self._program.source.arguments[kernel]]
 
@@ -335,7 +334,7 @@ class OpenCLTraining(TrainingKernels):
     ) -> list[cl.Event]:
         """Replay a command list of a training step, with the arguments `given`; record it again if necessary.
 
-        launches: called to record the launches if the key, the splats or the buffers have changed.
+        launches: returns the launches; called if the key, the splats or the buffers have changed.
         """
         commands = self._replayed.setdefault(name, CommandList(self._program))
         key = (*key, self._version, self._workspace.pool.state)
@@ -370,11 +369,11 @@ class OpenCLTraining(TrainingKernels):
         return -(-3 * columns // self._lanes) * self._lanes + 2 * _MARGIN
 
     def _allocate_images(self, height: int, columns: int) -> cl.Buffer:
-        """Images of the loss for frames of this size, zero-filled: kernels leave the margins zeroed."""
+        """Zero-filled images of the loss for frames of this size; kernels leave the margins zero."""
         if self._loss_images is not None and self._loss_images[0] == (height, columns):
             return self._loss_images[1]
         size = 4 * (11 if self._lanes == 1 else 3) * self._stride(columns) * (height + 2 * _MARGIN_ROWS)
-        self._loss_images = None  # release the old ones first
+        self._loss_images = None  # release the old images first
         buffer = self._workspace.pool.fresh("the loss's images", size)
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
         self._loss_images = (height, columns), buffer

@@ -27,7 +27,7 @@ def read_uint8(
     """
     into, count = workspace.host_memory.empty(shape, np.uint8), math.prod(shape)
     queue, name = workspace.read_queue, "8 bits of an image"
-    with workspace.lock:  # arguments belong to one image at a time
+    with workspace.lock:  # the kernel's arguments are shared by all images
         kernel, values = _kernel(workspace)
         made = workspace.pool.lease(name, count)
         items = -(-count // (values * _GROUP)) * _GROUP

@@ -1,5 +1,4 @@
-"""Uniforms of views: the records `View` and other arrays, and the numbers that are kernel arguments of their
-own."""
+"""Uniforms of views for the kernels: the records `View`, other arrays, and scalar arguments."""
 
 from __future__ import annotations
 
@@ -13,8 +12,7 @@ from fidsplat.backends.view import View
 
 
 def scalars_of(view: View) -> dict[str, float]:
-    """Numbers of a view that are kernel arguments of their own in every program, by the names of the
-    arguments."""
+    """Scalar kernel arguments that every program has, by name."""
     red, green, blue = view.background
     return {
         **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
@@ -24,7 +22,7 @@ def scalars_of(view: View) -> dict[str, float]:
 
 
 def numbers_of(view: View, source: Source) -> dict[str, Any]:
-    """All numbers of a view that are arguments of the kernels, by the names of the arguments."""
+    """All scalar kernel arguments of a view, by name."""
     numbers: dict[str, Any] = scalars_of(view)
     for group, names in source.uniform_groups.items():
         values = view.uniform(group)
@@ -34,8 +32,8 @@ def numbers_of(view: View, source: Source) -> dict[str, Any]:
 
 
 def projection_arrays(views: ViewBatch, source: Source, row: int, end: int) -> dict[str, np.ndarray]:
-    """Arrays of views that kernels of the projection read, for rows of samples [row, end), by the names of
-    the arguments. They are read-only: `BufferPool.put` copies such an array once."""
+    """Array arguments of the projection kernels by name, for rows of samples [row, end). They are read-only,
+    so that `BufferPool.put` copies each only once."""
     view = views.view
     if view.band is not None:
         row, end = max(row, view.band[0]), min(end, view.band[1])
@@ -48,8 +46,7 @@ def projection_arrays(views: ViewBatch, source: Source, row: int, end: int) -> d
 
 
 def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.ndarray:
-    """(moving groups + 1, views) of the record `View` (layout.py) for rows of samples [row, end); the numbers
-    of a single view are in one row."""
+    """Records `View` (layout.py), (moving groups + 1, views), for rows of samples [row, end)."""
     real = record[0].base  # all members have one type
     if len(views) == 1:
         numbers = _numbers(views.view, row, end, record)
@@ -67,7 +64,7 @@ def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.n
 
 
 def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
-    """The members of the record `View` of one view, in their order."""
+    """The members of the record `View` of one view, in order."""
     values: dict[str, Any] = {
         **{"rotation": view.rotation.ravel().tolist(), "translation": view.translation.tolist()},
         **{"eye": view.eye.tolist(), "focal_x": view.focal_x, "focal_y": view.focal_y},
@@ -75,7 +72,7 @@ def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
         **{"log_cut": view.log_cut, "width": view.width, "height": view.height},
         **{"filter": 1.0 / view.samples**2, "band": row, "band_end": end, "slopes": view.slopes},
     }
-    # the members of a lens and its map follow those of every view
+    # members of a lens and its map follow the common members
     lens = iter(() if view.raster is None else view.raster.uniforms)
     flat: list[float] = []
     for name in record.names or ():

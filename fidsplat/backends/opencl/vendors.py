@@ -1,8 +1,7 @@
-"""Registration of Intel's OpenCL runtime for CPUs, installed by pip, with the OpenCL loader; what it leaves
-unreported.
+"""Registration of Intel's OpenCL CPU runtime from pip with the OpenCL loader, and detection of CPU features.
 
-The packages intel-opencl-rt and intel-cmplr-lib-rt contain the libraries, but no file in /etc/OpenCL/vendors
-that names them, and the loader does not find their dependencies.
+The packages intel-opencl-rt and intel-cmplr-lib-rt contain the libraries but do not register them in
+/etc/OpenCL/vendors, and the loader does not find their dependencies.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _NEEDED = ("libintlc.so.5", "libimf.so", "libirng.so", "libsvml.so")
 
 
 def intel_library() -> Path | None:
-    """Intel's runtime as installed by pip; None if it or intel-cmplr-lib-rt is missing."""
+    """Path of Intel's runtime from pip; None if it or intel-cmplr-lib-rt is missing."""
     try:
         files = metadata.files("intel-opencl-rt") or ()
     except metadata.PackageNotFoundError:
@@ -50,8 +49,8 @@ def processor_flags() -> frozenset[str]:
 
 @contextmanager
 def intel_registered() -> Iterator[None]:
-    """A context in which the loader finds this runtime in addition to those of the system when it first
-    lists platforms. A folder that the user has set is not replaced."""
+    """A context in which the loader, when it first lists platforms, finds Intel's runtime in addition to
+    those of the system. A vendors folder set by the user is not replaced."""
     library = None if _VENDORS in os.environ else intel_library()
     if library is None:
         yield
@@ -60,7 +59,7 @@ def intel_registered() -> Iterator[None]:
         for known in _SYSTEM.glob("*.icd"):
             shutil.copy(known, folder)
         (Path(folder) / "fidsplat-intel-cpu.icd").write_text(f"{library}\n", "utf-8")
-        with suppress(OSError):  # libraries for another system: the loader skips them
+        with suppress(OSError):  # libraries for another system; the loader skips them
             for name in _NEEDED:
                 ctypes.CDLL(str(library.parent / name), ctypes.RTLD_GLOBAL)
         os.environ[_VENDORS] = folder

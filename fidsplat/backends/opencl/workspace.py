@@ -18,7 +18,7 @@ from fidsplat.util.errors import DeviceError
 
 
 class Workspace:
-    """An open device: its queues and buffers."""
+    """State of an open device: queues, buffers, memory budget and lock."""
 
     compiler_options: list[str]
     """of all programs"""
@@ -28,23 +28,23 @@ class Workspace:
         self.context = shared_context(device) if is_pocl(device) else cl.Context([device])
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.side_queue = cl.CommandQueue(self.context)
-        """for counts that the host reads while the stages run"""
+        """queue for counts that the host reads while the stages run"""
         self.read_queue = cl.CommandQueue(self.context)
-        """for images that the host reads while the next frame is rendered"""
+        """queue for images that the host reads while the next frame is rendered"""
         self.replay_queue = cl.CommandQueue(self.context)
-        """for replayed frames: without profiling, a launch takes the host a third less time"""
+        """queue for replayed frames, without profiling: a launch takes the host a third less time"""
         self._last, self._idle = self.queue, True
         self.frames = 0
-        """frames that were begun: each overwrites the scratch buffers of the last"""
+        """number of frames started; each overwrites the scratch buffers of the previous one"""
         self.lock = threading.RLock()
-        """held while a frame is submitted: scratch buffers and kernel arguments belong to one at a time"""
+        """lock held while a frame is submitted, as frames share scratch buffers and kernel arguments"""
         self.pool = BufferPool(self.context, device)
         self.host_memory = HostMemory(self.context, device)
         self.ray_buffers = RayBuffers(self.pool, self.queue)
         self.limit_memory(info.memory_bytes * 9 // 10)
 
     def switch_to(self, queue: cl.CommandQueue) -> cl.CommandQueue:
-        """Order what is submitted to this queue from now on after all that was submitted to another."""
+        """Make later work on this queue wait for all work submitted to other queues."""
         if queue is not self._last:
             if not self._idle:
                 before = cl.enqueue_marker(self._last)
@@ -61,8 +61,8 @@ class Workspace:
 
     @contextmanager
     def rendering(self) -> Iterator[None]:
-        """Use the device exclusively. After a failure the device is idle, since a CPU may be reading the
-        arrays of a cloud that is released.
+        """A context with exclusive use of the device. After a failure it waits until the device is idle,
+        since a CPU may still be reading a cloud's arrays.
 
         Raises:
             DeviceError: the device fails.
@@ -81,7 +81,8 @@ class Workspace:
 
     @contextmanager
     def failing(self, what: str) -> Iterator[None]:
-        """Raise the device's failures as DeviceError. what: the activity, `rendering rgb` say."""
+        """A context that raises the device's failures as DeviceError. what: the activity, such as `rendering
+        rgb`."""
         try:
             yield
         except cl.Error as error:
@@ -90,7 +91,7 @@ class Workspace:
     def limit_memory(self, budget: int) -> None:
         """Limit a frame and its cloud to `budget` bytes of the device (memory_plan.py)."""
         self.memory_budget, self.largest_buffer = budget, self.device.max_mem_alloc_size
-        """bytes of a frame and its cloud, and of one buffer"""
+        """maximum bytes of a frame with its cloud, and of one buffer"""
         largest = self.largest_buffer // 8
         self.pair_budget = max(1, min(largest, budget // 8 // self.shape.pair_bytes, 2**32 - 1))
-        """most pairs of splats and tiles that are listed at once"""
+        """maximum number of pairs of a splat and a tile in the lists at once"""

@@ -24,14 +24,16 @@ from fidsplat.splats.harmonics import color_range
 from fidsplat.util import interrupts
 from fidsplat.util.errors import UnknownDeviceError
 
-_BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once: half a megabyte each, which caches hold
+_BLOCK = (
+    1 << 16
+)  # (sample, splat) pairs that are evaluated at once: arrays of half a megabyte, which fit the cache
 _TILE = 16  # samples along a side of a tile, for which splats are culled together
-_WIDEST = 128  # the same, at most, of samples that are far apart
-_FEW = 16  # samples: tiles with fewer are widened, since culling takes longer than more splats
+_WIDEST = 128  # maximum side of a tile, for samples that are far apart
+_FEW = 16  # tiles with fewer samples are widened: culling once more would take longer than extra splats
 
 
 def devices() -> list[DeviceInfo]:
-    """The one reference device: this machine's NumPy."""
+    """List the reference device: NumPy on this machine."""
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
     return [
         DeviceInfo(
@@ -52,18 +54,20 @@ def devices() -> list[DeviceInfo]:
 
 
 def open_device(selector: str = "") -> ReferenceBackend:
-    """The reference; it has no variants.
+    """Open the reference device; it has no variants.
 
     Raises:
         UnknownDeviceError: a selector was given.
     """
     if selector:
-        raise UnknownDeviceError(f"the reference has no device {selector!r}; its name is just 'reference'")
+        raise UnknownDeviceError(
+            f"device must be 'reference', got 'reference:{selector}'; it has no variants"
+        )
     return ReferenceBackend()
 
 
 class ReferenceBackend(Backend):
-    """NumPy in float64."""
+    """The reference device: NumPy in float64."""
 
     traits = DeviceTraits(differentiates=True)
 
@@ -71,7 +75,7 @@ class ReferenceBackend(Backend):
         self.info = devices()[0]
 
     def upload(self, cloud: SplatCloud) -> ReferenceCloud:
-        """The cloud itself."""
+        """Wrap the cloud; nothing is copied."""
         return ReferenceCloud(cloud)
 
     def pipeline(self, features: FeatureSet, shape: None = None) -> ReferencePipeline:
@@ -102,7 +106,7 @@ class ReferenceCloud(ResidentData):
         self.cloud = cloud
         self.count = len(cloud)
         self.origin = cloud.origin
-        self.memory_bytes = 0  # it reads the cloud's own arrays
+        self.memory_bytes = 0  # nothing is copied to a device
         self.sh_degree = cloud.sh_degree
         self.has_coplanar_groups = cloud.coplanar_groups is not None
         self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
@@ -156,8 +160,8 @@ class ReferencePipeline(Pipeline):
         columns: np.ndarray,
         widest: int = _WIDEST,
     ) -> dict[str, np.ndarray]:
-        """Outputs at pixels (row, column), each (k,) or (k, 3) float64, and `certificate` (k,). widest:
-        maximum samples along a side of a tile, for which splats are culled together."""
+        """Render single pixels (row, column): outputs (k,) or (k, 3) float64, and `certificate` (k,). widest:
+        maximum side in samples of a tile, for which splats are culled together."""
         n = view.samples
         sub_rows, sub_columns = np.mgrid[0:n, 0:n]
         y = (np.asarray(rows)[:, None] * n + sub_rows.ravel() + 0.5).ravel()
@@ -190,8 +194,8 @@ class ReferencePipeline(Pipeline):
     def _exposed(
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
-        """The samples of several sub-frames: the mean of colours, fog and transmittances, all else from
-        the middle one; `certificate_middle` is that one's certificate."""
+        """Combine the samples of several sub-frames: colour, fog and transmittance are averaged, other
+        outputs are from the middle sub-frame; `certificate_middle` is its certificate."""
         out: dict[str, np.ndarray] = {}
         rows_of = [
             (y > sub_frame.top) & (y < sub_frame.top + sub_frame.view.height) for sub_frame in view.sub_frames
@@ -210,8 +214,8 @@ class ReferencePipeline(Pipeline):
 
 
 def _by_tile(view: View, x: np.ndarray, y: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of samples (k,) tile by tile, and the start of each tile but the first. Samples that are far
-    apart have wider tiles, up to `widest` along a side."""
+    """Sort samples by tile: their indices (k,), and the start of each tile except the first. Tiles are wider,
+    up to `widest` samples a side, where samples are far apart."""
     side = _TILE
     while True:
         tile = y // side * view.width + x // side
@@ -224,7 +228,7 @@ def _by_tile(view: View, x: np.ndarray, y: np.ndarray, widest: int) -> tuple[np.
 
 @dataclass
 class _Progress:
-    """Number of rendered samples of a frame, and its progress callback."""
+    """Counter of a frame's rendered samples that calls the progress callback."""
 
     callback: Callable[[float], object] | None = None
     total: int = 1

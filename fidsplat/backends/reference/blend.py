@@ -1,4 +1,4 @@
-"""Blending: compositing of fragments and layers, with all decisions of the devices."""
+"""Blending: compositing of fragments and coplanar layers, with the same decisions as on devices."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
 INVERSE_DEPTH = 0.2 * 100 / (100 - 0.2)
-"""metres, by which inverse depths are multiplied for the depth distortion"""
+"""metres: factor on inverse depths in the depth distortion"""
 SPREAD_NEAR = 0.2
 """metres: minimum depth for the depth distortion"""
 _SURE = 5e-5
-"""relative error of a depth that is still compared: half of the tolerance"""
+"""relative error of a depth up to which it is compared with a device: half of the tolerance"""
 
 
 def composite(
     s: Setup, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Blend all splats at samples (k,) with grid positions x, y; the sample buffers before resolving."""
+    """Blend all splats at samples (k,) with grid positions x, y; returns the sample buffers."""
     f = fragments_of(s, view, x, y)
     span = error_bounds.span_of(s, view, f)
     surface = None if view.external_depth is None else surface_at(view.external_depth, view, x, y)
@@ -102,8 +102,8 @@ def composite(
 
 
 def inverse_depth(z: np.ndarray) -> np.ndarray:
-    """1 / z in the units of the depth distortion, those of a depth buffer from 0.2 to 100 m as in 2DGS;
-    nearer depths count as the near plane of that buffer."""
+    """Inverse depth in the units of the depth distortion: a depth buffer from 0.2 to 100 m, as in 2DGS;
+    smaller depths are clamped to 0.2 m."""
     return INVERSE_DEPTH / np.maximum(z, SPREAD_NEAR)
 
 
@@ -115,7 +115,7 @@ def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
 def transmittance(
     alpha: np.ndarray, stop: float, exclusive: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transmittance in front of each fragment, whether it contributes, and the transmittance at the end."""
+    """Transmittance in front of each fragment, whether it contributes, and the final transmittance."""
     after = np.cumprod(1 - alpha, axis=1)
     before = shifted(after)
     live = before > stop

@@ -1,7 +1,7 @@
-"""Culling of splats for a block of samples, by interval arithmetic over their forms.
+"""Culling of splats for a block of samples, by interval arithmetic over the samples' coordinates.
 
-A culled splat has an opacity of exactly 0 at each of the samples, for all roundings to float32, so the result
-does not change. Bounds of footprints are not used: an error in those of a device shows in a comparison.
+A culled splat has an opacity of exactly 0 at each of the samples, however float32 rounds, so the result does
+not change. The bounding boxes of devices are not used, so a comparison finds errors in them.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 
 _SPARE = 1.001
-"""relative: rounding of the intervals themselves in float64 is far less"""
+"""relative padding of intervals; far more than their rounding in float64"""
 
 
 def may_contribute(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether each splat, (n,) bool, may contribute to any of the samples (k,) at grid positions x, y.
 
-    The first splat of a visible coplanar group is included: it determines the position of the layer.
+    The first splat of a visible coplanar group is always kept: it determines the layer's position in the
+    order.
     """
     samples = samples_of(view, x, y)
     if not samples.valid.any():
@@ -44,13 +45,13 @@ def may_contribute(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.nda
     for form in (s.forms[:, :, 0], s.forms[:, :, 1]):
         error = rounding(form)
         q_low += np.maximum(np.abs(middle @ form) - half @ np.abs(form) - error, 0) ** 2
-        # an edge of a box is visible half a sample beyond it, and the gradient's terms are rounded
+        # the edge of a box is antialiased over half a sample outwards, and the gradient's terms are rounded
         off = d_error + 1.5 * error + 2 * ROUND * (reach @ (np.abs(d) + np.abs(form)))
         for side in (d + form, d - form):
             meets &= middle @ side + (half + reach) @ np.abs(side) + _SPARE * off > 0
     r2 = 2 * (s.half_r2 + slack) * _SPARE
     with np.errstate(divide="ignore", invalid="ignore"):
-        # of a 3D Gaussian rho falls by 1 + rho / m^2: below r2 everywhere, if m^2 is
+        # for a 3D Gaussian rho is divided by 1 + rho / m^2: below r2 everywhere if m^2 is
         r2_of_disk = np.where(s.inverse_m2 * r2 < 1, r2 / (1 - s.inverse_m2 * r2), np.inf)
         contributing = (d_high > 0) & np.where(s.box, meets, q_low <= d_high**2 * r2_of_disk)
     if s.screen:
@@ -67,12 +68,12 @@ def _ends(at: np.ndarray) -> np.ndarray:
 
 
 def _outside(at: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Distance of centres (n,) from the range of positions."""
+    """Distance of centres (n,) from an interval of positions; 0 inside."""
     return np.maximum(np.maximum(at.min() - center, center - at.max()), 0)
 
 
 def _steps(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Upper bound of the change of coordinates (3,) per sample in any direction."""
+    """Upper bound of the change of each coordinate (3,) from a sample to its neighbours."""
     if view.raster is None:
         return np.array([0.0, 1.0, 1.0])
     slopes = np.nan_to_num(view.raster.slopes[y.astype(int), x.astype(int)].astype(np.float64))

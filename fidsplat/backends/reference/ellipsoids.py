@@ -1,7 +1,7 @@
 """3D Gaussians as disks with the same image (docs/primitives.md).
 
-`exact`: with W the map that makes the covariance the unit matrix, the disk through the centre p that is
-perpendicular to W p there. A ray's minimum squared distance is rho / (1 + rho / |W p|^2) of that disk's rho.
+`exact`: W maps the covariance to the unit matrix. In that space the disk goes through the centre p,
+perpendicular to W p. The minimum squared distance of a ray is rho / (1 + rho / |W p|^2) for the disk's rho.
 `ewa`: a disk that faces the camera, whose image has the covariance of 3DGS.
 """
 
@@ -13,9 +13,9 @@ import numpy as np
 
 from fidsplat.backends.view import View
 
-_ROUND = 1e-15  # of a direction in float64
+_ROUND = 1e-15  # rounding error of a direction in float64
 EWA_SPREAD = 0.3
-"""square pixels, by which 3DGS widens the covariance of every image"""
+"""square pixels: low-pass variance that 3DGS adds to every projected covariance"""
 
 
 @dataclass
@@ -23,23 +23,23 @@ class Axes:
     """Disks in the camera frame, (n, 3) or (n,)."""
 
     a: np.ndarray
-    """scaled tangents, as b"""
+    """scaled tangent"""
     b: np.ndarray
     normal: np.ndarray
     """unit"""
     surface: np.ndarray
-    """unit normal (n, 3) of the visible surface; that of the disk except with `ewa`"""
+    """unit normal (n, 3) of the visible surface"""
     area: np.ndarray
     """|a x b|"""
     third: np.ndarray
-    """half axis of the ellipsoid that is conjugate to a and b; 0 of disks"""
+    """half axis of the ellipsoid conjugate to a and b; 0 for disks"""
     inverse_m2: np.ndarray
-    """1 / |W p|^2; 0 of disks"""
+    """1 / |W p|^2; 0 for disks"""
     faint: np.ndarray
-    """term that is added to the logarithm of the opacity"""
+    """term added to the logarithm of the opacity"""
     turned: np.ndarray
-    """error bound of the normal: that of a flat ellipsoid turns by a right angle within the square of its
-    flatness of edge-on"""
+    """error bound of the normal; large for flat ellipsoids near edge-on, whose surface normal turns by a
+    right angle within a small change of direction"""
 
 
 def disks(unit_a: np.ndarray, unit_b: np.ndarray, scale: np.ndarray) -> Axes:
@@ -59,7 +59,7 @@ def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Ax
     m = np.linalg.norm(white, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         e3 = white / m[:, None]
-        # perpendicular to the longest axis, so that none of it is in there
+        # perpendicular to the longest axis, to avoid cancellation
         e2 = np.cross(e3, np.eye(3)[np.argmax(scales, axis=1)])
         length = np.linalg.norm(e2, axis=1)
         e2 = np.where((length > 0)[:, None], e2 / length[:, None], np.roll(e3, 1, axis=1))
@@ -75,8 +75,8 @@ def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Ax
 def _surface_normals(
     axes: np.ndarray, scales: np.ndarray, towards: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (n, 3) of the surfaces of the largest values along rays, at the centres: along the inverse
-    covariance times the ray, as in RaDe-GS and GOF; and the angle by which rounding may turn them."""
+    """Unit normals (n, 3) as in RaDe-GS and GOF: the direction of the inverse covariance times the ray
+    through the centre; and the angle by which rounding may turn them."""
     shares = (scales.min(axis=1)[:, None] / scales) ** 2
     normal = np.einsum("nk,nkc->nc", np.einsum("nkc,nc->nk", axes, towards) * shares, axes)
     length = np.linalg.norm(normal, axis=1)

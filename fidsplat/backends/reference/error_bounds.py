@@ -1,10 +1,10 @@
 """Error bounds (certificates) of the reference's outputs for rendering in float32.
 
 A device evaluates the affine forms n_u, n_v, D of a pixel in float32, about the pixel nearest to the splat's
-centre. Interval arithmetic over their rounding gives for each fragment the lowest and the highest opacity
-that it may have: far apart where a decision is at its threshold (a rim, the near plane, the
-horizon) or where the splat is thinner than the rounding of its distance (needles, grazing disks). A pixel's
-certificate adds up what that can change in it, to first order.
+centre. Interval arithmetic over their rounding gives the lowest and the highest opacity of each fragment.
+They are far apart where a value is near a threshold (the cut-off, the near plane, the horizon) or where the
+splat is thinner than the rounding error of its distance (needles, disks seen edge-on). The certificate of a
+pixel adds up the possible changes of its fragments, to first order.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 
 _ROUND = ROUND
-_WEIGHT = 2 * _ROUND  # relative, of half rho and of an opacity: a division, two products, exp
-_DEPTH = _ROUND  # relative, of a depth in addition to its denominator's: numerator, a division, a product
+_WEIGHT = 2 * _ROUND  # relative error of half rho and of an opacity: a division, two products, exp
+_DEPTH = _ROUND  # relative error of a depth in addition to its denominator's: numerator, division, product
 STOP = 5e-5
-"""relative, of a transmittance at a threshold"""
+"""relative error of a transmittance that is compared with a threshold"""
 
 
 @dataclass
 class Span:
-    """Intervals of fragments or layers (k, n)."""
+    """Intervals of the values that fragments or layers (k, n) may have in float32."""
 
     low: np.ndarray
     """opacity"""
@@ -41,18 +41,19 @@ class Span:
 
     @classmethod
     def of(cls, low: np.ndarray, high: np.ndarray, z_low: np.ndarray, z_high: np.ndarray) -> Span:
-        """Intervals in compositing order, with the transmittances that follow."""
+        """Intervals of opacities and depths in compositing order, and of the transmittances that they
+        imply."""
         fronts = shifted(np.cumprod(1 - high, axis=1)), shifted(np.cumprod(1 - low, axis=1))
         return cls(low, high, z_low, z_high, *fronts)
 
 
 def span_of(s: Setup, view: View, f: Fragments) -> Span:
-    """The span of fragments whose forms are computed in float32."""
+    """Intervals of fragments that are computed in float32."""
     terms = [s.forms[:, :, c] for c in range(3)]
     e_u, e_v, e_d = (
         _rounding(s, f, form, term) for form, term in zip((f.n_u, f.n_v, f.d), terms, strict=True)
     )
-    # one rounding where it is the splat's; a form of its own for parallel rays
+    # the numerator of a depth has one rounding; with parallel rays it is a form with its own rounding
     e_dz = _ROUND * f.dz if s.depth_forms is None else _rounding(s, f, f.dz, s.depth_forms)
     d_low, d_high = f.d - e_d, f.d + e_d
     q_low = np.maximum(np.abs(f.n_u) - e_u, 0) ** 2 + np.maximum(np.abs(f.n_v) - e_v, 0) ** 2
@@ -70,7 +71,7 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
             d_low = np.where(thick & ahead, d_low + lowest, d_low)
             q_low = np.where(thick, 2 * nearest * np.maximum(d_low, 0) ** 2, q_low)
             q_high = np.where(thick, 2 * furthest * d_high**2, q_high)
-            weight = np.where(thick, 2 * _WEIGHT, _WEIGHT)  # twice the roundings
+            weight = np.where(thick, 2 * _WEIGHT, _WEIGHT)  # 3D Gaussians have twice the roundings
         may = (d_high > 0) & (d_low * view.near <= f.dz + e_dz)
         must = (d_low > 0) & (d_high * view.near <= f.dz - e_dz)
         plane = nearest, furthest
@@ -88,8 +89,8 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     high = np.exp(s.log_opacity - nearest * (1 - weight)) * (1 + weight)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
     if s.box.any():
-        # of an edge's distance: its two forms', one of them multiplied once more, the sum's, and near it the
-        # gradient's
+        # rounding errors of the distance to an edge: two forms, a product, a sum, and the gradient near the
+        # edge
         off = np.stack(
             [
                 (e_d + 1.5 * e) * edge + _ROUND * terms
@@ -103,7 +104,8 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         high = np.where(s.box, np.where(may, highest, 0.0), high)
     z_low = np.where(d_low > 0, z_low, -np.inf)
     if s.screen:
-        # outside of the circle; both depths where rounding decides: they are equal on the circle
+        # depths outside the circle are mirrored; where rounding decides, the interval has both (equal on the
+        # circle)
         circle = np.maximum(disc_low, HALF_RHO_OF_RANGE), np.maximum(disc_high, HALF_RHO_OF_RANGE)
         beyond = _of_mirrored_depth(s, (d_low, d_high), (q_low, q_high), (near_dz, far_dz), circle)
         may_plane = s.coplanar | (plane[0] * (1 - weight) <= circle[1] * (1 + weight))
@@ -111,12 +113,12 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         z_low = np.minimum(np.where(may_plane, z_low, np.inf), np.where(may_beyond, beyond[0], np.inf))
         z_high = np.maximum(np.where(may_plane, z_high, -np.inf), np.where(may_beyond, beyond[1], -np.inf))
     z_low, z_high = np.clip(z_low, s.z_low, s.z_high), np.clip(z_high, s.z_low, s.z_high)
-    # no ray to the plane beyond `near`: the centre's depth, of dots
+    # if a ray does not meet the plane beyond `near`, the fragment has the depth of the centre
     missed = ~must & s.disc
     z_low = np.where(missed, np.where(may, np.minimum(z_low, s.pz), s.pz), z_low)
     z_high = np.where(missed, np.where(may, np.maximum(z_high, s.pz), s.pz), z_high)
-    # the ends of the depth range are a sum and a difference of float32; of a disk that faces the camera
-    # exactly they are its one depth
+    # the ends of the depth range are a sum and a difference in float32; a disk that faces the camera exactly
+    # has only one depth
     off = np.where(s.z_high > s.z_low, 2.0**-23 * (np.abs(s.z_low) + np.abs(s.z_high)), 0.0)
     z_low = np.where(z_low <= s.z_low, z_low - off, z_low)
     z_high = np.where(z_high >= s.z_high, z_high + off, z_high)
@@ -124,24 +126,24 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
 
 
 _Pair = tuple[np.ndarray, np.ndarray]
-"""lowest and highest, (k, n) or (n,)"""
+"""lowest and highest value, (k, n) or (n,)"""
 
 
 def _of_mirrored_depth(s: Setup, d: _Pair, q: _Pair, dz: _Pair, circle: _Pair) -> _Pair:
-    """Interval of depths (k, n) that are mirrored at a circle of half a rho, pz + circle (dz - pz d) 2 d / q,
-    from the intervals of its factors."""
+    """Interval of mirrored depths pz + circle (dz - pz d) 2 d / q (k, n), from the intervals of the factors.
+    circle: half of the rho at which depths are mirrored."""
     d = np.maximum(d[0], 0.0), np.maximum(d[1], 0.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         beyond = dz[0] - np.maximum(s.pz * d[0], s.pz * d[1]), dz[1] - np.minimum(s.pz * d[0], s.pz * d[1])
         lowest, highest = 2 * circle[0] * d[0] / q[1], 2 * circle[1] * d[1] / q[0]
         low = s.pz + np.where(beyond[0] < 0, beyond[0] * highest, beyond[0] * lowest)
         high = s.pz + np.where(beyond[1] > 0, beyond[1] * highest, beyond[1] * lowest)
-    off = 2 * _ROUND * np.abs(s.pz)  # of a difference that is multiplied by a share
+    off = 2 * _ROUND * np.abs(s.pz)  # error of the difference that is multiplied by a share
     return np.where(np.isnan(low), -np.inf, low - off), np.where(np.isnan(high), np.inf, high + off)
 
 
 def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Rounding error bounds (k, n) of forms (k, n) with factors (3, n)."""
+    """Rounding error bounds (k, n) of affine forms (k, n) with factors (3, n)."""
     total = np.abs(form)
     for away, term in zip(f.away, terms, strict=True):
         total = total + away * np.abs(term)
@@ -155,9 +157,9 @@ def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.nda
     t_low = span.front_low * (1 - span.high) * (1 - STOP)
     t_high = span.front_high * (1 - span.low) * (1 + STOP)
     may_stop = (span.high > 0) & (t_low <= view.stop) & (t_high >= view.stop)
-    # an exclusive stop drops a fragment, an inclusive one only what follows
+    # an exclusive stop omits the fragment that reaches the threshold, an inclusive one only later fragments
     lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.stop)
-    # if fragments change places, the fragments in front decide whether one is blended
+    # if the order changes, the transmittance in front decides whether a fragment is blended
     may_miss = (
         (span.high > 0)
         & (span.front_low * (1 - STOP) <= view.stop)
@@ -174,15 +176,17 @@ def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
     """
     lowest = thin.sum(1, keepdims=True)
     others = thick.sum(1, keepdims=True) - thick
-    # slope of the layer's colour over one splat's depth, at most: by the light left and the others' share
+    # maximum derivative of the layer's colour with respect to one splat's optical depth
     slope = np.exp(-lowest) + np.minimum(1.0, others / np.maximum(lowest, 1e-9)) / np.maximum(lowest, 1.0)
     moved = np.minimum(1.0, slope * (thick - thin)).sum(1, keepdims=True)
     return np.where((thick > 0).sum(1, keepdims=True) > 1, moved, 0.0)
 
 
 def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Error bound (k, 1) of the colour of a layer of n boxes with opacities between `low` and `high` (k, n):
-    its colour times its opacity is their sum, or their mean if they cover more than all.
+    """Error bound (k, 1) of the colour of a layer of n boxes with opacities between `low` and `high` (k, n).
+
+    The layer's colour times its opacity is the sum over its boxes, or the mean if their opacities add up to
+    more than 1.
     """
     return np.where((high > 0).sum(1, keepdims=True) > 1, (high - low).sum(1, keepdims=True), 0.0)
 
@@ -205,13 +209,14 @@ def of_layer_depth(
     blended = share.any(1, keepdims=True)
     low = np.where(blended, np.maximum(low, nearest), nearest)
     high = np.where(blended, np.minimum(high, furthest), furthest)
-    # a running mean rounds at every fragment
+    # the running mean is rounded at every fragment
     off = (2 + count) * 2.0**-24 * np.maximum(np.abs(nearest), np.abs(furthest))
     return low - off, high + off
 
 
 def first_column(mask: np.ndarray, start: int) -> np.ndarray:
-    """The first column (k,) where mask (k, m) is set, counted from `start`; start + m if there is none."""
+    """Number of the first column (k,) where mask (k, m) is set; columns are numbered from `start`; start + m
+    if there is none."""
     k, m = mask.shape
     return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
 
@@ -220,7 +225,7 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
     """Bounds over all depth orders that rounding allows, of fragments or layers (k, m) sorted by depth.
 
     Returns the span with bounds of the transmittances in front, and the largest change of colour by a change
-    of order (k,), per unit of colour. lift (k, m): by how much each counts as nearer.
+    of order (k,), per unit of colour. lift (k, m): share of its depth by which each counts as nearer.
 
     A swap of two neighbours changes a colour by at most the product of their opacities and the transmittance
     in front of them. Every possible order results from swaps of pairs whose depth intervals overlap. Exactly
@@ -242,16 +247,17 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
 
 
 def of_layers(span: Span, lift: np.ndarray, place: np.ndarray) -> tuple[Span, np.ndarray]:
-    """The same of fragments in the order of the splats' centres, place (k, m), that layers (place < 0) divide
-    by depth.
+    """Bounds as of `of_order`, for fragments in the order of the splats' centres between layers sorted by
+    depth.
 
-    Two fragments may also swap where a layer may be between them or not.
+    Two fragments may also swap where rounding decides whether a layer is between them. place (k, m): position
+    in the order of centres; negative for layers.
     """
     near, far = _sort_depths(span, lift)
     may, layered = span.high > 0, place < 0
     bound, lowest, highest = np.zeros(len(may)), span.front_low.copy(), span.front_high.copy()
     layers = layered.sum(1).max(initial=0)
-    # by column of a layer: whether it may exist, surely exists; its interval
+    # for each layer: whether it may exist, whether it surely exists, and its interval
     columns = np.argsort(~layered, axis=1, kind="stable")[:, :layers]
     own = [np.take_along_axis(each, columns, 1) for each in (may & layered, span.low > 0, near, far)]
     unsure = np.zeros(len(may), bool)
@@ -287,7 +293,8 @@ def _sort_depths(span: Span, lift: np.ndarray) -> _Pair:
 
 
 def _of_swaps(span: Span, pairs: list[tuple]) -> tuple[Span, np.ndarray]:
-    """Bounds over the orders in which the pairs (slices of columns, and where they meet) may be swapped."""
+    """Bounds over all orders in which pairs may be swapped. pairs: two slices of columns, and a mask of the
+    samples where they may be swapped."""
     dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
     light = np.cumsum(dimmed, axis=1) - dimmed
     lowest = span.front_low.copy()
@@ -303,7 +310,7 @@ def _of_swaps(span: Span, pairs: list[tuple]) -> tuple[Span, np.ndarray]:
 
 
 def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
-    """Nearest and furthest possible depth (k,), and the sum of weights times the error of each depth."""
+    """Smallest and largest possible depth (k,), and the sum of weights times the error of each depth."""
     possible = span.front_high * span.high > 0
     return {
         "nearest": np.where(possible, span.z_low, np.inf).min(1, initial=np.inf),
@@ -326,13 +333,13 @@ def of_count(span: Span, count: np.ndarray, bound: np.ndarray, stop: float) -> n
     fragment or layer, and its error bound."""
     may, must = span.high > 0, span.low > 0
     off = np.where(may, bound + np.where(must, 0, count), 0)
-    # from where the light may have reached the stop to where it must have, a fragment may be blended or not
+    # rounding decides between the first fragment that may reach the stop and the first that must
     open_to = (span.front_high >= stop * (1 - STOP)) & (span.front_low * (1 - span.high) <= stop * (1 + STOP))
     return np.where(may & open_to & (stop > 0), count + bound, off).sum(1)
 
 
 def of_label(span: Span, labels: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """Whether a fragment of another label (k,), or none at all, may be the heaviest."""
+    """Whether rounding may give samples another label (k,), or none."""
     own = labels == label[:, None]
     heaviest = np.where(own, span.front_low * span.low, 0.0).max(1, initial=0.0)
     other = np.where(own, 0.0, span.front_high * span.high).max(1, initial=0.0)

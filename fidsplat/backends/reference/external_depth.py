@@ -18,7 +18,7 @@ class Surface:
     """An external depth image at k samples."""
 
     z: np.ndarray
-    """(k,) metres; infinite where there is none"""
+    """(k,) metres; infinite without a surface"""
     color: np.ndarray
     """(k, 3)"""
     label: np.ndarray
@@ -26,12 +26,12 @@ class Surface:
 
     @property
     def exists(self) -> np.ndarray:
-        """(k,) bool: whether there is a surface."""
+        """(k,) bool: whether a sample has a surface."""
         return np.isfinite(self.z)
 
     def occlude(self, f: Fragments, span: Span) -> Span:
-        """Remove fragments at its depth or behind it. In the returned span a fragment that rounding may move
-        to the other side has opacities down to 0."""
+        """Remove fragments at the surface or behind it. In the returned span the opacity interval of a
+        fragment that rounding may move behind the surface starts at 0."""
         z = self.z[:, None]
         f.alpha = np.where(f.z < z, f.alpha, 0.0)
         return Span.of(

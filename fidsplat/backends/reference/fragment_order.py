@@ -14,7 +14,8 @@ from fidsplat.backends.reference.fragments import Fragments, optical_depth
 from fidsplat.backends.reference.setup import Setup
 
 COPLANAR_BIAS = 2.0**-16
-"""share of its depth by which a coplanar layer is nearer: more than rounding, and invisible"""
+"""share of its depth by which a coplanar layer counts as nearer: more than rounding errors, too little to
+be visible"""
 
 
 @dataclass
@@ -22,26 +23,26 @@ class OrderedFragments:
     """Fragments and layers of k samples, m each, in compositing order."""
 
     alpha: np.ndarray
-    """(k, m), as z [m], labels, moved, label_may_flip"""
+    """(k, m), as are z [m], labels, moved, label_may_flip"""
     z: np.ndarray
     span: Span
     colors: np.ndarray
-    """(m, 3) or (k, m, 3), as normal"""
+    """(m, 3) or (k, m, 3), as is normal"""
     normal: np.ndarray
     labels: np.ndarray
     ids: np.ndarray
-    """index in the depth order, of a layer that of its heaviest splat"""
+    """index in the depth order; for a layer, of the splat with the largest weight"""
     count: np.ndarray
-    """splats that are blended in each"""
+    """number of splats blended in each fragment or layer"""
     count_bound: np.ndarray
-    """error bound of the count, if it contributes"""
+    """error bound of this number, if the fragment contributes"""
     moved: np.ndarray
     """error bound of a layer's mean colour, per unit of light in front of it"""
     label_may_flip: np.ndarray
     """bool: whether rounding may change the layer's label"""
     id_may_flip: np.ndarray
     reordered: np.ndarray
-    """(k,) error bound of colour from changes of the order"""
+    """(k,) error bound of colour due to possible changes of the order"""
 
     def take(self, rank: np.ndarray) -> OrderedFragments:
         """Reorder by rank (k, m)."""
@@ -74,13 +75,13 @@ _COLUMNS = (
 
 def by_center(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
     """Fragments in the order of the splats' centres."""
-    # colours and normals once, not for each sample
+    # colours and normals are stored once, not for each sample
     return replace(_plain(s, f, span, slice(None)), colors=s.colors, normal=s.normal)
 
 
 def by_depth(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
-    """Fragments, and one layer per coplanar group, by their own depths at each sample. Ties: layers first,
-    then in the splats' order. Fragments that do not contribute are omitted."""
+    """Fragments, and one layer per coplanar group, sorted by their depths at each sample. Ties: layers first,
+    then the splats' order. Fragments that do not contribute are omitted."""
     columns, lift, arrival = _with_layers(s, f, span)
     may = columns.span.high > 0
     depth = np.where(may, columns.z - lift, np.inf)
@@ -111,14 +112,14 @@ def by_layers(s: Setup, f: Fragments, span: Span) -> OrderedFragments:
 
 
 def _with_layers(s: Setup, f: Fragments, span: Span) -> tuple[OrderedFragments, np.ndarray, np.ndarray]:
-    """Fragments (k, n) of splats without a group, then layers (k, p); by how much each counts as nearer; and
-    the order of ties (n + p,), negative for layers."""
+    """Fragments (k, n) of splats without a group, then layers (k, p); the share of its depth by which each
+    counts as nearer; and the order of ties (n + p,), negative for layers."""
     groups = np.full(f.alpha.shape[1], -1) if s.coplanar_groups is None else s.coplanar_groups
     plain = np.flatnonzero(groups < 0)
     members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
     columns = _concatenated([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])
     arrival = np.concatenate([plain, np.arange(len(members)) - len(members)])
-    # a coplanar layer is in front of other splats in its plane
+    # a coplanar layer is composited in front of other splats in its plane
     return columns, np.where(arrival < 0, COPLANAR_BIAS * np.abs(columns.z), 0.0), arrival
 
 
@@ -191,7 +192,8 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> OrderedFra
 
 
 def _coverage(opacity: np.ndarray, boxes: bool) -> np.ndarray:
-    """Opacity (k, 1) of a layer: boxes are next to each other, Gaussians overlap."""
+    """Opacity (k, 1) of a layer: the sum for boxes, which do not overlap; 1 - prod(1 - opacity) for
+    Gaussians."""
     if boxes:
         return np.minimum(opacity.sum(1, keepdims=True), 1.0)
     return 1 - (1 - opacity).prod(1, keepdims=True)

@@ -15,12 +15,12 @@ _NO_EDGES = np.zeros((4, 0))
 HALF_RHO_OF_RANGE = math.log(255)
 """where a splat is 1/255 of its opacity"""
 MAX_OPTICAL_DEPTH = 24 * math.log(2)
-"""optical depth at which float32 leaves no light"""
+"""optical depth at which the transmittance is 0 in float32"""
 
 
 @dataclass
 class Fragments:
-    """k samples against n splats; arrays (k, n) float64."""
+    """Intersections of the rays of k samples with n splats; arrays (k, n) float64."""
 
     dx: np.ndarray
     """distance from the anchor, samples"""
@@ -31,13 +31,13 @@ class Fragments:
     n_v: np.ndarray
     d: np.ndarray
     dz: np.ndarray
-    """d times the depth; (n,) unless rays are parallel"""
+    """depth times d; (n,) unless rays are parallel"""
     offset: np.ndarray
     """squared distance from the projected centre, pixels; infinite where the sample has no ray"""
     alpha: np.ndarray
     z: np.ndarray
     edges: np.ndarray
-    """(4, n) or (4, k, n), and their terms, as `edges_of` has them, if there are boxes"""
+    """results of `edges_of`, if there are boxes"""
     edge_terms: np.ndarray
 
 
@@ -58,7 +58,7 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
         half_rho = np.where(inside, q / (2 * d_bulged * d_bulged), np.inf)
         z = dz / d_bulged
         if s.screen:
-            # depths beyond the circle of the disc are mirrored at it
+            # depths beyond the disc's circle are mirrored at it
             circle = np.maximum(offset, HALF_RHO_OF_RANGE)
             mirrored = s.pz + circle * (dz - s.pz * d_bulged) * (2 * d_bulged / q)
             z = np.where((q <= 2 * circle * d_bulged**2) | s.coplanar, z, mirrored)
@@ -76,8 +76,10 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
 
 
 def bulged(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """D and n_u^2 + n_v^2 (k, n) of 3D Gaussians, from those of their disks: rho = q / D^2
-    falls, and D, by which depths are divided, grows by 1 + rho / m^2. inverse_m2 (n,): 0 for disks."""
+    """Convert D and q = n_u^2 + n_v^2 (k, n) of equivalent disks to those of 3D Gaussians.
+
+    Both grow so that rho = q / D^2 is divided by 1 + rho / m^2. inverse_m2 (n,): 0 for disks.
+    """
     if not inverse_m2.any():
         return d, q
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

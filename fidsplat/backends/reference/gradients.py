@@ -1,4 +1,4 @@
-"""Gradients of the reference in float64, with the decisions of the forward pass held constant."""
+"""Gradients of the reference renderer in float64, with the decisions of the forward pass held constant."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ReferenceGradients(GradientPipeline):
         return images
 
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Gradients in float64."""
+        """Gradients as NumPy arrays in float64."""
         check_gradients(self._features, gradients)
         if self._last is None or self._last[0] is not images:
             raise InputError(NOT_THE_LAST)
@@ -58,14 +58,15 @@ class FrozenFrame:
             self._blocks.append((*at, decide(self._setup, view, *at)))
 
     def images(self, parameters: Parameters) -> dict[str, np.ndarray]:
-        """Output images, float64, of other parameters."""
+        """Render output images (float64) with other parameters, under the frozen decisions."""
         parts = [_images(blend.samples, made, parameters) for blend, made in self._blend(parameters)]
         height, width = self._view.height, self._view.width
         whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return {name: image.reshape(height, width, *image.shape[1:]) for name, image in whole.items()}
 
     def backward(self, gradients: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Gradients by the parameters, and `screen`, from those by the images."""
+        """Gradients with respect to the parameters, and `screen`, from gradients with respect to the
+        images."""
         view, parameters = self._view, self.parameters
         flat = {}
         for name in GRADIENT_OUTPUTS:
@@ -83,7 +84,7 @@ class FrozenFrame:
             for name, values in vars(found).items():
                 getattr(slopes, name)[...] += values
         placed = place(parameters, view)
-        # as in 2DGS: the gradient by the projected centre, in half images
+        # gradient with respect to the projected centre in units of half images, as in 2DGS
         slope_x, slope_y = slopes.p[:, 0] / view.focal_x, slopes.p[:, 1] / view.focal_y
         screen = 0.5 * placed.p[:, 2] * np.hypot(view.width * slope_x, view.height * slope_y)
         return {
@@ -115,7 +116,7 @@ def _images(samples: Samples, made: Decisions, parameters: Parameters) -> dict[s
 def _images_backward(
     by: Mapping[str, np.ndarray], samples: Samples, made: Decisions, parameters: Parameters
 ) -> Samples:
-    """Gradients by samples, from those by pixels."""
+    """Gradients with respect to samples, from gradients with respect to pixels."""
     weight = np.where(made.covered, samples.weight, np.inf)
     depth = np.where(made.covered, samples.depth / weight, 0.0)
     length = np.linalg.norm(samples.normal, axis=1)

@@ -1,7 +1,7 @@
 """Samples as functions of placed splats, with the frame's decisions held constant; and their derivatives.
 
-Where a ray meets a splat's plane is computed here from the ray and the plane's normal, not from the forms of
-the set-up, which devices have: so each finds the mistakes of the other.
+The intersection of a ray and a splat's plane is computed from the plane's normal, not from the affine forms
+of the set-up as on devices, so that a comparison finds errors in either.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from fidsplat.backends.view import View
 
 @dataclass
 class Decisions:
-    """Decisions of the forward pass at k samples for m splats; bool arrays (k, m) unless stated."""
+    """Discrete decisions of the forward pass at k samples for m splats; bool arrays (k, m) unless stated."""
 
     order: np.ndarray
     """(m,) int: the cloud's splats, nearest first"""
     contributes: np.ndarray
-    """in reach, and light was left"""
+    """above the cut-off, and blended before the stop"""
     by_disc: np.ndarray
-    """the disc of the low-pass is the larger weight"""
+    """the low-pass disc has the larger weight"""
     clamped: np.ndarray
-    """at the ceiling of opacities"""
+    """clamped to the maximum alpha"""
     missed: np.ndarray
-    """the ray does not meet the plane beyond `near`: the depth is the centre's"""
+    """the ray does not meet the plane beyond `near`, so the depth is that of the centre"""
     mirrored: np.ndarray
     """the depth is mirrored at a circle"""
     wide: np.ndarray
-    """that circle is the disc's, not the one where the splat is 1/255 of its opacity"""
+    """mirrored at the disc's circle, not at the circle where the splat is 1/255 of its opacity"""
     covered: np.ndarray
-    """(k,): enough is covered for depths and normals"""
+    """(k,): the coverage suffices for depths and normals"""
 
 
 def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
@@ -64,7 +64,7 @@ def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
 
 @dataclass
 class Samples:
-    """Sample buffers of k samples; or the derivatives of a loss by each of them."""
+    """Sample buffers of k samples; also used for the derivatives of a loss with respect to each of them."""
 
     rgb: np.ndarray
     """(k, 3)"""
@@ -83,7 +83,7 @@ class Samples:
 
 
 class Blend:
-    """k samples of m placed splats under decisions; arrays (k, m) or (k, m, 3)."""
+    """Differentiable blending of m placed splats at k samples under frozen decisions."""
 
     def __init__(self, placed: Placed, view: View, made: Decisions, x: np.ndarray, y: np.ndarray) -> None:
         self._placed, self._view, self._made = placed, view, made
@@ -106,7 +106,7 @@ class Blend:
             self._disc_y = y[:, None] - (view.focal_y * self._p[:, 1] / pz + view.center_y)
             disc, plane = self._disc_x**2 + self._disc_y**2, (self._u**2 + self._v**2) / 2
             half_rho = np.where(made.by_disc, disc, plane)
-            # of the way from the centre's depth to that on the plane
+            # share of the way from the centre's depth to the depth on the plane
             circle = np.where(made.wide, disc, HALF_RHO_OF_RANGE)
             self._share = np.where(made.mirrored, circle / plane, 1.0)
             self._plane = plane
@@ -133,7 +133,7 @@ class Blend:
         )
 
     def backward(self, by: Samples) -> Placed:
-        """Derivatives of a loss by the placed splats, from those by the samples."""
+        """Derivatives of a loss with respect to the placed splats, from those with respect to the samples."""
         made, view = self._made, self._view
         facing = self._normal * self._towards
         by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
@@ -147,7 +147,9 @@ class Blend:
         share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             by_share = np.where(mirrored, by_z * (self._z_plane - self._p[:, 2]), 0.0)
-            by_plane = np.where(mirrored, -by_share * share / self._plane, 0.0)  # by rho / 2 on the plane
+            by_plane = np.where(
+                mirrored, -by_share * share / self._plane, 0.0
+            )  # with respect to rho / 2 on the plane
             by_plane -= np.where(on_plane, by_log, 0.0)
             by_u = np.where(on_plane | met, by_plane * self._u / self._su, 0.0)
             by_v = np.where(on_plane | met, by_plane * self._v / self._sv, 0.0)
@@ -162,7 +164,7 @@ class Blend:
         by_b = np.einsum("kn,knc->nc", by_v, off) + np.cross(by_normal, self._unit_a)
         by_p = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
 
-        # the disc, at the centre's image
+        # the low-pass disc around the projected centre
         by_x = 2 * np.where(by_disc != 0, by_disc * self._disc_x, 0.0).sum(0)
         by_y = 2 * np.where(by_disc != 0, by_disc * self._disc_y, 0.0).sum(0)
         x, y, z = self._p.T
@@ -187,8 +189,8 @@ class Blend:
         return out
 
     def _by_opacity(self, by: Samples, facing: np.ndarray) -> np.ndarray:
-        """Derivatives (k, m) by the opacities of fragments: the value of their own light less that of the
-        light that they occlude; from back to front, without a division by the transmittance."""
+        """Derivatives (k, m) with respect to the fragments' opacities: the value of a fragment's own colour
+        minus that of the colour behind it; from back to front, without a division by the transmittance."""
         worth = by.rgb @ self._rgb.T + by.normal @ facing.T + by.depth[:, None] * self._z
         worth = worth + by.weight[:, None] + by.inverse[:, None] * self._inverse
         worth = worth + by.squares[:, None] * self._inverse**2

@@ -15,18 +15,19 @@ _SMALLEST = float(np.float32(1e-20))
 
 @dataclass
 class Parameters:
-    """Parameters by which a frame is differentiated."""
+    """Parameters with respect to which a frame is differentiated."""
 
     means: np.ndarray
     quats: np.ndarray
-    """(n, 4) of any length"""
+    """(n, 4) quaternions of any length"""
     scales: np.ndarray
     opacities: np.ndarray
     colors: np.ndarray | None
     sh: np.ndarray | None
     background: np.ndarray
     pose: np.ndarray
-    """(6,): rotation vector [rad] and translation [m] of a motion after world_to_camera, in its axes"""
+    """(6,): rotation vector [rad] and translation [m] of a motion applied after world_to_camera, in camera
+    axes"""
 
     @classmethod
     def of(cls, cloud: SplatCloud, view: View) -> Parameters:
@@ -45,7 +46,7 @@ class Parameters:
 
 @dataclass
 class Placed:
-    """Splats in the camera's frame; or the derivatives of a loss by each of these arrays."""
+    """Splats in the camera's frame; also used for the derivatives of a loss with respect to each array."""
 
     unit_a: np.ndarray
     """(n, 3) unit tangents"""
@@ -53,19 +54,19 @@ class Placed:
     p: np.ndarray
     """(n, 3) centres [m]"""
     scales: np.ndarray
-    """(n, 2) as rendered [m]"""
+    """(n, 2) rendered scales [m]"""
     log_opacity: np.ndarray
     rgb: np.ndarray
 
     @classmethod
     def zeros(cls, n: int) -> Placed:
-        """Derivatives to be added to."""
+        """Zero derivatives of n splats."""
         a, b, p, rgb = np.zeros((4, n, 3))
         return cls(a, b, p, np.zeros((n, 2)), np.zeros(n), rgb)
 
 
 def motion_of(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and translation (3,) of a motion (6,)."""
+    """Rotation (3, 3) and translation (3,) of a motion given as rotation vector and translation (6,)."""
     angle = np.linalg.norm(pose[:3])
     if angle == 0:
         return np.eye(3), pose[3:]
@@ -95,12 +96,13 @@ def place(parameters: Parameters, view: View) -> Placed:
 
 
 def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: Placed) -> dict:
-    """Derivatives by the parameters, at a pose of 0, from those by the placed splats."""
+    """Derivatives with respect to the parameters, at a zero pose, from those with respect to placed
+    splats."""
     rotation = view.rotation
     by_color, by_ray = _rgb_backward(parameters, _eye(parameters, view), slopes.rgb)
     pairs = [(slopes.unit_a, placed.unit_a), (slopes.unit_b, placed.unit_b), (slopes.p, placed.p)]
     turned = sum(np.cross(at, slope).sum(0) for slope, at in pairs)
-    # a motion of the camera moves its centre against the motion, and turns around it
+    # moving the camera by t moves its centre by -t; the rotation is about the centre
     moved = slopes.p.sum(0) + by_ray.sum(0) @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
         by_opacity = slopes.log_opacity / parameters.opacities
@@ -135,7 +137,7 @@ def _tangents_backward(quats: np.ndarray, by_u: np.ndarray, by_v: np.ndarray) ->
             -2 * ux * z + uy * w + uz * x - vx * w - 2 * vy * z + vz * y,
         ]
     )
-    # along the quaternion nothing changes
+    # scaling a quaternion has no effect, so the derivative along it is 0
     return ((slopes - unit * (unit * slopes).sum(0)) / length.T).T
 
 
@@ -168,7 +170,8 @@ def _unclamped(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
 def _rgb_backward(
     parameters: Parameters, eye: np.ndarray, by_rgb: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives by the coefficients or colours, and by the rays (n, 3) from the eye to the centres."""
+    """Derivatives with respect to the SH coefficients or colours, and to the rays (n, 3) from eye to
+    centre."""
     if parameters.sh is None:
         return by_rgb, np.zeros_like(by_rgb)
     directions, length = _directions(parameters.means - eye)
@@ -183,8 +186,8 @@ def _rgb_backward(
 
 
 def _basis_slope(degree: int, directions: np.ndarray, axis: int) -> np.ndarray:
-    """Derivatives (n, k) of the basis by a coordinate. Of polynomials of degree 3 the central differences
-    over h and 2 h, extrapolated, are exact."""
+    """Derivatives (n, k) of the SH basis with respect to a coordinate, by Richardson extrapolation of central
+    differences, which is exact for polynomials of degree 3."""
 
     def difference(h: float) -> np.ndarray:
         step = np.zeros(3)

@@ -1,4 +1,4 @@
-"""Cameras of the reference: rays of samples, and the affine forms of a splat for each camera model.
+"""Camera models of the reference: rays of samples, and the linear forms of splats in the rays' coordinates.
 
 A sample has three coordinates, in which the numerators n_u, n_v and the denominator D of a splat are linear:
 1, x, y for a pinhole or parallel rays, and X, Y, Z of the sample's float32 ray behind a lens.
@@ -13,9 +13,9 @@ import numpy as np
 from fidsplat.backends.view import View
 
 ROUND = 4 * 2.0**-24
-"""of a form, relative to its terms: its coefficients' rounding, and its sums'"""
+"""rounding error of a form relative to its terms, from its coefficients and sums"""
 ROUND_OF_RAYS = 6 * 2.0**-24
-"""the same with one more term, and with the rounding of the distance from the anchor"""
+"""the same for a lens: one more term, and the rounding of the distance from the anchor"""
 
 
 @dataclass
@@ -25,7 +25,7 @@ class Samples:
     x: np.ndarray
     y: np.ndarray
     coordinates: np.ndarray
-    """0 where there is no ray"""
+    """0 without a ray"""
     valid: np.ndarray
     """(k, 1) bool"""
 
@@ -42,8 +42,8 @@ def samples_of(view: View, x: np.ndarray, y: np.ndarray) -> Samples:
 
 
 def rays_of(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (k, 3) in the camera frame of the rays through samples at grid positions x, y (k,), along z
-    1 or of unit length; and whether there is one (k,)."""
+    """Directions (k, 3) in the camera frame of the rays through samples at grid positions x, y (k,), with z =
+    1 or of unit length; and whether a sample has a ray (k,)."""
     if view.raster is not None:
         rays = view.raster.rays[y.astype(int), x.astype(int)].astype(np.float64)
         return rays, np.isfinite(rays[:, 0])
@@ -57,8 +57,7 @@ def rays_of(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
-    """Length (k,) of the rays through samples at grid positions x, y, per metre of depth; 1 where there is
-    none."""
+    """Length (k,) of the rays through samples at grid positions x, y, per metre of depth; 1 without a ray."""
     if view.along_ray or view.parallel:
         return np.ones_like(x)
     rays, valid = rays_of(view, x.ravel(), y.ravel())
@@ -66,11 +65,11 @@ def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
 
 
 def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Forms of splats with scaled tangents a, b and centres p (n, 3), camera frame.
+    """Linear forms of splats with scaled tangents a, b and centres p (n, 3), camera frame.
 
     Returns:
-        (3, n, 3) factors of the coordinates in n_u, n_v, D; (3, n) those in D times the depth, for parallel
-        rays; and what the volume of a, b, p is multiplied by to give D times the depth, for others.
+        (3, n, 3) coefficients of the coordinates in n_u, n_v and D; (3, n) coefficients in D times the depth,
+        for parallel rays; and, for other rays, D times the depth divided by the volume of a, b, p.
     """
     if view.raster is not None:
         forms = np.stack([np.cross(b, p), np.cross(p, a), np.cross(a, b)], axis=2)
@@ -84,7 +83,7 @@ def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[n
 
 
 def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image positions of centres p (n, 3) [samples]; infinite where not `known` or without an image."""
+    """Project centres p (n, 3) to samples; infinite where not `known`, or where the lens has no image."""
     if view.raster is not None or view.parallel:
         image = p[:, :2] if view.raster is None else view.raster.lens.image(p)
         x, y = (image * (view.focal_x, view.focal_y) + (view.center_x, view.center_y)).T
@@ -97,8 +96,7 @@ def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray
 
 
 def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
-    """Jacobian (n, 2, 3) of the image positions [samples] of points p (n, 3); NaN where a lens has no image
-    of them."""
+    """Jacobian (n, 2, 3) of the projection of points p (n, 3) to samples; NaN where the lens has no image."""
     if view.lens is None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y, ahead = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], 1 / p[:, 2]
@@ -111,8 +109,8 @@ def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
 
 
 def along_of(view: View, p: np.ndarray) -> np.ndarray:
-    """The derivative (n, 3) of the logarithm of points' depths by their coordinates p (n, 3), as the view
-    means depth; 0 for parallel rays."""
+    """Derivative (n, 3) of log(depth) with respect to the coordinates of points p (n, 3), for the view's
+    definition of depth; 0 for parallel rays."""
     if view.parallel:
         return np.zeros_like(p)
     if view.along_ray:
@@ -121,12 +119,12 @@ def along_of(view: View, p: np.ndarray) -> np.ndarray:
 
 
 def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges of boxes with `forms` (3, n, 3), at samples (k,) on the grid.
+    """Inverse gradients of the edge functions of boxes with linear `forms` (3, n, 3), at samples (k,).
 
     Returns:
-        1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v by the sample's position, (4, n) or, where each
-        sample has a ray of its own, (4, k, n); and what the gradients' terms come to, relative to them (0
-        where devices have them from their set-up).
+        1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v with respect to the sample position, (4, n), or
+        (4, k, n) behind a lens; and the sum of the absolute terms relative to the gradient, for its rounding
+        error (0 where devices compute it in the set-up).
     """
     sides = [(axis, sign) for axis in (0, 1) for sign in (1, -1)]
     if view.raster is None:
@@ -143,7 +141,7 @@ def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tup
 
 
 def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Coordinates (3, n) about which devices store the forms of splats with anchor pixels (x, y); NaN where
+    """Coordinates (3, n) of the anchor pixels (x, y) relative to which devices store forms; NaN if
     unknown."""
     if view.raster is None:
         return np.stack([np.ones_like(x), x, y])
@@ -153,7 +151,7 @@ def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def away_of(view: View, samples: Samples, anchors: np.ndarray) -> np.ndarray:
-    """Upper bound (3, k, n) of the distance of samples from the anchors, by coordinate."""
+    """Upper bound (3, k, n) of the distance of samples from the anchors along each coordinate."""
     away = np.abs(samples.coordinates - anchors[:, None, :])
     if view.raster is not None:
         furthest = np.nanmax(np.abs(view.raster.rays), axis=(0, 1), initial=1.0)[:, None, None]

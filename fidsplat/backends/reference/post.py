@@ -1,4 +1,4 @@
-"""Steps on rgb after blending: background, and the steps of the sensor."""
+"""Post-processing of rgb after blending: background, and the steps of the sensor model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fidsplat.backends.view import View
 from fidsplat.capture.environment import Gradient, Panorama
 
 _ROUND = 2e-6
-"""relative error of float32 before each step"""
+"""relative rounding error of float32 before each step"""
 
 
 def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,7 +52,8 @@ def _panorama_at(panorama: Panorama, rays: np.ndarray) -> tuple[np.ndarray, np.n
 
     right, bottom = (u - left)[:, None], (v - top)[:, None]
     above, below = at(0, 0) * (1 - right) + at(1, 0) * right, at(0, 1) * (1 - right) + at(1, 1) * right
-    # directions are rounded to a few 1e-7 of the circle, which near the poles turns the ray all round
+    # directions are rounded by a few 1e-7 of a circle; near the poles this changes the longitude by any
+    # amount
     near = np.stack([at(dx, dy) for dx in (-1, 0, 1, 2) for dy in (-1, 0, 1, 2)])
     contrast = (near.max(0) - near.min(0)).max(1)
     off = 1e-6 * (width * np.linalg.norm(rays, axis=1) / np.maximum(flat, 1e-12) + height)
@@ -101,7 +102,7 @@ def _step(name: str, value: np.ndarray, view: View, x: np.ndarray, y: np.ndarray
 
 
 def variates(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
-    """Variates (k, 3) of mean 0 and variance 1 by pixel and channel, bit-identical to post/noise.cl."""
+    """Random numbers (k, 3) of mean 0 and variance 1 by pixel and channel, bit-identical to post/noise.cl."""
     columns = []
     for channel in range(3):
         words = [

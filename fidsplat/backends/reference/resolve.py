@@ -1,4 +1,4 @@
-"""Resolving: pixels from their samples."""
+"""Resolve stage: pixels from their samples."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from fidsplat.backends.reference.post import apply_sensor, max_value
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
-_ROUND = 1e-6  # relative, of a sum of weights
+_ROUND = 1e-6  # relative rounding error of a sum of weights
 
 
 def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) -> dict[str, np.ndarray]:
     """Images of pixels (k, ...) from their samples (k, n * n, ...), and their certificates.
 
-    `certificate`: colour per unit of colour, and alpha; `certificate_depth`, `certificate_distance` metres;
-    `certificate_normal` difference of unit vectors; `depth_median_may_flip`, `label_may_flip` and so on bool;
-    `blended_bound` splats. samples: with `x`, `y`, positions on the sample grid.
+    The certificates are upper bounds of the error in float32: `certificate` of alpha, and of rgb per unit of
+    colour; `certificate_depth` and `certificate_distance` in metres; `certificate_normal` of unit vectors;
+    `depth_median_may_flip`, `label_may_flip` and so on (bool); `blended_bound` in splats. samples: sample
+    buffers, with grid positions `x`, `y`.
     """
     t, bound = samples["t"].mean(1), samples["certificate"]
     center_x, center_y = samples["x"].mean(1), samples["y"].mean(1)
@@ -41,7 +42,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         out["distortion"] = samples["distortion"].mean(1)
     covered, unsure = samples["covered"], np.asarray(samples["covered_may_flip"].any(1))
     bound_covered = np.where(covered, bound, 0.0).sum(1)
-    # of the ray through each sample, per metre of depth
+    # length of the ray through each sample, per metre of depth
     length = ray_lengths(samples["x"], samples["y"], view)
     if "depth" in features.names:
         # rays of samples may differ in length
@@ -50,7 +51,8 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
                 np.where(covered, samples[key], 0.0) for key in ("depth", "depth_moved", "weight")
             )
             out[name] = _ratio((depth * along).sum(1), weight.sum(1), 0.0)
-            # light that moves from the nearest to the furthest fragment, in a mean of weight >= `minimum`
+            # weight that may move from the nearest to the furthest fragment, in a mean with a weight of at
+            # least `minimum`
             spread = np.where(covered, samples["furthest"] * along, -math.inf).max(1)
             spread -= np.where(covered, samples["nearest"] * along, math.inf).min(1)
             moved = bound_covered * np.where(bound_covered > 0, np.maximum(spread, 0), 0)
@@ -78,7 +80,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         heaviest = np.argmax(samples["heaviest"], axis=1)
         weights = np.sort(samples["heaviest"], axis=1)
         out[name] = np.take_along_axis(samples[name], heaviest[:, None], 1)[:, 0].astype(np.int32)
-        # of samples that weigh the same the first wins, by rounding
+        # rounding may break a tie between samples of equal weight
         close = (samples["heaviest"] >= weights[:, -1:] * (1 - 5e-5) - bound) & (
             samples[name] != out[name][:, None]
         )
@@ -90,7 +92,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """Lower median (k,) of the positive values (k, n); 0 where there is none."""
+    """Lower median (k,) of the positive values (k, n); 0 if there is none."""
     medians = np.sort(np.where(values > 0, values, math.inf), axis=1)
     hits = np.isfinite(medians).sum(1)
     middle = np.take_along_axis(medians, np.maximum((hits - 1) // 2, 0)[:, None], 1)[:, 0]
@@ -98,7 +100,7 @@ def _median(values: np.ndarray) -> np.ndarray:
 
 
 def _nearest(values: np.ndarray) -> np.ndarray:
-    """Smallest positive value (k,) of (k, n); 0 where there is none."""
+    """Smallest positive value (k,) of (k, n); 0 if there is none."""
     nearest = np.where(values > 0, values, math.inf).min(1)
     return np.where(np.isfinite(nearest), nearest, 0.0)
 

@@ -1,4 +1,4 @@
-"""Per-splat set-up of the reference."""
+"""Per-splat set-up of the reference renderer: culling, camera transform, forms, colours, depth order."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Setup:
             reach, box_reach = np.hypot(a[:, 2], b[:, 2]), np.abs(a[:, 2]) + np.abs(b[:, 2])
             reach = np.hypot(reach, shape.third[:, 2])
         radius = np.sqrt(np.maximum(2 * half_r2, 0))
-        # the disc of the low-pass, at any cut-off
+        # the disc of the low-pass applies at any cut-off
         within = np.maximum(radius, _RANGE_RADIUS if "lowpass_screen" in features.slots else 0.0) * reach
         within = np.where(box, box_reach, within)
         reach = np.where(box, box_reach, radius * reach)
@@ -67,7 +67,7 @@ class Setup:
         """whether fragments are composited by their own depth"""
         layered = not {"compose_coplanar", "compose_coplanar_pixel"}.isdisjoint(features.slots)
         groups = group_index(cloud) if layered else np.full(len(cloud), -1, np.int32)
-        # depths are the same at every cut-off
+        # depths must not depend on the cut-off
         radius = np.where(groups >= 0, _PLANE_RADIUS, np.where(box, 1.0, _RANGE_RADIUS))
         with np.errstate(divide="ignore", invalid="ignore"):
             further = reach * radius / np.where(box, 1.0, np.sqrt(2 * half_r2))
@@ -81,7 +81,7 @@ class Setup:
         if self.by_depth:
             self.key = z_low.astype(np.float32)
         self.key[groups >= 0] = -np.inf
-        visible &= np.isfinite(shape.inverse_m2)  # else the camera is at its centre
+        visible &= np.isfinite(shape.inverse_m2)  # infinite if the camera is at the splat's centre
         order = np.flatnonzero(visible)
         order = order[np.lexsort((groups[order], self.key[order]))]
         self.order = order
@@ -95,15 +95,15 @@ class Setup:
         """range of the fragments' depths"""
         self.labels = cloud.labels[order]
         self.pz = depth[order]
-        # the plane's height above the camera's centre decides its side, and whether it is edge-on
+        # the sign of the camera's distance from the plane decides the visible side; 0: edge-on
         height = normal[:, 2] if view.parallel else np.einsum("ij,ij->i", normal, p)
         edge_on = np.abs(height) <= 1e-13 * (1.0 if view.parallel else np.linalg.norm(p, axis=1))
         sign = np.where(edge_on, 0.0, np.sign(height))
         self.forms, depth_forms, size = optics.forms_of(view, a, b, p)
-        """(3, n, 3): factors of a sample's coordinates in n_u, n_v, D"""
+        """(3, n, 3): coefficients of a sample's coordinates in n_u, n_v, D"""
         self.forms[:, :, 2] *= sign
         self.depth_forms = depth_forms * sign if view.parallel else None
-        """(3, n): those in D times the depth, for parallel rays; for others that is `z_numerator` (n,)"""
+        """(3, n): coefficients in D times the depth, for parallel rays; otherwise it is `z_numerator` (n,)"""
         self.z_numerator = size * area * np.abs(height * sign)
 
         self.box = box[order]
@@ -118,7 +118,7 @@ class Setup:
         self.anchor_y = _anchor(middle_y, ahead, view.height)
         self.anchors = optics.anchors_of(view, self.anchor_x, self.anchor_y)
         self.round = optics.ROUND if view.raster is None else optics.ROUND_OF_RAYS
-        """of a form in float32, relative to its terms"""
+        """rounding error of a form in float32, relative to its terms"""
         self.colors = _colors(cloud, order, outward[order])
         self.normal = shape.surface[order] * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
@@ -146,10 +146,11 @@ class Setup:
 DEPTH_SHARE = 1 / 8
 """standard deviation along the ray of the low-pass `pixel`, per metre of depth"""
 _RANGE_RADIUS = math.sqrt(2 * math.log(255))
-"""radius, in standard deviations, of the part of a splat whose depths bound those of all of it"""
+"""radius in standard deviations of the part of a splat whose depth range limits the depths of its
+fragments"""
 _PLANE_RADIUS = 64.0
-"""the same for splats of a coplanar group: beyond every cut-off and low-pass, so that culled splats do not
-move the layer; for boxes in half sides"""
+"""the same for splats of a coplanar group (boxes: in half sides); larger than any cut-off and low-pass, so
+that culling a splat does not move the layer"""
 _OF_SPLATS = (
     *("order", "log_opacity", "half_r2", "z_low", "z_high", "labels", "pz", "z_numerator"),
     *("inverse_m2", "turned"),
@@ -179,7 +180,7 @@ def _shapes(
     view: View,
     features: FeatureSet,
 ) -> ellipsoids.Axes:
-    """Disks with the image of the splats, 3D Gaussians included.
+    """Equivalent disks of the splats: a disk with the same image for each 3D Gaussian.
 
     unit_a, unit_b, p (n, 3) in the camera frame, scale (n, 2).
     """
@@ -204,8 +205,8 @@ def _shapes(
 def _posed(
     view: View, tangent_u: np.ndarray, tangent_v: np.ndarray, mean: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Unit tangents and centre in the camera frame, and the centre from the eye in the cloud's, (n, 3)
-    each."""
+    """Unit tangents and centres in the camera frame, and centres relative to the eye in the cloud's axes,
+    (n, 3) each."""
     rotation = view.rotation.T
     return tangent_u @ rotation, tangent_v @ rotation, mean @ rotation + view.translation, mean - view.eye
 
@@ -215,11 +216,11 @@ def _filtered(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
 
-    chosen (n,) bool: others are unchanged, and those whose centre has no image. The filter of a sample
-    is a Gaussian about its ray, with a standard deviation of half a sample across and of `DEPTH_SHARE`
-    of the depth along it; infinite for parallel rays, whose projection is linear. So the covariance
-    of the filter in (u, v) is (G^T G)^-1 with G the derivative of the two by (u, v) at the centre, in these
-    units.
+    chosen (n,) bool: other splats, and splats whose centre has no image, are unchanged. The filter of a
+    sample is a Gaussian about its ray, with a standard deviation of half a sample across the ray and of
+    `DEPTH_SHARE` of the depth along it (infinite for parallel rays, whose projection is linear). Its
+    covariance in (u, v) is (G^T G)^-1, with G the derivative of these two coordinates, in units of their
+    standard deviations, with respect to (u, v) at the centre.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         across, along = optics.derivatives_of(view, p) / 0.5, optics.along_of(view, p) / DEPTH_SHARE
@@ -233,7 +234,7 @@ def _filtered(
         l11 = np.sqrt(c11)
         grown, wide_a = np.where(chosen, grown, 1.0), l11[:, None] * a + (c12 / l11)[:, None] * b
         wide_b = (grown / l11)[:, None] * b
-    # edge-on to parallel rays: they grow without limit and are culled
+    # disks edge-on to parallel rays grow without limit and are culled
     chosen = (chosen & np.isfinite(grown))[:, None]
     return np.where(chosen, wide_a, a), np.where(chosen, wide_b, b), grown
 

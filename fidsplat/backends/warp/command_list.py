@@ -1,4 +1,4 @@
-"""Launches of kernels: timed by stage, divided over threads on the CPU, and captured for replay on CUDA."""
+"""Kernel launches with times by stage: divided over threads on the CPU, captured as CUDA graphs on GPUs."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from fidsplat.backends.warp.workspace import Workspace
 BLOCK = 256
 """default threads per block on a GPU"""
 _MIN_PIECE = 2048
-"""minimum threads of a piece of a CPU launch, below which the call costs more than it saves"""
+"""minimum threads of a piece of a CPU launch; smaller pieces cost more than they save"""
 _MIN_TILES = 4
-"""minimum tiles of a piece, for the same reason"""
+"""minimum tiles of a piece of a CPU launch"""
 
 
 @cache
@@ -27,23 +27,23 @@ def _parameters(kernel: Any) -> tuple[str, ...]:
 
 
 def _arguments(kernel: Any, given: Mapping[str, Any], first: int = 0) -> list[Any]:
-    """The kernel's arguments from `first` on, by the names of its parameters."""
+    """List the arguments of a kernel, from parameter number `first` on, by the names of its parameters."""
     return [given[name] for name in _parameters(kernel)[first:]]
 
 
 class LaunchCache:
-    """The last launch of each kernel of a device, of which only changed arguments are packed again."""
+    """Cache of the last launch of each kernel, so that only changed arguments are packed again."""
 
     def __init__(self, device: Any, threads: int) -> None:
-        """threads: of the host, over which launches on the CPU are divided."""
+        """threads: number of host threads for launches on the CPU."""
         self.device, self.threads = device, threads
-        # a CPU launch runs on the calling thread, without the interpreter's lock
+        # a CPU launch runs on the calling thread and releases the GIL
         self.workers = None if device.is_cuda else ThreadPoolExecutor(threads, "fidsplat-warp")
         self._wp = load()
         self._launches: dict[tuple[Any, int], tuple[Any, list[Any], list[int]]] = {}
 
     def release_arrays(self) -> None:
-        """Release the launches, and with them their arrays."""
+        """Discard the cached launches and release their arrays."""
         self._launches.clear()
 
     def launch(self, kernel: Any, count: int, args: list[Any], block: int = BLOCK) -> None:
@@ -58,7 +58,7 @@ class LaunchCache:
             for index, value in enumerate(args):
                 if value is not before[index]:
                     command.set_param_at_index(index, value)
-                    before[index] = value  # kept alive: the command has its address only
+                    before[index] = value  # kept alive, as the command stores only its address
             if dim[0] != count:
                 command.set_dim(count)
                 dim[0] = count
@@ -73,12 +73,12 @@ class Launcher:
         self._wp, self.timed = load(), timed
         self._device, self._workers, self._cache = cache.device, cache.workers, cache
         self.pieces = 8 * cache.threads if divided else 1
-        """of a CPU launch, several per thread since work is uneven"""
+        """number of pieces of a CPU launch: several per thread, as work is uneven"""
         self._stream = None if self._workers else self._device.stream  # the caller may switch it later
         self._marks: list[tuple[str | None, Any]] = []
 
     def launch(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
-        """Launch `count` threads of a kernel whose first parameter is the number of thread 0."""
+        """Launch `count` threads of a kernel whose first parameter is the index of its first thread."""
         args = _arguments(kernel, given, 1)
         pieces = 1 if self._workers is None else min(self.pieces, -(-count // _MIN_PIECE))
         if pieces == 1:
@@ -88,7 +88,7 @@ class Launcher:
         self._run(kernel, [(end - first, [first, *args]) for first, end in pairwise(cuts)])
 
     def launch_whole(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
-        """Launch `count` threads in one piece on every device, with all arguments given."""
+        """Launch `count` threads in one piece on every device, with all arguments from `given`."""
         self._cache.launch(kernel, count, _arguments(kernel, given), block)
 
     def launch_tiles(self, kernel: Any, first: int, end: int, area: int, given: Mapping[str, Any]) -> None:
@@ -150,18 +150,19 @@ class Launcher:
 
 
 class CommandList:
-    """A CUDA graph of launches, captured once and replayed; on the CPU, for tests, Warp's own list."""
+    """Command list: a CUDA graph that is captured once and replayed; on the CPU (in tests) Warp's own
+    list."""
 
     def __init__(self, graph: Any) -> None:
         self._graph = graph
 
     @staticmethod
     def record(workspace: Workspace, launch: Callable[[], object]) -> CommandList | None:
-        """Capture what `launch` submits from one thread and without times; nothing runs. None where the
-        device cannot capture, after a warning; later frames are not captured either."""
+        """Capture the launches that `launch` submits, without running them. Returns None after a warning if
+        the device cannot capture; later frames are then not captured either."""
         wp, device = load(), workspace.device
         try:
-            # a stream of its own: the user's current one may be one that cannot be captured
+            # a separate stream, as the caller's current stream may not support capture
             with wp.ScopedStream(workspace.capture_stream, sync_enter=False):
                 wp.capture_begin(device=device)
                 try:

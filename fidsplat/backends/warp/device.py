@@ -25,7 +25,7 @@ from fidsplat.util.errors import DeviceError, UnknownDeviceError
 
 
 def devices() -> list[DeviceInfo]:
-    """Warp's devices here; one that says how to install Warp if it is missing."""
+    """List Warp's devices; without Warp an unusable entry that says how to install it."""
     try:
         wp = runtime.load()
     except DeviceError as error:
@@ -34,12 +34,12 @@ def devices() -> list[DeviceInfo]:
 
 
 def open_device(selector: str = "") -> WarpBackend:
-    """`cpu`, `cuda` (the first), `cuda:1`, or part of a device's name; without a selector CUDA before the
-    CPU.
+    """Open a Warp device: `cpu`, `cuda` (the first), `cuda:1`, or part of a device's name; without a selector
+    a CUDA device if there is one, else the CPU.
 
     Raises:
         DeviceError: Warp is missing or cannot be started, or there is no CUDA device.
-        UnknownDeviceError: nothing matches the selector.
+        UnknownDeviceError: no device matches the selector.
     """
     found = runtime.load().get_devices()
     requested = selector.strip().lower()
@@ -49,7 +49,7 @@ def open_device(selector: str = "") -> WarpBackend:
     if not matching:
         if requested.split(":")[0] == "cuda" and not any(device.is_cuda for device in found):
             raise DeviceError(
-                "Warp sees no CUDA device here (no NVIDIA driver, or no GPU); use device='warp:cpu'"
+                "Warp finds no CUDA device (no NVIDIA driver, or no GPU); use device='warp:cpu'"
             )
         known = ", ".join(f"warp:{device.alias}" for device in found)
         raise UnknownDeviceError(f"no Warp device matches {selector!r}; there are: {known}")
@@ -84,18 +84,18 @@ class WarpBackend(Workspace, Backend):
         return Resident.of(cloud, self.pool)
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
-        """A cloud of arrays that are on the device, without a copy."""
+        """Make a cloud of arrays that are already on the device, without a copy."""
         return Resident.around(arrays, origin, self.pool)
 
     def unsupported(self, features: FeatureSet) -> str:
-        """Error message naming the effects without Warp kernels; empty if all have them."""
+        """Error message naming requested effects that have no Warp kernels; empty if there are none."""
         return unsupported(features, self.info.name)
 
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
 
         Raises:
-            DeviceError: what is `unsupported`, or the compiler fails.
+            DeviceError: an effect is not supported, or the compiler fails.
         """
         key = (features, shape or self.shape)
         if key not in self._pipelines:
@@ -116,7 +116,7 @@ class WarpBackend(Workspace, Backend):
         return WarpProbe(self)
 
     def shapes(self, kind: str) -> dict[str, WarpShape]:
-        """Other build constants, by name, for tests."""
+        """Alternative build constants by name, for tests."""
         return other_shapes(self.shape, kind)
 
 

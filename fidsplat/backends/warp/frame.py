@@ -1,13 +1,13 @@
-"""The stages of a frame of one or many views: project, sort, bin, blend, resolve.
+"""The stages of a frame with one or many views: project, sort, bin, blend, resolve.
 
-The view is one more index of every stage: splats, tiles and samples are numbered view after view. Between the
-stages the host reads two numbers, of visible splats and of pairs of splats and tiles, which are the sizes of
-arrays and launches. A frame with more pairs than the memory budget holds is rendered in bands of tiles; the
-images are bit-identical.
+Splats, tiles and samples of all views are numbered consecutively, view after view. Between the stages the
+host reads the number of visible splats and the number of pairs of a splat and a tile: they are the sizes of
+arrays and launches. A frame with more pairs than the memory budget allows is rendered in bands of tiles,
+bit-identically.
 
-A frame of a kind that was rendered before does not wait for these numbers: its lists have a `Capacity`, and
-its `totals` hold the true numbers. If they exceed the capacity its lists are empty (recorded_frame.py renders
-it again).
+A frame of a kind that was rendered before does not wait for these numbers: its lists have the `Capacity` of
+earlier frames, and `totals` on the device holds the true numbers. If they exceed the capacity, the lists are
+empty, and recorded_frame.py renders the frame again.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class ImageArrays:
     arrays: Mapping[str, Any]
     """by the names of the outputs"""
     indices: Any
-    """(views) int32 on the device: index of each view's images in them"""
+    """(views) int32 on the device: batch index of each view in these arrays"""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Capacity:
     """Sizes of the lists of a frame."""
 
     visible: int
-    """splats that are not culled"""
+    """number of visible splats"""
     pairs: int
-    """of splats and tiles"""
+    """number of pairs of a splat and a tile"""
 
 
 class DeviceFrame:
-    """The stages of a frame, each a method, and their arrays."""
+    """State of a frame: its arrays, and a method for each stage."""
 
     def __init__(
         self,
@@ -72,9 +72,9 @@ class DeviceFrame:
     ) -> None:
         """
         Args:
-            reserved: bytes on the device of the frame or batch of which this one is a part.
-            capacity: of its lists; by default the host waits for their sizes.
-            inputs: arrays that the host fills for the views; the workspace's by default.
+            reserved: device memory in bytes of the frame or batch to which this one belongs.
+            capacity: capacity of the lists; by default the host waits for their sizes.
+            inputs: pool of the arrays that the host fills for the views; by default that of the workspace.
         """
         self.program, self.planner, self.workspace = program, planner, planner.workspace
         self.pool = self.workspace.pool
@@ -87,20 +87,20 @@ class DeviceFrame:
         self.views, self.splats = len(stack), len(stack) * resident.count
         self.tiles = self.views * rows * columns
         self.grid = rows * shape.tile_height, columns * shape.tile_width
-        """of samples of a view"""
+        """rows and columns of samples of a view"""
         self.named: dict[str, Any] = {}
         """arrays and structs by the names of the kernels' parameters"""
         self.bands = 0
-        """of tiles, in which it was rendered"""
+        """number of bands of tiles in which the frame was rendered"""
         self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
         self.set_views(stack)
 
     def set_views(self, stack: ViewBatch) -> None:
-        """Fill the arrays and structs of other views of the same kind."""
+        """Fill the input arrays and structs for other views of the same kind."""
         program, inputs, view = self.program, self.inputs, stack.view
         self.stack, self.view = stack, view
         if view.sub_frames:
-            return  # each sub-frame fills its own
+            return  # each sub-frame fills its own inputs
         self._fill_views()
         self.named["lens"] = lens_of(view, self.workspace)
         self.named["moving"] = moving_of(self.resident, stack, inputs)
@@ -115,11 +115,11 @@ class DeviceFrame:
         self.named["views"] = self.inputs.filled("views", numbers, kernels("common").View)
 
     def render(self) -> None:
-        """Run all stages but the last, which fill `samples`."""
+        """Run all stages except resolve; the result is in `samples`."""
         self.samples = self._render_exposure() if self.view.sub_frames else self._render_pose()
 
     def _render_exposure(self) -> Any:
-        """Run all stages but the last for each sub-frame, and accumulate their samples."""
+        """Run all stages except resolve for each sub-frame, and accumulate their samples."""
         exposed = self._samples("exposed")
         reserved = self.reserved + self.planner.sample_bytes(self.view)
         for sub_frame in self.view.sub_frames:
@@ -129,11 +129,11 @@ class DeviceFrame:
             self.launcher.stage("expose")
             self._accumulate(sub_frame, samples, exposed)
             self.stats = {name: max(value, part.stats[name]) for name, value in self.stats.items()}
-        self._fill_views()  # sub-frames overwrote them
+        self._fill_views()  # sub-frames have overwritten the inputs
         return exposed
 
     def _accumulate(self, sub_frame: SubFrame, samples: Any, exposed: Any) -> None:
-        """Add the samples of a sub-frame: light is averaged, other buffers are those of one pose."""
+        """Add the samples of a sub-frame: colours are averaged, other buffers are from the middle pose."""
         start, count = sub_frame.top * self.grid[1], sub_frame.view.height * self.grid[1]
         for name in self.program.sample_fields:
             source, target = getattr(samples, name), getattr(exposed, name)
@@ -146,7 +146,7 @@ class DeviceFrame:
                 self.wp.copy(target, source, dest_offset=start, count=count)
 
     def _render_pose(self) -> Any:
-        """Run all stages but the last for one pose; returns the sample buffers."""
+        """Run all stages except resolve for one pose; returns the sample buffers."""
         wp, n, program = self.wp, self.splats, self.program
         self._take("starts", self.tiles + 1, wp.int32)
         self._take("lists", 1, wp.int32)
@@ -166,9 +166,9 @@ class DeviceFrame:
             self.launcher.stage("blend")
             self._blend(first, end, samples)
         if program.backdrop:
-            # here, as sub-frames may look in different directions
+            # prepared here, as sub-frames may have different directions
             self.launcher.stage("resolve")
-            # without derivatives, unlike those of blending: another struct type
+            # rays without derivatives: another struct type than for blending
             rays = rays_of(self.view, self.workspace, self.inputs)
             count = self.views * self.view.width * self.view.height
             self._launch(program.backdrop, count, rays=rays, color=samples.color)
@@ -183,7 +183,7 @@ class DeviceFrame:
         self._take("keys", n, wp.uint32)
         counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
         visible, offsets = self._exact("visible", n, wp.int32), self._exact("offsets", n, wp.int32)
-        # not read if all splats are of one kind
+        # not read if all splats are of one kind, so any array will do
         cloud = {"boxes": visible, "coplanar_groups": visible, "thickness": self.resident.arrays["opacities"]}
         cloud |= self.resident.arrays
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
@@ -198,26 +198,26 @@ class DeviceFrame:
 
     def _sort(self, visible: int) -> None:
         """Sort visible splats by depth, ties by index."""
-        # the second half is the scratch of the sort
+        # the second half is scratch memory of the sort
         keys = self._take("sorted_keys", 2 * visible, self.wp.uint32)
         order = self._take("order", 2 * visible, self.wp.int32)
         self._launch(self.program.sort.compact, self.splats, capacity=visible)
         self.wp.utils.radix_sort_pairs(keys, order, visible)
 
     def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:
-        """Ranges of tiles (first, end, pairs) whose lists fit the budgets; usually one."""
+        """Split the tiles into ranges (first, end, pairs) whose lists fit the budgets; usually one."""
         limit = self.planner.max_pairs(self.resident, self.stack, visible, self.reserved)
         if pairs <= limit:
             return iter([(0, self.tiles, pairs)])
         totals = self._take("tile_totals", self.tiles, self.wp.int32)
         totals.zero_()
         self.program.load_banding()
-        # in one piece: on the CPU its atomic additions are plain ones
+        # in one piece, as its atomic additions on the CPU are ordinary additions
         self.launcher.launch_whole(self.program.lists.histogram, visible, {**self.named, "first": 0})
         return split_by_cost(totals.numpy()[: self.tiles], limit)
 
     def fits(self, capacity: Capacity) -> bool:
-        """Whether a frame of this capacity keeps to the budgets in one band."""
+        """Whether a frame of this capacity fits the budgets in one band."""
         try:
             limit = self.planner.max_pairs(self.resident, self.stack, capacity.visible, self.reserved)
         except DeviceError:
@@ -225,7 +225,7 @@ class DeviceFrame:
         return capacity.pairs <= limit
 
     def _bin(self, visible: int, first: int, end: int, pairs: int, complete: bool) -> None:
-        """Make the tile lists of one band, each in depth order. complete: whether it is all tiles."""
+        """Make the tile lists of one band, each in depth order. complete: whether the band has all tiles."""
         wp, lists, sort = self.wp, self.program.lists, self.program.sort
         tiles = self._take("tiles", 2 * pairs, wp.int32)
         listed = self._take("lists", 2 * pairs, wp.int32)
@@ -240,7 +240,7 @@ class DeviceFrame:
         self._launch(sort.find_starts, end - first + 1, **band, pairs=pairs)
 
     def _samples(self, kind: str) -> Any:
-        """The struct of sample buffers; each kind has its own."""
+        """The struct of sample buffers of a kind."""
         samples = self.program.samples_type()
         for name, dtype in self.program.sample_fields.items():
             size = self.views * self.grid[0] * self.grid[1]
@@ -250,7 +250,7 @@ class DeviceFrame:
     def _blend(self, first: int, end: int, samples: Any) -> None:
         """Blend the tiles of one band."""
         program, shape = self.program, self.program.shape
-        # the default is not read
+        # the placeholder is not read
         groups = self.resident.arrays.get("coplanar_groups", self.named["lists"])
         given = {**self.named, "rays": self._rays, "samples": samples, "coplanar_groups": groups}
         area = shape.tile_width * shape.tile_height
@@ -264,7 +264,7 @@ class DeviceFrame:
         self.launcher.launch_tiles(program.blend, first, end, area, given)
 
     def resolve(self, into: ImageArrays, launcher: Launcher) -> None:
-        """Run the last stage, which makes images from samples."""
+        """Run the resolve stage: make images from samples."""
         launcher.stage("resolve")
         view, wp, program = self.view, self.wp, self.program
         width, pixels = view.width // view.samples, view.width * view.height // view.samples**2

@@ -1,4 +1,4 @@
-"""Gradients of a frame: the backward kernels (kernels/warp/*_backward.py) on the arrays of its stages."""
+"""Gradients of a frame, by the backward kernels (kernels/warp/*_backward.py)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fidsplat.effects.differentiable import check_gradients
 from fidsplat.util.errors import DeviceError, InputError
 
 _SHARES = 2048
-"""threads of a sum over all pixels or splats; the order of additions depends on it"""
+"""number of threads of a sum over all pixels or splats; it determines the order of additions"""
 
 
 class WarpDifferentiable(DifferentiableImages):
@@ -56,8 +56,8 @@ class WarpGradients(GradientPipeline):
         frame, images = self._pipeline.render_counted(resident, view)
         if frame.bands > 1:
             raise DeviceError(
-                f"{resident.count:,} splats are rendered in bands within the memory budget, and such frames "
-                "have no gradient; raise memory_budget, or use fewer splats or smaller images"
+                "frames with derivatives must fit the memory budget without bands, got "
+                f"{resident.count:,} splats; raise memory_budget, or use fewer splats or smaller images"
             )
         return WarpDifferentiable(frame, images)
 
@@ -72,7 +72,7 @@ class WarpGradients(GradientPipeline):
 
 
 class _Backward:
-    """The backward pass of a frame: the stages in order, each a method."""
+    """The backward pass of a frame, with a method for each stage."""
 
     def __init__(self, frame: DeviceFrame, made: GradientKernels, gradients: Mapping[str, Any]) -> None:
         self._frame, self._made, self._wp = frame, made, load()
@@ -88,14 +88,14 @@ class _Backward:
         }
 
     def results(self) -> dict[str, Any]:
-        """Run all stages; returns the arrays of `GradientPipeline.backward`."""
+        """Run all stages; returns gradients as `GradientPipeline.backward` does."""
         found = self._allocate_results()
         self._launcher.stage("blend backward")
         self._blend()
         self._launcher.stage("project backward")
         if self._pairs:
             self._launcher.launch(self._made.project, self._count, self._given)
-        else:  # no splat is visible: there are no moments
+        else:  # no splat is visible, so there are no moments
             for array in (*found.values(), self._given["by_poses"]):
                 array.zero_()
         view = self._frame.view
@@ -110,7 +110,7 @@ class _Backward:
         return found
 
     def _blend(self) -> None:
-        """Sum moments over the samples of each pair of a splat and a tile."""
+        """Sum gradient moments over the samples of each pair of a splat and a tile."""
         wp, frame, made, pairs = self._wp, self._frame, self._made, self._pairs
         if not pairs:
             return
@@ -145,7 +145,7 @@ class _Backward:
         self._launcher.launch(made.as_single, columns, {"sums": total, "singles": result})
 
     def _by(self, gradients: Mapping[str, Any]) -> Any:
-        """The gradients of the images as the kernels' struct; missing ones are 0."""
+        """The kernels' struct of the gradients with respect to the images; missing gradients are 0."""
         by = self._made.blend.By()
         for name in self._made.losses:
             view, given = self._frame.view, gradients.get(name)
@@ -173,7 +173,7 @@ class _Backward:
         return flat_of(given)
 
     def _allocate_results(self) -> dict[str, Any]:
-        """Allocate the results, which each call overwrites."""
+        """Allocate the results; each call overwrites them."""
         wp, count, terms = self._wp, self._count, max(self._made.sh_terms, 1)
         kinds = {
             "by_means": wp.vec3,
@@ -209,14 +209,14 @@ def flat_of(array: Any) -> Any:
 
 
 def add_to(sums: Any, values: Any) -> None:
-    """Add flat float32 arrays of equal length on their device."""
+    """Add flat float32 values to sums of equal length on the device."""
     given = {"device": sums.device, "record_tape": False}
     with quiet():
         load().launch(kernels("column_sums").add_to, sums.size, [sums, values], **given)
 
 
 def _shape_of(array: Any) -> tuple[int, ...]:
-    """Shape of an array in numbers, with an axis for vectors."""
+    """Shape of an array of numbers or vectors; vectors add an axis."""
     wp = load()
     shape = tuple(array.shape)
     if isinstance(array, wp.array) and wp.types.type_is_vector(array.dtype):

@@ -26,12 +26,12 @@ class Rendered:
 
     launcher: Launcher
     counts: dict[str, int]
-    """splats, visible, pairs; see `complete`"""
+    """number of splats, visible splats and pairs; final after `settle`"""
     complete: Callable[[], Rendered | None] | None = None
-    """of a frame whose counts are not known: waits for it, and returns its second rendering into the same
-    arrays if it exceeded its capacity"""
+    """for a frame with unknown counts: waits for it, renders it again into the same arrays if it exceeded its
+    capacity, and returns it"""
     profile: Callable[[], Mapping[str, float]] | None = None
-    """of a replayed frame: measures its stages"""
+    """for a replayed frame: renders it again to measure its stages"""
 
     def settle(self) -> Rendered:
         """Wait for the counts; render the frame again if it exceeded its capacity."""
@@ -68,10 +68,12 @@ class WarpImages(Images):
         self._outputs, self._size, self.views, self._splats = outputs, size, views, splats
         self.nbytes, pixels = 0, views * size[0] * size[1]
         self.arrays: dict[str, Any] = {}
-        """by the names of the outputs; complete or not"""
+        """arrays by the names of the outputs; possibly not complete yet"""
         for name, output in outputs.items():
             self.nbytes += 4 * pixels * output.channels
-            if views > 1 and self.nbytes > workspace.memory_budget:  # a frame counts them in its plan
+            if (
+                views > 1 and self.nbytes > workspace.memory_budget
+            ):  # single frames include images in their plan
                 raise DeviceError(
                     f"the images of {views} views must be at most {bytes_words(workspace.memory_budget)}, "
                     f"the memory budget, got {bytes_words(self.nbytes)}; render fewer views or outputs at "
@@ -80,16 +82,16 @@ class WarpImages(Images):
             dtype = getattr(load(), output.dtype)
             self.arrays[name] = workspace.pool.fresh(name, pixels * output.channels, dtype)
         self.rendered: list[Rendered] = []
-        """in parts of the batch"""
+        """the parts of the batch"""
 
     def blank(self) -> None:
-        """Fill the images of all views, of which some are masked out."""
+        """Fill the images of all views with the blank value, as some views are masked out."""
         for name, output in self._outputs.items():
             self.arrays[name].fill_(output.blank)
 
     def device_array(self, name: str, index: int | None = None) -> Any:
-        """The images as a wp.array (views, h, w) or (views, h, w, 3), with an index that of one view, on the
-        device; no copy."""
+        """The images as a wp.array (views, h, w) or (views, h, w, 3), or of one view (h, w) or (h, w, 3), on
+        the device, without a copy."""
         for part in self.rendered:
             part.settle()
         output, array = self._outputs[name], self.arrays[name]
@@ -103,7 +105,7 @@ class WarpImages(Images):
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
         """Copy the images of all views, or of one, to the host."""
-        # a CPU array's numpy() is its own memory, which device_array shares
+        # copied, as on the CPU numpy() shares the memory of `device_array`
         return np.array(self.device_array(name, index).numpy())
 
     def read_uint8(self, name: str, index: int = 0) -> np.ndarray:
@@ -130,6 +132,6 @@ class WarpImages(Images):
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """visible and pairs, sums over all views; splats in the cloud."""
+        """Number of splats in the cloud, and of visible splats and pairs, summed over all views."""
         none = {"splats": 0, "visible": 0, "pairs": 0}
         return summed([none, *(part.settle().counts for part in self.rendered)]) | {"splats": self._splats}

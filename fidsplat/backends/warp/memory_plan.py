@@ -1,4 +1,4 @@
-"""The memory plan: how many pairs a frame lists at once, and which views are rendered together."""
+"""The memory plan: how many pairs a frame lists at once, and how many views are rendered together."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from fidsplat.backends.warp.uniforms import memory_bytes
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.util.errors import DeviceError, bytes_words
 
-# bytes: of a splat's bounds; of its window, key, counts and sums; of a visible splat in the sort and the
-# lists; of a pair with the scratch of its sort
+# bytes of a splat's bounds; of its window, key, counts and sums; of a visible splat in the sort and the
+# lists; of a pair, including scratch memory of the sort
 _BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
 _MAX_PART_BYTES = {True: 1 << 31, False: 1 << 28}
-"""of the views of a part, on CUDA and on the CPU: more is no faster"""
+"""maximum bytes of a part of a batch on CUDA and on the CPU; larger parts are not faster"""
 _MAX_NUMBERED = 1 << 30
-"""samples, and lines of records, of all views of a part: kernels number them in 32 bits"""
+"""maximum number of samples and of records of a part; kernels use 32-bit indices"""
 
 
 class MemoryPlanner:
@@ -34,10 +34,10 @@ class MemoryPlanner:
         self._lines = program.layout.lines
         self._splat_bytes = 16 * self._lines + _BOUNDS + _PROJECTED
         self._same_settings = program.sensor is not None
-        """whether the views of a part must have the same numbers"""
+        """whether the views of a part must have equal camera parameters"""
 
     def sample_bytes(self, view: View) -> int:
-        """Bytes of the sample buffers of a view, of complete tiles."""
+        """Bytes of the sample buffers of a view, padded to complete tiles."""
         return self._samples(view) * self._sample_bytes
 
     def _samples(self, view: View) -> int:
@@ -45,7 +45,7 @@ class MemoryPlanner:
         return rows * columns * self._tile_width * self._tile_height
 
     def max_pairs(self, resident: Resident, stack: ViewBatch, visible: int, reserved: int) -> int:
-        """Number of pairs that may be listed at once. reserved: bytes of other arrays.
+        """Maximum number of pairs that may be listed at once. reserved: bytes of other arrays.
 
         Raises:
             DeviceError: the rest of the frame exceeds the memory budget.
@@ -69,10 +69,10 @@ class MemoryPlanner:
             return iter([(k, k + 1) for k in range(count)])
         each = resident.count * (self._splat_bytes + _VISIBLE) + self.sample_bytes(batch.view)
         free = workspace.memory_budget - resident.memory_bytes - reserved
-        # half is for the lists
+        # half of the budget is for the lists
         fitting = min(free // 2, _MAX_PART_BYTES[workspace.device.is_cuda]) // each
         numbered = _MAX_NUMBERED // max(self._samples(batch.view), resident.count * self._lines)
         together = max(1, min(fitting, numbered))
-        # of equal size, so that parts have the same launches
+        # parts have equal size, so that their launches can be replayed
         parts = -(-count // together)
         return pairwise([count * k // parts for k in range(parts + 1)])

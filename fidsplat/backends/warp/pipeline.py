@@ -38,7 +38,7 @@ class WarpPipeline(Pipeline):
             return images
 
     def render(self, resident: Resident, views: ViewBatch) -> WarpImages:
-        """Render views, as many at once as memory holds. Raises DeviceError as `render_view`."""
+        """Render views, as many at once as memory allows. Raises DeviceError if the device fails."""
         wp, device = load(), self.workspace.device
         with self.workspace.working("while rendering"):
             images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)
@@ -52,10 +52,11 @@ class WarpPipeline(Pipeline):
             return images
 
     def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
-        """Render one view; its frame, whose arrays are valid until another is rendered, and its images.
+        """Render one view and wait for its counts. Returns the frame, whose arrays are valid until the next
+        frame, and the images.
 
         Raises:
-            DeviceError: as `render_view`.
+            DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.working("while rendering"):
             images, into = self._new_images(resident, view)

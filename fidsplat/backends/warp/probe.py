@@ -1,6 +1,4 @@
-"""Looks into an open device: single kernels of kernels/warp/check.py, and arrays that are filled with rubbish
-first.
-"""
+"""Access to an open device for tests: single kernels of kernels/warp/check.py, and arrays filled with NaN."""
 
 from __future__ import annotations
 
@@ -24,11 +22,11 @@ class WarpProbe(Probe):
         self._workspace = workspace
 
     fuses = True
-    """Warp's devices fuse multiply-adds where requested"""
+    """always true: Warp fuses multiply-adds where requested"""
 
     def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
-        """a b - a b; a b + a; (a / 3) (b / 3) - (a / 3) (b / 3) in float64; a b - (a b), fused: each (n,),
-        from a, b (n,) float32."""
+        """Evaluate a b - a b; a b + a; (a/3)(b/3) - (a/3)(b/3) in float64; fma(a, b, -(a b)): each (n,), from
+        a, b (n,) float32."""
         n = len(a)
         types = (np.float32, np.float32, np.float64, np.float32)
         return run(self._workspace, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types])
@@ -41,7 +39,7 @@ class WarpProbe(Probe):
     def arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Kernels of check.py."""
+        """Run the kernels of check.py."""
         workspace, n = self._workspace, len(exponents)
         single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
         (found,) = run(workspace, "arithmetic", n, single, [np.zeros((8, n), np.float32)])
@@ -54,12 +52,12 @@ class WarpProbe(Probe):
         return results
 
     def options(self) -> list[str]:
-        """Compiler options of every kernel that are on."""
+        """Enabled compiler options, the same for every kernel."""
         return [name for name, value in kernels("common").STRICT.items() if value is True]
 
     def scan(self, pipeline: Any, lengths: np.ndarray) -> tuple[np.ndarray, int]:
         """Prefix sums of list lengths (n,) uint32, modulo 2^32, (n + 1,) uint32; and the total in
-        64 bits. All pipelines scan alike.
+        64 bits. All pipelines use the same kernel.
         """
         wp, device = load(), self._workspace.device
         with wp.ScopedDevice(device):
@@ -88,7 +86,7 @@ class WarpProbe(Probe):
 
 
 class PoisonedPool(ArrayPool):
-    """A pool whose arrays hold nothing useful."""
+    """A pool whose arrays are first filled with NaN."""
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         return poison(super().scratch(name, size, dtype))
@@ -98,7 +96,7 @@ class PoisonedPool(ArrayPool):
 
 
 def poison(array: Any) -> Any:
-    """The array, its bytes all 0xFF."""
+    """Set all bytes of an array to 0xFF, and return it."""
     wp = load()
     wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(nbytes(array),), device=array.device).fill_(0xFF)
     return array
@@ -107,8 +105,7 @@ def poison(array: Any) -> Any:
 def run(
     workspace: Workspace, kernel: str, count: int, inputs: Sequence[np.ndarray], outputs: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """Launch `count` threads of a kernel of kernels/warp/check.py on arrays; what stands in `outputs`
-    afterwards.
+    """Launch `count` threads of a kernel of kernels/warp/check.py on arrays, and return the output arrays.
 
     Raises:
         DeviceError: the compiler refuses, or the device fails.

@@ -25,13 +25,13 @@ SLOTS = frozenset(
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"}
     | {"motion_groups", "shutter_exposure", "external_depth"}
-    # without effect on images
+    # effects without influence on images
     | {"shutter_rows", "ellipsoids_only"}
 )
-"""supported features; supported outputs and post-processing steps have a file each"""
+"""supported features, in addition to outputs and post-processing steps, which have a file each"""
 _SETTINGS = {"blend_half": "blend_precision='float16'", "blend_double": "blend_precision='float64'"}
 """quality settings that request unsupported features"""
-# effects that a stage depends on; it is compiled once for all feature sets with the same
+# effects on which each stage depends; feature sets with the same ones share its kernels
 _RECORD = (
     *("lowpass_screen", "rays", "camera_orthographic", "ray_depth"),
     *("compose_pixel", "compose_coplanar", "footprint_box", "footprint_mixed", "ellipsoid_exact"),
@@ -49,7 +49,7 @@ def known() -> frozenset[str]:
 
 
 def unsupported(features: FeatureSet, name: str) -> str:
-    """Error message naming unsupported effects; empty if there are none. name: of the device."""
+    """Error message naming unsupported effects; empty if there are none. name: name of the device."""
     effects = {*features.slots, *features.outputs, *features.posts} - known()
     lacking = ", ".join(sorted(_SETTINGS.get(name, name) for name in effects))
     return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
@@ -60,11 +60,11 @@ class _Needs:
     """Requirements of a feature set."""
 
     effects: frozenset[str]
-    """features, and effects that they and outputs imply"""
+    """features, and effects that they or the outputs imply"""
     outputs: tuple[str, ...]
     """files of kernels/warp/output, dependencies included"""
     blending: tuple[str, ...]
-    """those that take part in blending"""
+    """outputs of `outputs` that take part in blending"""
     steps: tuple[str, ...]
     """files of kernels/warp/post, in their order"""
 
@@ -97,17 +97,17 @@ class _Needs:
 
 
 _MAKING = threading.RLock()
-"""held while kernels and structs are made: their caches are not thread-safe"""
+"""lock for making kernels and structs, whose caches are not thread-safe"""
 
 
 class Program:
     """Compiled kernels of all stages, and their struct types."""
 
     def __init__(self, device: Any, name: str, features: FeatureSet, shape: WarpShape) -> None:
-        """name: of the device, for errors.
+        """name: name of the device, for errors.
 
         Raises:
-            DeviceError: what is `unsupported`, or the compiler fails.
+            DeviceError: an effect is not supported, or the compiler fails.
         """
         if why := unsupported(features, name):
             raise DeviceError(why)
@@ -147,18 +147,18 @@ class Program:
         self.sloped = boxes and "rays" in needs.effects
         """whether blending reads the derivatives of a lens's rays"""
         self.opaque = "external_depth" in needs.effects
-        """whether it reads an external depth image"""
+        """whether blending reads an external depth image"""
         grouped = self.shape.schedule == "group"
         self.blend, self.state, self.blend_block = kernels("blend").make_blend(
             needs.among(_SAMPLE), blending, grouped, self.tile_area, self.shape.k_buffer_size
         )
         """the kernel, the struct of a sample, and the threads of a tile on a GPU"""
         self.sample_fields = buffers.sample_fields(blending)
-        """sample buffers: type of an element"""
+        """element type of each sample buffer"""
         self.samples_type = buffers.make_samples(tuple(self.sample_fields.items()))
         light = buffers.light_of(blending) if "shutter_exposure" in needs.effects else ()
         self.expose = {name: kernels("shutter").make_expose(self.sample_fields[name]) for name in light}
-        """kernels that accumulate sample buffers of sub-frames, by the buffer's name"""
+        """kernels that accumulate sample buffers of sub-frames, by the name of the buffer"""
 
     def _make_resolve(self, features: FeatureSet, needs: _Needs) -> None:
         output, behind = kernels("output"), kernels("background")
@@ -169,7 +169,7 @@ class Program:
         self.images_type = kernels("buffers").make_images(images, needs.outputs)
         self.cloud_arrays = output.fields(needs.outputs, "cloud_arrays")
         self.view_arrays = output.fields(needs.outputs, "view_arrays")
-        """further arrays that resolving reads: type of an element"""
+        """element type of each further array that resolving reads"""
         self.stretched = "camera_brown_conrady" in needs.effects and bool(
             output.having(features.outputs, "length")
         )
@@ -185,13 +185,13 @@ class Program:
         Raises:
             DeviceError: the compiler refuses.
         """
-        # here rather than at the first launch: several threads launch it
+        # compiled here, not at the first launch, as several threads may launch it
         try:
             loaded = kernel.module.load(self.device, block if self.device.is_cuda else 1)
         except Exception as error:
             raise DeviceError(f"{self._name} cannot compile {kernel.key}: {error}") from error
         if loaded is None:
-            raise DeviceError(f"{self._name} cannot compile {kernel.key}; Warp says more on stderr")
+            raise DeviceError(f"{self._name} cannot compile {kernel.key}; see Warp's messages on stderr")
 
     def load_banding(self) -> None:
         """Compile the kernels of frames with several bands."""

@@ -1,9 +1,9 @@
-"""Frames that are rendered without waiting for the counts of their splats and pairs, and replayed.
+"""Frame replay: frames are rendered without waiting for their counts, from a captured command list.
 
-The lists of a frame get the capacity that frames of this size of the cloud have needed so far, and an eighth
-more. A frame that exceeds it is rendered again when it is read. From the third frame of a kind on, all stages
-but the last are one captured command list: they have the same arguments, and what the host fills for their
-views is in arrays that are filled before the replay.
+The lists of a frame have the largest capacity that earlier frames of the same cloud and size needed, plus an
+eighth. A frame that exceeds it is rendered again when it is read. From the third frame of a kind on, all
+stages except resolve are one captured command list. Its arguments are constant: values that differ between
+views are in input arrays, which the host fills before the replay.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace
 
 _SPARE = 256
-"""added to a capacity, in addition to an eighth"""
+"""constant added to a capacity, in addition to an eighth"""
 _MAX_KINDS = 8
-"""of frames of a cloud, that are cached"""
+"""maximum number of kinds of frames that are cached for a cloud"""
 
 
 class RecordedFrame:
-    """A frame whose stages but the last are a command list."""
+    """A frame with its stages, except resolve, as a command list."""
 
     def __init__(self, frame: DeviceFrame, token: tuple[Any, ...], commands: CommandList) -> None:
         self.frame, self.token, self._commands = frame, token, commands
-        # a cloud caches its recorded frames, and must not be kept alive by them
+        # the cloud caches its recorded frames, so they must not keep it alive
         frame.resident = weakref.proxy(frame.resident)
 
     @staticmethod
     def of(frame: DeviceFrame, token: tuple[Any, ...], launcher: Launcher) -> RecordedFrame | None:
-        """Record a frame that was rendered; None where the device cannot capture. launcher: of one thread,
-        without times."""
+        """Record the launches of a rendered frame; None if the device cannot capture. launcher: a launcher
+        with one thread that does not measure times."""
         before, frame.launcher = frame.launcher, launcher
         commands = CommandList.record(frame.workspace, frame.render)
         frame.launcher = before
         return None if commands is None else RecordedFrame(frame, token, commands)
 
     def replay(self, stack: ViewBatch) -> None:
-        """Run all stages but the last for other views."""
+        """Replay all stages except resolve for other views."""
         if len(stack) > 1 or stack.view is not self.frame.view:
             self.frame.set_views(stack)
         self._commands.submit()
@@ -57,13 +57,13 @@ class RecordedFrame:
 
 @dataclass(eq=False)
 class _CachedFrame:
-    """A kind of frame of a cloud: of one size and number of views."""
+    """Cache entry: a kind of frame of a cloud, with one image size and number of views."""
 
     inputs: ArrayPool
-    """filled by the host for the views"""
+    """pool of the input arrays that the host fills for the views"""
     capacity: Capacity
     token: tuple[Any, ...] = ()
-    """dependencies of the last frame's launches"""
+    """result of `_token` for the last frame"""
     recorded: RecordedFrame | None = None
 
     def release_arrays(self) -> None:
@@ -85,10 +85,10 @@ class FrameRenderer:
     def render_counted(
         self, resident: Resident, views: ViewBatch, into: ImageArrays, reserved: int
     ) -> tuple[DeviceFrame, Rendered]:
-        """Render views, waiting for their counts.
+        """Render views and wait for their counts.
 
         Args:
-            into: arrays of the images.
+            into: image arrays to fill.
             reserved: bytes on the device of the images of all views.
         """
         launcher = Launcher(self._launches)
@@ -101,15 +101,15 @@ class FrameRenderer:
         return frame, Rendered(launcher, frame.stats)
 
     def render(self, resident: Resident, views: ViewBatch, into: ImageArrays, reserved: int) -> Rendered:
-        """Render views without waiting where a frame of their kind was rendered before."""
+        """Render views; without waiting if a frame of their kind was rendered before."""
         workspace, view = self._workspace, views.view
-        # adopted arrays may have changed by the time that a frame must be rendered again
+        # adopted arrays may change before a frame is rendered again, so these frames must wait
         if not workspace.asynchronous or view.sub_frames or resident.adopted or not resident.count:
             return self.render_counted(resident, views, into, reserved)[1]
         cached = self._cached.get(resident, {}).get((view.width, view.height, len(views)))
         if cached is None:
             return self.render_counted(resident, views, into, reserved)[1]
-        # other frames overwrite the inputs, and a failure leaves them undefined
+        # after a failure or another kind of frame the inputs are undefined
         capacity, recorded, cached.recorded = cached.capacity, cached.recorded, None
         if recorded is not None and recorded.token == self._token(cached, view, reserved):
             recorded.replay(views)
@@ -138,15 +138,15 @@ class FrameRenderer:
         into: ImageArrays,
         reserved: int,
     ) -> Rendered:
-        """A frame whose counts are not known yet."""
+        """A submitted frame whose counts are checked later."""
         workspace, pool = self._workspace, frame.pool
         counts = pool.lend("totals", 2, load().int64)
         load().copy(counts, frame.named["totals"])
         frame.resolve(into, launcher)
         rendered = Rendered(launcher, {"splats": resident.count, "visible": 0, "pairs": 0})
-        # a later frame may write there, even if this one is still running
+        # give the array back; a later frame may then use it
         weakref.finalize(rendered, pool.give_back, "totals", counts)
-        stats = rendered.counts  # not the object, which is freed at once if nothing reads the images
+        stats = rendered.counts  # capture only the counts, so that the object can be released
 
         def complete() -> Rendered | None:
             with workspace.failing("while rendering"):
@@ -173,7 +173,7 @@ class FrameRenderer:
         return rendered
 
     def _record(self, cached: _CachedFrame, frame: DeviceFrame, reserved: int) -> None:
-        """Record a frame whose launches equal those of the last of its kind."""
+        """Record a frame if its launches equal those of the previous frame of its kind."""
         token = self._token(cached, frame.view, reserved)
         workspace = self._workspace
         if workspace.replays and token == cached.token:
@@ -183,7 +183,7 @@ class FrameRenderer:
         cached.token = token
 
     def _token(self, cached: _CachedFrame, view: View, reserved: int) -> tuple[Any, ...]:
-        """Dependencies of launches, except the numbers of the views."""
+        """Everything on which the launches depend, except the numbers of the views."""
         workspace, labels = self._workspace, tuple(label for label, _ in view.groups)
         budgets = workspace.memory_budget, workspace.pair_budget, reserved
         states = workspace.pool.state, cached.inputs.state

@@ -30,14 +30,14 @@ class Resident(ResidentData):
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.memory_bytes = sum(map(nbytes, arrays.values()))
-        """including adopted arrays"""
+        """bytes on the device, including adopted arrays"""
         self.sh_degree, self.has_coplanar_groups = sh_degree, "coplanar_groups" in arrays
         self.footprint, self.ellipsoids = footprint, ellipsoids
         self.adopted = False
         """whether the caller may change the arrays"""
 
     def color_range(self) -> tuple[float, float]:
-        """Lower and upper bound of every channel, from any direction, of the current values."""
+        """Lower and upper bound of every channel, from any direction, for the current values."""
         colors = self.arrays["colors"].numpy()[: self.count * max(self.sh_degree + 1, 1) ** 2]
         if self.sh_degree > 0:
             return color_range(None, colors.reshape(self.count, -1, 3))
@@ -78,7 +78,7 @@ class Resident(ResidentData):
         count = arrays["means"].size
         if count and arrays["scales"].dtype is load().vec3:
             arrays |= _apart(arrays["scales"])
-            ellipsoids = "some"  # decided per splat when a frame is rendered
+            ellipsoids = "some"  # the kernels decide for each splat
         terms = 0
         if "sh" in arrays:
             arrays["colors"] = arrays.pop("sh")
@@ -142,7 +142,7 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool, dtype: Any = None) 
         return wp.array(np.ascontiguousarray(array), dtype=dtype, device=pool.device).flatten()
     except (RuntimeError, MemoryError) as error:
         raise DeviceError(
-            f"the cloud's {name} need {bytes_words(array.nbytes)}, which {pool.device} has not; use fewer "
+            f"the cloud's {name} need {bytes_words(array.nbytes)}, more than {pool.device} has; use fewer "
             "splats"
         ) from error
 
@@ -157,7 +157,7 @@ def _is_thick(scales: Any) -> bool:
 
 
 def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
-    """One array in the element type of the kernels, on the memory of `value` where possible."""
+    """Convert one array to the element type of the kernels, sharing the memory of `value` if possible."""
     wp = load()
 
     dtype = wp.vec3 if name == "scales" and _is_thick(value) else _dtype(name)
@@ -176,7 +176,7 @@ def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
             f"{name} must be on {pool.device}, the device of this renderer, got {array.device}; move it there"
         )
     if not array.is_contiguous:
-        raise InputError(f"{name} is not contiguous; give a contiguous array")
+        raise InputError(f"{name} must be contiguous; give a contiguous copy")
     if array.dtype == scalar and width > 1 and array.shape[-1] == width:
         array = wp.from_dlpack(array, dtype=dtype)
     if (

@@ -1,4 +1,4 @@
-"""Build constants of kernels for a device, and others for tests."""
+"""Build constants of the kernels, by device."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ class WarpShape:
     """Build constants of the kernels."""
 
     schedule: str
-    """`tiles`: a thread renders a tile (CPU). `group`: a block of threads renders a tile (CUDA)."""
+    """`tiles`: a thread renders a tile (CPU); `group`: a block of threads renders a tile (CUDA)"""
     tile_width: int
-    """samples: 8, 16 or 32, as its height"""
+    """width and height of a tile in samples: 8, 16 or 32"""
     tile_height: int
     k_buffer_size: int = 8
-    """fragments of a pixel that are sorted by depth at once (k-buffer)"""
+    """size of the k-buffer: fragments of a pixel that are sorted by depth at once"""
 
 
 def shape_for(device: Any) -> WarpShape:
-    """The shape for a device."""
+    """The build constants for a device."""
     return WarpShape("group" if device.is_cuda else "tiles", 16, 16)
 
 
 def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
-    """Other build constants, by name, for tests: `Backend.shapes`."""
+    """Alternative build constants by name, for tests (`Backend.shapes`)."""
     if kind == "schedule":
         return {"groups": WarpShape("group", 8, 8)}
     if kind == "listing":

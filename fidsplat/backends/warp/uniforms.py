@@ -1,6 +1,6 @@
-"""The structs of kernels/warp that hold a view: its numbers, lens, moving groups, and background.
+"""Conversion of views to the structs of kernels/warp: uniforms, rays, lens, moving groups, background.
 
-Arrays of lenses and panoramas are cached as long as the host refers to them.
+Device arrays of lenses and panoramas are cached as long as their host objects exist.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def _record() -> Any:
 
 
 def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
-    """Fill the struct `View` (views,) for tiles of this shape. splats: of the cloud. sloped: whether kernels
-    read derivatives of rays."""
+    """Make the structs `View` (views,). splats: number of splats of the cloud. sloped: whether kernels read
+    the derivatives of rays."""
     view = stack.view
     derived = {
         **{"tile_w": shape.tile_width, "tile_h": shape.tile_height, "splats": splats},
@@ -44,7 +44,7 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
     for name in ("focal_x", "focal_y", "near"):
         filled[f"per_{name}"] = 1.0 / filled[name]
     filled["ray"] = view.uniform("ray")
-    if not (view.along_ray or view.parallel):  # else depths are distances
+    if not (view.along_ray or view.parallel):  # otherwise depths are distances
         own = (filled["focal_x"], filled["focal_y"], filled["center_x"], filled["center_y"])
         filled["ray"] = np.stack(own, axis=1)
     if sloped and view.raster:
@@ -60,8 +60,13 @@ def rays_of(
     sloped: bool = False,
     opaque: bool = False,
 ) -> Any:
-    """The struct `Rays` of a view, with derivatives if `sloped`, with its layer if `opaque`; without rays if
-    it has no raster, or unless `bent`. inputs: of the layer.
+    """Make the struct `Rays` of a view.
+
+    Args:
+        inputs: pool for the external depth image.
+        bent: include the rays, if the view has a lens.
+        sloped: include the derivatives of the rays.
+        opaque: include the external depth image.
 
     Raises:
         DeviceError: the device has too little memory.
@@ -96,7 +101,7 @@ def array_of(stack: ViewBatch, name: str) -> np.ndarray:
 
 
 def lens_of(view: View, workspace: Workspace) -> Any:
-    """The struct `Lens` of a view; an empty one if it has no raster.
+    """Make the struct `Lens` of a view; empty if the view has no lens.
 
     Raises:
         DeviceError: the device has too little memory.
@@ -117,7 +122,7 @@ def lens_of(view: View, workspace: Workspace) -> Any:
 
 
 def moving_of(resident: Resident, stack: ViewBatch, inputs: ArrayPool) -> Any:
-    """The struct `Moving` of a frame; empty if nothing moves. inputs: pool of its arrays."""
+    """Make the struct `Moving` of a frame; empty if nothing moves. inputs: pool for its arrays."""
     declared, groups = kernels("motion"), stack.view.groups
     kind = declared.make_motion(bool(groups)).Moving
     if not groups:
@@ -135,12 +140,12 @@ def moving_of(resident: Resident, stack: ViewBatch, inputs: ArrayPool) -> Any:
 
 @cache
 def _empty(kind: Any) -> Any:
-    """A struct without arrays, shared by all frames so that it is packed once."""
+    """An empty struct, shared by all frames so that it is packed only once."""
     return kind()
 
 
 def surroundings_of(view: View, workspace: Workspace) -> Any:
-    """The struct `Surroundings` of a gradient or panorama.
+    """Make the struct `Surroundings` of a gradient or panorama.
 
     Raises:
         DeviceError: the device has too little memory for the panorama.
@@ -169,7 +174,7 @@ def memory_bytes(view: View, workspace: Workspace) -> int:
 
 
 def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:
-    """Device arrays of a complete raster."""
+    """Device arrays of a lens's rays."""
     wp, raster = load(), raster.whole or raster
     cached = workspace.lenses.setdefault(raster, {})
     if not cached:
@@ -194,7 +199,7 @@ def _panorama(panorama: Panorama, workspace: Workspace) -> Any:
             cached[panorama] = wp.array(image, dtype=wp.vec3, device=workspace.device)
         except (RuntimeError, MemoryError) as error:
             raise DeviceError(
-                f"the panorama needs {bytes_words(image.nbytes)}, which {workspace.device} has not; use a "
+                f"the panorama needs {bytes_words(image.nbytes)}, more than {workspace.device} has; use a "
                 "smaller one"
             ) from error
     return cached[panorama]

@@ -1,4 +1,4 @@
-"""Shared by all frames of a device: scratch arrays, arrays of lenses and panoramas, and the memory budget."""
+"""State of an open Warp device: scratch arrays, cached arrays of lenses and panoramas, memory budget."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class ArrayPool:
         self._arrays: dict[tuple[str, Any], Any] = {}
         self._parts: dict[tuple[str, Any], Any] = {}
         self._memory: dict[tuple[str, Any], tuple[Any, np.ndarray]] = {}
-        """parts of scratch arrays on the CPU, and their memory as NumPy arrays"""
+        """cached views of scratch arrays on the CPU, with their memory as NumPy arrays"""
         self._hosts: dict[str, Any] = {}
         self._spare: dict[str, list[Any]] = {}
         self.state = object()
-        """another object whenever a scratch array is replaced"""
+        """identity of the set of scratch arrays: a new object whenever one is replaced"""
         self.holders: WeakSet[Any] = WeakSet()
-        """caches of scratch arrays, whose `release_arrays` is called when one is replaced"""
+        """caches that reference scratch arrays; their `release_arrays` is called when an array is replaced"""
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         """An array of at least `size` elements with undefined contents."""
@@ -56,7 +56,7 @@ class ArrayPool:
         return part
 
     def filled(self, name: str, values: np.ndarray, dtype: Any) -> Any:
-        """A scratch array of the size of `values`, with these values of the host."""
+        """Copy host values to a scratch array of the same size."""
         wp = load()
         if self.device.is_cuda:
             given = wp.array(values, dtype=dtype, device="cpu")
@@ -72,13 +72,13 @@ class ArrayPool:
         return array
 
     def host(self, name: str, size: int, dtype: Any) -> Any:
-        """A page-locked array of the host."""
+        """A page-locked array in host memory."""
         if name not in self._hosts:
             self._hosts[name] = load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
         return self._hosts[name]
 
     def lend(self, name: str, size: int, dtype: Any) -> Any:
-        """One of several page-locked arrays of the host, until `give_back`."""
+        """Lend a page-locked host array until `give_back`."""
         spare = self._spare.setdefault(name, [])
         return (
             spare.pop()
@@ -91,7 +91,7 @@ class ArrayPool:
         self._spare[name].append(array)
 
     def fresh(self, name: str, size: int, dtype: Any) -> Any:
-        """A new array.
+        """A new array outside the pool.
 
         Raises:
             DeviceError: the device has too little memory.
@@ -99,10 +99,10 @@ class ArrayPool:
         wp = load()
         try:
             return wp.empty(max(size, 1), dtype=dtype, device=self.device)
-        except (RuntimeError, MemoryError, ValueError) as error:  # the last: 2^31 elements and more
+        except (RuntimeError, MemoryError, ValueError) as error:  # ValueError: 2^31 elements and more
             raise DeviceError(
                 f"{name} needs {bytes_words(size * wp.types.type_size_in_bytes(dtype))}, which "
-                f"{self.device} has not; use fewer splats or a smaller image"
+                f"more than {self.device} has; use fewer splats or a smaller image"
             ) from error
 
 
@@ -110,27 +110,27 @@ class Workspace:
     """State of an open device."""
 
     def __init__(self, device: Any, name: str, memory_budget: int) -> None:
-        """name: of the device, for errors."""
+        """name: name of the device, for errors."""
         self.device, self.name, self._lock = device, name, threading.RLock()
         self.pool = ArrayPool(device)
         self.memory_budget = memory_budget
-        """bytes of the device for a frame and its cloud"""
+        """maximum device memory in bytes of a frame and its cloud"""
         self.pair_budget = 2**30 - 1
-        """maximum number of splat-tile pairs that are listed at once; tests lower it"""
+        """maximum number of pairs of a splat and a tile in the lists at once; tests lower it"""
         self.asynchronous = device.is_cuda
-        """whether frames do not wait for their counts if one of their kind was rendered before"""
+        """whether frames of a kind that was rendered before are submitted without waiting for their counts"""
         self.replays = device.is_cuda
-        """whether such frames are recorded as command lists"""
+        """whether such frames are recorded as command lists and replayed"""
         self.frames = 0
-        """number of frames that were started; each overwrites the arrays of the last"""
+        """number of frames started; each overwrites the scratch arrays of the previous one"""
         self.lenses: WeakKeyDictionary[RayRaster, dict[str, Any]] = WeakKeyDictionary()
-        """arrays of complete rasters, by name"""
+        """device arrays of the rays of lenses, by name"""
         self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
-        """on the device, as long as the host refers to them"""
+        """device arrays of panoramas, as long as their host arrays exist"""
 
     @cached_property
     def first_index(self) -> Any:
-        """Batch index of a single view: an array of one 0."""
+        """The batch index of a single view, as an array with one 0."""
         return load().zeros(1, dtype=load().int32, device=self.device)
 
     @cached_property
@@ -140,11 +140,11 @@ class Workspace:
 
     @contextmanager
     def working(self, doing: str) -> Iterator[None]:
-        """A context with exclusive use of the device: a thread that reads images may have to render them
+        """A context with exclusive use of the device; needed for reading images too, as that may render
         again.
 
         Raises:
-            DeviceError: as `failing`.
+            DeviceError: the device fails.
         """
         with self._lock, self.failing(doing), load().ScopedDevice(self.device):
             yield

@@ -1,9 +1,9 @@
 """Check of PoCL's kernel cache, from which PoCL loads files without a check.
 
-A bitcode file or a shared object that is cut off, empty or noise ends the process ("LLVM ERROR", SIGBUS,
-abort) or makes a program without kernels, in that run and in every later one. Such files are removed before
-PoCL first builds a program; PoCL then compiles them again. PoCL renames a file when it is complete. Files
-that another process is writing are called tempfile_* and are not removed: that process would end.
+A truncated or damaged bitcode file or shared object ends the process ("LLVM ERROR", SIGBUS, abort) or yields
+a program without kernels, in every run. Such files are removed before PoCL first builds a program, and PoCL
+compiles them again. PoCL writes files as tempfile_* and renames them when complete; those are not removed,
+since this would end the process that writes them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def is_loaded(name: str) -> bool:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a bitcode file or a shared object is as long as its own headers say."""
+    """Whether a bitcode file or a shared object has the length that its headers state."""
     if path.suffix not in (".so", ".bc"):
         return True
     with path.open("rb") as stream:
@@ -35,7 +35,7 @@ def is_whole(path: Path) -> bool:
 
 
 def _is_whole_elf(stream: BinaryIO, size: int) -> bool:
-    """Whether the table of sections and every section are in the file; GNU ld writes the table last."""
+    """Whether the file contains the section table and every section; GNU ld writes the table last."""
     head = stream.read(64)
     if len(head) < 64 or not head.startswith(_ELF):
         return False
@@ -49,7 +49,7 @@ def _is_whole_elf(stream: BinaryIO, size: int) -> bool:
 
 
 def _is_whole_bitcode(stream: BinaryIO, size: int) -> bool:
-    """Walks over the top-level blocks of an LLVM bitstream, each of which says how many words it has."""
+    """Whether the top-level blocks of an LLVM bitstream, whose headers state their lengths, fill the file."""
     if stream.read(4) != _BITCODE or size % 4:
         return False
     at = 4

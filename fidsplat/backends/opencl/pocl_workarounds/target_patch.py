@@ -2,13 +2,12 @@
 
 Devices that need no patch are preferred (device.py), and the variable FIDSPLAT_NO_POCL_PATCH forbids it.
 
-PoCL 3.0 from PyPI takes the processor's name from its LLVM 14. For one that is newer than LLVM 14 (AMD Zen
-5, say) that name is "generic", which PoCL passes to clang as -target-cpu, where it is an error: every build
-fails with "unknown target CPU 'generic'" (pocl issues #512, #1049). For one that LLVM 14 takes for an older
-one (Zen 4, with AVX-512, for Zen 3, without) builds crash or never end: PoCL selects its kernel library by
-the processor's feature flags, and that library is for AVX-512. PoCL 3.1 and later read POCL_LLVM_CPU_NAME;
-3.0 has no such setting. So the name is replaced where PoCL stores it, in the field `llvm_cpu` of the
-device's record, after `llvm_target_triplet`. The new name is the one for which PoCL built the kernel
+PoCL 3.0 from PyPI asks its LLVM 14 for the processor's name. A processor newer than LLVM 14 (such as AMD Zen
+5) is called "generic". PoCL passes this to clang as -target-cpu, and every build fails with "unknown target
+CPU 'generic'" (pocl issues #512, #1049). Zen 4 (with AVX-512) is called Zen 3 (without): builds crash or
+never end, since PoCL selects its AVX-512 kernel library by the feature flags. PoCL 3.1 and later read
+POCL_LLVM_CPU_NAME, but 3.0 has no such setting. Therefore the name is replaced in the field `llvm_cpu` of
+PoCL's device record, after `llvm_target_triplet`. The new name is the one for which PoCL built its kernel
 library.
 """
 
@@ -24,7 +23,7 @@ from pathlib import Path
 
 from fidsplat.backends.opencl.vendors import processor_flags
 
-# The x86 levels of PoCL's "distro" kernel libraries, best last, with LLVM's name for each.
+# the x86 levels of PoCL's "distro" kernel libraries with LLVM's names, best last
 _LEVELS = (
     ("x86-64", ()),
     ("core2", ("ssse3", "cx16")),
@@ -35,14 +34,14 @@ _LEVELS = (
     ("skylake-avx512", ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")),
 )
 FORBID = "FIDSPLAT_NO_POCL_PATCH"
-"""set to anything but 0, it forbids to write into PoCL's memory"""
+"""environment variable: any value except 0 forbids the patch"""
 _NAME = re.compile(r"PoCL.*-x86_64-[\w-]*gnu-([\w-]+)$")
 _RECORD_BYTES = 2048
-_corrected: dict[int, ctypes.Array] = {}  # PoCL keeps pointing at these
+_corrected: dict[int, ctypes.Array] = {}  # kept alive, as PoCL's records point to these strings
 
 
 def needs_correction(device_version: str) -> bool:
-    """Whether this device is one of PoCL 3.0's whose processor LLVM took for another one."""
+    """Whether a device is driven by PoCL 3.0 and LLVM misidentified its processor."""
     if platform.system() != "Linux" or platform.machine() != "x86_64":
         return False
     name = _name_of_llvm(device_version)
@@ -50,10 +49,9 @@ def needs_correction(device_version: str) -> bool:
 
 
 def why_not(device_address: int, device_version: str) -> str:
-    """Why the PoCL device whose record is at this address may not or cannot be corrected; empty if it can.
-    Changes nothing."""
+    """Why the PoCL device with its record at this address must not or cannot be patched; empty if it can."""
     if os.environ.get(FORBID, "0") not in ("", "0"):
-        return f"{FORBID} forbids to correct it"
+        return f"the environment variable {FORBID} forbids the patch"
     if device_address in _corrected:
         return ""
     try:
@@ -63,8 +61,8 @@ def why_not(device_address: int, device_version: str) -> str:
 
 
 def correct_target(device_address: int, device_version: str) -> str:
-    """Set the processor name of the PoCL device whose record is at this address to that of its kernel
-    library, and return it. If `why_not` has a reason, nothing is changed, and LLVM's name is returned."""
+    """Patch the processor name of the PoCL device with its record at this address, and return the new name.
+    If `why_not` returns a reason, nothing is changed, and LLVM's name is returned."""
     if device_address not in _corrected:
         place = None if why_not(device_address, device_version) else _place(device_address, device_version)
         if place is None:
@@ -81,7 +79,7 @@ def announce_once(cache: Path, text: str) -> None:
         (cache / "fidsplat-patch-announced").touch(exist_ok=False)
     except FileExistsError:
         return
-    except OSError:  # a folder that cannot be written has its own warning
+    except OSError:  # ensure_caches warns of folders that cannot be written
         pass
     warnings.warn(text, stacklevel=4)
 
@@ -108,7 +106,7 @@ def _place(device_address: int, device_version: str) -> int | None:
 
 
 def _name_of_llvm(device_version: str) -> str:
-    """What LLVM takes the processor for, from PoCL's version string; empty if that does not say."""
+    """LLVM's name of the processor, from PoCL's version string; empty if it is not in there."""
     found = _NAME.search(device_version.strip())
     return found[1] if found else ""
 
