@@ -1,4 +1,4 @@
-"""Table 3: largest tilts at which markers are found and read, with gaps below them."""
+"""Table 3 of the paper: largest tilts at which markers are found and read, with missed tilts below them."""
 
 from __future__ import annotations
 

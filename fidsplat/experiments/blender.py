@@ -23,8 +23,8 @@ from fidsplat.util.files import atomic_write, from_json, read_text, user_cache, 
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
-"""`standard`: sRGB texture, linear light, the 'Standard' view, probably as in the paper; `raw`: display
-values, so edges are means of displayed values"""
+"""`standard`: sRGB texture and the view transform 'Standard', so that pixels average linear light (probably
+as in the paper); `raw`: pixels average display values"""
 FULL_SAMPLES = 64
 WORKER = Path(__file__).with_name("blender_worker.py")
 TEST, TRAINING = "test", "view"
@@ -125,7 +125,7 @@ def marker_job(category: Category, index: int, seed: int, folder: Path, view: st
 def image_job(file: Path, camera: Camera) -> dict:
     """File and camera of an image. Raises InputError unless the pixels of the camera are square."""
     if camera.fx != camera.fy:
-        raise InputError("fx and fy of a Blender camera must be equal")
+        raise InputError("fx and fy of a Blender camera must be equal; use square pixels")
     facts = {name: getattr(camera, name) for name in ("width", "height", "fx", "cx", "cy")}
     return {"file": str(file.absolute()), **facts, "matrix": camera.world_to_camera.tolist()}
 

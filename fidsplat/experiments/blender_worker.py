@@ -26,7 +26,7 @@ def render(scene, objects: list[dict], build) -> None:
         built = build(one)
         for image in one["images"]:
             aim(scene, image)
-            # a worker of a killed run may still render the same image
+            # a worker of a killed run may still be writing the same image
             part = f"{image['file']}.{os.getpid()}.part.png"
             scene.render.filepath = part
             bpy.ops.render.render(write_still=True)
@@ -57,7 +57,7 @@ def prepare(job: dict):
     render.image_settings.color_mode = "RGB"
     render.image_settings.color_depth = "8"
     render.resolution_percentage = 100
-    # the default, AgX, shows white as 196
+    # the default view transform, AgX, displays white as 196
     scene.view_settings.view_transform = "Standard" if job["view"] == "standard" else "Raw"
     scene.view_settings.look = "None"
     ground = job["background"]

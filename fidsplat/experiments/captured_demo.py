@@ -27,7 +27,7 @@ _ANGLES = (-10.0, 30.0)
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where markers and cameras are in a captured scene [m], y down."""
+    """Positions of markers and cameras in a captured scene [m], y down."""
 
     tag: tuple[float, float, float]
     code: tuple[float, float, float]

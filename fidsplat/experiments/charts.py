@@ -22,7 +22,7 @@ from fidsplat.util.files import atomic_write, printable
 Values = Sequence[float]
 _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "fidsplat",  # files are reproducible
-    "figure.dpi": 72,  # of SVG, so that labels are where they were placed
+    "figure.dpi": 72,  # the resolution of SVG, so that measured text sizes are correct
     "font.size": 10,
     "axes.grid": True,
     "axes.axisbelow": True,

@@ -17,7 +17,7 @@ from fidsplat.util.files import writable_folder
 from fidsplat.worlds.city import City, flight
 
 IMAGE_ERROR = 1 / 255
-"""error of the images, one step of 8 bits"""
+"""allowed error of the images: one 8-bit level"""
 
 
 @dataclass(frozen=True)

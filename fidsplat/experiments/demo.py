@@ -30,9 +30,9 @@ from fidsplat.vision.readback import Reading, read_back
 from fidsplat.worlds.yard import OUTPUTS, demo_scene, demo_views
 
 COMPLETE = 0.98
-"""visible share of a completely visible marker; the rest is the soft edge of its quiet zone"""
+"""minimum visible share of a completely visible marker; the rest is the soft edge of its quiet zone"""
 MAX_POSITION_ERROR = 0.01
-"""relative to the distance"""
+"""maximum position error relative to the distance"""
 _FRAMES = 3
 """timed frames after the one that compiles kernels"""
 
@@ -68,7 +68,7 @@ class DemoResult:
     visible_splats: dict[str, int]
     """by view: number of splats after culling"""
     seconds: float
-    """duration of the run"""
+    """duration of the run in seconds"""
     files: list[Path]
 
     @property

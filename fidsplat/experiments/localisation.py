@@ -23,9 +23,9 @@ SIZE = 0.16
 """edge of the code in metres"""
 WIDTH, HEIGHT, FOV = 1280, 720, 60.0
 DISTANCES = (0.5, 1.0, 2.0, 3.0, 4.0)
-"""metres"""
+"""distances in metres"""
 TILTS = (0.0, 20.0, 40.0, 60.0, 70.0)
-"""degrees"""
+"""tilts in degrees"""
 QUICK_DISTANCES, QUICK_TILTS = (0.5, 1.0, 2.0), (0.0, 40.0, 60.0)
 
 
@@ -49,8 +49,8 @@ def localisation_points(
 def measure_localisation(point: dict, markers: MarkerRenderer, seed: int, pool: Executor) -> dict:
     """Pose errors of a marker at every distance and tilt.
 
-    Roll and aim of the cameras are random, so that modules have any position relative to pixels; they are the
-    same for every method.
+    Roll and aim of the cameras are random, so that modules are not aligned with pixels; they are the same for
+    every method.
 
     Returns `views`: distance_m, tilt_deg, and position_mm, angle_deg, corners_px (root mean square), all None
     where the marker was not read.

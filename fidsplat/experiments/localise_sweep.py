@@ -150,7 +150,7 @@ def _write_chart(folder: Path, found: Found) -> None:
     errors = {name: 100 * facts["ate_m"] for name, facts in found.items()}
     shown = [name for name in _PLOTTED if name in errors]
     with chart(folder / CHART, panels=2, size=(11.0, 4.6), one_scale=False) as (figure, axes):
-        # the drive at the default speed, or that of the first measured variant
+        # show the drive at the default speed, else at the speed of the first measured variant
         speeds = [VARIANTS[name].speed for name in found]
         for number, name in enumerate([_truth(None if None in speeds else speeds[0]), *shown]):
             path = load_trajectory(folder / _tum(name)).poses[::10, :2, 3]  # every fifth of a second

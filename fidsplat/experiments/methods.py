@@ -23,7 +23,7 @@ FILTERS = {
     "screen": Quality(alpha_cutoff=_CUT),
     "best": Quality(alpha_cutoff=_CUT, lowpass="none", samples=3),
 }
-"""filters: the low-pass of 2DGS, and ours without a low-pass, 3 x 3 samples; with the cut-off of other
+"""filters: the low-pass of 2DGS, and 3 x 3 samples without a low-pass; both with the cut-off of other
 renderers"""
 _LIGHT = "light"
 """the filter "best", blended in linear light and then encoded by the sensor's sRGB curve"""

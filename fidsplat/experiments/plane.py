@@ -1,6 +1,6 @@
 """Ideal image of a printed plane: each pixel is the exact mean of the texture over its square.
 
-Analytic antialiasing, as in rasterisers of fonts. A texture of square modules is constant except for jumps
+Analytic antialiasing, as in font rasterisers. A texture of square modules is constant except for jumps
 across module edges, which are straight segments in a pinhole image. By Green's theorem the mean of a pixel is
 a sum over the segments that cross it or pass on its left: segments are cut at pixel borders, and each piece
 adds its jump times its height times the share of the pixel to its right. Nothing is sampled; the result is
@@ -86,7 +86,10 @@ def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Sum over directed segments (n, 2) pixels of jump * (share of each pixel to their right), (h, w)."""
+    """Image (h, w): for each pixel the sum over segments of jump * (share of the pixel to their right).
+
+    begin, end: (n, 2) pixels. jump: (n,).
+    """
     h, w = shape
     which, t0, t1 = _pieces(begin, end)
     step = (end - begin)[which]

@@ -24,7 +24,7 @@ from fidsplat.util.provenance import code_hash
 from fidsplat.worlds.plants import GOLDEN, KINDS, Mesh
 
 BACKGROUND = (0.9, 0.2, 0.9)
-"""background of training, unlike any plant, so that holes are visible"""
+"""background colour of training; no plant has it, so that holes are visible"""
 WORKER = Path(__file__).with_name("blender_plants.py")
 SETTINGS = "plants.json"
 HEIGHT, FOCAL = 320, 480.0
@@ -139,7 +139,7 @@ def write_plants(
 
 
 def _record(settings: PlantSettings, folder: Path) -> None:
-    """Check and record the settings of a folder."""
+    """Check a folder's recorded settings, or record them."""
     file = folder / SETTINGS
     # plants may be added later
     own = {name: value for name, value in asdict(settings).items() if name not in ("kind", "each")}

@@ -187,7 +187,7 @@ def _views(rows: Frame, folder: Path) -> dict:
             if linear  # like the paper's, which is Blender's
         }
         tables[truth] = {"title": TRUTHS[truth], "rows": _table(categories, methods, cells, paper)}
-        # methods that blend as the ground truth averages
+        # methods that blend in the same light (linear or display) in which the ground truth averages
         ending = "light" if linear else "best"
         shown = [method for method in methods if "/" not in method or method.endswith(f"/{ending}")]
         title = f"mixtures rendered as `{ending}` against\n{TRUTHS[truth]}"
@@ -281,9 +281,10 @@ def _spread(rows: Frame) -> dict | None:
 
 
 def _enough(table: Frame) -> list[dict]:
-    """Fewest training views per category after which a marker is readable like the training-free one.
+    """Smallest number of training views per category with which a marker is read as far as without training.
 
-    If there are none, the views with the smallest difference of tilt in degrees, `before`.
+    If no number suffices, the number with the smallest difference of tilts, and this difference in degrees,
+    `before`.
     """
     ours, free, seconds = (
         pd.Series(pd.to_numeric(table[name], errors="coerce"))

@@ -1,4 +1,4 @@
-"""Results of the paper's experiments as a summary table each."""
+"""Summary tables of the paper's experiments."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _angles_rows(record: Record) -> Rows:
 def _views_rows(record: Record) -> Rows:
     key = record.key
     row = {name: key[name] for name in ("truth", "category", "method")} | {"marker": key["index"]}
-    # of equally many views, the record with more metrics
+    # prefer records with more views, then with more metrics
     row["amount"] = key["views"] + 0.1 * bool(key["flip"]) + 0.2 * bool(key["lpips"])
     for name in ("psnr", "ssim", "flip", "lpips"):
         values = [value for value in record.result[name] or () if value is not None]
@@ -104,7 +104,7 @@ def _localisation_rows(record: Record) -> Rows:
 
 
 def _trained_rows(record: Record) -> Rows:
-    """A resumed training has no total time."""
+    """Row of a training; a resumed one has no total time."""
     key, found = record.key, record.result
     row = {name: key[name] for name in ("category", "views", "seed")} | {"marker": key["index"]}
     row |= {name: found[name] for name in ("psnr", "ssim", "splats")}

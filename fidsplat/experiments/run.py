@@ -42,7 +42,7 @@ def prepared(names: Iterable[str], options: MeasureSettings) -> Iterator[list[Sw
         markers, workers = MarkerRenderer(renderer, options.trained), options.workers
     device = None if renderer is None else device_name(renderer)
     with thread_pool(workers) as pool:
-        # first, since it reads files: --overwrite deletes nothing if a run cannot start
+        # first, so that --overwrite deletes nothing if the files of a run cannot be read
         measures = {name: _measure(name, options, markers, pool) for name in points}
         yield [
             Sweep(

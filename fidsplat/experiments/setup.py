@@ -1,4 +1,4 @@
-"""Set-up of the paper's section 4.1: markers, planes, viewpoints, and two protocols for angles."""
+"""Markers, planes and viewpoints of the paper's section 4.1, and two protocols for tilts."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ PROTOCOLS = {
     "fixed-plane": Protocol("2 x 2 plane, 800 x 800, 4 m, 50 degrees", 800, 4.0, 50.0, None),
     "fixed-module": Protocol("P*: 8 px a module, 1600 x 1600, 12 m, 17.7 degrees", 1600, 12.0, 17.7, 8.0),
 }
-"""plane of the paper (its camera is unknown), and one with modules of equal size for all codes"""
+"""the plane of the paper (whose camera is unknown), and planes with modules of equal size for all codes"""
 
 COLLECTIONS = (3, 5, 9, 17)
 """numbers of training views; each collection contains the smaller ones"""

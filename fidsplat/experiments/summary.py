@@ -1,4 +1,4 @@
-"""Results as small tables: CSV below lines of facts.
+"""Results as small CSV tables, preceded by lines with facts of the runs.
 
 A summary has a row for each result, with the `amount` of measurements in it and the number of its `run`.
 Lines that begin with "# " hold the facts of the runs, notes, and two lists of columns: `empty` columns, and
@@ -42,7 +42,7 @@ class Summary:
     def write(self, file: Path) -> Summary:
         """Write the table, with numbers to four digits; returns it as read from the file.
 
-        Thus raw results and summaries make equal reports.
+        Reading back the rounded numbers makes reports of raw results and of summaries equal.
 
         Raises InputError when the file cannot be written.
         """
@@ -83,9 +83,9 @@ def read_summary(file: Path) -> Summary:
         lines = read_text(file).splitlines()
         facts = [from_json(line.removeprefix(_MARK)) for line in lines if line.startswith(_MARK)]
         if not all(isinstance(one, dict) for one in facts):
-            raise ValueError("a line before its table holds no facts")
+            raise ValueError("the lines before its table must be facts")
         repeated = [name for one in facts for name in one.get("repeated", ())]
-        # only an empty cell is missing: "None" is a text, and so is a number in a column of texts
+        # only empty cells are missing values: "None" is text, and a column of texts may contain numbers
         rows = pd.read_csv(
             io.StringIO("\n".join(lines[len(facts) :])),
             dtype=dict.fromkeys(repeated, str),
@@ -117,7 +117,7 @@ def join(summaries: Sequence[Summary], keys: Sequence[str]) -> Summary:
     rows = pd.concat(frames, ignore_index=True)
     chosen = rows.sort_values("amount", ascending=False, kind="stable").drop_duplicates(list(keys))
     rows = rows.loc[sorted(chosen.index)].reset_index(drop=True)
-    # a repeated report reads the tables of the previous one, which may contribute no row
+    # a repeated report reads its own earlier tables, which may contribute no row
     used = sorted(set(rows["run"]))
     rows["run"] = rows["run"].map({number: place for place, number in enumerate(used)})
     notes = list(dict.fromkeys(note for summary in summaries for note in summary.notes))

@@ -71,7 +71,7 @@ class Results:
                     f"{file} holds results of another {' and '.join(differ)}; give another folder with -o, "
                     "or --overwrite to measure again"
                 )
-        # a device that failed may work again
+        # failed points are measured again, as the device may work now
         self.done = {record.name: record for record in records if not record.failed}
         if overwrite or file.exists():  # discards an incomplete line of a killed run
             _write(file, self.done.values())
@@ -206,7 +206,7 @@ def folder_records(folder: Path, name: str) -> list[Record]:
 
 
 def shard(points: list[Key], text: str | None) -> list[Key]:
-    """Every n-th point from the i-th on, for "i/n"; all points for None.
+    """Every n-th point, starting with the i-th, for "i/n"; all points for None.
 
     Raises InputError unless 1 <= i <= n.
     """

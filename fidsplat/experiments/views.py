@@ -66,7 +66,7 @@ def views_points(
         points += [
             {**common, "method": method, "truth": truth, **metrics}
             for method, truth in product(with_linear_light(methods), truths)
-            # equal by definition, or averages of different light
+            # skip pairs that are equal by definition, or that average different light
             if (method, truth) != (IDEAL, "exact") and (truth in LINEAR or not in_linear_light(method))
         ]
     return points
@@ -113,7 +113,7 @@ def measure_views(
     module = PROTOCOLS["fixed-plane"].module(plain_marker(spec).grid.shape[0])
     marker = (point["category"], point["index"], seed)
     method = (*marker, point["method"])
-    # uploads splats only if an image is missing
+    # prepared lazily: splats are uploaded only if an image is missing
     prepared = lru_cache(1)(
         lambda: markers.prepare(point["method"], f"{category.name}-{point['index']}", spec, module)
     )

@@ -19,7 +19,7 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import open_input, path_of
 
 OPTICAL = np.array([0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5])
-"""rotation sensor from camera: SDF sensors look along x with z up, our cameras along z with y down"""
+"""rotation from camera to sensor axes: SDF sensors look along x with z up, our cameras along z with y down"""
 KINDS = {
     "camera": ("rgb",),
     "wideanglecamera": ("rgb",),

@@ -29,7 +29,7 @@ from fidsplat.util.errors import InputError, unknown
 from fidsplat.util.files import path_of
 
 DEEPEST = 32
-"""maximum depth of nested includes, and of nested models"""
+"""maximum nesting depth of includes and of models"""
 
 
 @dataclass
@@ -37,7 +37,7 @@ class Description:
     """Cameras, bodies and splats of a description file."""
 
     cameras: dict[str, RigCamera] = field(default_factory=dict)
-    """by the sensor's name, for `Rig`; each is attached to its link"""
+    """cameras by the sensor's name, for `Rig`; each is attached to its link"""
     bodies: dict[str, np.ndarray] = field(default_factory=dict)
     """poses (7,) of links in the world by name, MODEL::LINK in SDF; of a robot with all joints at 0"""
 

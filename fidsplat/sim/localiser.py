@@ -1,4 +1,5 @@
-"""Error-state Kalman filter for a robot on a floor, with wheels, a gyroscope and tags of known poses."""
+"""Error-state Kalman filter for a robot on a floor, from wheel odometry, a gyroscope and tags of known
+pose."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from fidsplat.cameras import Camera
 from fidsplat.splats.rotations import rigid_matrix
 
 GATE = 4.0
-"""outlier gate: maximum residual of a tag's corners in standard deviations"""
+"""outlier threshold: maximum residual of a tag's corners in standard deviations"""
 TILT = 0.005, 0.005, 0.003
 """standard deviations of roll and pitch [rad] and height [m], which are not part of the state"""
 _STEP = 1e-5
@@ -36,7 +37,7 @@ class Localiser:
         self._noise = corner_noise
         self.covariance = np.diag([0.01, 0.01, 0.01, 0.005, 0.02]) ** 2
         self.rejected = 0
-        """number of tags that the outlier gate rejected"""
+        """number of tags rejected as outliers"""
 
     @property
     def pose(self) -> np.ndarray:

@@ -133,7 +133,7 @@ def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:
     fovy, physical = float(model.cam_fovy[number]), np.asarray(model.cam_sensorsize[number], float)
     center, lens = size / 2, None
     if model.cam_projection[number] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
-        focal, lens = np.full(2, height / fovy), Orthographic()  # fovy is metres then
+        focal, lens = np.full(2, height / fovy), Orthographic()  # fovy of an orthographic camera is in metres
     elif physical.all():
         focal_length, shift = np.split(np.asarray(model.cam_intrinsic[number], float), 2)
         focal = focal_length / physical * size

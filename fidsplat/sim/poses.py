@@ -47,14 +47,14 @@ def check_poses(name: str, poses: Any, axes: tuple[str, ...]) -> np.ndarray:
 
 
 def compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """Composition of two poses: a_from_c of a_from_b and b_from_c."""
+    """Compose two poses: returns a_from_c, given a_from_b and b_from_c."""
     outer, inner = np.broadcast_arrays(outer, inner)
     position = outer[..., :3] + rotate(outer[..., 3:], inner[..., :3])
     return np.concatenate([position, quaternion_multiply(outer[..., 3:], inner[..., 3:])], axis=-1)
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:
-    """Inverse pose: b_from_a of a_from_b."""
+    """Invert a pose: returns b_from_a, given a_from_b."""
     back = pose[..., 3:] * [1.0, -1.0, -1.0, -1.0]
     return np.concatenate([-rotate(back, pose[..., :3]), back], axis=-1)
 

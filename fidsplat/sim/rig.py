@@ -30,11 +30,11 @@ class RigCamera:
     body: str | None = None
     """the body that carries it; None: the world"""
     sensor: Sensor | None = None
-    """sensor model of rgb, with other noise for every image; None: the scene's"""
+    """sensor model of rgb, with different noise for every image; None: the scene's"""
     outputs: tuple[str, ...] | None = None
     """names of its output images; None: the rig's"""
     rate: float | None = None
-    """frames a second, for schedulers; rendering ignores it"""
+    """frames per second, as information for schedulers; rendering ignores it"""
 
     def __post_init__(self) -> None:
         instance("camera", self.camera, Camera, remedy="use fs.Camera.pinhole(...)")

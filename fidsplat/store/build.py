@@ -33,9 +33,9 @@ from fidsplat.util.errors import InputError, bytes_words
 from fidsplat.util.files import atomic_write, from_json, path_of, read_input
 
 _SAVE_EVERY = 16
-"""parts of the work after which progress is saved"""
+"""number of parts of the work after which progress is saved"""
 _MIN_ROOT = 64
-"""splats below which another level of detail is of no use"""
+"""number of splats below which no further level of detail is built"""
 
 
 def build_store(
@@ -83,7 +83,7 @@ class _Build:
 
     def __init__(self, plan: BuildPlan, folder: Path, progress: Progress) -> None:
         self.plan, self.folder, self.progress = plan, folder, progress
-        self.buckets = len(plan.splitters) + 2  # the last for coplanar groups
+        self.buckets = len(plan.splitters) + 2  # the last bucket is for coplanar groups
         self.workers = min(4, os.cpu_count() or 1)
         self.state = self._saved_state()
         self.columns: ColumnFiles
@@ -124,7 +124,7 @@ class _Build:
         return fresh | dict.fromkeys(("windows", "thick", "sorted", "nodes", "level", "merged"), 0)
 
     def _is_on_disk(self, state: dict[str, Any]) -> bool:
-        """Whether all files that a state describes are complete, which a power cut can prevent.
+        """Whether all files of a saved state are complete; after a power cut they may not be.
 
         Raises OSError for a missing file.
         """
@@ -145,7 +145,8 @@ class _Build:
         given: Iterable[Any],
         most: int | None = None,
     ) -> Iterator[Any]:
-        """Results of threads in the order of inputs. most: limit on concurrent results; None: threads + 1."""
+        """Run `work` in threads and yield results in the order of inputs. most: maximum number of pending
+        results; None: threads + 1."""
         waiting: deque[Future] = deque()
         for one in given:
             waiting.append(pool.submit(work, one))
@@ -189,7 +190,7 @@ class _Build:
     def _spread(
         self, window: tuple[int, tuple[int, int]]
     ) -> tuple[list[tuple[int, np.ndarray]], dict[str, int]]:
-        """Records of a part of an input by bucket, in the order of the input."""
+        """Distribute a part of an input over buckets: its records by bucket, in the order of the input."""
         plan, (number, span) = self.plan, window
         arrays, dropped = splats_of(plan.sources[number], span, plan.origin, plan.columns, plan.sh_degree)
         codes = plan.grid.codes(arrays["means"])
@@ -303,21 +304,21 @@ class _Build:
             dropped=dict(self.state["dropped"]),
             sources=tuple(source.rows.path.name for source in plan.sources),
         ).save(self.folder)
-        # first, since the state must not describe files that are removed
+        # the state is removed first, as it must not describe removed files
         (self.folder / "state.json").unlink()
         for file in (self.folder / "nodes", *map(self._bucket, range(self.buckets))):
             file.unlink(missing_ok=True)
 
 
 def _groups(nodes: np.ndarray, level: int, pinned: int) -> list[np.ndarray]:
-    """Numbers of the nodes of a level that are merged into each node of the next, in order. Chunks from row
-    `pinned` on are never merged."""
+    """Group the nodes of a level: each group becomes a node of the next level. Chunks from row `pinned` on
+    are never merged."""
     below = np.flatnonzero((nodes["level"] == level) & ((level > 0) | (nodes["first"] < pinned)))
     return np.array_split(below, -(-len(below) // REDUCTION)) if len(below) else []
 
 
 def _enclose(node: np.ndarray, children: np.ndarray) -> None:
-    """Extend a node's box and sizes to those of its children: if it is culled, so are they."""
+    """Extend a node's box and sizes to include its children, so that culling a node also culls them."""
     node["size"] = max(float(node["size"][0]), float(children["size"].max()))
     for name in ("low", "far_low"):
         node[name] = np.minimum(node[name], children[name].min(axis=0))
@@ -327,6 +328,6 @@ def _enclose(node: np.ndarray, children: np.ndarray) -> None:
 
 
 def _is_root(nodes: np.ndarray, level: int) -> bool:
-    """Whether another level would save less than half of the splats of the only node of this one."""
+    """Whether the level has a single node, and merging it again would save less than half of its splats."""
     counts = [int(nodes["count"][nodes["level"] == at].sum()) for at in (level - 1, level)]
     return counts[1] <= _MIN_ROOT or (level > 0 and 2 * counts[1] > counts[0])

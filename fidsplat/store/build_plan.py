@@ -22,11 +22,11 @@ COLORS = ("float32", "float16")
 _MAX_BUCKETS = 1000
 _MIN_MEMORY = 256 * 2**20
 _MERGE_BYTES = 400, 6
-"""memory to merge a splat: bytes, and a multiple of its own size (measured in all: 610 bytes with plain
+"""memory per merged splat: a constant in bytes plus a multiple of its size (in total 610 bytes with plain
 colours, 1,530 with SH of degree 3)"""
 ON_PLANE = np.uint64(1 << 63)
-"""code of splats of coplanar groups: they are last, in their own chunks, which are part of every frame, since
-a group is sorted as one"""
+"""Morton code that sorts coplanar splats last, into their own chunks; these are part of every frame, as a
+group is composited as one layer"""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class BuildSettings:
     levels: bool = True
     """store levels of detail; without them every image is exact"""
     sh_degree: int | None = None
-    """highest SH degree to store (default: that of the files)"""
+    """maximum SH degree to store (default: that of the files)"""
     colors: str = "float32"
     """type of colours and SH: float32 or float16"""
 

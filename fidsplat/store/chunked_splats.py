@@ -24,13 +24,13 @@ from fidsplat.store.subchunks import Subchunks, SubchunkTable
 from fidsplat.util.errors import InputError
 
 HOST_CACHE_BYTES = 2 * 2**30
-"""capacity of the cache of chunks whose arrays are computed rather than mapped from the files"""
+"""capacity in bytes of the cache of chunks whose arrays are computed, not mapped from files"""
 
 CellSizes = float | tuple[tuple[float, ...], ...]
-"""samples: cells of a smaller size on the image are merged; one for all, or for each level of each store"""
+"""projected size in samples below which cells are merged; one number, or one for each level of each store"""
 
 NodeMasks = tuple[np.ndarray, ...]
-"""(instances * nodes,) bool for each store: the selected nodes"""
+"""for each store (instances * nodes,) bool: mask of the selected nodes"""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class ChunkedSplats:
 
     @property
     def content(self) -> tuple:
-        """Identities of the stores and the cloud in memory, for digests."""
+        """Identities of the stores and of the cloud in memory, to compute digests."""
         return (*(store.identity for store in self.stores), self.in_memory)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -111,11 +111,12 @@ class ChunkedSplats:
         return Selection.of(tuple(masks))
 
     def cell_sizes(self, *qualities: Quality) -> CellSizes:
-        """Size on the image [samples] below which cells are merged, by `detail_error`; the strictest quality
-        decides. 0: exact.
+        """Projected size [samples] below which cells are merged, from the `detail_error` of the strictest
+        quality. 0: exact.
 
         Raises:
-            InputError: an error is allowed, but that of the store's levels of detail was not measured.
+            InputError: `detail_error` is positive, but the errors of the store's levels of detail were not
+                measured.
         """
         if not all(quality.detail_error for quality in qualities):
             return 0.0
@@ -180,7 +181,7 @@ class ChunkedSplats:
         for number, nodes in enumerate(selection.nodes):
             for node in nodes:
                 for array in self.chunk(number, node).values():
-                    # one byte of each page is enough
+                    # reading one byte of each memory page loads it
                     array.reshape(-1).view(np.uint8)[:: 1 << 12].max(initial=0)
 
     def chunk(self, number: int, node: int) -> dict[str, np.ndarray]:

@@ -16,8 +16,8 @@ from fidsplat.util.files import atomic_write, from_json, read_input
 
 FILE = "detail.json"
 MARGIN = 3.0
-"""factor between the requested error and the largest measured one: other views have larger errors than the
-measured views, and a few still exceed the requested error"""
+"""safety factor between the requested error and the largest measured error, as other views may have larger
+errors; a few still exceed the requested error"""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class DetailSettings:
     """
 
     views: int = 60
-    """number of viewpoints, each for one level in turn"""
+    """number of viewpoints; levels are measured in rotation, one for each viewpoint"""
     lowpass: Names = ("pixel",)
     """low-pass filters: pixel, screen, none"""
     seed: int = 0
@@ -53,8 +53,7 @@ class DetailErrors:
     sizes: tuple[float, ...]
     """samples, rising: cells below this size on the image are merged"""
     errors: tuple[float | None, ...]
-    """largest difference of rgb from the exact frame over all views, for each size; None where no view had
-    cells of about this size"""
+    """for each size the largest rgb error over all views; None if no view had cells of about this size"""
     views: int
     device: str
     date: str
@@ -63,9 +62,9 @@ class DetailErrors:
 def allowed_cell_size(measured: Iterable[DetailErrors], level: int, error: float) -> float:
     """Largest cell size [samples] of a level whose error in the measured views is at most `error` / `MARGIN`.
 
-    0: none. Other views may exceed `error`. Sizes that no measured view contained are not used. The adjacent
-    levels count too: cells of equal size have similar errors, but few views contain a level's cells where
-    their error is largest, in the gaps between surfaces.
+    0 if there is none. Other views may exceed `error`. Sizes that no measured view contained are not used.
+    Measurements of the adjacent levels are used too: cells of equal size have similar errors, but few views
+    contain a level's cells in the gaps between surfaces, where their error is largest.
     """
     near = [one for one in measured if abs(one.level - level) <= 1]
     if not any(one.level == level for one in near):
@@ -91,8 +90,8 @@ def save_detail_errors(folder: Path, identity: str, measured: Sequence[DetailErr
 
 
 def load_detail_errors(folder: Path, identity: str) -> list[DetailErrors]:
-    """The measured errors of a store; empty if they are of other content. Raises InputError for a damaged
-    file."""
+    """The measured errors of a store; empty if the store's content has changed since. Raises InputError for a
+    damaged file."""
     file = folder / FILE
     if not file.exists():
         return []

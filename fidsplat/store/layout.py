@@ -61,9 +61,9 @@ NODE = np.dtype(
         ("crc", "<u4"),  # CRC-32 of its rows of all columns, one after the other
         ("size", "<f4"),  # metres: edge of the cells whose splats were merged; 0 on level 0
         ("reach", "<f4"),  # metres: largest standard deviation
-        ("low", "<f4", 3),  # metres from the origin: box around the centres
+        ("low", "<f4", 3),  # metres from the origin: lowest corner of the box around the centres
         ("high", "<f4", 3),
-        ("far_low", "<f4", 3),  # the same around splats of `FAR` standard deviations
+        ("far_low", "<f4", 3),  # lowest corner of the box around splats to `FAR` standard deviations
         ("far_high", "<f4", 3),
     ]
 )
@@ -80,7 +80,7 @@ class Header:
     pinned: int
     """first row of the splats of coplanar groups, which are part of every frame"""
     chunk: int
-    """splats of a chunk, at most"""
+    """maximum number of splats of a chunk"""
     origin: tuple[float, float, float]
     """metres: the world's position of the means' zero"""
     sh_degree: int
@@ -110,7 +110,7 @@ class Header:
 
 
 def header_crc(said: Mapping[str, Any]) -> int:
-    """CRC-32 of a header without the checksum itself."""
+    """CRC-32 of the fields of a header except the checksum."""
     rest = {name: value for name, value in said.items() if name != "crc"}
     return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 
@@ -189,7 +189,8 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
 
 
 def npy_header(kind: str, shape: tuple[int, ...]) -> bytes:
-    """Header of a .npy file, of fixed length so that it can be rewritten when the number of rows is known."""
+    """Header of a .npy file; of fixed length, so that it can be rewritten when the number of rows is
+    known."""
     text = f"{{'descr': '{np.dtype(kind).str}', 'fortran_order': False, 'shape': {shape!r}, }}"
     body = text.encode("ascii").ljust(NPY_HEADER - 11) + b"\n"
     return b"\x93NUMPY\x01\x00" + (NPY_HEADER - 10).to_bytes(2, "little") + body
@@ -269,8 +270,8 @@ def read_nodes(folder: Path, header: Header) -> np.ndarray:
 
 
 def _misfit(nodes: np.ndarray, header: Header) -> str:
-    """Description of how an index contradicts its header; empty if it does not. Rendering relies on every
-    condition."""
+    """Describe a contradiction between an index and its header; empty if there is none. Rendering relies on
+    every condition."""
     first, count, level, parent = (
         nodes[name].astype(np.int64) for name in ("first", "count", "level", "parent")
     )

@@ -21,7 +21,7 @@ from fidsplat.store.morton import BITS, Grid
 REDUCTION = 4
 """mean number of splats that are merged into one, as for a surface at half the resolution"""
 MAX_OPACITY = 4.0
-"""highest opacity of a merged splat; where more is needed, several copies are stored"""
+"""maximum opacity of a merged splat; if more is needed, several copies are stored"""
 EDGE = 0.06
 """standard deviation of brightness in a cell above which bright and dark splats are merged separately"""
 _CLASSES = 3
@@ -29,9 +29,11 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndarray], float]:
-    """Merged splats, at most a quarter as many where cells allow it, and the edge [m] of the cells.
+    """Merge splats to about a quarter of their number; returns the merged splats and the edge [m] of the
+    cells.
 
-    `labels` is that of the splat with the largest weight. splats: in a store's columns.
+    The label of a merged splat is that of the splat with the largest weight. splats: arrays of a store's
+    columns.
     """
     u, v, normal = _frames(splats["quats"])
     sides = np.abs(normal)
@@ -52,7 +54,7 @@ def _runs(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _split_edges(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
-    """(n,) new keys, two for each cell that contains an edge of brightness."""
+    """(n,) new cell keys, with two different keys in each cell that contains an edge of brightness."""
     colors = splats["colors"] if "colors" in splats else C0 * splats["sh"][:, 0]
     order, starts = _runs(keys)
     light = colors.astype(np.float64).mean(axis=1)[order]
@@ -74,10 +76,11 @@ def _frames(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
-    """(n,) key of the cell and class of each splat, and the number of grid levels that the cells combine."""
+    """(n,) key of each splat's cell and class, and the size of the cells as a number of combined grid
+    levels."""
     target = max(1, len(codes) // REDUCTION)
     ordered = np.sort(codes)
-    # number of levels at which neighbours in the order differ
+    # number of levels at which neighbouring splats in Morton order differ
     _, exponents = np.frexp((ordered[1:] ^ ordered[:-1]).astype(np.float64))
     differing = np.bincount((exponents + 2) // 3, minlength=BITS + 2)
     cells = 1 + np.cumsum(differing[::-1])[::-1]  # [s + 1]: number of cells that combine s levels
@@ -108,7 +111,7 @@ def _by_moments(
     light = splats["opacities"] * area
     weights = np.maximum(light, 1e-300)
     total = np.add.reduceat(weights, starts)
-    # relative to the first splat of the run, against cancellation
+    # relative to the first splat of the run, to avoid cancellation
     base = splats["means"][starts].astype(np.float64).T
     away = splats["means"].T - np.repeat(base, lengths, axis=1)
     u, v = frames[0] * scales[0], frames[1] * scales[1]

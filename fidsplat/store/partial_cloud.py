@@ -1,4 +1,5 @@
-"""Partial clouds: some splats of a scene with the traits of the complete scene; and arrays of splats."""
+"""Partial clouds: some splats of a scene, with the traits of the complete scene; operations on their
+arrays."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """Lock the staging folder next to `folder` and yield it, with what an interrupted build left in it.
+    """Lock the staging folder next to `folder` and yield it, with the files of an interrupted build.
 
     On success it is renamed to `folder`, and the folder of that name is removed. Raises InputError if another
     process builds there or it cannot be written.

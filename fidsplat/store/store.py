@@ -75,7 +75,7 @@ class Store(Summarised):
         self._columns = self._mapped()
         if (
             self.has_coplanar_groups
-        ):  # the coplanar groups are prepared on the host, and belong to every frame
+        ):  # coplanar splats are part of every frame and are prepared on the host, so they must be valid
             rows = self._rows(own.pinned, own.splats, None)
             if wrong := _unrenderable(rows):
                 raise InputError(
@@ -97,7 +97,7 @@ class Store(Summarised):
         return f"Store({str(self.path)!r}, {len(self):,} splats{instances})"
 
     def summary(self) -> dict[str, str]:
-        """Its content in words."""
+        """Content of the store as text, by topic."""
         rows = {"splats": f"{len(self):,}", "chunks": f"{self.chunks:,}"}
         rows["colours"] = "plain" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
         if self.poses is not None:
@@ -107,7 +107,7 @@ class Store(Summarised):
         return rows | {f"dropped: {why}": f"{n:,}" for why, n in self.header.dropped.items()}
 
     def facts(self) -> dict[str, Any]:
-        """Its content as JSON values: splats, chunks, levels of detail, bytes, bounds."""
+        """Content of the store as JSON values: splats, chunks, levels of detail, bytes, bounds."""
         header, nodes = self.header, self.nodes
         kinds = {"none": "2D", "all": "3D", "some": "2D and 3D"}
         facts = {"store": str(self.path), "splats": len(self), "kind": kinds[self.ellipsoids]}
@@ -150,7 +150,7 @@ class Store(Summarised):
 
     @property
     def identity(self) -> str:
-        """Hexadecimal digest of its content."""
+        """Hexadecimal digest of the store's content."""
         poses = "" if self.poses is None else self.poses.tobytes().hex()
         return self.header.identity + poses
 
@@ -198,9 +198,10 @@ class Store(Summarised):
         return int(self.nodes["level"].max(initial=0))
 
     def cell_sizes(self, quality: Quality) -> tuple[float, ...]:
-        """Size on the image [samples] below which cells of each level, from 0, are rendered; 0: never.
+        """For each level from 0 the projected cell size [samples] below which its cells are rendered; 0:
+        never.
 
-        It follows from the quality's `detail_error`. Raises InputError if the error was not measured.
+        Determined by the quality's `detail_error`. Raises InputError if the errors were not measured.
         """
         instance("quality", quality, Quality)
         if not self.levels:
@@ -263,7 +264,7 @@ class Store(Summarised):
         return self.nodes["count"][self._checked(numbers) % max(len(self.nodes), 1)]
 
     def _checked(self, numbers: np.ndarray) -> np.ndarray:
-        """Validated numbers of nodes, (k,)."""
+        """Validate numbers of nodes (k,)."""
         given, count = real_array("numbers", numbers), self.instances * len(self.nodes)
         if not ((given == np.rint(given)) & (given >= 0) & (given < count)).all():
             raise invalid("numbers", f"whole numbers of nodes, 0 to {count - 1}", numbers)
@@ -290,7 +291,7 @@ class Store(Summarised):
         return np.concatenate([rotations.reshape(-1, 9), self._offsets, quats], axis=1)
 
     def labels(self) -> set[int]:
-        """Labels of its splats. Reads the complete column."""
+        """All labels of the splats. Reads the complete column."""
         if "labels" not in self._columns:
             return {0} if len(self) else set()
         made: set[int] = set()
@@ -300,19 +301,19 @@ class Store(Summarised):
         return made
 
     def last_group(self) -> int:
-        """Largest id of its coplanar groups; -1 without."""
+        """Largest coplanar group id; -1 without groups."""
         if not self.has_coplanar_groups:
             return -1
         return int(self._columns["coplanar_groups"][self._own.pinned : self._own.splats].max(initial=-1))
 
     def cloud(self) -> SplatCloud:
-        """All splats in one cloud, mapped from the files where possible. Frames of the store are
-        bit-identical to frames of this cloud."""
+        """All splats in one cloud, memory-mapped if possible. Frames of the store are bit-identical to frames
+        of this cloud."""
         parts = [self._rows(0, self._own.splats, instance) for instance in range(self.instances)]
         return PartialCloud.of(concatenated(parts), self, self.header.dropped)
 
     def verify(self, progress: Progress | None = None) -> list[str]:
-        """Check every chunk's checksum and values, and return a description of each damage."""
+        """Check the checksum and values of every chunk, and return a description of each defect."""
         callback("progress", progress)
         wrong = []
         for number, node in enumerate(self.nodes):
@@ -347,8 +348,8 @@ class Store(Summarised):
 
 
 def _unrenderable(rows: dict[str, np.ndarray], merged: bool = False) -> str:
-    """Defects of splats that cannot be rendered, with their counts; empty without. merged: of splats that
-    stand for several, whose opacities may exceed 1."""
+    """Describe invalid values and their counts; empty if all are valid. merged: whether these are merged
+    splats, whose opacities may exceed 1."""
     names = rows.keys() - {"labels", "coplanar_groups"}
     _, found = find_defects({name: rows[name].astype(np.float32, copy=False) for name in names})
     if merged:

@@ -1,4 +1,4 @@
-"""Stores from streamed SOG with its levels of detail, and streamed SOG from stores."""
+"""Conversion between stores and streamed SOG, with levels of detail."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
 
 _LEAF = 2**18
-"""splats of a leaf of streamed SOG, at most, unless a chunk has more"""
+"""maximum splats of a leaf of streamed SOG, unless a chunk has more"""
 _ENCLOSE = dict.fromkeys(("high", "far_high", "size", "reach"), np.maximum)
 _ENCLOSE |= dict.fromkeys(("low", "far_low"), np.minimum)
 _GRID = 64
-"""cells along the largest extent, by which the area of a scene is estimated"""
+"""number of grid cells along the largest extent, for estimating the area of a scene"""
 
 
 def is_streamed(inputs: object) -> bool:
-    """Whether the inputs of a store are one streamed SOG."""
+    """Whether the inputs of a store are a single streamed SOG."""
     if isinstance(inputs, Sequence) and not isinstance(inputs, str) and len(inputs) == 1:
         inputs = inputs[0]
     return isinstance(inputs, (str, os.PathLike)) and path_of(inputs).name.lower() == META
@@ -40,7 +40,7 @@ def is_streamed(inputs: object) -> bool:
 def import_streamed(path: Path, folder: Path, progress: Progress) -> None:
     """Write a store with the chunks and levels of a streamed SOG.
 
-    Raises InputError for a damaged file, or an environment, which a store has no place for.
+    Raises InputError for a damaged file, or an environment, which stores do not support.
     """
     scene = read_streamed(path)
     scene.check_memory()

@@ -55,7 +55,7 @@ class SubchunkTable:
     def __init__(self, store: Store, offset: np.ndarray, pinned: np.ndarray) -> None:
         self._store, self._offset, self._pinned = store, offset, pinned
         self._known: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-        """node of one place -> corners of the boxes, largest standard deviations"""
+        """cache: node of the unplaced store -> corners of the boxes, largest standard deviations"""
 
     def of(self, numbers: np.ndarray) -> Subchunks:
         """The subchunks of nodes (k,), by their numbers."""

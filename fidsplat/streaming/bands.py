@@ -1,6 +1,7 @@
-"""Row bands: frames that do not fit on the device are rendered in bands of rows, each of its visible chunks.
+"""Row bands: a frame that does not fit on the device is rendered in bands of rows, each from its visible
+chunks.
 
-Where a band cannot be split further, the device projects the splats in chunks: slower, with the same image.
+If a band cannot be split further, the device projects its splats in chunks: slower, with the same image.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from fidsplat.streaming.occlusion_test import contributing_tiles, node_keys, occ
 _MIN_ROWS = 16
 """pixels"""
 _MAX_OVERLAP = 1.6
-"""a band is not split where its halves together need more than this times its splats, e.g. under a fisheye,
-where each half needs all"""
+"""a band is not split if its halves together need more than this times its splats; with a fisheye each half
+may need all"""
 
 
 @dataclass(frozen=True)
 class BandData:
-    """A band of rows on the device: the splats to render it from, or its images if it is rendered already."""
+    """A band of rows on the device: its splats, or its images if it has been rendered already."""
 
     rows: tuple[int, int]
     """pixels [first, end)"""
@@ -140,7 +141,7 @@ class Band:
         return tuple(each & ~own for each, own in zip(self.visible, self.nodes, strict=True))
 
     def occluded(self, termination: TerminationDepths) -> NodeMasks:
-        """Nodes that are occluded, given termination depths."""
+        """Nodes that are occluded according to termination depths."""
         return occluded_nodes(self.scene, self.view, self.features, termination)
 
     def minimum_keys(self) -> tuple[np.ndarray, ...]:
@@ -167,7 +168,7 @@ class Band:
 
     @property
     def halves(self) -> list[Band]:
-        """The two halves of its rows; empty where splitting does not help."""
+        """The two halves of its rows; empty if splitting does not help."""
         first, end = self.rows
         middle = (first + end) // 2
         if end - first < 2 * _MIN_ROWS or self.full_view.sub_frames:
@@ -181,7 +182,7 @@ class BandSplitter:
 
     def __init__(self) -> None:
         self._cuts: dict[tuple[int, int], list[int]] = {}
-        """rows of the previous view -> rows at which its bands began, and the end"""
+        """image height of the previous view -> first rows of its bands, and the end"""
         self._capacity = 0
         """largest number of splats that fitted"""
 

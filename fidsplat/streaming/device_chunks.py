@@ -92,7 +92,7 @@ class DeviceChunks(ChunkedScene):
         if "coplanar_groups" in result:
             ids, known = result["coplanar_groups"], self._group_ids
             dense = np.searchsorted(known, ids).astype(np.int32)
-            # a damaged store has ids in chunks that should have none
+            # in a damaged store, chunks without coplanar groups may have ids
             result["coplanar_groups"] = np.where(np.isin(ids, known), dense, np.int32(-1))
         if "boxes" in result:
             result["boxes"] = result["boxes"].astype(np.int32)

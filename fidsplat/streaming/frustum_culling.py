@@ -21,22 +21,23 @@ from fidsplat.effects import FeatureSet
 from fidsplat.store.merge import MAX_OPACITY
 
 Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
-"""(standard deviations) -> lowest, highest corners (n, 3) float64 [m] of boxes around splats"""
+"""function from a number of standard deviations to lowest and highest corners (n, 3) float64 [m] of boxes
+around the splats to that extent"""
 
 PADDING = 1.01
 """factor on the extent of splats, for rounding"""
 _ACROSS, _ALONG = 0.5, 1 / 8
-"""standard deviations of a sample's footprint under the low-pass `pixel`: across its ray in samples, along
-it as a share of the depth (kernels/opencl/slot/lowpass_pixel.cl)"""
+"""standard deviations of the filter of the low-pass `pixel`: across the ray in samples, and along it as a
+share of the depth (kernels/opencl/slot/lowpass_pixel.cl)"""
 _ROUNDING = 1e-5
 """relative error of a coordinate that projection in float32 computes"""
 
 
 def in_frustum(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
-    """(n,) bool: boxes whose splats can contribute to the frame, at any pose of the shutter.
+    """Frustum culling: (n,) bool, whether a box can contain splats that contribute to the frame.
 
     Args:
-        boxes: tested with the motion of the camera and with that of each moving group.
+        boxes: tested at all poses of the shutter and with the motion of each moving group.
         reach: (n,) metres: largest standard deviation of a box's splats.
     """
     if view.sub_frames:
@@ -82,11 +83,11 @@ class Extent:
         rays (an unbounded footprint) and for cut-offs as low as 1e-13.
         """
         radius = max(cutoff_radius(view), minimum)
-        # the disc of the low-pass, or the widening by EWA
+        # margin for the low-pass disc, or for the low-pass of EWA
         plain = Extent(radius, radius * view.samples + 2.0, radius)
         if not _widened(features):
             return plain
-        # depths along the ray are bounded by spheres around disks, which include their extent to the side
+        # bounding spheres of disks bound depths along the ray; they include the sideways extent
         aside = _ACROSS * _max_ray_rotation(view) if view.along_ray else 0.0
         nearer = 1.0 - radius * math.hypot(_ALONG, aside)
         if nearer <= 0 or view.parallel or isinstance(view.lens, BrownConrady):
@@ -241,7 +242,7 @@ def _max_ray_rotation(view: View) -> float:
     angles = np.linspace(1e-6, lens.limit, 4096)
     slopes = lens.distance(angles + 1e-6) - lens.distance(angles - 1e-6)
     slope = min(float(slopes.min()) / 2e-6, float((lens.distance(angles) / np.sin(angles)).min()))
-    # 5 % for the change between sampled angles
+    # 5 % margin, as angles are sampled
     return math.inf if slope < 0.05 else 1.05 / (slope * min(view.focal_x, view.focal_y))
 
 

@@ -1,4 +1,5 @@
-"""Level-of-detail selection of chunks: the visible nodes of a scene's stores, as coarse as allowed."""
+"""Level-of-detail selection: the coarsest visible nodes of a scene's stores that the allowed error
+permits."""
 
 from __future__ import annotations
 

@@ -24,22 +24,24 @@ from fidsplat.streaming.bands import Band
 MIN_SPLATS = 1_000_000
 """views of fewer splats are rendered without occlusion culling"""
 _INITIAL_SPLATS = 1_500_000
-"""number of splats of the first guess, and minimum number added to a guess"""
+"""number of splats of the first guess, and minimum number added per pass"""
 _MAX_GROWTH = 2.0
 """limit on the growth of a guess per pass: nodes that are added first may occlude the rest"""
 _MAX_VISIBLE = 0.7
 """share of a view's splats that are not occluded above which all are rendered"""
 _PROBE_SHARE, _PROBE_SPLATS = 4, 4_000_000
-"""a guess of at most 1 / _PROBE_SHARE of the splats, or of _PROBE_SPLATS, is always tried"""
+"""occlusion culling is always tried with a guess of at most 1 / _PROBE_SHARE of the splats, or
+_PROBE_SPLATS"""
 _PAUSE = 16
-"""views rendered without occlusion culling after one in which little was occluded"""
+"""number of views without occlusion culling after a view with little occlusion"""
 _SAMPLES_PER_TILE, _MOTION_SLACK = 4, 4.0
-"""reprojection of termination depths: directions of a tile, across and down, that are looked up; and the
+"""reprojection of termination depths: number of sampled directions per tile, across and down; and the
 multiple of the camera's motion that is added to the depths"""
 _PATCH_RATIO = 2
-"""missing chunks are rendered alone, in their tiles, if they are so many times fewer splats than the frame"""
+"""missing chunks are rendered alone, only in their tiles, if they have this many times fewer splats than the
+frame"""
 _MAX_PASSES = 12
-"""passes after which a view is rendered from all of its chunks"""
+"""maximum number of passes; then a view is rendered from all visible chunks"""
 
 
 class OcclusionCulling:
@@ -51,7 +53,7 @@ class OcclusionCulling:
         """number of views to render without occlusion culling"""
 
     def is_worthwhile(self, full: Band, views_later: int = 0) -> bool:
-        """Whether occlusion culling of a view is expected to pay, so many views later."""
+        """Whether occlusion culling is expected to save time. views_later: number of views until this one."""
         return full.count >= MIN_SPLATS and self._pause <= views_later
 
     def skip_view(self) -> None:
@@ -59,7 +61,7 @@ class OcclusionCulling:
         self._pause = max(self._pause - 1, 0)
 
     def initial_guess(self, full: Band) -> Band:
-        """The view with the chunks from which to render it first."""
+        """First guess of the chunks that are not occluded."""
         last = self._last
         termination = None if last is None else _reprojected(*last, full.view)
         if termination is None:
@@ -137,7 +139,7 @@ def _without(nodes: NodeMasks, others: NodeMasks) -> NodeMasks:
 
 
 def _nearest(full: Band, nodes: NodeMasks, max_splats: int) -> NodeMasks:
-    """The nearest of some nodes, with about so many splats in total; at least one node."""
+    """The nearest of some nodes, with about `max_splats` splats in total; at least one node."""
     depths = [depth[mask] for depth, mask in zip(full.minimum_keys(), nodes, strict=True)]
     counts = [count[mask] for count, mask in zip(full.scene.node_counts, nodes, strict=True)]
     order = np.argsort(np.concatenate(depths), kind="stable")

@@ -18,7 +18,8 @@ from fidsplat.store.chunked_splats import ChunkedSplats, NodeMasks
 from fidsplat.streaming.frustum_culling import PADDING, Boxes, CameraBoxes, Extent, ewa_reach
 
 _RANGE = 3.33
-"""standard deviations: splats have their own depth within sqrt(2 ln 255) (slot/compose_pixel.cl)"""
+"""standard deviations within which a splat's depth varies between pixels, at least sqrt(2 ln 255)
+(slot/compose_pixel.cl)"""
 
 
 def is_supported(view: View, features: FeatureSet) -> bool:
@@ -144,7 +145,8 @@ class _RangeMaximum:
 
     def __init__(self, values: np.ndarray) -> None:
         self._tables: dict[tuple[int, int], np.ndarray] = {(0, 0): values}
-        """by powers of two (rows, columns): the maximum of the rectangle of that size from each cell on"""
+        """for each size, powers of two (rows, columns): maximum of the rectangle of this size that starts at
+        each cell"""
 
     def _table(self, down: int, across: int) -> np.ndarray:
         if (down, across) not in self._tables:

@@ -40,7 +40,7 @@ class Residency:
         self._splitter, self._occlusion = BandSplitter(), OcclusionCulling()
         self._prefetch_thread: threading.Thread | None = None
         self.nodes = 0
-        """number of nodes of the last views"""
+        """number of selected nodes of the last views"""
 
     @property
     def count(self) -> int:
@@ -93,8 +93,8 @@ class Residency:
     def gather(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[ResidentData, Callable[[], np.ndarray]]:
-        """The visible splats of several views on the device, and a function that returns their scene indices
-        (n,) int32. The strictest quality decides for all views.
+        """Load the splats that are visible in any of several views; returns them, and a function that returns
+        their scene indices (n,) int32. The strictest quality applies to all views.
 
         Raises:
             InputError: a quality allows an error that was not measured.
@@ -140,7 +140,7 @@ class Residency:
                     return
                 waiting = following
         finally:
-            if self._prefetch_thread is not None:  # the device may be gone when the process ends
+            if self._prefetch_thread is not None:  # wait, as the device may be closed next
                 self._prefetch_thread.join()
 
     def _prefetch(self, capture: Capture) -> None:

@@ -95,7 +95,7 @@ def check(renderer, cloud, camera, quality=None, background=(0.0, 0.0, 0.0)):
     [(300, 1e-3, HAZE, 1.4), (1000, 1e-3, RIM, 4.0), (3000, 1e-3, RIM, 7.9), (10_000, 9.9e-6, MIDDLE, 48.0)],
 )
 def test_haze_below_the_cutoff_is_counted(renderer, n, opacity, camera, wrong):
-    """By how much `standard` is wrong, in half steps of 8 bits."""
+    """By how much `standard` is wrong, in half 8-bit levels."""
     frame, off = check(renderer, haze(n, opacity), camera)
     assert off.max() > wrong / 512
     assert frame["error"].max() < 1.1 * off.max()  # and the bound is of use

@@ -236,7 +236,7 @@ def test_a_definition_has_a_truth_of_its_own(session):
 
 
 def test_omissions_of_standard_are_invisible(session):
-    """Half a step of 8 bits, on what constants hurt most."""
+    """The error is within half an 8-bit level on the scenes that constants change most."""
     standard = PRESETS["standard"]
     assert (
         np.abs(session.render("hard", standard)["rgb"] - session.reference("hard", standard)).max() <= 1 / 512

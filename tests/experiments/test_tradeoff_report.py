@@ -272,7 +272,7 @@ def test_devices_are_side_by_side_in_one_chart(tmp_path):
     report.write_plot([tmp_path / "cpu", tmp_path / "gpu"], tmp_path / "both.svg")
     chart = xml.dom.minidom.parse(str(tmp_path / "both.svg"))
     comments = [node.data.strip() for node in walk(chart) if node.nodeType == node.COMMENT_NODE]
-    assert {"hard on A processor", "hard on A card", "half a step of 8 bits"} <= set(comments)
+    assert {"hard on A processor", "hard on A card", "half an 8-bit level"} <= set(comments)
     assert comments.count("gsplat") == 2
     write(tmp_path / "other", plain_records("r100k_720p", **GPU))
     with pytest.raises(fs.InputError, match="A processor and A card have no scene in common to plot"):

@@ -61,7 +61,7 @@ def open_device(selector: str = "") -> ReferenceBackend:
     """
     if selector:
         raise UnknownDeviceError(
-            f"device must be 'reference', got 'reference:{selector}'; it has no variants"
+            f"the reference must have no selector, got {selector!r}; use device='reference'"
         )
     return ReferenceBackend()
 

@@ -19,7 +19,7 @@ from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.util.errors import InputError, unknown
 
 TIMED = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, arithmetic="precise")
-"""quality of the benchmark: cut-off and stop of all peers, for equal work"""
+"""quality of the benchmark: cut-off and stop of other renderers, for equal work"""
 WALL_COLUMNS, WALL_ROWS, _WALL_CODES = 20, 10, 10
 
 
@@ -103,11 +103,11 @@ def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, Be
 
 
 DEFAULT_SCENES = ("tag", "r100k_720p", "r1m_1080p", "tag_in_million")
-"""default scenes: about a minute on two cores"""
+"""default scenes; they take about a minute on two cores"""
 
 
 def scene_names(words: Iterable[str]) -> tuple[str, ...]:
-    """Distinct scene names: `all` is every scene, none the default.
+    """Distinct scene names: `all` means every scene, no word the default scenes.
 
     Raises:
         InputError: an unknown scene.

@@ -35,16 +35,16 @@ class Result:
     width: int
     height: int
     timer: Timer
-    """wall times of frames until the device is done; parts are stages"""
+    """wall times of complete frames, with the times of their stages"""
     rates: Rates | None = None
     renderer: str = "fidsplat"
-    """renderer; benchmarks/peers has others"""
+    """name of the renderer; other renderers are in benchmarks/peers"""
     first_frame_ms: float = 0.0
-    """time of the first frame, with compilation or a kernel cache"""
+    """time of the first frame, including compilation or loading of cached kernels"""
     counts: dict[str, int] = field(default_factory=dict)
-    """splats, visible and pairs of the frame, and fragments if the backend counts them"""
+    """number of splats, visible splats and pairs of the frame, and of fragments if the backend counts them"""
     host_ms: list[float] = field(default_factory=list)
-    """time of the call for the same frames, which returns before the device is done"""
+    """times until the call returns, for the same frames; the device is then still rendering"""
     mean_rgb: float = 0.0
     memory_bytes: int | None = None
     """device memory in bytes: cloud, scratch buffers and image"""
@@ -53,7 +53,7 @@ class Result:
 
     @property
     def times_roofline(self) -> dict[str, float]:
-        """Ratio to the roofline by stage, and of `frame`; without unknown ones."""
+        """Ratio of measured times to the roofline by stage and for the complete `frame`, where known."""
         measured = self.timer.part_medians | {"frame": self.timer.median}
         rooflines = self.rooflines | {"frame": sum(self.rooflines.values())}
         return {name: ms / rooflines[name] for name, ms in measured.items() if rooflines.get(name, 0.0) > 0}
@@ -146,7 +146,7 @@ class Bench:
 
 
 class SceneRun:
-    """A scene on a device, with its own renderer so that memory is that of the scene."""
+    """A scene on a device, with its own renderer, so that memory is measured for this scene alone."""
 
     def __init__(
         self, scene: str, device: str, rates: Rates | None, cloud: SplatCloud, camera: Camera
@@ -199,7 +199,7 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
         FidsplatError: the device fails, or its backend does not count.
     """
     data = resident.data
-    assert not isinstance(data, Residency), "of splats in memory"
+    assert not isinstance(data, Residency), "splats must be in memory"
     features, view = prepare(data, Capture(camera, quality=quality))
     features = replace(features, outputs=("overdraw",))
     return renderer.backend.pipeline(features).render_view(data, view).read("overdraw", 0)

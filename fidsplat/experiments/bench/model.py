@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 from fidsplat.backends.interface import Rates
 
-# bytes of a splat: position, scales and opacity for culling; rotation and colour if it is visible
+# bytes read per splat: position, scales and opacity for culling; rotation and colour if it is visible
 _DECIDE, _ROTATION, _COLOR = 12 + 8 + 4, 16, 12
 RECORD = 64  # intersection and colour of a splat, as in splat.cl
 WINDOW = 8  # tile range of a splat
 _KEY, _INDEX = 4, 4
-# operations that a multiply-add unit can do one of per cycle
+# operations, of which a multiply-add unit can do one per cycle
 _DECIDE_FMA, _SET_UP_FMA, _SET_UP_DIVISIONS = 20, 160, 4
-FRAGMENT_FMA = 30  # exp and division are counted apart
+FRAGMENT_FMA = 30  # exp and division are counted separately
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Work:
     division: float = 0.0
 
     def ms(self, rates: Rates) -> float:
-        """Minimum time: memory and arithmetic overlap, kinds of arithmetic share units."""
+        """Minimum time [ms]: memory and arithmetic overlap; all kinds of arithmetic share the units."""
         memory = self.bytes / rates.copy_bytes
         arithmetic = self.fma / rates.fma + self.exp / rates.exp + self.division / rates.division
         return 1e3 * max(memory, arithmetic)

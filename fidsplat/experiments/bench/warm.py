@@ -19,13 +19,13 @@ from fidsplat.splats.cloud import SplatCloud
 from fidsplat.util.timing import Timer
 
 COUNTS = (2, 70_000)
-"""numbers of splats of the frames: launches of few and of many work-items"""
+"""numbers of splats of the frames, for launches with few and with many work-items"""
 
 _OUTPUTS = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
 _STANDARD = Quality()
 _SHARP = Quality(lowpass="none", samples=3)  # what docs/accuracy.md advises for dense codes
 MARKER, DISKS, CAPTURE = "a marker", "disks", "a capture"
-"""boxes on a plane, 2D splats, 3D Gaussians"""
+"""kinds of splats: boxes on a plane, 2D splats, 3D Gaussians"""
 
 
 @dataclass(frozen=True)

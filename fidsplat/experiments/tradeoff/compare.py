@@ -25,7 +25,7 @@ from fidsplat.vision.readers import Target, attempt
 
 FULL_TILTS, QUICK_TILTS = "0:40:20,46:88:1", "0:40:40,48:88:4"
 READERS = {"apriltag": "aruco", "qr": "zxing"}
-"""one installed detector of each kind"""
+"""detectors: one installed detector for each kind of marker"""
 FLIP_SIDE = 256
 """pixels: edge of the middle square for FLIP; the scene of hard cases is used completely"""
 NO_FLIP = "flip-evaluator is not installed; pip install 'fidsplat[experiments]'"
@@ -106,14 +106,14 @@ def beyond_certificates(difference: np.ndarray, scene: TradeScene, quality: Qual
         return None
     worst = np.argsort(difference, axis=None)[::-1][: count + 1]
     rows, columns = np.unravel_index(worst[:count], difference.shape)
-    # the reference does not round
+    # the float64 reference has no rounding error
     plain = quality.with_(arithmetic="precise", blend_precision="float32")
     frame = FrameSpec(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
     try:
         certified = reference_images(frame, (rows, columns))["certificate"]
     except FidsplatError:
         return None
-    # a certificate is per unit of colour
+    # certificates are per unit of colour
     brightest = max(1.0, 0.0 if scene.cloud.colors is None else float(np.abs(scene.cloud.colors).max()))
     uncertified = [difference.flat[worst[:count]] - certified * brightest, difference.flat[worst[count:]]]
     return max(float(np.concatenate(uncertified).max()), 0.0)

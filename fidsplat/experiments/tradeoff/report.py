@@ -20,9 +20,9 @@ from fidsplat.experiments.tradeoff.summary import TILT, DeviceResults, load
 from fidsplat.util.errors import InputError
 
 INVISIBLE = 1 / 512
-"""half a step of 8 bits"""
+"""half an 8-bit level"""
 _SMALLEST = 1e-7
-"""smaller errors are plotted here"""
+"""lower limit of the error axis; smaller errors are plotted at this value"""
 SHOWN_MARKER = "qr10"
 """marker of the table of mixtures"""
 
@@ -186,7 +186,7 @@ def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, fl
         axes.plot(chosen["ms"], chosen["error"], style, color=colour, label=text)
     axes.axhline(INVISIBLE, color="#777777", linestyle="--", linewidth=0.8)
     axes.annotate(
-        "half a step of 8 bits", (0, INVISIBLE), (4, 3), xycoords=("axes fraction", "data"),
+        "half an 8-bit level", (0, INVISIBLE), (4, 3), xycoords=("axes fraction", "data"),
         textcoords="offset points", fontsize=9, color="#555555",
     )  # fmt: skip
     axes.margins(0.08)

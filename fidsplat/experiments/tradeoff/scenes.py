@@ -25,7 +25,7 @@ HARD = "hard"
 MARKERS = {"apriltag": "apriltag", "qr2": "small", "qr5": "medium", "qr10": "large", "qr22": "huge"}
 """name -> category of the paper; its marker 0 is used"""
 FEW_SETTINGS = ("apriltag", "qr2", "qr5", "qr22")
-"""markers that only presets and marker qualities are measured on; qr10 has every setting"""
+"""markers on which only presets and marker qualities are measured; qr10 is measured with every setting"""
 NAMES = (*RANDOM, *GAUSSIANS_3D, HARD, *MARKERS)
 QUICK_NAMES = ("r100k_720p", HARD, "apriltag", "qr10")
 TILTS = (0, 60, 80)

@@ -18,7 +18,7 @@ from fidsplat.render.resident import ResidentCloud
 from fidsplat.util.timing import frame_timer, quartiles, ratios, time_interleaved
 
 _SCENES, _REFERENCES = 12, 6
-"""cached at a time"""
+"""maximum number of cached scenes"""
 DEFINITION = ("lowpass", "samples", "order")
 """settings that define the image; the others define its accuracy"""
 
@@ -125,7 +125,7 @@ def memory_of(session: Session, view: str, quality: Quality) -> int | None:
     if not backend.traits.measures_rates:
         return None
     backend.release_scratch()
-    # a cloud caches every form of its colours that was ever requested; a new one has none
+    # a cloud caches converted colours, so a new cloud is uploaded
     resident = session.renderer.upload(scene.cloud)
     session.renderer.render(resident, scene.capture, quality=quality)
     return backend.memory_bytes + resident.memory_bytes + 12 * scene.camera.width * scene.camera.height
