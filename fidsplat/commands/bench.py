@@ -38,8 +38,9 @@ class Bench:
       qr_wall         200 QR codes of version 22 on a wall, 1920 x 1080
       tag_in_million  an AprilTag before 1,000,000 random splats, 1920 x 1080
 
-    --scene measures your own scene from its camera, or from eight poses of --cameras. Only splats are timed:
-    its effects and motions are left out.
+    --scene measures your own scene with everything that it requests (quality, outputs, lens, shutter,
+    motions, markers, fog, sensor), from its camera or from eight poses of --cameras. The table shows the time
+    that each effect adds.
 
     Examples:
       fidsplat bench
@@ -55,7 +56,12 @@ class Bench:
     scene: UserScenes = ()
     cameras: Cameras = None
     device: Devices = ()
-    repeats: Annotated[int, option("N", "timed frames of each scene on each device")] = 20
+    repeats: Annotated[
+        int,
+        option(
+            "N", "timed frames of each scene on each device; of your own, 3 or as many as start in a minute"
+        ),
+    ] = 20
     json: str | None = None
     """FILE: also write all figures to a file after each scene; - for stdout only"""
     plot: str | None = None
@@ -79,7 +85,7 @@ class Bench:
         where = console(self.json == "-")
         interrupted, measuring = False, None
         devices = self.device or (default_device(),)
-        frames = len(scenes) * len(set(devices)) * self.repeats
+        frames = sum(1 + len(known[name].without) for name in scenes) * len(set(devices)) * self.repeats
         columns = (*Progress.get_default_columns(), TextColumn("{task.fields[now]}"))
         with progress_bar(where, *columns) as progress:
             task = progress.add_task("frames", total=frames, now="")

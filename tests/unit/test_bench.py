@@ -12,6 +12,8 @@ from fidsplat.cli import main
 from fidsplat.experiments.bench import catalogue, measure
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, BenchScene, scene_names
 from fidsplat.experiments.bench.measure import overdraw
+from fidsplat.experiments.bench.shares import without_effects
+from fidsplat.experiments.bench.table import scene_table
 from fidsplat.scenes.random_clouds import random_cloud, standard_camera
 from fidsplat.util.timing import WARM_UP, Timer
 
@@ -30,6 +32,7 @@ FIGURES = (
         "host_ms",
         "stages_ms",
         "fastest_stages_ms",
+        "effects_ms",
     ),
     *("splats", "visible", "pairs", "fragments", "splats_per_second", "memory_bytes", "mean_rgb"),
     *("rates", "rooflines_ms", "times_roofline"),
@@ -299,9 +302,9 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
     """Each pose is timed by itself, so many at most, and renders what it sees."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(catalogue, "MOST_VIEWS", 3)
-    fs.save_ply(random_cloud(200, 0.2), "own.ply")
+    fs.save_ply(random_cloud(50, 0.2), "own.ply")
     (tmp_path / "own.toml").write_text(
-        "[camera]\nwidth = 64\nheight = 48\nfov_x_deg = 60.0\nposition = [0.0, 0.0, 0.0]\n"
+        "[camera]\nwidth = 24\nheight = 18\nfov_x_deg = 60.0\nposition = [0.0, 0.0, 0.0]\n"
         'look_at = [0.0, 0.0, 1.0]\n[[splats]]\nfile = "own.ply"\n'
     )
     lines = [f"{k} {0.1 * k} 0 0 0 0 0 1" for k in range(5)]
@@ -311,15 +314,17 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
     said = json.loads(capsys.readouterr().out)
     assert said["scenes"] == [f"own.toml@{k}" for k in (0, 2, 4)]
     cloud, renderer = fs.load_ply("own.ply"), fs.Renderer("reference")
+    f = 12 / np.tan(np.radians(30))
     for k, result in zip((0, 2, 4), said["results"], strict=True):
         pose = np.eye(4)
         pose[0, 3] = -0.1 * k
-        camera = fs.Camera.pinhole(64, 48, CAMERA.fx, CAMERA.fy, 32, 24, pose)
-        rendered = renderer.render(cloud, camera, quality=catalogue.TIMED)["rgb"]
+        camera = fs.Camera.pinhole(24, 18, f, f, 12, 9, pose)
+        rendered = renderer.render(cloud, camera)["rgb"]
+        assert result["effects_ms"] == {}
         assert result["mean_rgb"] == pytest.approx(float(rendered.mean(dtype=np.float64)), rel=1e-5)
     assert bench(*words) == 0
     out = capsys.readouterr().out
-    assert "own.toml: 200 splats, 64 x 48" in out
+    assert "own.toml: 50 splats, 24 x 18" in out
     assert "more with --scenes" not in out
     for wrong, why in (
         (("--scene", "own.toml", "--scenes", "small"), "exclude each other"),
@@ -327,6 +332,79 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
     ):
         assert bench(*wrong) == 2
         assert why in capsys.readouterr().err
+
+
+REQUESTS = """
+[camera]
+width = 16
+height = 12
+fov_x_deg = 60.0
+[camera.distortion]
+k1 = -0.1
+[camera.shutter]
+exposure_time_ms = 20.0
+sub_poses = 2
+[[camera.motion]]
+time = -1.0
+position = [0.0, 0.0, 0.0]
+look_at = [0.0, 0.0, 1.0]
+[[camera.motion]]
+time = 1.0
+position = [0.4, 0.0, 0.0]
+look_at = [0.4, 0.0, 1.0]
+[[splats]]
+file = "own.ply"
+[[markers]]
+spec = "apriltag:36h11:5"
+size = 0.5
+position = [0.0, 0.0, 1.5]
+[render]
+outputs = ["rgb", "depth"]
+quality = "fast"
+"""
+
+
+def test_ones_own_scene_with_everything_it_requests(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    fs.save_ply(random_cloud(20, 0.2), "own.ply")
+    (tmp_path / "own.toml").write_text(REQUESTS)
+    words = ("--device", "reference", "--repeats", "1", "--json", "-")
+    assert main(["bench", "--scene", "own.toml", *words]) == 0
+    (result,) = json.loads(capsys.readouterr().out)["results"]
+    assert set(result["effects_ms"]) == {"lens", "shutter", "order", "outputs", "markers"}
+    assert result["repeats"] == 1
+    scene = fs.Scene.load("own.toml")
+    image = fs.Renderer("reference").render(scene)["rgb"]
+    assert result["mean_rgb"] == pytest.approx(float(image.mean(dtype=np.float64)), rel=1e-5)
+    assert result["splats"] == len(scene.cloud()) > 20
+    assert result["rooflines_ms"] == {}
+    less = without_effects(scene, scene.capture)
+    assert less["lens"].capture.camera.lens is None
+    assert not less["shutter"].capture.exposed
+    assert less["outputs"].capture.outputs == ("rgb",)
+    assert len(less["markers"].cloud) == 20
+    assert all(one.cloud is None for name, one in less.items() if name != "markers")
+
+
+def test_a_scenes_shutter_moves_along_the_cameras(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    fs.save_ply(random_cloud(20, 0.2), "own.ply")
+    (tmp_path / "own.toml").write_text(REQUESTS)
+    path = fs.Trajectory([0.0, 1.0], np.array([np.eye(4), np.eye(4) + 0.3 * np.eye(4, k=3)]))
+    scenes = catalogue.own_scenes("own.toml", fs.Scene.load("own.toml"), path)
+    first = scenes["own.toml@0"].capture
+    np.testing.assert_allclose(np.linalg.inv(first.motion.camera_at(0.5))[:3, 3], (0.15, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(scenes["own.toml@1"].make()[1].position, (0.3, 0, 0), atol=1e-12)
+    assert first.exposed
+
+
+def test_the_table_shows_the_share_of_each_effect():
+    timer, less = Timer(lambda: None), Timer(lambda: None)
+    timer.ms, less.ms = [10.0, 12.0, 14.0], [4.0, 6.0, 11.0]
+    device = fs.Renderer("reference").device
+    result = measure.Result("own", device, 8, 8, timer, counts={"splats": 5}, without={"fog": less})
+    assert result.effects == {"fog": 6.0}
+    assert ["of which fog", "6.00 (50 %)", ""] in scene_table([result])[1]
 
 
 @pytest.mark.usefixtures("rates_once")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import random
 import string
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory
+from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
+from fidsplat.experiments.bench.shares import Reduced, middle_camera, without_effects
 from fidsplat.markers import marker
+from fidsplat.render.flight import Flight
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.scenes.random_clouds import SCENES, load_scene, standard_camera
 from fidsplat.splats.cloud import SplatCloud
@@ -29,6 +32,10 @@ class BenchScene:
 
     about: str
     make: Callable[[], tuple[SplatCloud, Camera]]
+    capture: Capture | None = None
+    """timed capture; None: rgb of the camera at the quality `TIMED`"""
+    without: Mapping[str, Reduced] = field(default_factory=dict)
+    """effect of the capture -> the same frame without it, which is timed for comparison"""
 
 
 def tag() -> tuple[SplatCloud, Camera]:
@@ -81,9 +88,9 @@ MOST_VIEWS = 8
 
 
 def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, BenchScene]:
-    """Benchmark scenes of a user's scene by name, such as `room.toml@2`.
+    """Benchmark scenes of a user's scene by name, such as `room.toml@2`, with everything that it requests.
 
-    The view is its camera, or poses of a trajectory (camera to world).
+    The view is its camera, or poses of a trajectory (camera to world), along which its shutter moves.
 
     Raises InputError for a scene without a camera.
     """
@@ -92,13 +99,20 @@ def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, Be
         raise InputError(f"{name} has no [camera] table; add one with the size and lens of the images")
     about = f"{len(scene.cloud()):,} splats, {camera.width} x {camera.height}"
     if path is None:
-        return {name: BenchScene(about, lambda: (scene.cloud(), camera))}
-    poses = path.inverse().poses
-    some = sorted({round(k) for k in np.linspace(0, len(poses) - 1, min(len(poses), MOST_VIEWS))})
-    views = {k: camera.with_pose(poses[k]) for k in some}
+        captures = {name: scene.capture}
+    else:
+        poses = len(path)
+        some = sorted({round(k) for k in np.linspace(0, poses - 1, min(poses, MOST_VIEWS))})
+        flight = Flight(scene, path, np.asarray(path.times)[some], scene.capture)
+        captures = {f"{name}@{k}": capture for k, capture in zip(some, flight.captures, strict=True)}
     return {
-        f"{name}@{k}": BenchScene(f"{about}, pose {k}", lambda view=view: (scene.cloud(), view))
-        for k, view in views.items()
+        view: BenchScene(
+            about if view == name else f"{about}, pose {view.rpartition('@')[2]}",
+            lambda capture=capture: (scene.cloud(), middle_camera(capture)),
+            capture,
+            without_effects(scene, capture),
+        )
+        for view, capture in captures.items()
     }
 
 

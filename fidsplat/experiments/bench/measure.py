@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,15 +16,20 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
+from fidsplat.effects import select
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED, BenchScene
 from fidsplat.experiments.bench.model import Counts, roofline_ms
+from fidsplat.experiments.bench.shares import Reduced, middle_camera
 from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.streaming.residency import Residency
 from fidsplat.util.errors import FidsplatError
-from fidsplat.util.timing import Timer, time_interleaved
+from fidsplat.util.timing import Timer, frame_timer, time_interleaved
+
+MIN_ROUNDS, SECONDS = 3, 60.0
+"""for a user's scene: no round is started later than SECONDS, after MIN_ROUNDS rounds"""
 
 
 @dataclass
@@ -48,6 +54,8 @@ class Result:
     mean_rgb: float = 0.0
     memory_bytes: int | None = None
     """device memory in bytes: cloud, scratch buffers and image"""
+    without: dict[str, Timer] = field(default_factory=dict)
+    """times of the same frames without an effect, by its name"""
     rooflines: dict[str, float] = field(default_factory=dict)
     """roofline by stage in milliseconds, if device rates are known"""
 
@@ -62,6 +70,15 @@ class Result:
     def host(self) -> float:
         """Median time of the call in milliseconds."""
         return float(np.median(self.host_ms[-len(self.timer.ms) :])) if self.host_ms else math.nan
+
+    @property
+    def effects(self) -> dict[str, float]:
+        """Milliseconds that each effect adds to the frame: medians of interleaved differences."""
+        return {
+            name: float(np.median(np.subtract(self.timer.ms[: len(less.ms)], less.ms)))
+            for name, less in self.without.items()
+            if less.ms
+        }
 
     def as_dict(self) -> dict:
         """Flat record for JSON."""
@@ -90,6 +107,7 @@ class Result:
             "host_ms": self.host,
             "stages_ms": self.timer.part_medians,
             "fastest_stages_ms": {stage: min(times) for stage, times in self.timer.parts.items()},
+            "effects_ms": self.effects,
             **self.counts,
             "splats_per_second": 1e3 * self.counts["splats"] / middle,
             "memory_bytes": self.memory_bytes,
@@ -135,24 +153,37 @@ class Bench:
     def run(self, scene: str, repeats: int) -> None:
         """Render a scene `repeats` times on each device. Errors of a device are stored in its result."""
         self._report(f"making {scene}")
-        cloud, camera = self._scenes[scene].make()
-        runs = []
+        entry = self._scenes[scene]
+        cloud, camera = entry.make()
+        timers: list[Timer] = []
         for name, rates in self.devices.items():
             self._report(f"{scene}: first frame on {name}")
-            runs.append(SceneRun(scene, name, rates, cloud, camera))
-            self.results.append(runs[-1].result)
+            run = SceneRun(scene, name, rates, cloud, entry.capture or camera, entry.without)
+            self.results.append(run.result)
+            timers += [run.result.timer, *run.result.without.values()]
         self._report(scene)
-        time_interleaved([run.result.timer for run in runs], repeats, tick=self._tick)
+        if entry.capture is None:
+            time_interleaved(timers, repeats, tick=self._tick)
+        else:  # a frame of any duration
+            few = min(MIN_ROUNDS, repeats)
+            time_interleaved(timers, repeats, min_rounds=few, seconds=SECONDS, warm_up=1, tick=self._tick)
 
 
 class SceneRun:
     """A scene on a device, with its own renderer, so that memory is measured for this scene alone."""
 
     def __init__(
-        self, scene: str, device: str, rates: Rates | None, cloud: SplatCloud, camera: Camera
+        self,
+        scene: str,
+        device: str,
+        rates: Rates | None,
+        cloud: SplatCloud,
+        capture: Camera | Capture,
+        without: Mapping[str, Reduced] = MappingProxyType({}),
     ) -> None:
         self.renderer = Renderer(device)
-        self.camera, self.capture = camera, Capture(camera, quality=TIMED)
+        self.capture = Capture(capture, quality=TIMED) if isinstance(capture, Camera) else capture
+        self.camera = camera = middle_camera(self.capture)
         self.image = np.zeros((camera.height, camera.width, 3), np.float32)
         """rendered image (h, w, 3)"""
         timer = Timer(self._complete, catch_errors=True, parts=lambda frame: frame.timings)
@@ -161,6 +192,11 @@ class SceneRun:
             self.resident = self.renderer.upload(cloud)
             self.result.first_frame_ms = Timer(self._first).run()
             self._count(cloud)
+            for name, less in without.items():
+                resident = self.resident if less.cloud is None else self.renderer.upload(less.cloud)
+                self.result.without[name] = frame_timer(
+                    self.renderer, resident, less.capture, catch_errors=True
+                )
         except FidsplatError as error:
             timer.error = str(error)
 
@@ -176,7 +212,8 @@ class SceneRun:
 
     def _first(self) -> None:
         frame = self.render()
-        self.image, self.result.counts = frame["rgb"], dict(frame.stats)
+        image = frame[frame.outputs[0]]  # waits for the device
+        self.image, self.result.counts = frame["rgb"] if "rgb" in frame.outputs else image, dict(frame.stats)
 
     def _count(self, cloud: SplatCloud) -> None:
         result, backend = self.result, self.renderer.backend
@@ -185,7 +222,10 @@ class SceneRun:
             return
         pixels = result.width * result.height
         result.memory_bytes = backend.memory_bytes + self.resident.memory_bytes + 12 * pixels
-        fragments = overdraw(self.renderer, self.resident, self.camera, TIMED)
+        plain = Capture(self.camera, quality=self.capture.quality)
+        if select(cloud, plain) != select(cloud, self.capture):
+            return  # the roofline describes frames without effects
+        fragments = overdraw(self.renderer, self.resident, self.camera, self.capture.quality)
         result.counts["fragments"] = int(fragments.sum(dtype=np.int64))
         coefficients = max(cloud.sh_degree + 1, 1) ** 2 - 1
         counts = Counts(pixels=pixels, sh_coefficients=coefficients, **result.counts)
