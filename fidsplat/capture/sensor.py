@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.util.arguments import as_float, invalid, number, own_scalars, whole_number
+from fidsplat.util.arguments import as_float, invalid, items, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError
 
 RESPONSES = ("linear", "srgb")
@@ -47,6 +47,8 @@ class Sensor:
     even steps of v from 0 to 1. All but "linear" clamp v to [0, 1]."""
     bits: int | None = None
     """bits of quantisation and of the rgb file, 8 or 16; None: no quantisation"""
+    extra_steps: tuple[str, ...] = ()
+    """steps of other packages before quantisation, NAME or NAME:NUMBER,NUMBER (docs/effects.md)"""
 
     def __post_init__(self) -> None:
         own_scalars(self)
@@ -59,6 +61,10 @@ class Sensor:
         whole_number("sensor: seed", self.seed, 0, 2**32 - 1)
         if self.bits is not None and (not isinstance(self.bits, int) or self.bits not in BITS):
             raise invalid("sensor: bits", "8, 16 or None", self.bits)
+        steps = items("sensor: extra_steps", self.extra_steps, str, "several texts, as ('negative:1',)")
+        object.__setattr__(self, "extra_steps", tuple(steps))
+        if len(self.extra) < len(steps):
+            raise invalid("sensor: extra_steps", "different steps", steps)
         object.__setattr__(self, "vignetting", _numbers("vignetting", self.vignetting, 0, 3))
         if isinstance(self.response, str):
             if self.response not in RESPONSES:
@@ -68,6 +74,15 @@ class Sensor:
             number("sensor: a gamma", self.response, "from {:g} to {:g}".format(*GAMMAS), *GAMMAS)
         else:
             object.__setattr__(self, "response", _numbers("response", self.response, 2, 65536))
+
+    @cached_property
+    def extra(self) -> dict[str, tuple[float, ...]]:
+        """Names of `extra_steps` with their numbers."""
+        found = {}
+        for text in self.extra_steps:
+            name, colon, numbers = text.partition(":")
+            found[name] = _numbers("extra_steps", map(float, numbers.split(",") if colon else ()), 0, 64)
+        return found
 
     @cached_property
     def steps(self) -> tuple[str, ...]:
@@ -86,6 +101,7 @@ class Sensor:
             # a line from 0 to 1 only clamps, which every output does as well
             line = np.linspace(0, 1, len(self.response))
             found.append(("response_table", not np.array_equal(self.response, line)))
+        found += [(name, True) for name in self.extra]
         found.append(("quantise", self.bits is not None))
         return tuple(name for name, active in found if active)
 
@@ -103,6 +119,8 @@ class Sensor:
                 return (np.int32(len(self.response)),)  # type: ignore[arg-type]
             case "quantise_steps":
                 return (2.0**self.bits - 1,)  # type: ignore[operator]
+            case _ if name in self.extra:
+                return self.extra[name]
             case _:
                 return (getattr(self, name),)
 

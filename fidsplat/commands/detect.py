@@ -60,12 +60,14 @@ class Detect:
 
     def run(self) -> int:
         from fidsplat.images.tag_dictionaries import parse_family
+        from fidsplat.markers.kinds import detectors
         from fidsplat.vision.readback import means
 
         if not self.images:
             raise InputError("detection needs at least one IMAGE: an image, a folder of images, or a video")
         for name in self.family:
-            parse_family(name)
+            if name not in detectors():
+                parse_family(name)
         scene = None if self.scene is None else _load_scene(self.scene)
         results: list[dict[str, Any]] = []
         readings: list[Reading] = []

@@ -17,7 +17,7 @@ from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, check_request
 from fidsplat.commands.output import console, delayed_progress, report
 from fidsplat.commands.scenes import RenderInput, Size
-from fidsplat.effects.catalogue import outputs_help
+from fidsplat.effects.extensions import outputs_help
 from fidsplat.scenes.sources import StartPose
 from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.files import path_of, writable_folder

@@ -1,6 +1,7 @@
 """Effects and outputs as data, and the selection of those that a frame requires."""
 
 from fidsplat.effects.catalogue import CATALOGUE, IMAGES, OUTPUTS, Effect, Output, declared_output
+from fidsplat.effects.extensions import Extension, load_extensions, register
 from fidsplat.effects.select import FeatureSet, select
 
 __all__ = [
@@ -8,8 +9,11 @@ __all__ = [
     "IMAGES",
     "OUTPUTS",
     "Effect",
+    "Extension",
     "FeatureSet",
     "Output",
     "declared_output",
+    "load_extensions",
+    "register",
     "select",
 ]

@@ -120,10 +120,3 @@ def declared_output(name: str) -> Output:
     """Declaration of an output that captures can request, or of an internal one."""
     effect = CATALOGUE.get(name)
     return effect.output if effect is not None and effect.output else {"rgb": RGB, **COMPOSED}[name]
-
-
-def outputs_help() -> str:
-    """Table of all outputs that captures can request, a line each."""
-    outputs = (*OUTPUTS.values(), *COMPOSED.values())
-    width = max(len(output.name) for output in outputs) + 2
-    return "\n".join(f"  {output.name:{width}}{output.summary}" for output in outputs)

@@ -12,6 +12,7 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.environment import Gradient, Panorama
 from fidsplat.capture.quality import Quality
 from fidsplat.effects.catalogue import CATALOGUE, COMPOSED, OUTPUTS, RGB, Output
+from fidsplat.effects.extensions import EXTENSIONS, load_extensions
 from fidsplat.util.errors import InputError, unknown
 
 _KINDS = {Gradient: "gradient", Panorama: "panorama"}
@@ -86,6 +87,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
     Raises:
         InputError: an unknown output, or two effects that exclude each other.
     """
+    _load_extensions_of(capture)
     for name in capture.outputs:
         if name not in (*OUTPUTS, *COMPOSED):
             raise InputError(unknown("output", name, (*OUTPUTS, *COMPOSED)))
@@ -139,6 +141,25 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
         setup_precision=quality.setup_precision,
         posts=(*(("fog",) if capture.foggy else ()), *capture.sensor.steps),
     )
+
+
+def _load_extensions_of(capture: Capture) -> None:
+    """Load extensions if the capture requests an unknown name.
+
+    Raises:
+        InputError: an unknown step of the sensor, or another number of values than it has.
+    """
+    steps = capture.sensor.extra
+    if not {*capture.outputs, *steps} <= {*OUTPUTS, *COMPOSED, *EXTENSIONS}:
+        load_extensions()
+    for name, values in steps.items():
+        step = EXTENSIONS.get(name)
+        if step is None or step.output is not None:
+            names = [name for name, known in EXTENSIONS.items() if known.output is None]
+            raise InputError(unknown("sensor step", name, names))
+        if len(values) != len(step.uniforms):
+            form = f"{name}:{','.join(step.uniforms)}" if step.uniforms else name
+            raise InputError(f"sensor: a step of extra_steps must be {form}, got {len(values)} numbers")
 
 
 def with_termination_depths(features: FeatureSet) -> FeatureSet:

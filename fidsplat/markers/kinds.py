@@ -8,15 +8,17 @@ import numpy as np
 
 from fidsplat.images.family_names import foreign_family
 from fidsplat.markers import boards, images, qr, svg, tags
-from fidsplat.markers.spec import Kind, Spec
+from fidsplat.markers.spec import Detector, Kind, Spec
 from fidsplat.util.arguments import instance, invalid
 from fidsplat.util.errors import InputError, did_you_mean
+from fidsplat.util.plugins import load_plugins
 
 _kinds = {kind.name: kind for module in (tags, qr, images, svg, boards) for kind in module.KINDS}
 
 
 def register(kind: Kind) -> None:
-    """Add a kind of marker for specs in this process.
+    """Add a kind of marker for specs in this process. Installed packages add theirs by an entry point of the
+    group `fidsplat.markers` that names the Kind.
 
     Raises:
         InputError: a name that exists or is invalid.
@@ -28,6 +30,12 @@ def register(kind: Kind) -> None:
     if not kind.name.isalnum() or kind.name != kind.name.lower():
         raise InputError(f"the name of a kind must be lower-case letters and digits, got {kind.name!r}")
     _kinds[kind.name] = kind
+
+
+def detectors() -> dict[str, Detector]:
+    """Detectors of registered kinds and of those of installed packages, by kind."""
+    load_plugins("fidsplat.markers", register)
+    return {name: kind.detect for name, kind in _kinds.items() if kind.detect is not None}
 
 
 def kind_of(spec: Spec) -> Kind:
@@ -79,8 +87,11 @@ def with_file(text: str, change: Callable[[str], str]) -> str:
 
 
 def _named(head: str) -> Kind | None:
-    """The kind in the head of a spec, without options."""
-    return _kinds.get(head.lower()) or _kinds.get(head.lower().partition("-")[0])
+    """The kind in the head of a spec, without options; that of an installed package if necessary."""
+    names = (head.lower(), head.lower().partition("-")[0])
+    if _kinds.keys().isdisjoint(names) and foreign_family(head) is None:
+        load_plugins("fidsplat.markers", register)
+    return _kinds.get(names[0]) or _kinds.get(names[1])
 
 
 def _forms() -> str:

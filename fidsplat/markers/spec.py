@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,11 @@ class Spec:
     None"""
 
 
+Detector = Callable[[np.ndarray], Iterable[tuple[str, np.ndarray]]]
+"""Called with an image, (h, w) uint8 grey; returns the spec and the corners of each code, (4, 2) pixels TL,
+TR, BR, BL as printed. The first pixel has its centre at (0.5, 0.5)."""
+
+
 @dataclass(frozen=True)
 class Kind:
     """A kind of marker, added by `fidsplat.markers.register`."""
@@ -53,3 +58,5 @@ class Kind:
     w) uint8, 1 = dark or an index of the spec's colours, 255 = no paper (a hole); raises InputError"""
     is_file: bool = False
     """whether the part after the colon is a file name, relative to the scene file"""
+    detect: Detector | None = None
+    """detector of such markers, for `fidsplat.vision.detect`; None: there is none"""

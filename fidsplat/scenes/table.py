@@ -123,6 +123,7 @@ class Table:
             "str": self.text,
             "tuple[float, float, float]": lambda key: self.numbers(key, 3),
             "tuple[float, ...]": self.any_numbers,
+            "tuple[str, ...]": self.texts,
         }
         found = {}
         for field in fields(kind):

@@ -14,6 +14,7 @@ import zxingcpp
 from fidsplat.images.apriltag3 import HOLE, LAYOUTS, outside
 from fidsplat.images.files import pixels_of
 from fidsplat.images.tag_dictionaries import dictionary_bits, parse_family, predefined
+from fidsplat.markers.kinds import detectors, parse_spec
 from fidsplat.util.arguments import invalid, items
 from fidsplat.util.errors import InputError
 from fidsplat.vision.align import align, fit
@@ -40,7 +41,7 @@ class Detection:
     """A detected code."""
 
     kind: str
-    """"apriltag", "aruco" or "qr"; of `read_back` also a kind of board"""
+    """"apriltag", "aruco", "qr" or a kind of another package; of `read_back` also a kind of board"""
     family: str
     """the tag's dictionary, e.g. "36h11"; of a QR code its version and error level, e.g. "v2-L" """
     id: int | None
@@ -63,7 +64,7 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
     Args:
         image: (h, w, 3) RGB or (h, w) grey, uint8.
         families: tag families to detect ("36h11" or "apriltag:36h11"); None for `DEFAULT_FAMILIES`; () for
-            none.
+            none. Kinds of other packages are named like families; None includes those with a detector.
         qr: whether to detect QR codes.
 
     A tag that decodes in two families (the small ArUco families are parts of the large ones) is reported
@@ -78,7 +79,9 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
         families = items("families", families, str, "several names, as ('36h11',)")
     if not isinstance(qr, bool | np.bool_ | int):
         raise InputError(f"qr must be True or False, got a {type(qr).__name__}")
-    requested = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
+    hooks = detectors()
+    names = (*DEFAULT_FAMILIES, *hooks) if families is None else families
+    requested = [parse_family(name) for name in names if name not in hooks]
     if min(pixels.shape[:2]) < MIN_SIDE:
         return []
     if max(pixels.shape[:2]) > MAX_SIDE:
@@ -90,7 +93,15 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
     found: list[Detection] = []
     for kind, family in dict.fromkeys(requested):
         found += [tag for tag in _tags(grey, kind, family) if not _known(tag, found)]
+    for name in names:
+        if name in hooks:
+            found += [_of_hook(*code) for code in hooks[name](grey)]
     return found + (_qr_codes(grey) if qr else [])
+
+
+def _of_hook(text: str, corners: np.ndarray) -> Detection:
+    spec = parse_spec(text)
+    return Detection(spec.kind, spec.family or "", spec.id, spec.payload, np.asarray(corners, np.float64))
 
 
 def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:

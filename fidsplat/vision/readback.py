@@ -11,6 +11,7 @@ from fidsplat.cameras import Camera
 from fidsplat.images.files import pixels_of, to_uint8
 from fidsplat.images.tag_dictionaries import parse_family
 from fidsplat.markers import Marker
+from fidsplat.markers.kinds import detectors
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.util.arguments import invalid
 from fidsplat.vision.boards import BOARDS, board_pose
@@ -137,9 +138,11 @@ def corner_error(code: Detection, corners: np.ndarray) -> float:
 
 
 def families_of(markers: Iterable[Marker]) -> tuple[str, ...]:
-    """Distinct tag families of markers, for `detect`."""
+    """Distinct tag families of markers, and kinds with a detector of another package, for `detect`."""
+    markers, hooks = list(markers), detectors()
     tags = (made for made in markers if made.kind in ("apriltag", "aruco", *BOARDS))
-    return tuple(dict.fromkeys(":".join(parse_family(str(tag.family))) for tag in tags))
+    names = [":".join(parse_family(str(tag.family))) for tag in tags]
+    return tuple(dict.fromkeys((*names, *(made.kind for made in markers if made.kind in hooks))))
 
 
 def means(readings: Sequence[Reading]) -> dict[str, Any]:
@@ -157,7 +160,7 @@ def means(readings: Sequence[Reading]) -> dict[str, Any]:
 
 
 def _same(found: Detection, made: Marker) -> bool:
-    if found.kind == "qr":  # its family is its version
+    if made.id is None:  # the family of a QR code is its version
         return (found.kind, found.payload) == (made.kind, made.payload)
     return (found.kind, found.family, found.id) == (made.kind, made.family, made.id)
 

@@ -19,7 +19,8 @@ from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.cli import main
 from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, declared_output, select
-from fidsplat.effects.catalogue import COMPOSED, outputs_help
+from fidsplat.effects.catalogue import COMPOSED
+from fidsplat.effects.extensions import outputs_help
 from fidsplat.render.output_files import save_output
 from fidsplat.selftest.agreement import compare
 

@@ -31,10 +31,11 @@ from fidsplat.backends.opencl.declare import (
     Scalars,
     output_argument,
 )
-from fidsplat.backends.opencl.effect_layouts import LAYOUTS
+from fidsplat.backends.opencl.effect_layouts import LAYOUTS, extension_layout
 from fidsplat.backends.opencl.layout import BOUNDS, GROUP_KERNELS, KERNELS, MOMENTS, SPLAT, VIEW
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet, Output
+from fidsplat.effects.extensions import EXTENSIONS
 from fidsplat.util.errors import DeviceError
 from fidsplat.util.files import kernels_folder
 
@@ -145,6 +146,8 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
     """Layouts of all effects and of the parts that they require, in the order of their text: slots (one
     effect of each kind), parts, outputs, post-processing steps."""
     chosen = [*features.slots, *features.outputs, *features.posts]
+    for name in EXTENSIONS.keys() & {*chosen} - LAYOUTS.keys():
+        LAYOUTS[name] = extension_layout(EXTENSIONS[name])
     parts: set[str] = set()
     todo = chosen.copy()
     while todo:

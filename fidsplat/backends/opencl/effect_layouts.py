@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from fidsplat.backends.opencl.declare import Layout, Samples, member, takes, uniforms
 from fidsplat.backends.opencl.layout import RAY_UNIFORMS
+from fidsplat.effects.extensions import Extension
 
 _RAYS = takes("in float rays  // 3 channels X, Y, Z; NaN outside the field of view")
 _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
@@ -343,3 +344,13 @@ LAYOUTS: dict[str, Layout] = {
     "quantise": Layout("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),
 }
 """declaration of each effect, and of the parts that several share"""
+
+
+def extension_layout(extension: Extension) -> Layout:
+    """Declaration of an output or a sensor step of another package."""
+    return Layout(
+        str(extension.opencl),
+        parts=extension.parts,
+        samples=tuple(Samples("float", name) for name in extension.samples),
+        resolve=uniforms(extension.name, *(f"float {name}" for name in extension.uniforms)),
+    )

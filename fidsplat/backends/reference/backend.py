@@ -19,10 +19,11 @@ from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
+from fidsplat.effects.extensions import EXTENSIONS
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.harmonics import color_range
 from fidsplat.util import interrupts
-from fidsplat.util.errors import UnknownDeviceError
+from fidsplat.util.errors import DeviceError, UnknownDeviceError
 
 _BLOCK = (
     1 << 16
@@ -78,8 +79,19 @@ class ReferenceBackend(Backend):
         """Wrap the cloud; nothing is copied."""
         return ReferenceCloud(cloud)
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """Error message naming extensions of other packages; empty if there are none."""
+        lacking = ", ".join(sorted(EXTENSIONS.keys() & features.names))
+        return f"reference has no {lacking}; use an OpenCL device for it" if lacking else ""
+
     def pipeline(self, features: FeatureSet, shape: None = None) -> ReferencePipeline:
-        """The pipeline for these features; nothing is compiled."""
+        """The pipeline for these features; nothing is compiled.
+
+        Raises:
+            DeviceError: the features are `unsupported`.
+        """
+        if why := self.unsupported(features):
+            raise DeviceError(why)
         return ReferencePipeline(features)
 
     def render_every(

@@ -13,6 +13,7 @@ from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS
+from fidsplat.effects.extensions import EXTENSIONS
 from fidsplat.util.errors import DeviceError
 
 SLOTS = frozenset(
@@ -51,6 +52,10 @@ def known() -> frozenset[str]:
 def unsupported(features: FeatureSet, name: str) -> str:
     """Error message naming unsupported effects; empty if there are none. name: name of the device."""
     effects = {*features.slots, *features.outputs, *features.posts} - known()
+    for own in (EXTENSIONS[effect] for effect in effects & EXTENSIONS.keys()):
+        if own.warp is not None:
+            kernels("post" if own.output is None else "output").__path__.append(str(own.warp))
+    effects -= known()
     lacking = ", ".join(sorted(_SETTINGS.get(name, name) for name in effects))
     return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
 
