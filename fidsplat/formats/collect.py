@@ -1,5 +1,8 @@
-"""Conversion of a file's rows to splats, window by window. Unusable rows are dropped on the way, so that
-memory grows with the valid splats, not with the count that the file declares."""
+"""Conversion of a file's rows to splats, window by window.
+
+Invalid rows are dropped in each window, so that memory grows with the number of valid splats, not with the
+count that the file declares.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -31,7 +31,7 @@ def refuse_boxes(cloud: SplatCloud, what: str) -> None:
 
 
 def world_means(cloud: SplatCloud) -> np.ndarray:
-    """Means (n, 3) float32 in the world; those of the cloud if it has no origin."""
+    """Means (n, 3) float32 in world coordinates, without an origin."""
     return cloud.world_means().astype(np.float32) if cloud.origin.any() else cloud.means
 
 

@@ -53,7 +53,7 @@ def load_sog(path: Path) -> SplatCloud:
 
 
 def load_sog_folder(path: Path) -> SplatCloud:
-    """Read a meta.json and the images in its folder. Raises InputError as `load_sog`."""
+    """Read a meta.json and the images in its folder. Raises InputError for a damaged or incomplete scene."""
     return _read(path, lambda name, maximum: read_input(neighbour(path, name), maximum))
 
 
@@ -72,7 +72,7 @@ def neighbour(path: Path, name: str) -> Path:
 
 def _read(path: Path, part: Parts) -> SplatCloud:
     try:
-        # numbers beyond float32 become splats that are left out
+        # numbers beyond float32 become invalid splats, which are dropped
         with np.errstate(over="ignore", invalid="ignore"):
             return _cloud(path, part)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -90,7 +90,7 @@ def _cloud(path: Path, part: Parts) -> SplatCloud:
         )
     count = int(meta["count"] if version == 2 else meta["means"]["shape"][0])
     high_sh, palette = meta.get("shN"), None
-    if high_sh is not None and version == 1:  # the number of bands follows from the image
+    if high_sh is not None and version == 1:  # version 1 does not store the number of bands
         palette = _image(path, part, high_sh["files"][0], MAX_ENTRIES * _COEFFICIENTS[3])
         bands = {_ROW * k: degree for degree, k in _COEFFICIENTS.items()}.get(palette.shape[1])
         if bands is None:
@@ -202,7 +202,8 @@ def save_sog(cloud: SplatCloud, path: Path) -> None:
 
 
 def save_sog_folder(cloud: SplatCloud, path: Path) -> None:
-    """Write a meta.json and its images next to it. Raises InputError as `save_sog`."""
+    """Write a meta.json and its images next to it. Raises InputError for boxes, an empty cloud, or a file
+    that cannot be written."""
     parts = sog_parts(cloud)
     parts[path.name] = parts.pop("meta.json")  # last: it marks a complete scene
     for name, data in parts.items():

@@ -29,7 +29,7 @@ _HEAD = struct.Struct("<IIIBBBB")
 _HEAD_4 = struct.Struct("<IIIBBBBI12x")
 _SIZES, _RECORD = struct.Struct("<QQ"), struct.Struct("<II")
 _HAS_EXTENSIONS = 2
-"""flag of version 4"""
+"""flag of version 4: the file has extensions"""
 _AXES = 0xADBE0003
 """type of Adobe's extension with the coordinate system"""
 _TO_RDF = {0: (1, -1, -1), 1: (-1, 1, -1), 4: (1, -1, -1), 6: (1, 1, 1), 7: (-1, -1, 1)}
@@ -121,7 +121,8 @@ def _check_memory(path: Path, n: int, widths: dict[str, int]) -> None:
 
 
 def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.ndarray], bytes]:
-    """As many values as `_gzip` returns, of version 4, and its extensions."""
+    """Version, number of splats, SH degree, fractional bits, arrays (n, bytes) and extensions of version
+    4."""
     if len(data) < _HEAD_4.size:
         raise InputError(f"{path}: cut short: the header must have {_HEAD_4.size} bytes, got {len(data)}")
     _, version, n, degree, point, flags, streams, table = _HEAD_4.unpack_from(data)
@@ -129,7 +130,7 @@ def _frames(path: Path, data: bytes) -> tuple[int, int, int, int, dict[str, np.n
     if version != 4:
         raise InputError(f"{path}: SPZ of version {version} must be compressed by gzip; it is damaged")
     widths = {name: width for name, width in _widths(version, degree).items() if width}
-    if n == 0:  # empty arrays are left out
+    if n == 0:  # a file without splats has no arrays
         widths = {}
     if streams != len(widths):
         raise InputError(f"{path}: SPZ of degree {degree} must have {len(widths)} arrays, got {streams}")

@@ -1,4 +1,4 @@
-"""Markers from images of two grey levels, one pixel per module."""
+"""Markers from images of two grey levels, with one pixel per module."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Templates by a formula instead of a fit: Gaussians that shrink geometrically towards the edges.
+"""Templates computed by a formula, not fitted: Gaussians whose sizes shrink geometrically towards the edges.
 
 Along each axis there are a central Gaussian and pairs at the distances d = ratio^-k from the ends. The width
 of each follows from its decay at its overhang beyond the end. A template is their product over both axes.

@@ -1,8 +1,7 @@
 """Connected components of a one-bit grid: 4-connected by colour, each with 8-connected holes.
 
-A hole is what is left of the rest of the plane once a component is taken out and the outside is taken away;
-since the component is 4-connected, cells of the rest that touch at a corner belong together. The shapely
-polygons of `polygons` are for geometry, figures and tests; no decision depends on them.
+The holes of a component are the bounded, 8-connected regions of its complement. The shapely polygons of
+`polygons` are for geometry, figures and tests; no decision depends on them.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 import numpy as np
 
 LONG = 0.6
-"""A rectangle of L modules along an axis grows by max(1, LONG * L) times the growth along it."""
+"""A rectangle with a length of L modules along an axis grows by max(1, LONG * L) times the growth there."""
 
 
 def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Hard cases of splat rendering, run on a device by tests and by `fidsplat check` (`catalogue.all_cases`)."""
+"""Self-test: hard cases of splat rendering, run on a device by tests and by `fidsplat check`."""

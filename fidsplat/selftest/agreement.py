@@ -29,7 +29,7 @@ from fidsplat.splats.cloud import SplatCloud
 ALL_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
 COLOR_TOLERANCE = declared_output("rgb").tolerance
 DEPTH_TOLERANCE = declared_output("depth").tolerance
-"""relative"""
+"""relative slack for the rounding of the comparison"""
 RARE = 1e-3
 """maximum share of pixels with a certificate above `RISKY`"""
 RISKY = 0.05
@@ -53,7 +53,7 @@ class FrameSpec:
 
     @property
     def capture(self) -> Capture:
-        """The capture that renders it."""
+        """The capture of the frame."""
         sensor = self.sensor or Sensor()
         return Capture(self.camera, self.outputs, self.quality, self.background, sensor=sensor, fog=self.fog)
 
@@ -64,13 +64,15 @@ class FrameSpec:
 
 @dataclass(frozen=True)
 class Difference:
-    """One output of one frame against the reference. Errors are in units of the output, or relative if it is
-    declared so; of discontinuous outputs they are the share of pixels that differ.
+    """Error of one output of one frame relative to the reference.
+
+    Errors are in units of the output, or relative if the output is declared so. For discontinuous outputs the
+    error is the share of pixels that differ.
     """
 
     output: str
     error: float
-    """largest error, certified pixels included"""
+    """largest error, including pixels with a certificate"""
     excess: float
     """largest error beyond certificate and tolerance; at most 0 if the device agrees"""
     risky: float
@@ -89,7 +91,7 @@ class Difference:
 
 
 def tolerance_of(name: str) -> float:
-    """Largest error of an output beyond its certificate; of a discontinuous one the share of pixels, 0."""
+    """Allowed error of an output beyond its certificate; for discontinuous outputs the share of pixels, 0."""
     output = declared_output(name)
     return 0.0 if output.discontinuous else output.tolerance
 
@@ -124,7 +126,7 @@ def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
 
 
 def _errors(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
-    """Largest error of a continuous output, and beyond the certificate."""
+    """Largest error of a continuous output, and largest error beyond the certificate."""
     want, certified = truth[name], _certificate(name, truth)
     error = np.abs(image - want)
     if error.ndim > truth["certificate"].ndim:
@@ -144,7 +146,8 @@ def _certificate(name: str, truth: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
-    """Share of pixels in which a discontinuous output differs, and of those that may not."""
+    """Share of pixels in which a discontinuous output differs, and share that differs without a
+    certificate."""
     output, want = declared_output(name), truth[name]
     limit = output.tolerance * want if output.relative else truth.get(f"{name}_bound", output.tolerance)
     differs = np.abs(image - want) > limit
@@ -177,12 +180,13 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
 
 
 def out_of_order(traced: Mapping[str, np.ndarray], expected: np.ndarray) -> int:
-    """Number of splats of a trace that violate the order `expected` (visible,) in lists or overall."""
+    """Number of splats of a trace that violate the expected depth order (visible,), in tile lists or
+    overall."""
     if "lists" not in traced:
         return int((traced["order"] != expected).sum())
     rank = np.full(len(traced["keys"]), -1)
     rank[expected] = np.arange(len(expected))
     places, starts = rank[traced["lists"]], traced["starts"].astype(np.int64)
-    follows = np.ones(len(places), bool)  # the one before it in the same list
+    follows = np.ones(len(places), bool)  # whether a splat comes after its predecessor in the same list
     follows[starts[:-1][starts[:-1] < len(places)]] = False
     return int((places < 0).sum() + (follows[1:] & (np.diff(places) <= 0)).sum())

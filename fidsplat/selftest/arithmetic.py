@@ -17,8 +17,8 @@ from fidsplat.selftest.clouds import camera, splats
 from fidsplat.splats.cloud import SplatCloud
 
 _COUNT = 1 << 18
-# in ulp: bounds of OpenCL C 1.2 (section 7.4); of the fast functions over all arguments, with and without a
-# fused multiply-add (tools/fast_bounds.py); reciprocals are correctly rounded
+# error bounds in ulp: those of OpenCL C 1.2 (section 7.4) with correctly rounded reciprocals; for the fast
+# functions the maximum over all arguments, with and without fused multiply-add (tools/fast_bounds.py)
 BOUNDS = {
     "exp": 3.0,
     "log": 3.0,
@@ -34,7 +34,7 @@ BOUNDS = {
 }
 VIEW = camera(60, 45, 48.0)
 UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
-"""words of build options that violate IEEE arithmetic"""
+"""parts of build options that violate IEEE arithmetic"""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Arithmetic:
     """Measured arithmetic of a device."""
 
     float64: bool
-    """whether it has float64, for the per-splat setup"""
+    """whether the device has float64, for the per-splat set-up"""
     denormals: bool
     """whether float32 numbers below 1.2e-38 are not flushed to 0"""
     ulp: dict[str, float]
@@ -50,7 +50,7 @@ class Arithmetic:
 
     @property
     def findings(self) -> list[Finding]:
-        """Each function against its bound, with a margin for the rounding of the exact value."""
+        """Error of each function with its bound, including a margin for the rounding of the exact value."""
         return [Finding(f"{name} [ulp]", ulp, BOUNDS[name] * 1.001) for name, ulp in self.ulp.items()]
 
 
@@ -58,8 +58,8 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
     """Measure a device on a quarter of a million arguments of each function; None for a backend without
     kernels, such as the reference.
 
-    exp on -14 to 0 (1e-6, the smallest cut-off of a preset, to 1), log on 2^-24 to 1 (transmittances),
-    quotients and roots of 1e-9 to 1e9.
+    Arguments: exp from -14 (1e-6, the smallest cut-off of a preset) to 0; log from 2^-24 to 1
+    (transmittances); quotients and roots from 1e-9 to 1e9.
 
     Raises:
         DeviceError: the device cannot compile or run the kernels.
@@ -96,7 +96,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
 def worst(got: np.ndarray, truth: np.ndarray) -> float:
     """Largest error of `got` in ulp of its type, both (n,); infinite if a value is not finite."""
     spacing = np.spacing(np.abs(truth).astype(got.dtype))
-    # np.max alone could hide a NaN
+    # np.max alone would not report infinity for a NaN
     errors = np.abs(got - truth) / spacing
     return float(errors.max()) if np.isfinite(errors).all() else float("inf")
 
@@ -165,7 +165,7 @@ def f4(renderer: Renderer) -> Found:
     yield FrameSpec(dark, VIEW, background=(1e-40, 0.0, 1e-45))
     measured = measure(renderer)
     if measured:
-        # both are valid: rendered weights are larger (the presets' cut-off is at least 1e-6)
+        # flushing denormals is valid: rendered weights are larger (the presets' cut-off is at least 1e-6)
         yield Finding("denormals are flushed to 0 (1) or preserved (0)", float(not measured.denormals), 1)
 
 
@@ -195,7 +195,7 @@ def f5(renderer: Renderer) -> Found:
 
 
 def in_a_row(depths) -> SplatCloud:
-    """One splat on the optical axis per depth."""
+    """One splat on the optical axis for each depth."""
     means = np.zeros((len(depths), 3))
     means[:, 2] = depths
     return splats(means, (1, 0, 0, 0), (0.05, 0.05), 0.05)

@@ -15,7 +15,7 @@ from fidsplat.splats.cloud import SplatCloud
 
 FOCAL = 52.0  # 1000 px at a width of 1920 are 52 px at 100
 GROUND = quaternion((1, 0, 0), (0, 0, 1))
-"""in the ground plane: tangents along x and z"""
+"""quaternion of a splat in the ground plane: tangents along x and z"""
 CUT = 1.0 / 255.0
 
 

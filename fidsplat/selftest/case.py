@@ -1,4 +1,4 @@
-"""Hard cases (docs/correctness.md): trigger values, frames to compare, and properties with bounds."""
+"""Definition of a hard case (docs/correctness.md): frames to compare, and measured numbers with bounds."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Case:
     """e.g. "A1"; the letter is the group"""
     title: str
     trigger: str
-    """the values that trigger it"""
+    """input values that make it hard"""
     run: Callable[[Renderer], Found]
     """yields frames to compare with the reference, and findings: invariances, counts, jumps"""
 

@@ -1,4 +1,4 @@
-"""All cases by group."""
+"""Catalogue of all hard cases by group."""
 
 from __future__ import annotations
 

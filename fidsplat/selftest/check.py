@@ -28,7 +28,7 @@ class Worst:
     certificate: np.ndarray
     """(h, w)"""
     rank: tuple[bool, float]
-    """whether it fails, and its largest error: the sort key"""
+    """sort key: whether the frame fails, and its largest error"""
 
 
 @dataclass
@@ -40,7 +40,7 @@ class CaseResult:
     uncertified: dict[str, float] = field(default_factory=dict)
     """output -> largest error beyond the certificate"""
     largest: dict[str, float] = field(default_factory=dict)
-    """output -> largest error, certified ones included"""
+    """output -> largest error, including pixels with a certificate"""
     findings: list[Finding] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
     """failures as messages"""

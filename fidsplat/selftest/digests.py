@@ -1,7 +1,7 @@
-"""Digests of random scenes, which are equal on all devices with float64 and fused multiply-adds.
+"""Digests of random scenes, equal on all devices with float64 and fused multiply-adds.
 
-A scene is determined by its seed: only sums, products, quotients and roots of random bits, which every
-processor rounds alike.
+A scene is determined by its seed. It is made with sums, products, quotients and roots only, which IEEE
+arithmetic rounds equally on every processor.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from fidsplat.selftest.agreement import CULLED, FrameSpec, render, trace
 from fidsplat.splats.cloud import SplatCloud
 
 COUNT = 200
-"""scenes of the table"""
+"""number of scenes in the table"""
 TABLE = Path(__file__).with_name("digests.csv")
 OUTPUTS = ("rgb", "alpha", "depth", "normal", "label")
 _FORMS = (
@@ -38,7 +38,7 @@ _FORMS = (
 
 @dataclass(frozen=True)
 class Kind:
-    """What scenes have in common that the same kernels render."""
+    """A kind of scene: scenes of one kind are rendered by the same kernels."""
 
     name: str
     quality: str = "standard"
@@ -186,7 +186,7 @@ class Digest:
     """Digests of a frame."""
 
     sha256: str
-    """of all outputs"""
+    """digest of all outputs together"""
     outputs: dict[str, str]
     """first 8 hexadecimal digits of the SHA-256 of each output"""
 
@@ -214,7 +214,7 @@ def stage_digests(renderer: Renderer, seed: int) -> dict[str, str]:
 
 
 def stages_of(data: Mapping[str, np.ndarray], spec: FrameSpec, backend: Backend) -> dict[str, np.ndarray]:
-    """Results between the stages of a trace, in the layout of no device."""
+    """Results between the stages of a trace, converted to a device-independent layout."""
     keys, visible = data["keys"], data["keys"] != CULLED
     features, _ = spec.prepared()
     records = data["records"]

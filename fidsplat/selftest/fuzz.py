@@ -68,7 +68,8 @@ def scene_of(seed: int) -> FrameSpec:
     for k in np.flatnonzero(kind == 1):
         quats[k] = _edge_on(generator, means[k])
     for k in np.flatnonzero(kind == 2):
-        # the disk extends three standard deviations along z; its centre is within that of the near plane
+        # the disk extends three standard deviations along z, and its centre is nearer than that to the near
+        # plane
         axes = quaternion_to_matrix(quats[k])[2, :2] * scales[k]
         means[k, 2] = near + generator.uniform(-3, 3) * np.linalg.norm(axes)
     planes = _coplanar(generator, np.flatnonzero(kind == 3), means, quats)
@@ -114,7 +115,7 @@ def _coplanar(generator, chosen: np.ndarray, means: np.ndarray, quats: np.ndarra
     for group in range(3):
         members = chosen[groups == group]
         depth = float(np.float32(log_uniform(generator, 0.3, 30.0)))
-        # half of the groups have an id
+        # only half of the groups have a group id
         known = generator.random() < 0.5
         for k in members:
             means[k, :2] *= depth / max(abs(means[k, 2]), 0.1)
@@ -159,7 +160,7 @@ class FuzzState:
     uncertified: dict[str, tuple[float, int]] = field(default_factory=dict)
     """output -> largest error beyond the certificate, and its seed"""
     largest: dict[str, tuple[float, int]] = field(default_factory=dict)
-    """output -> largest error, certified ones included, and its seed"""
+    """output -> largest error, including pixels with a certificate, and its seed"""
     failing: list[int] = field(default_factory=list)
     """seeds with an error beyond tolerance and certificate, or a non-finite value"""
     seconds: float = 0.0
@@ -224,5 +225,5 @@ def _load(file: Path | None, key: str) -> FuzzState:
         for name in ("uncertified", "largest"):
             values[name] = {output: (float(pair[0]), int(pair[1])) for output, pair in values[name].items()}
         return FuzzState(**values)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):  # none yet, or not one of ours
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):  # missing, or another file
         return FuzzState(key)

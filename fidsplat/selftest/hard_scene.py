@@ -17,7 +17,7 @@ COLUMNS, ROWS = 4, 2
 CELL = (WIDTH // COLUMNS, HEIGHT // ROWS)
 """width and height in pixels"""
 PLACE = np.array([5e5, 4.5e6, 300.0])
-"""position of the camera in metres, as far from the origin as map coordinates"""
+"""position of the camera in metres, far from the origin as in map (UTM) coordinates"""
 
 CELLS = ("haze", "veils", "opaque", "edge-on", "tiny", "pages", "needles", "near")
 """Contents of the cells, row by row."""

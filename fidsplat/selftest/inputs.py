@@ -22,7 +22,7 @@ from fidsplat.splats.cloud import SplatCloud
 NAN, INF = float("nan"), float("inf")
 DENORMAL = 1e-45
 VICTIM = 7
-"""index of the splat whose fields are corrupted"""
+"""index of the splat whose fields are corrupted (the victim)"""
 VIEW = camera(60, 45, 48.0)
 
 BROKEN = {
@@ -44,7 +44,7 @@ ODD = {
 
 
 def crowd() -> SplatCloud:
-    """Splats; the victim covers the image centre."""
+    """A cloud in which the victim covers the image centre."""
     cloud = random_splats(40, 41, depth=(1.0, 5.0), scale=(0.03, 0.4), across=1.0)
     victim = splats([[0.05, 0.02, 1.2]], rotation((1, 1, 0), 30), (0.3, 0.2), 0.9, (0.2, 0.9, 0.4))
     before, after = subset_of(cloud, np.arange(VICTIM)), subset_of(cloud, np.arange(VICTIM, len(cloud)))
@@ -52,7 +52,7 @@ def crowd() -> SplatCloud:
 
 
 def corrupted(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
-    """The cloud with other values in fields of the victim, which is dropped if invalid."""
+    """A copy of the cloud with changed fields of the victim; an invalid victim is dropped."""
     arrays = {name: getattr(cloud, name).copy() for name in BROKEN}
     for name, value in changes.items():
         arrays[name][VICTIM] = value
@@ -139,7 +139,7 @@ def e2(renderer: Renderer) -> Found:
             mean = [[(at[0] - VIEW.cx) / VIEW.fx, (at[1] - VIEW.cy) / VIEW.fy, 1.0]]
             stats = renderer.render(splats(mean, (1, 0, 0, 0), (1e-6, 1e-6)), VIEW, quality=CATALOGUED).stats
             pairs, visible = pairs + stats["pairs"], visible + stats["visible"]
-    if not renderer.device.always_float64:  # the reference has no bounds
+    if not renderer.device.always_float64:  # the reference renderer computes no bounding boxes
         yield Finding("splats outside of the image that are not culled", visible, 0)
     yield Finding("tiles that list them", pairs, 0)
 
@@ -191,7 +191,7 @@ SIZES = (
 
 
 def sized(width: int, height: int) -> Camera:
-    """A camera that sees the crowd in an image of any shape."""
+    """A camera with the crowd in view, for images of any size."""
     focal = 0.8 * max(width, height)
     return Camera.pinhole(width, height, focal, focal, width / 2, height / 2)
 

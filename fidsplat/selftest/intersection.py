@@ -24,12 +24,12 @@ from fidsplat.splats.cloud import SplatCloud
 
 WIDTH, HEIGHT, FOCAL = 8192, 5461, 6400.0
 QUALITY = Quality(lowpass="none", alpha_cutoff=1e-6)
-"""no low-pass, and a cut-off at 5.3 standard deviations, outside of the measured pixels"""
+"""quality without low-pass; its cut-off at 5.3 standard deviations is outside of the measured pixels"""
 CUT = 1.0 / 255.0
 SHIFT = np.array([5e5, 4.5e6, 300.0])
-"""metres; a position in UTM coordinates"""
+"""metres: a position in UTM coordinates"""
 EDGE_ON = quaternion((0, 1, 0), (0, 0, 1))
-"""edge-on to a camera on its axis: tangents along y and z"""
+"""quaternion of a splat that is edge-on to the camera: tangents along y and z"""
 FACING = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -78,7 +78,7 @@ def _tilted(generator: np.random.Generator, ray: np.ndarray, tilt: float, flatne
         float
     )
     along += generator.uniform(-2, 2, 2) * flatness
-    # camera-frame direction perpendicular to the ray that projects to `along`
+    # direction in the camera frame that is perpendicular to the ray and projects to `along`
     w = -(along @ ray[:2]) / (ray @ ray)
     tangent = np.array([*(along + ray[:2] * w), w])
     tangent /= np.linalg.norm(tangent)

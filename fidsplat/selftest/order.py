@@ -29,9 +29,10 @@ from fidsplat.splats.rotations import quaternion_to_matrix
 
 STEP = math.radians(1e-4)
 WALL_STEP = math.radians(1e-3)
-"""radians per frame; larger in front of a wall, whose splats change order less often"""
+"""camera steps in radians per frame; larger for a wall, whose splats change order less often"""
 SMOOTH = 1e-3
-"""largest change of a pixel by moving edges in a step of 1e-4 degrees; larger changes are order flips"""
+"""largest change of a pixel that moving edges cause in a step of 1e-4 degrees; larger changes are order
+flips"""
 ON_TAGS = Camera.look_at(96, 80, 0.8, (0.05, -0.03, -1.6), (0, 0, 0))
 SIDES = ("before", "behind", "through")
 

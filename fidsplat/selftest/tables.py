@@ -1,4 +1,4 @@
-"""Tables of self-tests: title, heads and rows."""
+"""Result tables of the self-test: title, column heads and rows."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _case_row(letter: str, results: list[CaseResult]) -> tuple[str, ...]:
 
 
 def digest_table(seeds: Iterable[int], differing: Mapping[int, Sequence[str]], device: str) -> Table:
-    """Bit-identical scenes of each kind. differing: outputs by the seeds of scenes that are not."""
+    """Number of bit-identical scenes of each kind. differing: differing outputs by the seed of the scene."""
     own = {kind: [seed for seed in seeds if digests.kind_of(seed) is kind] for kind in digests.KINDS}
     rows = [
         (

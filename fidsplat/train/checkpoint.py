@@ -1,4 +1,4 @@
-"""Training checkpoints: the state from which a run goes on to bit-identical results, in one file."""
+"""Training checkpoints: one file with the state of a run, from which it resumes bit-identically."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _GROUPS = ("values", "first", "second")
 _VALUES = tuple(f"values.{name}" for name in NAMES)
 _HISTORY = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
 _MAY_DIFFER = ("iterations",)
-"""settings that may change on resuming: a run may be extended"""
+"""settings that may differ when a run resumes, so that it can be extended"""
 
 
 @dataclass
@@ -87,7 +87,7 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"cannot read {file} as a checkpoint of `fidsplat train`: {error}") from error
     values, (red, green, blue) = splats.values, background.tolist()
-    with np.errstate(over="ignore"):  # the cloud leaves out splats whose scales overflow
+    with np.errstate(over="ignore"):  # the cloud drops splats whose scales overflow
         shapes = values["means"], values["quats"], splats.scales, splats.opacities
     cloud = SplatCloud(*shapes, sh=values["sh"], origin=origin, source=str(file))
     return cloud, (red, green, blue)
@@ -136,8 +136,8 @@ def _facts(arrays: Arrays) -> dict[str, Any]:
 
 
 def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Splats, Arrays]:
-    """The splats and the history of a checkpoint, which `arrays` releases. Raises ValueError where they do
-    not fit the settings."""
+    """Take the splats and the history out of a checkpoint's `arrays`. Raises ValueError if they contradict
+    the settings."""
     count = len(arrays["values.means"])
     if count > settings.max_splats:
         raise ValueError(f"its splats must be at most max_splats, {settings.max_splats}, got {count}")
@@ -156,7 +156,7 @@ def _group(arrays: Arrays, group: str, count: int, degree: int) -> Arrays:
 
 
 def _checked(arrays: Arrays, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
-    """A writable copy of an array, which `arrays` releases."""
+    """Take an array out of `arrays`: check it and return a writable copy."""
     array = arrays.pop(name)
     if array.dtype != dtype or array.shape != shape:
         expected = f"{np.dtype(dtype)} of the shape {shape}"
@@ -167,7 +167,7 @@ def _checked(arrays: Arrays, name: str, shape: tuple[int, ...], dtype: type = np
 
 
 def _made_by(device: str) -> dict[str, str]:
-    """Device and sources, on which results depend in addition to settings and data."""
+    """Device and digest of the sources: results depend on them in addition to settings and data."""
     return {"device": device, "fidsplat": f"{__version__}, sources {code_hash()}"}
 
 

@@ -17,13 +17,14 @@ from fidsplat.util.arguments import instance, invalid, items, real_array, text, 
 from fidsplat.util.errors import InputError
 
 FAR = 1e4
-"""distance from the world origin, in scene extents, beyond which means are relative to another origin, since
-float32 would round them"""
+"""distance from the world origin, in scene extents, beyond which means are stored relative to a nearer
+origin, to avoid rounding in float32"""
 _FACING, _RANDOM_DEPTH = 0.5, 3.0
-"""minimum cosine of cameras that face a common point; depth of random points otherwise, in scene extents"""
+"""minimum cosine between optical axis and direction to the common point, for cameras that face it; and depth
+of random points if most cameras do not, in scene extents"""
 MAX_POINTS = 2**31 - 1
 _MIN_EXTENT = 1e-9
-"""extent relative to the distance from the world origin below which camera motion is rounding error"""
+"""minimum scene extent relative to the distance from the world origin; a smaller one may be rounding error"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +136,9 @@ class Dataset:
         found = hashlib.sha256(json.dumps(self.background).encode())
 
         def update(*arrays: np.ndarray | None) -> None:
-            for array in arrays:  # types and shapes distinguish a mask from a part of an image
+            for (
+                array
+            ) in arrays:  # hash types and shapes too, so that a mask differs from equal bytes of an image
                 found.update(b"-" if array is None else f"{array.dtype.str} {array.shape}".encode())
                 found.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
 
@@ -163,12 +166,12 @@ class Dataset:
 
 
 def viewed_cube(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Corners (3,), (3,) of the cube around the point nearest to the optical axes of all cameras, as large as
-    their field of view at that point; and whether most cameras face it."""
+    """Cube around the point nearest to all optical axes, as large as the field of view there: its corners
+    (3,), (3,), and whether most cameras face it."""
     centers = np.array([camera.position for camera in cameras])
     axes = np.array([camera.world_to_camera[2, :3] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    # parallel axes have the least-norm solution, from their middle
+    # for parallel axes this is the least-norm solution relative to the mean camera position
     middle = centers.mean(0)
     shift = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers - middle), rcond=1e-6)[0]
     focus = middle + shift

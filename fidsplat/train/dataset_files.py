@@ -1,4 +1,5 @@
-"""Reader of data sets: COLMAP, nerfstudio's transforms.json, and COLMAP's layout with a note of ours."""
+"""Reader of data sets: COLMAP, nerfstudio's transforms.json, and COLMAP's layout with fidsplat's
+marker.json."""
 
 from __future__ import annotations
 
@@ -17,11 +18,11 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import from_json, path_of, read_text
 
 NOTES = ("dataset.json", "marker.json")
-"""files of our data sets with their `background`: one display value, or three"""
+"""files of fidsplat's data sets with the field `background`: one display value, or three"""
 _MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 """folders of COLMAP's model in a data set"""
 HOLD_OUT, MIN_VIEWS_TO_HOLD_OUT = 8, 16
-"""every eighth view is held out in data sets of at least 16 views without held-out views"""
+"""in data sets of at least 16 views without a test set, every eighth view is held out"""
 
 Progress = Callable[[str, float], None]
 Background = tuple[float, float, float]

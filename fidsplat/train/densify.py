@@ -1,5 +1,6 @@
-"""Densification of 3DGS and 2DGS (Kerbl et al. 2023, section 5.2): clone, split and prune by the mean screen
-gradient of each splat.
+"""Densification of 3DGS and 2DGS (Kerbl et al. 2023, section 5.2): clone, split and prune splats.
+
+A splat is cloned or split if its mean screen gradient is large.
 
 Remaining splats keep their order and new ones are appended, so that a run is reproducible.
 """

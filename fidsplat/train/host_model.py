@@ -41,7 +41,7 @@ class HostModel:
         return self._splats
 
     def geometry(self) -> Splats:
-        """The splats, to read only; harmonics and moments may be missing on other models."""
+        """The splats, read-only; other models omit harmonics and moments."""
         return self._splats
 
     def densify(self, made: Densification) -> None:
@@ -126,7 +126,7 @@ def visible(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:
         (x, camera.fx, camera.cx, camera.width),
         (y, camera.fy, camera.cy, camera.height),
     ):
-        # in pixels times depth, to avoid a division by a depth of 0
+        # lengths are in pixels times depth, to avoid a division by a depth of 0
         at = np.float32(focal) * coordinate + np.float32(center) * z
         radius = np.float32(focal) * reach
         inside &= (at + radius > 0) & (at - radius < np.float32(size) * z)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 RADIUS, SIGMA = 5, 1.5
-"""pixels, of the window"""
+"""width of the window in pixels"""
 C1, C2 = 0.01**2, 0.03**2
 
 
@@ -51,7 +51,7 @@ def blurred(image: np.ndarray) -> np.ndarray:
 def image_loss(
     image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, dssim_weight: float
 ) -> tuple[Loss, np.ndarray]:
-    """The loss of an image, and its gradient by the image.
+    """The loss of an image, and its gradient with respect to the image.
 
     Args:
         image: (h, w, 3) float, rendered, not clamped.
@@ -64,7 +64,7 @@ def image_loss(
     """
     weight = np.ones(image.shape[:2], image.dtype) if mask is None else mask.astype(image.dtype)
     weight = weight[:, :, None]
-    # not image * weight: a value that is not finite would remain
+    # not image * weight, which keeps NaN and infinity
     image = np.where(weight > 0, image, truth)
     number = float(image.size if mask is None else max(1, 3 * int(mask.sum())))
     difference = image - truth
@@ -79,7 +79,7 @@ def image_loss(
 
 
 def _ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
-    """Mean SSIM of two images (h, w, 3), and its gradient by the first."""
+    """Mean SSIM of two images (h, w, 3), and its gradient with respect to the first."""
     mean_a, mean_b = blurred(image), blurred(truth)
     var_a = blurred(image * image) - mean_a * mean_a
     var_b = blurred(truth * truth) - mean_b * mean_b
@@ -102,13 +102,12 @@ def normal_loss(
     focal: tuple[float, float],
     middle: tuple[float, float],
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Normal consistency: the mean over all pixels of alpha (1 - n . N), as in 2DGS (whose n is not
-    normalised), and its gradients.
+    """Normal consistency loss of 2DGS, the mean over all pixels of alpha (1 - n . N), and its gradients.
 
-    N is the normal of the surface through the depths, towards the camera: the normalised cross product of
-    central differences of neighbouring points. Border pixels, and pixels that lack a depth or have a
-    neighbour that does, add nothing. alpha is a constant weight. The kernel version is
-    kernels/opencl/train/surface.cl.
+    n is the rendered normal (2DGS does not normalise it). N is the normal of the surface through the depths,
+    towards the camera: the normalised cross product of central differences of neighbouring points. Pixels
+    without a depth, their neighbours and border pixels add nothing. alpha is a constant weight. The kernel
+    version is kernels/opencl/train/surface.cl.
 
     Args:
         depth: (h, w) metres along z, 0 without a surface.
@@ -117,7 +116,7 @@ def normal_loss(
         focal, middle: focal lengths and principal point [px], x and y.
 
     Returns:
-        the loss, and its gradients by `depth` and `normal`, in their shapes.
+        the loss, and its gradients with respect to `depth` and `normal`, in their shapes.
     """
     h, w = depth.shape
     by_depth, by_normal = np.zeros_like(depth), np.zeros_like(normal)

@@ -16,9 +16,9 @@ from fidsplat.train.random_numbers import Purpose, normal, uniform
 from fidsplat.train.settings import TrainSettings
 
 MAX_COPIES = 51
-"""largest number of copies in the relocation formula"""
+"""maximum number of copies in the relocation formula"""
 NOISE_SLOPE, NOISE_CUTOFF = 100.0, 0.995
-"""sigmoid of 1 - opacity that reduces the noise of opaque splats"""
+"""slope and threshold of the sigmoid that reduces the noise of opaque splats"""
 
 
 def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -> Splats:

@@ -10,12 +10,12 @@ from fidsplat.util.arguments import instance, whole_number
 from fidsplat.util.errors import InputError
 
 _COPIES = 7
-"""of each splat's values, at most: raw, Adam's two moments, activated, the gradients of both, and one copy
-during densification"""
+"""maximum number of copies of each splat's values: raw, Adam's two moments, activated, the gradients of raw
+and activated values, and one copy during densification"""
 _WORK = 256
 """bytes per splat: its record and its entries in tile lists"""
 _FLOATS_PER_PIXEL = 60
-"""of the loss: images and their blurred products"""
+"""number of images in the loss: the images and their blurred products"""
 
 
 def splats_within(settings: TrainSettings, budget: int, dataset: Dataset) -> TrainSettings:

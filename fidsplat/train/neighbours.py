@@ -63,4 +63,4 @@ def _nearest(mine: np.ndarray, among: np.ndarray) -> np.ndarray:
         squares.partition(count - 1, axis=1)
         nearest[part] = squares[:, :count]
     nearest.sort(axis=1)
-    return nearest[:, 1:]  # without the point itself
+    return nearest[:, 1:]  # the first is the point itself

@@ -1,4 +1,4 @@
-"""Features of the next phase of a training run, for background compilation."""
+"""Prediction of the kernels that a training run needs next, to compile them in the background."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class _Disks(NamedTuple):
 def next_features(
     settings: TrainSettings, iteration: int, plain: Capture, solid: Capture
 ) -> FeatureSet | None:
-    """Features of frames after the next growth of the SH degree or start of a loss; None: no change follows.
+    """Features of frames after the next change: a higher SH degree or another loss; None if no change
+    follows.
 
     Args:
         plain: a capture for the colour loss.

@@ -30,7 +30,7 @@ def learning_rates(settings: TrainSettings, iteration: int, extent: float) -> di
 def parameter_gradients(
     splats: Splats, gradients: Mapping[str, np.ndarray], settings: TrainSettings
 ) -> Arrays:
-    """Gradients by the raw parameters, from gradients by the activated values.
+    """Gradients with respect to the raw parameters, from those with respect to the activated values.
 
     Args:
         gradients: `means`, `quats`, `scales`, `opacities`, and `colors` or `sh`, of a

@@ -21,7 +21,7 @@ _MIN_SQUARE_DISTANCE = 1e-7
 """lower limit of the mean squared distance to neighbours, for initial scales [m^2]"""
 
 _OPACITY_MARGIN = 1e-6
-"""distance of initial opacities from 0 and 1, beyond which their gradients vanish"""
+"""minimum distance of initial opacities from 0 and 1, where gradients vanish"""
 
 Arrays = dict[str, np.ndarray]
 
@@ -65,7 +65,7 @@ class Splats:
     @property
     def scales(self) -> np.ndarray:
         """(n, 2) float32, metres."""
-        with np.errstate(over="ignore"):  # the cloud leaves out splats whose scales overflow
+        with np.errstate(over="ignore"):  # the cloud drops splats whose scales overflow
             return np.exp(self.values["log_scales"])
 
     def select(self, rows: np.ndarray) -> Splats:
@@ -107,7 +107,7 @@ class Splats:
         means, sh = values["means"][:], values["sh"][:, coefficients]
         return SplatCloud.of_checked(
             means if shared else means.copy(),
-            values["quats"].copy(),  # since SplatCloud normalises them in place
+            values["quats"].copy(),  # SplatCloud normalises them in place
             self.scales,
             self.opacities,
             np.ascontiguousarray(sh) if shared else sh.copy(),
@@ -179,7 +179,7 @@ def splats_from_cloud(cloud: SplatCloud, settings: TrainSettings, origin: np.nda
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
     """1 / (1 + exp(-x)), in the dtype of x."""
-    with np.errstate(over="ignore"):  # 0 is right
+    with np.errstate(over="ignore"):  # an overflow correctly yields 0
         return 1 / (1 + np.exp(-x))
 
 

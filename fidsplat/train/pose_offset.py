@@ -1,4 +1,4 @@
-"""Camera pose offset: a rigid motion (6,) of the camera, and the gradient by its numbers."""
+"""Camera pose offset: a rigid motion (6,) of the camera, and the gradient with respect to it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fidsplat.cameras import Camera
 from fidsplat.splats.rotations import quaternion_to_matrix
 
 _SMALL_ANGLE = 1e-3
-"""radians, below which the first term of the series is as accurate as the formula"""
+"""angle in radians below which the first term of the series is as accurate as the formula"""
 
 
 def offset_camera(camera: Camera, offset: np.ndarray) -> Camera:
@@ -19,10 +19,10 @@ def offset_camera(camera: Camera, offset: np.ndarray) -> Camera:
 
 
 def offset_gradient(by_pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """The gradient (6,) by an offset, from the gradient `pose` of a frame of the offset camera.
+    """Gradient (6,) with respect to an offset, from the gradient `pose` of a frame of the offset camera.
 
-    `pose` is the gradient by a second motion that follows the offset: R(w + dw) = R(J dw) R(w), so it is
-    multiplied by the transpose of J, the left Jacobian of SO(3).
+    `pose` is the gradient with respect to a second motion after the offset: R(w + dw) = R(J dw) R(w).
+    Therefore it is multiplied by the transpose of J, the left Jacobian of SO(3).
     """
     rotation, translation = offset[:3], offset[3:]
     by_rotation = by_pose[:3] - np.cross(translation, by_pose[3:])

@@ -1,5 +1,4 @@
-"""Counter-based random numbers: a number depends on the seed, the iteration, the purpose and the splat's
-index alone, so a resumed run has the numbers of an uninterrupted one.
+"""Counter-based random numbers, which depend only on seed, iteration, purpose and the splat's index.
 
 Philox 4x32-10: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011. The kernel version is
 in kernels/opencl/train/position_noise.cl.

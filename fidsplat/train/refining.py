@@ -30,14 +30,14 @@ ITERATIONS = 1000
 PIXELS = 12
 """pixels per module; images are shifted, so that no detail falls between pixels"""
 MARGIN = 1
-"""modules around the sheet that must stay empty"""
+"""width of the empty border around the sheet, in modules"""
 TILT = math.radians(3)
-"""tilt that changes the order of centres, and little else"""
+"""tilt; it changes the order of centres but hardly the image"""
 DISTANCE = 100.0
-"""camera distance in edges of the sheet: almost no perspective"""
+"""camera distance in edge lengths of the sheet; far, for almost no perspective"""
 QUALITY = Quality(order="centre", lowpass="none", alpha_cutoff=1 / 255, transmittance_stop=1e-6)
 OPAQUE = 8.0
-"""optical depth without a penalty, a transmittance of 3e-4"""
+"""optical depth from which there is no penalty (a transmittance of 3e-4)"""
 LEAK = 0.05
 """weight of squared missing optical depth, relative to squared colour errors"""
 RATES = {"positions": 0.003, "log_scales": 0.01, "logits": 0.1, "colors": 0.01}
@@ -46,7 +46,7 @@ BETA1, BETA2 = 0.9, 0.99
 MIN_SCALE, MAX_SCALE = 0.008, 3.0
 """modules"""
 SLOW = 0.15
-"""modules: below this scale the learning rate of the position is proportional to the scale"""
+"""scale in modules below which the learning rate of the position is proportional to the scale"""
 MAX_LOGIT = 7.0
 
 
@@ -56,9 +56,9 @@ class RefineStep(NamedTuple):
     iteration: int
     """number of the iteration, from 1"""
     psnr: float
-    """of the sheet and a module around it [dB]"""
+    """PSNR of the sheet and a module around it [dB]"""
     transmittance: float
-    """maximum on the sheet"""
+    """maximum transmittance on the sheet"""
 
 
 def refine(
@@ -153,7 +153,7 @@ class _Sheet:
     def gradients(
         self, camera: Camera, rgb: np.ndarray, alpha: np.ndarray, grey: np.ndarray
     ) -> tuple[dict[str, np.ndarray], float, float]:
-        """Gradients of the loss by the images, the PSNR, and the maximum transmittance on the sheet."""
+        """Gradients of the loss with respect to the images, the PSNR, and the maximum transmittance."""
         expected, inside = self._target(camera, grey)
         error = rgb - expected
         transmittance = np.maximum(1 - alpha, 1e-7)

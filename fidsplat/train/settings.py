@@ -29,7 +29,7 @@ _COUNTS = {
     "reset_every": (1, MAX_ITERATIONS),
     "relocate_until": (0, MAX_ITERATIONS),
 }
-"""whole numbers, with the range of each"""
+"""range of each whole number"""
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class TrainSettings:
             raise InputError(
                 f"training: strategy must be one of {', '.join(STRATEGIES)}, got {self.strategy!r}"
             )
-        if not isinstance(self.quality, str):  # checkpoints hold it as text
+        if not isinstance(self.quality, str):  # checkpoints store it as text
             raise InputError(f"training: quality must be text such as 'surfel', got {self.quality!r}")
         Quality.of(self.quality)
         if not isinstance(self.sparse_adam, bool):
@@ -163,7 +163,7 @@ class TrainSettings:
                     f"training: {name} must be at least 0 and below 1, got {getattr(self, name)!r}"
                 )
         for name in ("initial_opacity", "mcmc_opacity", "reset_opacity"):
-            if not 0 < getattr(self, name) < 1:  # whose logit is finite
+            if not 0 < getattr(self, name) < 1:  # the logit must be finite
                 raise InputError(f"training: {name} must be above 0 and below 1, got {getattr(self, name)!r}")
 
     def position_rate_at(self, iteration: int) -> float:

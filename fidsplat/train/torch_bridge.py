@@ -22,7 +22,7 @@ try:
 except ImportError as error:
     raise InputError(f"PyTorch must be installed, got {error}; pip install 'fidsplat[torch]'") from None
 
-torch: Any = _torch  # without types, since it may not be installed
+torch: Any = _torch  # untyped, since it may not be installed
 _INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh", "background", "pose")
 
 
@@ -62,7 +62,7 @@ def render(
         InputError: invalid arrays, or an effect without a gradient; in `backward`, if the device has rendered
             another frame since.
     """
-    if sh is not None and sh.shape[1] == 1:  # rendered as colours, which are clamped at 0
+    if sh is not None and sh.shape[1] == 1:  # degree 0 is rendered as colours, which are clamped at 0
         colors, sh = torch.clamp(C0 * sh[:, 0] + 0.5, min=0), None
     quats = torch.nn.functional.normalize(quats, dim=1)
     given = (means, quats, scales, opacities, colors, sh, background, pose)
@@ -85,7 +85,7 @@ class _Rendered(torch.autograd.Function):
             if capture.camera is None or pose.shape != (6,):
                 raise InputError(f"pose must be 6 numbers, for a capture with a camera, got {pose!r}")
             capture = replace(capture, camera=offset_camera(capture.camera, pose.astype(np.float64)))
-        # labels are the input rows, since invalid splats are dropped
+        # labels store input rows, to find the rows of the splats that were not dropped
         cloud = SplatCloud(**arrays, labels=np.arange(len(np.atleast_1d(arrays["means"]))))
         frame = ctx.frame = renderer.render_differentiable(cloud, capture)
         ctx.outputs, ctx.pose, ctx.rows, ctx.count = capture.outputs, pose, cloud.labels, len(tensors[0])
@@ -102,7 +102,7 @@ class _Rendered(torch.autograd.Function):
         found = ctx.frame.backward(given)
         if ctx.pose is not None:
             found["pose"] = offset_gradient(found["pose"].astype(np.float64), ctx.pose.astype(np.float64))
-        gradients: list[Any] = [None, None]  # none by the renderer and the capture
+        gradients: list[Any] = [None, None]  # the renderer and the capture have no gradient
         for name, like, needed in zip(_INPUTS, ctx.like, ctx.needs_input_grad[2:], strict=True):
             if like is None or not needed:
                 gradients.append(None)

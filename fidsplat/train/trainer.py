@@ -44,7 +44,7 @@ from fidsplat.util.files import ordinary_file, writable_folder
 _SURFACE = ("rgb", "alpha", "depth", "normal")
 """outputs of frames with normal consistency in the loss"""
 _READ_SECONDS = 0.1
-"""a run reads pending losses at least this often"""
+"""maximum number of iterations between two readbacks of pending losses"""
 CHECKPOINT_SECONDS = 30.0
 """time between checkpoints of a run"""
 
@@ -59,7 +59,7 @@ class Step(NamedTuple):
     loss: float
     """image loss"""
     psnr: float
-    """of the view before the step [dB]"""
+    """PSNR of the view before the step [dB]"""
     splats: int
     """number of splats after the step"""
 
@@ -77,7 +77,7 @@ class Trainer:
         renderer: device to train on; None: the default device.
         settings: settings of the run; None: the defaults. `changes` are settings by name.
         checkpoint: file from which the run resumes if it exists, and which `run` writes.
-        restart: start again although a checkpoint exists, which stays until the first new one replaces it.
+        restart: start again even if a checkpoint exists; the first new checkpoint replaces it.
         start: initial splats, instead of one at each point of the data set; the SH degree still grows from 0.
 
     Raises:
@@ -124,9 +124,9 @@ class Trainer:
         self._unreported: deque[tuple[int, str, Loss]] = deque()
         """unreported losses"""
         self._failure: TrainingError | None = None
-        """of an iteration that others followed before its loss was read"""
+        """error of an earlier iteration whose loss was read later"""
         self._features: FeatureSet | None = None
-        """of the last frame"""
+        """features of the last frame"""
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
     @property
@@ -141,8 +141,8 @@ class Trainer:
 
     @property
     def history(self) -> dict[str, np.ndarray]:
-        """`losses`, `psnrs` (float32) and numbers of splats `counts` (int32) of completed iterations; do
-        not write to them. Raises as `step`."""
+        """`losses`, `psnrs` (float32) and numbers of splats `counts` (int32) of completed iterations;
+        read-only. Raises TrainingError if a loss is not finite."""
         self._read_losses()
         return {name: array[: self.iteration] for name, array in self._state.history.items()}
 
@@ -158,14 +158,15 @@ class Trainer:
         return list(self._steps())[-1]
 
     def run(self, progress: Callable[[Step], None] | None = None, prompt: bool = True) -> SplatCloud:
-        """Train to the end, with regular checkpoints if there is a file for them.
+        """Run all remaining iterations, with regular checkpoints if the trainer has a file for them.
 
         progress: called after each iteration.
-        prompt: call it before the next iteration; False: a few iterations later, so that a GPU does not wait.
+        prompt: whether to call `progress` before the next iteration; False: a few iterations later, so that a
+            GPU does not wait.
 
         Raises:
-            InputError: as `step`; or a checkpoint cannot be written, and the last one stays.
-            TrainingError: as `step`.
+            InputError: all iterations are completed, or a checkpoint cannot be written (the last one stays).
+            TrainingError: the loss is not finite, all splats are pruned, or densification was interrupted.
         """
         callback("progress", progress)
         saved = read = time.monotonic()
@@ -192,7 +193,7 @@ class Trainer:
         save_ply(self.cloud(), path)
 
     def save_checkpoint(self) -> None:
-        """Write the checkpoint, if there is a file for it.
+        """Write the checkpoint, if the trainer has a file for it.
 
         Raises:
             InputError: it cannot be written; the last one stays.
@@ -235,7 +236,7 @@ class Trainer:
             raise InputError(
                 f"iterations must be more than the completed {self.iteration}, got {settings.iterations}"
             )
-        while self._pending and self._pending[-1][0] > state.iteration:  # of an interrupted iteration
+        while self._pending and self._pending[-1][0] > state.iteration:  # left by an interrupted iteration
             self._pending.pop()
         self._densify()
         iteration = state.iteration + 1
@@ -248,7 +249,7 @@ class Trainer:
         self._pending.append((iteration, view.name, loss))
         full = len(self._pending) > self._model.max_pending_losses
         if not late or full or settings.densifies_after(iteration):
-            self._read_losses()  # not before, since the device is busy meanwhile
+            self._read_losses()  # read late, so that the device is busy meanwhile
         self._update(gradients, iteration, view)
         state.iteration = iteration
         state.history["counts"][iteration - 1] = len(self._model)
@@ -268,7 +269,7 @@ class Trainer:
                     + self._checkpoint_state()
                 )
                 self._pending.clear()
-                if iteration > self.iteration:  # the splats are not updated yet
+                if iteration > self.iteration:  # the splats have not been updated yet
                     raise failure
                 self._failure = failure
             else:
@@ -290,7 +291,7 @@ class Trainer:
         """Render a view and differentiate its loss. Returns a function that reads the loss, and the gradients
         for `_update`.
 
-        waits: as `GradientPipeline.forward`.
+        waits: whether to wait until the frame's buffers are known to be large enough.
         """
         resident = self._model.resident(self.settings.degree_at(iteration), self.dataset.origin)
         by_normals, by_distortions = self.settings.surface_weights_at(iteration)
@@ -358,8 +359,8 @@ class Trainer:
         return int(self._order[1][index])
 
     def _densify(self) -> None:
-        """Densify by the default strategy, before the next iteration: a run that ends here returns optimised
-        splats and opacities before a reset, as the authors' trainer saves them."""
+        """Densify by the default strategy. This happens before the next iteration, not after the last one:
+        the splats of a completed run are optimised and not reset, as in the authors' trainer."""
         settings, iteration = self.settings, self.iteration
         if settings.strategy == "mcmc" or not settings.densifies_after(iteration):
             return
@@ -371,8 +372,8 @@ class Trainer:
                 self._model.reset_opacities()
 
     def _update(self, gradients: Any, iteration: int, view: TrainingView) -> None:
-        """Update the splats by Adam, unless densification by the default strategy follows: in the authors'
-        trainer new splats have no gradient yet."""
+        """Update the splats by Adam, unless densification by the default strategy follows, as in the authors'
+        trainer (whose new splats have no gradient yet)."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
         origin = self.dataset.origin
         if not mcmc_runs and settings.densifies_after(iteration):
@@ -389,8 +390,8 @@ class Trainer:
 
     @contextmanager
     def _all_or_failed(self) -> Iterator[None]:
-        """Refuse further steps if densification does not finish (no memory, an interrupt): arrays may have
-        different lengths then."""
+        """A context that forbids further steps if densification does not finish (too little memory, an
+        interrupt), as arrays may then have different lengths."""
         try:
             yield
         except BaseException:

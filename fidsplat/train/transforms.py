@@ -1,5 +1,5 @@
-"""nerfstudio's data sets: transforms.json (docs.nerf.studio, "Data conventions"), and the NeRF authors'
-transforms_train.json with transforms_test.json. Poses are camera to world with OpenGL's axes."""
+"""Reader of nerfstudio's transforms.json (docs.nerf.studio, "Data conventions"), and of the NeRF authors'
+transforms_train.json and transforms_test.json. Poses are camera to world with OpenGL's axes."""
 
 from __future__ import annotations
 
@@ -127,10 +127,10 @@ def _image(file: Path, name: str, others: set[tuple[int, int]]) -> np.ndarray:
 
 
 def check_other_image(image: Path, others: set[tuple[int, int]]) -> None:
-    """Raise InputError if a view has the image file of another view: a short list of views could expand one
-    file any number of times. others: device and inode of the images so far, extended."""
+    """Raise InputError if two views have the same image file, as a short list could load one file any number
+    of times. others: device and inode of earlier images; extended by this one."""
     if not path_of(image).is_file():
-        return  # reported when it is read
+        return  # the error is reported when the image is read
     status = image.stat()
     if (status.st_dev, status.st_ino) in others:
         raise InputError(f"views must have different images, got {image} twice; remove one of the views")

@@ -1,4 +1,4 @@
-"""Training views of photographs with lens distortion, undistorted when they are read."""
+"""Undistortion of training photographs when they are read."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from fidsplat.vision.undistort import undistort_masked
 
 
 def undistorted_view(name: str, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> TrainingView:
-    """A training view. A photograph with lens distortion is resampled to a pinhole camera of the same focal
-    length; the mask excludes pixels outside the photograph.
+    """Make a training view; a photograph with lens distortion is resampled to a pinhole camera of the same
+    focal length, and the mask excludes pixels outside the photograph.
 
-    Raises InputError as `TrainingView`.
+    Raises InputError if camera, image and mask do not match.
     """
     size = (camera.height, camera.width)
     if camera.lens is not None and image.shape[:2] == size and (mask is None or mask.shape == size):

@@ -51,7 +51,7 @@ def render(
             `world_to_camera`, in its axes.
 
     Returns:
-        the capture's outputs as float32 arrays (h, w) or (h, w, 3) of their own, with gradients.
+        the capture's outputs as new float32 arrays (h, w) or (h, w, 3), with gradients.
 
     Raises:
         DeviceError: the renderer is not a Warp device, or the device fails.

@@ -1,5 +1,5 @@
-"""The scene, settings and renderer of a viewer. A thread compiles the kernels of new settings and scenes
-while the old ones still render."""
+"""Viewer session: scene, settings and renderer. A thread compiles the kernels for new settings or scenes
+while the old ones are still rendered."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FIRST = Viewpoint((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
 
 @dataclass(frozen=True, eq=False)
 class RenderState:
-    """Everything that an image is rendered from."""
+    """Scene, settings, renderer and uploaded splats of an image."""
 
     scene: Scene
     settings: Settings
