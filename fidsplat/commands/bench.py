@@ -87,7 +87,7 @@ class Bench:
         devices = self.device or (default_device(),)
         frames = sum(1 + len(known[name].without) for name in scenes) * len(set(devices)) * self.repeats
         columns = (*Progress.get_default_columns(), TextColumn("{task.fields[now]}"))
-        with progress_bar(where, *columns) as progress:
+        with progress_bar(console(True), *columns) as progress:
             task = progress.add_task("frames", total=frames, now="")
             try:
                 measuring = Measuring(

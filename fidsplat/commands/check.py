@@ -82,7 +82,7 @@ class Check:
 
         expected = digests.read_table()
         found: dict[int, digests.Digest] = {}
-        with delayed_progress(where) as progress:
+        with delayed_progress() as progress:
             for seed in expected:
                 progress(digests.kind_of(seed).name, len(found) / len(expected))
                 found[seed] = digests.digest_of(renderer, seed)
@@ -114,7 +114,7 @@ class Check:
         from fidsplat.selftest.fuzz import fuzz_run
 
         total, state = self.fuzz or 0, None
-        with delayed_progress(where) as progress:
+        with delayed_progress() as progress:
             for state in fuzz_run(renderer, total, folder / "fuzz.json"):
                 progress(f"{state.splats:,} splats", min(state.splats / total, 1.0))
         assert state is not None

@@ -10,7 +10,7 @@ import tyro
 
 from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Json, Overwrite, new_file
-from fidsplat.commands.output import console, delayed_progress, report
+from fidsplat.commands.output import delayed_progress, report
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Marker:
         quality = fs.Quality.of(self.quality).marker
         if refined and self.quality is None:
             quality = fs.MarkerQuality(template=LADDER)
-        with delayed_progress(console(self.json)) as progress:
+        with delayed_progress() as progress:
             made = fs.marker(self.spec, self.size, mixture, quality=quality, progress=progress, **limit)
             if refined:
                 made = self._refine(made, progress)

@@ -75,19 +75,21 @@ def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable
 
 
 def progress_bar(where: Console, *columns: Any) -> Any:
-    """A progress bar that disappears when it is done. Files and pipes get none, as it would leave an empty
-    line."""
+    """A progress bar that disappears when it is done; for files and pipes, a line on stderr every 30 s."""
+    if not where.is_interactive:
+        from fidsplat.commands.progress_lines import ProgressLines
+
+        return ProgressLines()
     from rich.progress import Progress
 
-    return Progress(*columns, console=where, transient=True, disable=not where.is_interactive)
+    return Progress(*columns, console=where, transient=True)
 
 
 @contextmanager
 def delayed_progress(
     where: Console | None = None, after: float = 1.0
 ) -> Iterator[Callable[[str, float], None]]:
-    """A progress callback (description, share done) whose bar appears after some seconds, by default on
-    stderr.
+    """A progress callback (description, share done) whose bar appears on stderr after some seconds.
 
     A thread watches the time, so that long work between two calls also shows the bar.
     """
@@ -106,8 +108,7 @@ def delayed_progress(
     finally:
         timer.cancel()
         timer.join()
-        if bar.live.is_started:
-            bar.stop()
+        bar.stop()
 
 
 def show_progress(

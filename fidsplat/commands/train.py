@@ -126,11 +126,12 @@ def _bar(trainer: Trainer) -> Iterator:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
     columns = (
-        *(TextColumn("training"), BarColumn(), MofNCompleteColumn()),
-        *(TextColumn("{task.description}"), TimeRemainingColumn()),
+        *(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()),
+        *(TextColumn("{task.fields[now]}"), TimeRemainingColumn()),
     )
     with progress_bar(console(True), *columns) as bars:
-        task = bars.add_task("", total=trainer.settings.iterations, completed=trainer.iteration)
+        total, done = trainer.settings.iterations, trainer.iteration
+        task = bars.add_task("training", total=total, completed=done, now="")
         first, begun = trainer.iteration, time.perf_counter()
         mean = {"loss": 0.0, "psnr": 0.0}
 
@@ -140,7 +141,7 @@ def _bar(trainer: Trainer) -> Iterator:
             mean["psnr"] += share * (min(step.psnr, 100.0) - mean["psnr"])
             rate = (step.iteration - first) / (time.perf_counter() - begun)
             words = f"loss {mean['loss']:.4f}  {mean['psnr']:.1f} dB  {step.splats:,} splats  {rate:.1f} it/s"
-            bars.update(task, completed=step.iteration, description=words)
+            bars.update(task, completed=step.iteration, now=words)
 
         yield show
 
