@@ -1,12 +1,20 @@
 """`fidsplat bench`."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from fidsplat.commands.declarations import option
+from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Devices, check_plot, writable_file
-from fidsplat.commands.output import console, json_text, print_lines, print_table, progress_bar
+from fidsplat.commands.output import (
+    console,
+    delayed_progress,
+    json_text,
+    print_lines,
+    print_table,
+    progress_bar,
+)
 from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
 from fidsplat.util import interrupts
 from fidsplat.util.errors import InputError
@@ -38,6 +46,13 @@ class Bench:
       qr_wall         200 QR codes of version 22 on a wall, 1920 x 1080
       tag_in_million  an AprilTag before 1,000,000 random splats, 1920 x 1080
 
+    --suite compares renderers by time and error on scenes of every regime: uniform, skewed, haze, street,
+    markers, captured, batches, scaling. Each renderer runs in a process of its own: fidsplat on every device
+    of this machine (or --device), and the renderers of --adapters. Images are compared with float64
+    references. It takes about 10 minutes on two cores, with --quick 90 s. Results are written after each
+    scene; an interrupted run resumes. --scenes selects scenes or regimes. benchmarks/splatmark.py makes a
+    site of the results.
+
     --scene measures your own scene with everything that it requests (quality, outputs, lens, shutter,
     motions, markers, fog, sensor), from its camera or from eight poses of --cameras. The table shows the time
     that each effect adds.
@@ -49,6 +64,8 @@ class Bench:
       fidsplat bench --scenes all --json -
       fidsplat bench --scene room.ply --cameras poses.tum
       fidsplat bench --scene room.ply --device opencl:nvidia --device opencl:pocl --plot room.svg
+      fidsplat bench --suite --quick
+      fidsplat bench --suite --adapters benchmarks/adapters --json benchmarks/results/suite-NAME.json
     """
 
     scenes: tuple[str, ...] = ()
@@ -67,7 +84,20 @@ class Bench:
     plot: str | None = None
     """FILE.svg: also write a chart of the frame times, or FILE.png (extra: experiments)"""
 
+    suite: bool = False
+    """compare renderers by time and error on scenes of every regime"""
+    quick: bool = False
+    """with --suite: few scenes and frames"""
+    adapters: Annotated[
+        Path | None, option("DIR", "with --suite: folder of other renderers (benchmarks/adapters)")
+    ] = None
+    overwrite: Annotated[bool, switch("with --suite: replace existing results")] = False
+
     def run(self) -> int:
+        if self.suite:
+            return self._run_suite()
+        if self.quick or self.overwrite or self.adapters is not None:
+            raise InputError("--quick, --adapters and --overwrite need --suite; add it, or leave them out")
         from rich.progress import Progress, TextColumn
 
         from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
@@ -118,6 +148,34 @@ class Bench:
         if interrupted:
             raise KeyboardInterrupt
         return 1 if any(result.timer.error for result in results) else 0
+
+    def _run_suite(self) -> int:
+        from fidsplat.backends import devices
+        from fidsplat.experiments.bench import suite
+        from fidsplat.experiments.bench.regimes import suite_scenes
+        from fidsplat.render.renderer import Renderer
+
+        if self.scene or self.cameras or self.plot or self.json == "-":
+            raise InputError("--suite needs a FILE as --json, and no --scene, --cameras or --plot")
+        usable = (info.name for info in devices() if info.usable and not info.always_float64)
+        names = tuple(dict.fromkeys(self.device)) or tuple(usable)
+        large = any(Renderer(name).device.kind == "gpu" for name in names)
+        scenes = suite_scenes(self.scenes, self.quick, large)
+        renderers = suite.own_renderers(names)
+        if self.adapters is not None:
+            renderers |= suite.other_renderers(self.adapters)
+        file = writable_file(self.json or f"fidsplat-suite{'-quick' if self.quick else ''}.json")
+        command = " ".join(["fidsplat", *sys.argv[1:]])
+        measuring = suite.Suite(
+            file, scenes, renderers, suite.QUICK if self.quick else suite.FULL, command, self.overwrite
+        )
+        with delayed_progress() as progress:
+            results = measuring.run(progress)
+        failed = [one for one in results if "error" in one]
+        for one in failed:
+            print_lines(console(True), f"{one['scene']}, {one['renderer']}: {one['error']}")
+        print_lines(console(False), f"{len(results)} results in {file}")
+        return 1 if failed else 0
 
     def _save(self, measuring: "Measuring", scenes: tuple[str, ...], interrupted: bool) -> None:
         if self.json in (None, "-"):

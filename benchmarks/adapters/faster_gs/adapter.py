@@ -1,0 +1,41 @@
+"""Faster-GS (FasterGSCudaBackend of nerficg-project/faster-gaussian-splatting): 3D Gaussians by EWA, one view
+in a call."""
+
+from importlib.metadata import version
+
+import numpy as np
+import torch
+from FasterGSCudaBackend.torch_bindings import RasterizerSettings, diff_rasterize
+from torch_gpu import TorchAdapter
+
+C0 = 0.28209479177387814  # value of the constant spherical harmonic
+
+
+class Adapter(TorchAdapter):
+    settings = {"default": {"ellipsoids": {"ellipsoid": "ewa", "order": "centre"}}}
+
+    def __init__(self):
+        super().__init__("Faster-GS", version("FasterGSCudaBackend"))
+
+    def prepare(self):
+        count = len(self.means)
+        self.splats = {"means": self.means, "scales": self.scales.log(), "rotations": self.quats}
+        self.splats["opacities"] = self.opacities.clamp(1e-7, 1 - 1e-7).logit()[:, None]
+        self.splats["sh_coefficients_0"] = ((self.colors - 0.5) / C0)[:, None].contiguous()
+        self.splats["sh_coefficients_rest"] = torch.zeros((count, 0, 3), device="cuda")
+        self.splats["densification_info"] = torch.empty(0, device="cuda")
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        lens = {"focal_x": fx, "focal_y": fy, "center_x": cx, "center_y": cy}
+        rest = {"near_plane": 0.01, "far_plane": 1e4, "active_sh_bases": 1, "proper_antialiasing": False}
+        rest["bg_color"] = torch.zeros(3, device="cuda")
+        positions = self.tensor(np.linalg.inv(self.poses)[:, :3, 3])
+        self.cameras = [
+            RasterizerSettings(
+                w2c=view, cam_position=position, width=self.width, height=self.height, **lens, **rest
+            )
+            for view, position in zip(self.viewmats, positions, strict=True)
+        ]
+
+    def draw(self, setting, views):
+        images = (diff_rasterize(**self.splats, rasterizer_settings=self.cameras[view]) for view in views)
+        return [image.permute(1, 2, 0) for image in images]

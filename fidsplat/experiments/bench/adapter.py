@@ -1,0 +1,90 @@
+"""Process of one renderer of `fidsplat bench --suite`.
+
+    python -P adapter.py FILE.py [DEVICE]
+
+FILE.py defines a class `Adapter` (benchmarks/adapters/README.md). This file imports only NumPy, so that the
+environment of another renderer does not need fidsplat. Requests are JSON lines on stdin, answers JSON lines
+on stdout; what libraries print goes to stderr. An answer has `error` if the renderer failed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import runpy
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class Server:
+    """Answers requests by an adapter. A request is a dict with the name of a method as `do`."""
+
+    def __init__(self, adapter: Any) -> None:
+        self.adapter = adapter
+        self.rendered: Any = None
+
+    def load(self, file: str) -> dict:
+        """Read a scene; the adapter moves it to the device."""
+        with np.load(file) as arrays:
+            scene = {name: arrays[name] for name in arrays.files}
+        self.rendered = None
+        begun = time.perf_counter()
+        self.adapter.load(scene)
+        return {"load_ms": 1e3 * (time.perf_counter() - begun)}
+
+    def frame(self, setting: str, views: list[int]) -> dict:
+        """Render views as one submission; milliseconds until they are complete."""
+        begun = time.perf_counter()
+        self.rendered = self.adapter.render(setting, views)
+        taken = {"ms": 1e3 * (time.perf_counter() - begun)}
+        device = getattr(self.adapter, "device_ms", None)
+        return taken if device is None else taken | {"device_ms": device(self.rendered)}
+
+    def image(self, file: str) -> dict:
+        """Write the images of the latest frame (v, h, w, 3), and the memory of the renderer in bytes."""
+        np.save(file, np.asarray(self.adapter.read(self.rendered), np.float32))
+        device = getattr(self.adapter, "memory", lambda: None)()
+        if device is not None:
+            return {"memory_bytes": device, "memory_of": "device"}
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        return {"memory_bytes": peak, "memory_of": "process"}
+
+    def burst(self, setting: str, views: list[int], seconds: float) -> dict:
+        """Render the same views again and again; number of submissions and seconds."""
+        begun, count = time.perf_counter(), 0
+        while (taken := time.perf_counter() - begun) < seconds:
+            self.adapter.render(setting, views)
+            count += 1
+        return {"submissions": count, "seconds": taken}
+
+
+def main() -> None:
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+
+    def answer(content: dict) -> None:
+        print(json.dumps(content), file=answers, flush=True)
+
+    sys.path.append(str(Path(sys.argv[1]).parents[1]))  # modules that adapters share
+    try:
+        adapter = runpy.run_path(sys.argv[1])["Adapter"](*sys.argv[2:])
+        answer({"facts": adapter.facts, "settings": adapter.settings})
+    except (Exception, SystemExit) as error:  # no GPU, no package, no compiler: the renderer is left out
+        answer({"skipped": f"{type(error).__name__}: {error}".splitlines()[0]})
+        return
+    server = Server(adapter)
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            answer(getattr(server, request.pop("do"))(**request))
+        except Exception as error:
+            answer({"error": f"{type(error).__name__}: {error}".splitlines()[0]})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""fidsplat as a renderer of `fidsplat bench --suite`, on one device."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+import fidsplat as fs
+
+PRESETS = ("standard", "fast", "gsplat", "reference")
+EXACT = "standard,ellipsoid=exact"
+ON_GPUS = ("standard,arithmetic=approximate", "fast,blend_precision=float16")
+DEFINITION = ("lowpass", "samples", "order", "ellipsoid")
+"""fields of `Quality` that define the image"""
+
+
+class Adapter:
+    """Renderer of disks, 3D Gaussians and exact rectangles at several quality settings."""
+
+    def __init__(self, device: str) -> None:
+        self.renderer = fs.Renderer(device)
+        info = self.renderer.device
+        names = (*PRESETS, EXACT, *(ON_GPUS if info.kind == "gpu" else ()))
+        self.resident: Any = None
+        self.qualities = {name: fs.Quality.of(name) for name in names}
+        self.settings = {name: self._claims(name) for name in names}
+        self.facts = {
+            "renderer": "fidsplat",
+            "version": fs.__version__,
+            "device": info.title,
+            "kind": info.kind,
+            "platform": info.platform,
+            "driver": info.version,
+        }
+
+    def _claims(self, name: str) -> dict[str, dict]:
+        """Definition of the image by kind of splats."""
+        claim = {field: getattr(self.qualities[name], field) for field in DEFINITION}
+        kinds = ("ellipsoids",) if name == EXACT else ("disks", "ellipsoids", "boxes")
+        return dict.fromkeys(kinds, claim)
+
+    def load(self, scene: dict[str, np.ndarray]) -> None:
+        size, matrix, near, self.poses = (scene.pop(name) for name in ("size", "matrix", "near", "poses"))
+        boxes, groups = scene.pop("boxes", None), scene.pop("coplanar_groups", None)
+        cloud = fs.SplatCloud(**scene)
+        cloud = cloud if boxes is None else cloud.with_boxes(boxes)
+        cloud = cloud if groups is None else cloud.with_coplanar_groups(groups)
+        (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
+        self.camera = fs.Camera.pinhole(*map(int, size), fx, fy, cx, cy, near=float(near))
+        del self.resident  # releases the earlier scene first
+        if self.renderer.backend.traits.measures_rates:
+            self.renderer.backend.release_scratch()
+        self.resident = self.renderer.upload(cloud)
+        self.captures = lru_cache(None)(self._capture)
+
+    def _capture(self, setting: str, view: int) -> fs.Capture:
+        return fs.Capture(self.camera.with_pose(self.poses[view]), quality=self.qualities[setting])
+
+    def render(self, setting: str, views: list[int]) -> Any:
+        captures = [self.captures(setting, view) for view in views]
+        if len(captures) == 1:
+            return self.renderer.render(self.resident, captures[0]).wait()
+        return self.renderer.render_batch(self.resident, captures).wait()
+
+    def device_ms(self, rendered: Any) -> float:
+        return sum(rendered.timings.values())
+
+    def read(self, rendered: Any) -> np.ndarray:
+        rgb = rendered["rgb"]
+        return rgb[None] if rgb.ndim == 3 else rgb
+
+    def memory(self) -> int | None:
+        backend = self.renderer.backend
+        if not backend.traits.measures_rates:
+            return None
+        return backend.memory_bytes + self.resident.memory_bytes + 12 * self.camera.width * self.camera.height
