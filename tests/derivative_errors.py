@@ -43,14 +43,20 @@ def random_picture(
     outputs: tuple[str, ...] = ("rgb", "alpha", "depth", "normal"),
     quality: Any = None,
     origin: tuple[float, float, float] = _ORIGIN,
+    solid: float = 0.0,
     **splats: Any,
 ) -> tuple[SplatCloud, Capture]:
     """Random splats and a camera whose pixels are not square and whose principal point is not the centre.
 
-    origin: of the cloud, by default far from the world's. splats: arguments of `random_splats`.
+    origin: of the cloud, by default far from the world's. solid: share of 3D Gaussians. splats: arguments of
+    `random_splats`.
     """
     cloud = random_splats(count, seed, sh_degree=degree, **splats)
-    cloud = SplatCloud(*arrays_of(cloud), origin=np.array(origin), **colors_of(cloud))
+    means, quats, scales, opacities = arrays_of(cloud)
+    if solid:
+        third = np.where(np.arange(count) < solid * count, np.roll(scales[:, 0], 1), 0)
+        scales = np.column_stack([scales, third])
+    cloud = SplatCloud(means, quats, scales, opacities, origin=np.array(origin), **colors_of(cloud))
     eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3) + origin
     camera = stretched(Camera.look_at(*size, 1.1, eye, np.add(origin, (0.0, 0.1, 3.0))))
     return cloud, Capture(camera, outputs=outputs, quality=quality, background=_BEHIND)
@@ -120,7 +126,9 @@ def last_place(cloud: SplatCloud) -> SplatCloud:
         return np.nextafter(array, towards)
 
     means, quats = moved(cloud.means), moved(cloud.quats)
-    return SplatCloud(means, quats, cloud.scales, cloud.opacities, origin=cloud.origin, **colors_of(cloud))
+    third = [] if cloud.thickness is None else [cloud.thickness]
+    scales = np.column_stack([cloud.scales, *third])
+    return SplatCloud(means, quats, scales, cloud.opacities, origin=cloud.origin, **colors_of(cloud))
 
 
 def differences(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> Iterator[Difference]:

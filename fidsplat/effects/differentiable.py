@@ -11,6 +11,7 @@ from fidsplat.util.errors import InputError
 DIFFERENTIABLE = frozenset(
     (
         *("camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen"),
+        *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_only"),
         *("stop_inclusive", "stop_exclusive", "compose_ordered", "footprint_gaussian"),
         *("background_constant", "arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"),
     )
@@ -23,8 +24,6 @@ _REMEDIES = {
     "lowpass": "lowpass='screen' or 'none'",
     "compose": "order='centre'",
     "footprint": "a cloud without boxes",
-    "ellipsoid": "a cloud of disks",
-    "ellipsoids": "a cloud of disks",
     "background": "a background of one colour",
     "external": "a capture without an external depth image",
     "termination": "features without termination depths",

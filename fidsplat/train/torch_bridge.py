@@ -46,8 +46,8 @@ def render(
     Args:
         renderer: a device with gradients.
         capture: camera, outputs (`rgb`, `alpha`, `depth`, `normal`), quality; see docs/gradients.md.
-        means, quats, scales, opacities: (n, 3), (n, 4) wxyz of any length, (n, 2), (n,), as in a
-            `SplatCloud`.
+        means, quats, scales, opacities: (n, 3), (n, 4) wxyz of any length, (n, 2) or (n, 3) for 3D
+            Gaussians, (n,), as in a `SplatCloud`.
         colors, sh: (n, 3), or (n, k, 3) harmonics; one of them.
         background: (3,), instead of the capture's.
         pose: (6,) rotation vector [rad] and translation [m] of a motion after the camera's
@@ -89,6 +89,7 @@ class _Rendered(torch.autograd.Function):
         cloud = SplatCloud(**arrays, labels=np.arange(len(np.atleast_1d(arrays["means"]))))
         frame = ctx.frame = renderer.render_differentiable(cloud, capture)
         ctx.outputs, ctx.pose, ctx.rows, ctx.count = capture.outputs, pose, cloud.labels, len(tensors[0])
+        ctx.thick = arrays["scales"].shape[1:] == (3,)
         ctx.like = [None if tensor is None else (tensor.device, tensor.dtype) for tensor in tensors]
         ctx.set_materialize_grads(False)
         return tuple(torch.from_numpy(np.array(image)).to(tensors[0].device) for image in frame.values())
@@ -102,6 +103,9 @@ class _Rendered(torch.autograd.Function):
         found = ctx.frame.backward(given)
         if ctx.pose is not None:
             found["pose"] = offset_gradient(found["pose"].astype(np.float64), ctx.pose.astype(np.float64))
+        if ctx.thick:
+            third = found.get("thickness", np.zeros(len(ctx.rows), np.float32))  # without one: all are disks
+            found["scales"] = np.column_stack([found["scales"], third])
         gradients: list[Any] = [None, None]  # the renderer and the capture have no gradient
         for name, like, needed in zip(_INPUTS, ctx.like, ctx.needs_input_grad[2:], strict=True):
             if like is None or not needed:

@@ -13,12 +13,14 @@ kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_back
         own = splat_gradient(
             i, view, means, quats, scales, opacities, CLOUD_TERMS, SH_TERMS, splats, keys, windows, big_capacity, big_bounds, width,
             height, splat_slots, moments
+//@@ footprint_arguments
         );
         for (int k = 0; k < 3; k++) by_means[3 * i + k] = own.mean[k];
         for (int k = 0; k < 4; k++) by_quats[4 * i + k] = own.quat[k];
         for (int k = 0; k < 2; k++) by_scales[2 * i + k] = own.scale[k];
         by_opacities[i] = own.opacity;
         screen[i] = own.screen;
+//@@ footprint_results
         global float *by_terms = BY_TERMS + (size_t)i * SH_TERMS * 3;
         for (int k = 0; k < SH_TERMS; k++)
             for (int c = 0; c < 3; c++) by_terms[3 * k + c] = own.basis[k] * own.color[c];

@@ -6,6 +6,7 @@
 
 //@@ camera
 //@@ functions
+//@@ footprint_here
 
 //@@ struct Totals
 typedef char totals_have_the_fields_of_moments[sizeof(Totals) / sizeof(real) == FIELDS ? 1 : -1];
@@ -39,6 +40,7 @@ typedef struct {            // gradients by the parameters of one splat
     float color[3], basis[SH_TERMS];    // by coefficient k of the colour: basis[k] times `color`
     float screen;
     real3_ by_rotation, by_translation;               // contribution to the gradient of the pose
+//@@ footprint_gradient
 } SplatGradient;
 
 // Gradients of splat i; zero if it is culled. terms: SH coefficients, `row` per splat.
@@ -47,6 +49,7 @@ static inline SplatGradient splat_gradient(
     global const float *opacities, global const float *terms, uint row, global const Splat *splats, global const uint *keys,
     global const uint2 *windows, uint big_capacity, global const Bounds *big_bounds, int width, int height,
     global const uint *splat_slots, global const float *moments
+//@@ footprint_parameters
 ) {
     SplatGradient own = {{0}};
     if (keys[i] >= OUT_OF_BAND) return own;
@@ -69,6 +72,8 @@ static inline SplatGradient splat_gradient(
     real pz = p.z, su = fmax(scales[2 * i], MIN_SCALE), sv = fmax(scales[2 * i + 1], MIN_SCALE);
     real3_ a = scaled(su, unit_a), b = scaled(sv, unit_b);
     real offset = dot3(cross3(unit_a, unit_b), p);
+//@@ footprint_set_up
+//@@ ellipsoid_set_up
 
     // the forms, as in project.cl and the camera's file
     real x_offset = view->center_x - (splats[i].ax + REAL(0.5)), y_offset = view->center_y - (splats[i].ay + REAL(0.5));
@@ -76,6 +81,7 @@ static inline SplatGradient splat_gradient(
     real3_ tu = image_row(view->focal_x, x_offset, row_x, tw), tv = image_row(view->focal_y, y_offset, row_y, tw);
     real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);
     real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));
+//@@ camera_steepest
     real scale = (offset < 0 ? -1 : 1) / steepest, n_scale = scale * REAL(0.70710678118654752440);
     real facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
 
@@ -94,10 +100,11 @@ static inline SplatGradient splat_gradient(
     real across_x = by_tu.z * view->width, across_y = by_tv.z * view->height;
     own.screen = (float)(REAL(0.5) * pz * sqrt(across_x * across_x + across_y * across_y));
 //@@ disk_backward
-    real by_su = scales[2 * i] >= MIN_SCALE ? dot3(by_a, unit_a) : 0;
-    real by_sv = scales[2 * i + 1] >= MIN_SCALE ? dot3(by_b, unit_b) : 0;
+//@@ ellipsoid_backward
+    real by_su = dot3(by_a, unit_a), by_sv = dot3(by_b, unit_b);
     real3_ by_unit_a = scaled(su, by_a), by_unit_b = scaled(sv, by_b);
 //@@ facet_backward
+//@@ footprint_backward
     own.by_rotation = add3(cross3(p, by_p), add3(cross3(unit_a, by_unit_a), cross3(unit_b, by_unit_b)));
     own.by_translation = add3(by_p, rotate_to_camera(view, by_ray));
     real3_ by_mean = add3(rotate_to_world(view, by_p), by_ray);
@@ -115,8 +122,8 @@ static inline SplatGradient splat_gradient(
     own.mean[0] = (float)by_mean.x;
     own.mean[1] = (float)by_mean.y;
     own.mean[2] = (float)by_mean.z;
-    own.scale[0] = (float)by_su;
-    own.scale[1] = (float)by_sv;
+    own.scale[0] = scales[2 * i] >= MIN_SCALE ? (float)by_su : 0.0f;
+    own.scale[1] = scales[2 * i + 1] >= MIN_SCALE ? (float)by_sv : 0.0f;
     own.opacity = (float)(by_log / opacities[i]);
     return own;
 }

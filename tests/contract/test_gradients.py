@@ -71,6 +71,31 @@ def test_derivatives_of_random_scenes_are_the_references(backend, seeds):
         assert_same(backend, *random_picture(seed))
 
 
+@pytest.mark.parametrize(
+    ("projection", "solid"), [("ewa_antialiased", 1.0), ("exact", 0.7)], ids=["EWA", "exact, and disks"]
+)
+def test_derivatives_of_3d_gaussians_are_the_references(backend, projection, solid):
+    quality = fs.Quality(ellipsoid=projection)
+    scenes = [
+        random_picture(0, solid=solid, quality=quality),
+        random_picture(1, solid=solid, quality=quality, scale=(3e-3, 0.03), depth=(1.0, 5.0)),
+        random_picture(2, solid=solid, quality=quality, scale=(1e-2, 1.0), depth=(-0.5, 1.5), across=0.5),
+    ]
+    if "warp" in type(backend).__module__:
+        with pytest.raises(fs.DeviceError, match="has no gradients of 3D Gaussians; use an OpenCL device"):
+            derivatives(backend, *scenes[0])
+        return
+    for cloud, capture in scenes:
+        found = assert_same(backend, cloud, capture)
+        again = derivatives(backend, cloud, capture)
+        for name, array in found.items():
+            assert array.any(), name
+            assert array.tobytes() == again[name].tobytes(), name
+    (shape,) = backend.shapes("schedule").values()
+    if projection == "exact":
+        assert_same(backend, *scenes[2], shape=shape)
+
+
 def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
     for shape in backend.shapes("schedule").values():
         assert_same(backend, *random_picture(2), shape=shape)

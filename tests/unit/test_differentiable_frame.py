@@ -99,6 +99,15 @@ def test_gradients_are_named_arrays_in_the_shapes_of_the_cloud():
         frame.backward({"normal": ONES})
 
 
+def test_3d_gaussians_have_gradients_by_their_thickness():
+    given, renderer = arrays(), fs.Renderer("reference")
+    given["scales"] = np.column_stack([given["scales"], [0.1, 0, 0.2, 0.3, 0, 0.1]])
+    cloud = fs.SplatCloud(**given)
+    found = renderer.render_differentiable(cloud, CAMERA).backward({"rgb": ONES})
+    assert found["scales"].shape == (6, 2)
+    np.testing.assert_array_equal(found["thickness"] != 0, cloud.thickness > 0)
+
+
 def test_a_store_has_no_gradients(tmp_path):
     fs.save_ply(fs.SplatCloud(**arrays()), str(tmp_path / "cloud.ply"))
     store = fs.Store(fs.build_store([str(tmp_path / "cloud.ply")], str(tmp_path / "cloud.fss")))
@@ -175,6 +184,12 @@ def test_the_bridge_without_torch_itself(monkeypatch):
     assert [each is None for each in back] == [True, True, False, True, *[False] * 3, True, True, False]
     for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors"), (9, "pose")):
         np.testing.assert_array_equal(back[place].numpy(), expected[name])
+    third = np.array([0.1, 0, 0.2, 0.3, 0, 0.1])
+    solid = fs.SplatCloud(**given | {"scales": np.column_stack([given["scales"], third])})
+    bridge.render(renderer, fs.Capture(CAMERA), **tensors | {"scales": Tensor(np.c_[given["scales"], third])})
+    back = bridge._Rendered.backward(bridge._Rendered.context, Tensor(ONES))[4].numpy()
+    expected = renderer.render_differentiable(solid, offset_camera(CAMERA, pose)).backward({"rgb": ONES})
+    np.testing.assert_array_equal(back, np.column_stack([expected["scales"], expected["thickness"]]))
     tensors["scales"] = Tensor(
         given["scales"] * [[1], [0], [1], [1], [1], [1]]
     )  # one that cannot be rendered

@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -232,8 +232,7 @@ def assemble_step(features: FeatureSet, shape: DeviceShape) -> Source:
 def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, shape: DeviceShape) -> Source:
     layouts = layouts_of(features)
     # the backward pass needs the forward text of slots, but only the derivatives of outputs
-    slots = (part for slot in features.slots for part in (slot, *LAYOUTS[slot].parts))
-    files = [LAYOUTS[part].file for part in dict.fromkeys(slots)]
+    files = [layout.file for layout in layouts_of(replace(features, outputs=(), posts=())).values()]
     files += _dialect(shape, _scalars(features), features.slots)
     files += [layout.backward_file for layout in layouts.values()]
     kernels = kernels_of(shape)

@@ -89,13 +89,20 @@ LAYOUTS: dict[str, Layout] = {
         "slot/ellipsoid_exact.cl",
         parts=("thickness",),
         splat=(member("wide bulge", "2 / m^2 of a 3D Gaussian, 0 of a disk"),),
+        backward_file="slot/ellipsoid_exact_backward.cl",
+        moments=(member("float bulge"),),
     ),
     "ellipsoid_ewa": Layout(
         "slot/ellipsoid_ewa.cl",
         parts=("thickness",),
         view=(member("real slopes[4]", "of rays, -x, x, -y, y: limits of the linearisation"),),
+        backward_file="slot/ellipsoid_ewa_backward.cl",
     ),
-    "ellipsoid_ewa_antialiased": Layout("slot/ellipsoid_ewa_antialiased.cl", parts=("ellipsoid_ewa",)),
+    "ellipsoid_ewa_antialiased": Layout(
+        "slot/ellipsoid_ewa_antialiased.cl",
+        parts=("ellipsoid_ewa",),
+        backward_file="slot/ellipsoid_ewa_antialiased_backward.cl",
+    ),
     "ellipsoids_only": Layout(
         "slot/ellipsoids_only.cl",
         constant=(
@@ -171,7 +178,14 @@ LAYOUTS: dict[str, Layout] = {
         blend=_RAYS,
         backdrop=_RAYS,
     ),
-    "thickness": Layout("part/thickness.cl", project=takes("cloud float thickness  // (n) [m]; 0: a disk")),
+    "thickness": Layout(
+        "part/thickness.cl",
+        project=takes("cloud float thickness  // (n) [m]; 0: a disk"),
+        backward_file="part/thickness_backward.cl",
+        project_backward=takes(
+            "cloud float thickness  // (n) [m]; 0: a disk", "out float by_thickness  // (n)"
+        ),
+    ),
     "box_cover": Layout("part/box_cover.cl"),
     "box_edges": Layout(
         "part/box_edges.cl",

@@ -296,6 +296,8 @@ class OpenCLGradients(GradientPipeline):
             shapes["sh"] = (count, (features.sh_degree + 1) ** 2, 3)
         else:
             shapes["colors"] = (count, 3)
+        if "thickness" in self._cloud_arrays:
+            shapes["thickness"] = (count,)
         found = {}
         for name, shape in shapes.items():
             argument = name if name == "screen" else f"by_{name}"

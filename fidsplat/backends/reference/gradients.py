@@ -84,9 +84,14 @@ class FrozenFrame:
             for name, values in vars(found).items():
                 getattr(slopes, name)[...] += values
         placed = place(parameters, view)
-        # gradient with respect to the projected centre in units of half images, as in 2DGS
-        slope_x, slope_y = slopes.p[:, 0] / view.focal_x, slopes.p[:, 1] / view.focal_y
-        screen = 0.5 * placed.p[:, 2] * np.hypot(view.width * slope_x, view.height * slope_y)
+        # gradient with respect to the projected centre in units of half images, as in 2DGS; for EWA at a
+        # constant projected covariance, as in 3DGS
+        z = placed.p[:, 2]
+        across = z[:, None] * slopes.p[:, :2] / (view.focal_x, view.focal_y)
+        if "ellipsoid_exact" not in self._features.slots:
+            across = np.where(placed.scales[:, 2:] > 0, 0.0, across)
+        by_center = slopes.center + across
+        screen = 0.5 * np.sign(z) * np.hypot(view.width * by_center[:, 0], view.height * by_center[:, 1])
         return {
             **place_backward(parameters, view, placed, slopes),
             **{"background": by_background, "screen": screen},
@@ -95,7 +100,7 @@ class FrozenFrame:
     def _blend(self, parameters: Parameters) -> Iterator[tuple[Blend, Decisions]]:
         placed = place(parameters, self._view)
         for x, y, made in self._blocks:
-            yield Blend(placed, self._view, made, x, y), made
+            yield Blend(placed, self._view, self._features, made, x, y), made
 
 
 def _images(samples: Samples, made: Decisions, parameters: Parameters) -> dict[str, np.ndarray]:

@@ -1,7 +1,6 @@
 """Samples as functions of placed splats, with the frame's decisions held constant; and their derivatives.
 
-The intersection of a ray and a splat's plane is computed from the plane's normal, not from the affine forms
-of the set-up as on devices, so that a comparison finds errors in either.
+gradients_shapes.py computes the weights and depths of splats along rays.
 """
 
 from __future__ import annotations
@@ -12,11 +11,12 @@ import numpy as np
 
 from fidsplat.backends.reference.blend import INVERSE_DEPTH, SPREAD_NEAR, inverse_depth, transmittance
 from fidsplat.backends.reference.coverage import MIN_ALPHA
-from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, fragments_of
+from fidsplat.backends.reference.fragments import HALF_RHO_OF_RANGE, bulged, fragments_of
 from fidsplat.backends.reference.gradients_scene import Placed
-from fidsplat.backends.reference.optics import rays_of
+from fidsplat.backends.reference.gradients_shapes import shapes_of
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
+from fidsplat.effects import FeatureSet
 
 
 @dataclass
@@ -45,18 +45,18 @@ def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
     """The decisions of the forward pass at samples (k,) at grid positions x, y."""
     f = fragments_of(s, view, x, y)
     _, live, final = transmittance(f.alpha, view.stop, s.exclusive)
-    q = f.n_u**2 + f.n_v**2
-    inside = (q <= 2 * s.half_r2 * f.d**2) & (f.d > 0) & (f.d * view.near <= f.dz)
+    d, q = bulged(s.inverse_m2, f.d, f.n_u**2 + f.n_v**2)
+    inside = (q <= 2 * s.half_r2 * d**2) & (d > 0) & (d * view.near <= f.dz)
     with np.errstate(divide="ignore", invalid="ignore"):
-        plane = np.where(inside, q / (2 * f.d**2), np.inf)
+        plane = np.where(inside, q / (2 * d**2), np.inf)
     disc = np.where(f.offset <= s.half_r2, f.offset, np.inf) if s.screen else np.full_like(plane, np.inf)
     return Decisions(
         order=s.order,
         contributes=live & (f.alpha > 0),
         by_disc=disc < plane,
         clamped=s.log_opacity - np.minimum(plane, disc) > np.log(view.ceiling),
-        missed=(f.d <= 0) | (f.d * view.near > f.dz),
-        mirrored=s.screen & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * f.d**2),
+        missed=(d <= 0) | (d * view.near > f.dz),
+        mirrored=s.screen & (q > 2 * np.maximum(f.offset, HALF_RHO_OF_RANGE) * d**2),
         wide=f.offset > HALF_RHO_OF_RANGE,
         covered=1 - final >= MIN_ALPHA,
     )
@@ -85,34 +85,37 @@ class Samples:
 class Blend:
     """Differentiable blending of m placed splats at k samples under frozen decisions."""
 
-    def __init__(self, placed: Placed, view: View, made: Decisions, x: np.ndarray, y: np.ndarray) -> None:
-        self._placed, self._view, self._made = placed, view, made
-        order = made.order
-        self._unit_a, self._unit_b, self._p = placed.unit_a[order], placed.unit_b[order], placed.p[order]
-        self._su, self._sv = placed.scales[order].T
-        self._rgb, log_opacity = placed.rgb[order], placed.log_opacity[order]
-        self._rays = rays_of(view, x, y)[0][:, None, :]
-        self._normal = np.cross(self._unit_a, self._unit_b)
-        height = (self._normal * self._p).sum(1)
-        self._towards = np.where(height > 0, -1.0, 1.0)[:, None]
+    def __init__(
+        self,
+        placed: Placed,
+        view: View,
+        features: FeatureSet,
+        made: Decisions,
+        x: np.ndarray,
+        y: np.ndarray,
+    ) -> None:
+        self._count, self._made = len(placed.p), made
+        chosen = placed.select(made.order)
+        self._rgb, log_opacity = chosen.rgb, chosen.log_opacity.copy()
+        self._shapes = shapes_of(chosen, view, features, x, y)
+        self._pz = chosen.p[:, 2]
+        self._plane, self._z_plane = np.empty((2, len(x), len(self._pz)))
+        self._facing = np.empty_like(chosen.p)
+        for rows, shape in self._shapes:
+            self._plane[:, rows], self._z_plane[:, rows] = shape.half_rho, shape.z
+            self._facing[rows] = shape.facing
+            log_opacity[rows] += shape.faint
+        self._disc_x, self._disc_y = (at[:, None] - c for at, c in zip((x, y), chosen.center.T, strict=True))
+        plane, z_plane = self._plane, self._z_plane
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            self._slant = (self._rays * self._normal).sum(2)
-            self._z_plane = height / self._slant
-            self._off = self._z_plane[..., None] * self._rays - self._p
-            self._u = (self._off * self._unit_a).sum(2) / self._su
-            self._v = (self._off * self._unit_b).sum(2) / self._sv
-            pz = self._p[:, 2]
-            self._disc_x = x[:, None] - (view.focal_x * self._p[:, 0] / pz + view.center_x)
-            self._disc_y = y[:, None] - (view.focal_y * self._p[:, 1] / pz + view.center_y)
-            disc, plane = self._disc_x**2 + self._disc_y**2, (self._u**2 + self._v**2) / 2
+            disc = self._disc_x**2 + self._disc_y**2
             half_rho = np.where(made.by_disc, disc, plane)
             # share of the way from the centre's depth to the depth on the plane
             circle = np.where(made.wide, disc, HALF_RHO_OF_RANGE)
             self._share = np.where(made.mirrored, circle / plane, 1.0)
-            self._plane = plane
-            z = pz + self._share * (self._z_plane - pz)
+            z = self._pz + self._share * (z_plane - self._pz)
             opacity = np.where(made.clamped, view.ceiling, np.exp(log_opacity - half_rho))
-        self._z = np.where(made.contributes, np.where(made.missed, pz, z), 0.0)
+        self._z = np.where(made.contributes, np.where(made.missed, self._pz, z), 0.0)
         self._inverse = np.where(made.contributes, inverse_depth(self._z), 0.0)
         self._alpha = np.where(made.contributes, opacity, 0.0)
         after = np.cumprod(1 - self._alpha, axis=1)
@@ -127,71 +130,51 @@ class Blend:
             self._before[:, -1],
             (self._weight * self._z).sum(1),
             self._weight.sum(1),
-            self._weight @ (self._normal * self._towards),
+            self._weight @ self._facing,
             (self._weight * self._inverse).sum(1),
             (self._weight * self._inverse**2).sum(1),
         )
 
     def backward(self, by: Samples) -> Placed:
         """Derivatives of a loss with respect to the placed splats, from those with respect to the samples."""
-        made, view = self._made, self._view
-        facing = self._normal * self._towards
+        made = self._made
         by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
         by_inverse = np.where(self._z > SPREAD_NEAR, by_inverse, 0.0)
         by_z = self._weight * (by.depth[:, None] - by_inverse * self._inverse**2 / INVERSE_DEPTH)
-        by_alpha = np.where(made.contributes, self._by_opacity(by, facing), 0.0)
+        by_alpha = np.where(made.contributes, self._by_opacity(by), 0.0)
         by_log = np.where(made.clamped, 0.0, by_alpha * self._alpha)
 
         met = made.contributes & ~made.missed
         on_plane, mirrored = made.contributes & ~made.by_disc, met & made.mirrored
         share = np.where(met, self._share, 0.0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            by_share = np.where(mirrored, by_z * (self._z_plane - self._p[:, 2]), 0.0)
-            by_plane = np.where(
-                mirrored, -by_share * share / self._plane, 0.0
-            )  # with respect to rho / 2 on the plane
+            by_share = np.where(mirrored, by_z * (self._z_plane - self._pz), 0.0)
+            # with respect to rho / 2 on the plane
+            by_plane = np.where(mirrored, -by_share * share / self._plane, 0.0)
             by_plane -= np.where(on_plane, by_log, 0.0)
-            by_u = np.where(on_plane | met, by_plane * self._u / self._su, 0.0)
-            by_v = np.where(on_plane | met, by_plane * self._v / self._sv, 0.0)
             by_disc = np.where(made.contributes & made.by_disc, by_log, 0.0)
             by_disc -= np.where(mirrored & made.wide, by_share / self._plane, 0.0)
-            off = np.where((on_plane | met)[..., None], self._off, 0.0)
-            by_off = by_u[..., None] * self._unit_a + by_v[..., None] * self._unit_b
-            by_plane_z = (by_off * self._rays).sum(2) + by_z * share
-            by_plane_z = np.where(on_plane | met, by_plane_z / self._slant, 0.0)
-        by_normal = -(by_plane_z[..., None] * off).sum(0) + self._towards * (self._weight.T @ by.normal)
-        by_a = np.einsum("kn,knc->nc", by_u, off) + np.cross(self._unit_b, by_normal)
-        by_b = np.einsum("kn,knc->nc", by_v, off) + np.cross(by_normal, self._unit_a)
-        by_p = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
-
-        # the low-pass disc around the projected centre
-        by_x = 2 * np.where(by_disc != 0, by_disc * self._disc_x, 0.0).sum(0)
-        by_y = 2 * np.where(by_disc != 0, by_disc * self._disc_y, 0.0).sum(0)
-        x, y, z = self._p.T
-        by_p += np.stack(
-            [
-                by_x * view.focal_x / z,
-                by_y * view.focal_y / z,
-                -(by_x * view.focal_x * x + by_y * view.focal_y * y) / z**2,
-            ],
-            1,
-        )
-        by_p[:, 2] += (by_z * (1 - share)).sum(0)
-
-        out, order = Placed.zeros(len(self._placed.p)), made.order
-        out.unit_a[order], out.unit_b[order], out.p[order] = by_a, by_b, by_p
-        with np.errstate(invalid="ignore"):
-            by_su = -np.where(on_plane | met, by_u * self._u, 0.0).sum(0)
-            by_sv = -np.where(on_plane | met, by_v * self._v, 0.0).sum(0)
-        out.scales[order] = np.stack([by_su, by_sv], 1)
-        out.log_opacity[order] = by_log.sum(0)
-        out.rgb[order] = self._weight.T @ by.rgb
+        by_facing, by_log_opacity = self._weight.T @ by.normal, by_log.sum(0)
+        slopes = Placed.zeros(len(self._pz))
+        for rows, shape in self._shapes:
+            found = Placed.zeros(len(rows))
+            by_rays = (by_plane[:, rows], by_z[:, rows] * share[:, rows], (on_plane | met)[:, rows])
+            shape.backward(found, *by_rays, by_facing[rows], by_log_opacity[rows])
+            for name, array in vars(found).items():
+                getattr(slopes, name)[rows] = array
+        for axis, distance in enumerate((self._disc_x, self._disc_y)):
+            slopes.center[:, axis] += 2 * np.where(by_disc != 0, by_disc * distance, 0.0).sum(0)
+        slopes.p[:, 2] += (by_z * (1 - share)).sum(0)
+        slopes.log_opacity, slopes.rgb = by_log_opacity, self._weight.T @ by.rgb
+        out = Placed.zeros(self._count)
+        for name, array in vars(slopes).items():
+            getattr(out, name)[made.order] = array
         return out
 
-    def _by_opacity(self, by: Samples, facing: np.ndarray) -> np.ndarray:
+    def _by_opacity(self, by: Samples) -> np.ndarray:
         """Derivatives (k, m) with respect to the fragments' opacities: the value of a fragment's own colour
         minus that of the colour behind it; from back to front, without a division by the transmittance."""
-        worth = by.rgb @ self._rgb.T + by.normal @ facing.T + by.depth[:, None] * self._z
+        worth = by.rgb @ self._rgb.T + by.normal @ self._facing.T + by.depth[:, None] * self._z
         worth = worth + by.weight[:, None] + by.inverse[:, None] * self._inverse
         worth = worth + by.squares[:, None] * self._inverse**2
         hidden, slopes = by.t.copy(), np.zeros_like(worth)

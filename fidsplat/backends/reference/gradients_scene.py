@@ -28,6 +28,8 @@ class Parameters:
     pose: np.ndarray
     """(6,): rotation vector [rad] and translation [m] of a motion applied after world_to_camera, in camera
     axes"""
+    thickness: np.ndarray | None = None
+    """(n,) third standard deviations of 3D Gaussians [m], 0 of disks; None if all are disks"""
 
     @classmethod
     def of(cls, cloud: SplatCloud, view: View) -> Parameters:
@@ -36,7 +38,9 @@ class Parameters:
         color = cloud.colors if cloud.colors is not None else cloud.plain_colors
         sh = None if color is not None else cloud.sh
         given = [None if array is None else array.astype(np.float64) for array in (*arrays, color, sh)]
-        return cls(*given, np.array(view.background, np.float64), np.zeros(6))  # type: ignore[arg-type]
+        thickness = None if cloud.thickness is None else cloud.thickness.astype(np.float64)
+        background = np.array(view.background, np.float64)
+        return cls(*given, background, np.zeros(6), thickness)  # type: ignore[arg-type]
 
     @property
     def names(self) -> list[str]:
@@ -53,16 +57,22 @@ class Placed:
     unit_b: np.ndarray
     p: np.ndarray
     """(n, 3) centres [m]"""
+    center: np.ndarray
+    """(n, 2) projected centres [samples]; undefined behind the camera"""
     scales: np.ndarray
-    """(n, 2) rendered scales [m]"""
+    """(n, 3) rendered scales [m]; the third is 0 for disks"""
     log_opacity: np.ndarray
     rgb: np.ndarray
 
     @classmethod
     def zeros(cls, n: int) -> Placed:
         """Zero derivatives of n splats."""
-        a, b, p, rgb = np.zeros((4, n, 3))
-        return cls(a, b, p, np.zeros((n, 2)), np.zeros(n), rgb)
+        a, b, p, scales, rgb = np.zeros((5, n, 3))
+        return cls(a, b, p, np.zeros((n, 2)), scales, np.zeros(n), rgb)
+
+    def select(self, rows: np.ndarray) -> Placed:
+        """Some of the splats, by index."""
+        return Placed(*(array[rows] for array in vars(self).values()))
 
 
 def motion_of(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -83,13 +93,19 @@ def place(parameters: Parameters, view: View) -> Placed:
         rotation_offset @ view.translation + translation_offset,
     )
     tangent_u, tangent_v = _tangents(parameters.quats)
-    with np.errstate(divide="ignore"):
+    p = parameters.means @ rotation.T + translation
+    third = np.zeros(len(p)) if parameters.thickness is None else parameters.thickness
+    third = np.where(third > 0, np.maximum(third, _SMALLEST), 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
         log_opacity = np.log(parameters.opacities)
+        focal, middle = (view.focal_x, view.focal_y), (view.center_x, view.center_y)
+        center = p[:, :2] * focal / p[:, 2:] + middle
     return Placed(
         tangent_u @ rotation.T,
         tangent_v @ rotation.T,
-        parameters.means @ rotation.T + translation,
-        np.maximum(parameters.scales, _SMALLEST),
+        p,
+        center,
+        np.column_stack([np.maximum(parameters.scales, _SMALLEST), third]),
         log_opacity,
         _rgb(parameters, _eye(parameters, view)),
     )
@@ -100,20 +116,33 @@ def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: P
     splats."""
     rotation = view.rotation
     by_color, by_ray = _rgb_backward(parameters, _eye(parameters, view), slopes.rgb)
-    pairs = [(slopes.unit_a, placed.unit_a), (slopes.unit_b, placed.unit_b), (slopes.p, placed.p)]
+    by_p = slopes.p + center_backward(view, placed.p, slopes.center)
+    pairs = [(slopes.unit_a, placed.unit_a), (slopes.unit_b, placed.unit_b), (by_p, placed.p)]
     turned = sum(np.cross(at, slope).sum(0) for slope, at in pairs)
     # moving the camera by t moves its centre by -t; the rotation is about the centre
-    moved = slopes.p.sum(0) + by_ray.sum(0) @ rotation.T
+    moved = by_p.sum(0) + by_ray.sum(0) @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
         by_opacity = slopes.log_opacity / parameters.opacities
-    return {
-        "means": slopes.p @ rotation + by_ray,
+    rendered = slopes.scales[:, :2]
+    found = {
+        "means": by_p @ rotation + by_ray,
         "quats": _tangents_backward(parameters.quats, slopes.unit_a @ rotation, slopes.unit_b @ rotation),
-        "scales": np.where(parameters.scales >= _SMALLEST, slopes.scales, 0.0),
+        "scales": np.where(parameters.scales >= _SMALLEST, rendered, 0.0),
         "opacities": np.where(slopes.log_opacity != 0, by_opacity, 0.0),
         "sh" if parameters.colors is None else "colors": by_color,
         "pose": np.concatenate([turned, moved]),
     }
+    if parameters.thickness is not None:
+        found["thickness"] = np.where(parameters.thickness >= _SMALLEST, slopes.scales[:, 2], 0.0)
+    return found
+
+
+def center_backward(view: View, p: np.ndarray, by_center: np.ndarray) -> np.ndarray:
+    """Derivatives (n, 3) by centres, from those (n, 2) by their projections."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        across = by_center * (view.focal_x, view.focal_y) / p[:, 2:]
+        by_p = np.column_stack([across, -(across * p[:, :2]).sum(1) / p[:, 2]])
+    return np.where((by_center != 0).any(axis=1, keepdims=True), by_p, 0.0)
 
 
 def _tangents(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

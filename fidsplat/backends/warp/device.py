@@ -106,6 +106,10 @@ class WarpBackend(Workspace, Backend):
     def differentiate(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpGradients:
         """The pipeline with derivatives; `shape` replaces the device's own tiles (tests)."""
         check_differentiable(features)
+        if any(name.startswith("ellipsoid") for name in features.slots):
+            raise DeviceError(
+                f"{self.info.name} (NVIDIA Warp) has no gradients of 3D Gaussians; use an OpenCL device"
+            )
         key = (features, shape or self.shape)
         if key not in self._gradients:
             self._gradients[key] = WarpGradients(self.pipeline(*key))

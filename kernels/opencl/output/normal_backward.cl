@@ -30,5 +30,6 @@
 //@ facet_backward
         real towards = offset > 0 ? -1 : 1;
         real3_ by_facet = {towards * total.nx, towards * total.ny, towards * total.nz};
+//@@ ellipsoid_normal_backward
         by_unit_a = add3(by_unit_a, cross3(unit_b, by_facet));
         by_unit_b = add3(by_unit_b, cross3(by_facet, unit_a));

@@ -1,6 +1,23 @@
 // 3D Gaussians as in 3DGS (EWA splatting, Zwicker et al. 2001; Kerbl et al. 2023): the projected covariance by the Jacobian at the
 // centre, widened by 0.3 square pixels, and the centre's depth, with the constants of gsplat. The projection equals that of a
 // disk that faces the camera, so that only the setup has code for it.
+//@ functions
+typedef struct {            // widened covariance of the projection: its Cholesky factor, and the determinants before and after
+    real3_ crossed;
+    real determinant2, grown, l11, l21, l22;
+} Projected;
+
+static inline Projected widened(real3_ across, real3_ down, real spread) {
+    Projected w;
+    real xx = dot3(across, across), xy = dot3(across, down), yy = dot3(down, down);
+    w.crossed = cross3(across, down);                             // so that the determinant does not cancel
+    w.determinant2 = dot3(w.crossed, w.crossed);
+    w.grown = w.determinant2 + spread * (xx + yy + spread);
+    w.l11 = sqrt(xx + spread);
+    w.l21 = xy / w.l11;
+    w.l22 = sqrt(w.grown) / w.l11;
+    return w;
+}
 //@ lowpass_make
     if (THICK_HERE) {
         if (!(pz >= near)) return;           // early test of the near plane
@@ -8,14 +25,10 @@
         real3_ c = {facet.x * sw, facet.y * sw, facet.z * sw}, across, down;    // projected axes [samples]
         real per_x, per_y;                                           // samples per metre at the centre
 //@@ camera_image
-        const real spread = REAL(0.3) / view->filter;
-        real xx = dot3(across, across), xy = dot3(across, down), yy = dot3(down, down);
-        real3_ crossed = cross3(across, down);                        // so that the determinant does not cancel
-        real determinant2 = dot3(crossed, crossed), grown = determinant2 + spread * (xx + yy + spread);
+        const Projected wide_image = widened(across, down, REAL(0.3) / view->filter);
 //@@ ewa_opacity
-        real l11 = sqrt(xx + spread), l21 = xy / l11, l22 = sqrt(grown) / l11;
-        a.x = l11 / per_x; a.y = l21 / per_y; a.z = 0;
-        b.x = 0; b.y = l22 / per_y; b.z = 0;
+        a.x = wide_image.l11 / per_x; a.y = wide_image.l21 / per_y; a.z = 0;
+        b.x = 0; b.y = wide_image.l22 / per_y; b.z = 0;
         facet.x = facet.y = 0; facet.z = 1;
         offset = pz;
 //@@ camera_offset

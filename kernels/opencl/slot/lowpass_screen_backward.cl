@@ -5,8 +5,9 @@ static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho
 }
 //@ disc_geometry
     vint disc;               // depth reflected at `circle`: z_center + circle (z_numerator - z_center D) D / q
-    vfloat circle;
+    vfloat circle, q;
 //@ disc_geometry_make
+    g.q = c.q;
     g.circle = HAS_DISC(s) ? max(screen, (vfloat)WIDE(5.5412635451584261)) : (vfloat)1e30f;
     vint ahead = VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     flat = ahead & VMASK(g.half_rho <= g.circle);
@@ -14,16 +15,16 @@ static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho
     vfloat disc_depth = FMA(g.circle * (s->z_numerator - s->z_center * c.d), c.d / c.q, (vfloat)s->z_center);
     depth = VSELECT(VSELECT((vfloat)s->z_center, disc_depth, g.disc), depth, flat);
 //@ disc_add_depth
-    vfloat per_q = 1.0f / FMA(g->nu, g->nu, g->nv * g->nv), by_disc = VSELECT((vfloat)0.0f, by_z * per_q, g->disc);
+    vfloat per_q = 1.0f / g->q, by_disc = VSELECT((vfloat)0.0f, by_z * per_q, g->disc);
     vfloat scaled_d = g->circle * g->d;
     vfloat beyond = s->z_numerator - s->z_center * g->d;
     vfloat by_screen = VSELECT((vfloat)0.0f, by_disc * beyond * g->d, VMASK(g->circle == screen));
     by_numerator = FMA(by_disc, scaled_d, by_numerator);
     by_center = FMA(-by_disc * scaled_d, g->d, by_center);
     by_d = FMA(by_disc * g->circle, beyond - s->z_center * g->d, by_d);
-    by_disc = -2.0f * VSELECT((vfloat)0.0f, by_disc * scaled_d * beyond * per_q, g->disc);        // by n_u over n_u, by n_v over n_v
-    *by_nu = FMA(by_disc, g->nu, *by_nu);
-    *by_nv = FMA(by_disc, g->nv, *by_nv);
+    by_q = -2.0f * VSELECT((vfloat)0.0f, by_disc * scaled_d * beyond * per_q, g->disc);
+    *by_nu = FMA(by_q, g->nu, *by_nu);
+    *by_nv = FMA(by_q, g->nv, *by_nv);
     sums->disc_x = FMA(-by_screen, x - s->disc_x, sums->disc_x);
     sums->disc_y = FMA(-by_screen, y - s->disc_y, sums->disc_y);
 //@ sums

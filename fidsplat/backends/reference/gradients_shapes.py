@@ -1,0 +1,202 @@
+"""Weights and depths of splats along rays, with their derivatives: disks, and 3D Gaussians exact and by EWA.
+
+The formulas differ from those of the set-up, which devices have, so that each finds mistakes of the other:
+the intersection of a ray with a plane, the maximum of a Gaussian along a ray, the inverse of a projected
+covariance.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from fidsplat.backends.reference.ellipsoids import EWA_SPREAD
+from fidsplat.backends.reference.gradients_scene import Placed
+from fidsplat.backends.reference.optics import rays_of
+from fidsplat.backends.view import View
+from fidsplat.effects import FeatureSet
+
+
+class Shapes(Protocol):
+    """n splats of one kind along the rays of k samples."""
+
+    half_rho: np.ndarray
+    """(k, n) half the squared distance, in standard deviations"""
+    z: np.ndarray
+    """(k, n) depths [m]"""
+    facing: np.ndarray
+    """(n, 3) unit normals towards the camera"""
+    faint: np.ndarray
+    """(n,) term that is added to the logarithm of the opacity"""
+
+    def backward(
+        self,
+        out: Placed,
+        by_half_rho: np.ndarray,
+        by_z: np.ndarray,
+        used: np.ndarray,
+        by_facing: np.ndarray,
+        by_faint: np.ndarray,
+    ) -> None:
+        """Add derivatives of a loss with respect to the splats to `out`, from those with respect to the
+        attributes. used: (k, n) where half_rho or z counts; elsewhere they may be infinite."""
+        ...
+
+
+def shapes_of(
+    placed: Placed, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
+) -> list[tuple[np.ndarray, Shapes]]:
+    """Indices of the splats of each kind, and the splats."""
+    thick = placed.scales[:, 2] > 0
+    flat, solid = np.flatnonzero(~thick), np.flatnonzero(thick)
+    rays = rays_of(view, x, y)[0][:, None, :]
+    found: list[tuple[np.ndarray, Shapes]] = [(flat, _Disks(placed.select(flat), rays))]
+    if len(solid) and "ellipsoid_exact" in features.slots:
+        found.append((solid, _Ellipsoids(placed.select(solid), rays)))
+    elif len(solid):
+        antialiased = "ellipsoid_ewa_antialiased" in features.slots
+        found.append((solid, _Projected(placed.select(solid), view, antialiased, x, y)))
+    return found
+
+
+class _Disks:
+    def __init__(self, placed: Placed, rays: np.ndarray) -> None:
+        self._placed, self._rays = placed, rays
+        self._su, self._sv = placed.scales[:, :2].T
+        self._normal = np.cross(placed.unit_a, placed.unit_b)
+        height = (self._normal * placed.p).sum(1)
+        self._towards = np.where(height > 0, -1.0, 1.0)[:, None]
+        self.facing, self.faint = self._normal * self._towards, np.zeros(len(placed.p))
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            self._slant = (rays * self._normal).sum(2)
+            self.z = height / self._slant
+            self._off = self.z[..., None] * rays - placed.p
+            self._u = (self._off * placed.unit_a).sum(2) / self._su
+            self._v = (self._off * placed.unit_b).sum(2) / self._sv
+            self.half_rho = (self._u**2 + self._v**2) / 2
+
+    def backward(self, out, by_half_rho, by_z, used, by_facing, by_faint) -> None:
+        unit_a, unit_b = self._placed.unit_a, self._placed.unit_b
+        with np.errstate(invalid="ignore", divide="ignore"):
+            by_u = np.where(used, by_half_rho * self._u / self._su, 0.0)
+            by_v = np.where(used, by_half_rho * self._v / self._sv, 0.0)
+            off = np.where(used[..., None], self._off, 0.0)
+            by_off = by_u[..., None] * unit_a + by_v[..., None] * unit_b
+            by_plane_z = np.where(used, ((by_off * self._rays).sum(2) + by_z) / self._slant, 0.0)
+            out.scales[:, 0] = -np.where(used, by_u * self._u, 0.0).sum(0)
+            out.scales[:, 1] = -np.where(used, by_v * self._v, 0.0).sum(0)
+        by_normal = -(by_plane_z[..., None] * off).sum(0) + self._towards * by_facing
+        out.unit_a[:] = np.einsum("kn,knc->nc", by_u, off) + np.cross(unit_b, by_normal)
+        out.unit_b[:] = np.einsum("kn,knc->nc", by_v, off) + np.cross(by_normal, unit_a)
+        out.p[:] = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
+
+
+class _Solid:
+    """3D Gaussians: their axes, and the normal along the inverse covariance times the ray to the centre."""
+
+    def __init__(self, placed: Placed) -> None:
+        self._p, self._scales = placed.p, placed.scales
+        third = np.cross(placed.unit_a, placed.unit_b)
+        self._axes = np.stack([placed.unit_a, placed.unit_b, third], axis=1)
+        """(n, 3, 3), in rows"""
+        # relative to the shortest axis, which changes no direction
+        self._shares = (placed.scales.min(axis=1)[:, None] / placed.scales) ** 2
+        self._along = np.einsum("nkc,nc->nk", self._axes, placed.p)
+        normal = np.einsum("nk,nkc->nc", self._along * self._shares, self._axes)
+        self._length = np.linalg.norm(normal, axis=1, keepdims=True)
+        self.facing = -normal / self._length
+
+    def _finish(self, out: Placed, by_axes: np.ndarray, by_facing: np.ndarray) -> None:
+        """Add the derivatives by the normals, and those by all axes (n, 3, 3)."""
+        across = by_facing - self.facing * (self.facing * by_facing).sum(1, keepdims=True)
+        by_normal = -across / self._length
+        by_share = np.einsum("nkc,nc->nk", self._axes, by_normal)
+        by_along = by_share * self._shares
+        by_axes = by_axes + (self._along * self._shares)[..., None] * by_normal[:, None]
+        by_axes += by_along[..., None] * self._p[:, None]
+        out.p += np.einsum("nk,nkc->nc", by_along, self._axes)
+        # the length of the normal has no derivative, so that the shortest axis is a constant
+        out.scales += -2 * by_along * self._along / self._scales
+        a, b, c = by_axes.transpose(1, 0, 2)
+        out.unit_a += a + np.cross(self._axes[:, 1], c)
+        out.unit_b += b + np.cross(c, self._axes[:, 0])
+
+
+class _Ellipsoids(_Solid):
+    """The maximum along each ray. With y the centre and r the ray after whitening, it is where the distance
+    |y x r| / |r| is reached."""
+
+    def __init__(self, placed: Placed, rays: np.ndarray) -> None:
+        super().__init__(placed)
+        self.faint = np.zeros(len(placed.p))
+        self._rays, scales = rays[:, 0], placed.scales
+        self._y = self._along / scales
+        self._r = np.einsum("nkc,sc->snk", self._axes, self._rays) / scales
+        self._square = (self._r**2).sum(2)
+        self._cross = np.cross(self._y, self._r)
+        self.half_rho = (self._cross**2).sum(2) / (2 * self._square)
+        self.z = (self._y * self._r).sum(2) / self._square
+
+    def backward(self, out, by_half_rho, by_z, used, by_facing, by_faint) -> None:
+        by_cross = (by_half_rho / self._square)[..., None] * self._cross
+        by_dot = by_z / self._square
+        by_square = -(by_half_rho * self.half_rho + by_z * self.z) / self._square
+        by_r = 2 * by_square[..., None] * self._r + by_dot[..., None] * self._y + np.cross(by_cross, self._y)
+        by_y = (by_dot[..., None] * self._r + np.cross(self._r, by_cross)).sum(0)
+        scales = self._scales
+        by_axes = np.einsum("snk,sc->nkc", by_r, self._rays) + by_y[..., None] * self._p[:, None]
+        out.p += np.einsum("nk,nkc->nc", by_y / scales, self._axes)
+        out.scales -= (by_y * self._y + (by_r * self._r).sum(0)) / scales
+        self._finish(out, by_axes / scales[..., None], by_facing)
+
+
+class _Projected(_Solid):
+    """EWA: the covariance of the axes' images under the Jacobian at the centre, widened."""
+
+    def __init__(self, placed: Placed, view: View, antialiased: bool, x: np.ndarray, y: np.ndarray) -> None:
+        super().__init__(placed)
+        self._antialiased, self._per = antialiased, np.divide((view.focal_x, view.focal_y), placed.p[:, 2:])
+        left, right, up, down = view.slopes
+        slopes = placed.p[:, :2] / placed.p[:, 2:]
+        self._slopes = np.clip(slopes, (-left, -up), (right, down))
+        self._inside = self._slopes == slopes
+        scaled = self._axes * placed.scales[..., None]
+        self._flat = scaled[..., :2] - scaled[..., 2:] * self._slopes[:, None]
+        self._images = self._flat * self._per[:, None]
+        """(n, 3, 2) of the scaled axes [samples]"""
+        across, down = self._images[..., 0], self._images[..., 1]
+        self._crossed = np.cross(across, down)
+        self._own = (self._crossed**2).sum(1)
+        covariance = np.einsum("nki,nkj->nij", self._images, self._images) + EWA_SPREAD * np.eye(2)
+        grown = self._own + EWA_SPREAD * (np.einsum("nii->n", covariance) - EWA_SPREAD)
+        xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+        self._conic = np.array([[yy, -xy], [-xy, xx]]).transpose(2, 0, 1) / grown[:, None, None]
+        self._away = np.stack([x[:, None] - placed.center[:, 0], y[:, None] - placed.center[:, 1]], 2)
+        self._pull = np.einsum("nij,knj->kni", self._conic, self._away)
+        self.half_rho = (self._pull * self._away).sum(2) / 2
+        self.z = np.broadcast_to(placed.p[:, 2], self.half_rho.shape)
+        with np.errstate(divide="ignore"):
+            self.faint = 0.5 * np.log(self._own / grown) if antialiased else np.zeros(len(grown))
+
+    def backward(self, out, by_half_rho, by_z, used, by_facing, by_faint) -> None:
+        pz, per, scales = self._p[:, 2:], self._per, self._scales
+        out.center -= np.einsum("kn,kni->ni", by_half_rho, self._pull)
+        # by the covariance C: half_rho has -(C^-1 d)(C^-1 d)^T / 2
+        by_covariance = -0.5 * np.einsum("kn,kni,knj->nij", by_half_rho, self._pull, self._pull)
+        by_images = np.zeros_like(self._images)
+        if self._antialiased:
+            by_covariance -= 0.5 * by_faint[:, None, None] * self._conic
+            by_crossed = (by_faint / self._own)[:, None] * self._crossed
+            by_images[..., 0] += np.cross(self._images[..., 1], by_crossed)
+            by_images[..., 1] += np.cross(by_crossed, self._images[..., 0])
+        by_images += 2 * np.einsum("nij,nkj->nki", by_covariance, self._images)
+        by_per = (by_images * self._flat).sum(1)
+        by_flat = by_images * per[:, None]
+        by_scaled = np.concatenate([by_flat, -(by_flat * self._slopes[:, None]).sum(2, keepdims=True)], 2)
+        scaled_z = self._axes[:, :, 2] * scales
+        by_slopes = -np.einsum("nki,nk->ni", by_flat, scaled_z) * self._inside
+        out.p[:, :2] += by_slopes / pz
+        out.p[:, 2] += by_z.sum(0) - ((by_slopes * self._slopes + by_per * per) / pz).sum(1)
+        out.scales += (by_scaled * self._axes).sum(2)
+        self._finish(out, by_scaled * scales[..., None], by_facing)
