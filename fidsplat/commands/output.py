@@ -6,7 +6,6 @@ import json
 import math
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,9 +18,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Table = tuple[str, Sequence[str], Iterable[Sequence[object]]]
 """title, column heads and rows, the arguments of `print_table`"""
-
-LINE_SECONDS = 30.0
-"""seconds between progress lines in files and pipes"""
 
 
 def console(as_json: bool) -> Console:
@@ -93,13 +89,11 @@ def progress_bar(where: Console, *columns: Any) -> Any:
 def delayed_progress(
     where: Console | None = None, after: float = 1.0
 ) -> Iterator[Callable[[str, float], None]]:
-    """A progress callback (description, share done) whose bar appears on stderr after some seconds. Files
-    and pipes get a line every `LINE_SECONDS` instead.
+    """A progress callback (description, share done) whose bar appears on stderr after some seconds.
 
     A thread watches the time, so that long work between two calls also shows the bar.
     """
-    where = where or console(True)
-    bar, last = progress_bar(where), time.monotonic()
+    bar = progress_bar(where or console(True))
     task = bar.add_task("", total=1.0)
     timer = threading.Timer(after, bar.start)
     timer.daemon = True
@@ -107,11 +101,7 @@ def delayed_progress(
 
     def progress(description: str, share: float) -> None:
         interrupts.check()
-        nonlocal last
         bar.update(task, description=description, completed=share)
-        if not where.is_interactive and time.monotonic() - last >= LINE_SECONDS:
-            last = time.monotonic()
-            print_lines(where, f"{share:.0%} {description}")
 
     try:
         yield progress

@@ -5,7 +5,7 @@ from importlib.metadata import version
 
 import numpy as np
 import torch
-from FasterGSCudaBackend.torch_bindings import RasterizerSettings, diff_rasterize
+from FasterGSCudaBackend.torch_bindings import RasterizerSettings, rasterize
 from torch_gpu import TorchAdapter
 
 C0 = 0.28209479177387814  # value of the constant spherical harmonic
@@ -23,7 +23,6 @@ class Adapter(TorchAdapter):
         self.splats["opacities"] = self.opacities.clamp(1e-7, 1 - 1e-7).logit()[:, None]
         self.splats["sh_coefficients_0"] = ((self.colors - 0.5) / C0)[:, None].contiguous()
         self.splats["sh_coefficients_rest"] = torch.zeros((count, 0, 3), device="cuda")
-        self.splats["densification_info"] = torch.empty(0, device="cuda")
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         lens = {"focal_x": fx, "focal_y": fy, "center_x": cx, "center_y": cy}
         rest = {"near_plane": 0.01, "far_plane": 1e4, "active_sh_bases": 1, "proper_antialiasing": False}
@@ -37,5 +36,5 @@ class Adapter(TorchAdapter):
         ]
 
     def draw(self, setting, views):
-        images = (diff_rasterize(**self.splats, rasterizer_settings=self.cameras[view]) for view in views)
-        return [image.permute(1, 2, 0) for image in images]
+        how = {"to_chw": False, "clamp_output": False}
+        return [rasterize(**self.splats, rasterizer_settings=self.cameras[view], **how) for view in views]

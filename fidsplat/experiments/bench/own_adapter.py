@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import fidsplat as fs
+from fidsplat.splats.rotations import matrices_to_quaternions
 
 PRESETS = ("standard", "fast", "gsplat", "reference")
 EXACT = "standard,ellipsoid=exact"
@@ -53,16 +54,18 @@ class Adapter:
         if self.renderer.backend.traits.measures_rates:
             self.renderer.backend.release_scratch()
         self.resident = self.renderer.upload(cloud)
-        self.captures = lru_cache(None)(self._capture)
+        inverse = np.linalg.inv(self.poses)
+        self.vectors = np.hstack([inverse[:, :3, 3], matrices_to_quaternions(inverse[:, :3, :3])])
+        self.capture = lru_cache(None)(self._capture)
 
     def _capture(self, setting: str, view: int) -> fs.Capture:
         return fs.Capture(self.camera.with_pose(self.poses[view]), quality=self.qualities[setting])
 
     def render(self, setting: str, views: list[int]) -> Any:
-        captures = [self.captures(setting, view) for view in views]
-        if len(captures) == 1:
-            return self.renderer.render(self.resident, captures[0]).wait()
-        return self.renderer.render_batch(self.resident, captures).wait()
+        capture = self.capture(setting, views[0])
+        if len(views) == 1:
+            return self.renderer.render(self.resident, capture).wait()
+        return self.renderer.render_batch(self.resident, capture, poses=self.vectors[views]).wait()
 
     def device_ms(self, rendered: Any) -> float:
         return sum(rendered.timings.values())

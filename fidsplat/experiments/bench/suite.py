@@ -37,8 +37,9 @@ from fidsplat.vision.readback import means, read_back
 
 SCHEMA = 1
 """version of the format of the results"""
-SLOW = 1000.0
-"""milliseconds: slower frames are interleaved separately, so that faster renderers have more rounds"""
+SLOW, TOO_SLOW = 1000.0, 10_000.0
+"""Milliseconds of a frame. Above SLOW, a renderer is measured at its first setting, and interleaved
+separately, so that faster renderers have more rounds. Above TOO_SLOW it is left out."""
 Progress = Callable[[str, float], None]
 
 
@@ -241,6 +242,7 @@ class Suite:
         """Measure what the file lacks; returns all results. Each scene is in the file when it is complete."""
         done = {(result["scene"], result["renderer"]) for result in self.found["results"]}
         left = [name for name in self._scenes if any((name, one) not in done for one in self._openers)]
+        left.sort(key=lambda name: (self._scenes[name].x is not None, self._scenes[name].large))
         try:
             for number, name in enumerate(left):
                 missing = [one for one in self._openers if (name, one) not in done]
@@ -308,20 +310,20 @@ class Suite:
                     continue
                 try:
                     loaded = process.ask("load", file=str(file))
-                    for setting, claims in settings.items():
-                        claim = claims[views.kind]
-                        result = {
-                            "scene": name,
-                            "renderer": renderer,
-                            "setting": setting,
-                            "claim": claim,
-                            **loaded,
-                        }
-                        result |= self._first(
-                            process, setting, claim, references, views, Path(folder) / "image.npy"
-                        )
-                        timer = self._timer(process, setting, scene, len(views.poses))
-                        timers.append((timer, result, process, setting))
+                    for number, (setting, claims) in enumerate(settings.items()):
+                        claim, image = claims[views.kind], Path(folder) / "image.npy"
+                        result = {"scene": name, "renderer": renderer, "setting": setting, "claim": claim}
+                        result |= loaded | self._first(process, setting, claim, references, views, image)
+                        ms = result["first_ms"][-1]
+                        if ms > TOO_SLOW:
+                            reason = f"a frame takes {ms / 1e3:.3g} s, more than {TOO_SLOW / 1e3:g} s"
+                            self._add(name, [renderer], {"setting": setting, "skipped": reason})
+                        else:
+                            timer = self._timer(process, setting, scene, len(views.poses))
+                            # the first setting has the energy
+                            timers.append((timer, result, process, setting if number == 0 else ""))
+                        if ms > SLOW:
+                            break
                 except AdapterError as error:
                     timers = [one for one in timers if one[2] is not process]
                     self._processes.pop(renderer).close()
@@ -335,11 +337,11 @@ class Suite:
                     effort.rounds,
                     min_rounds=effort.min_rounds,
                     seconds=effort.seconds * (0.5 if scene.x is not None else 1.0),
-                    warm_up=1,
+                    warm_up=0 if slow else 1,
                     tick=interrupts.check,
                 )
-            for timer, result, process, setting in timers:
-                self._finish(timer, result, process, setting, scene, len(views.poses))
+            for timer, result, process, metered in timers:
+                self._finish(timer, result, process, metered, scene, len(views.poses))
 
     def _first(
         self,
@@ -387,11 +389,11 @@ class Suite:
         timer: Timer,
         result: dict[str, Any],
         process: RendererProcess,
-        setting: str,
+        metered: str,
         scene: SuiteScene,
         count: int,
     ) -> None:
-        """Add a result: times per view, and joules where the machine reports them."""
+        """Add a result: times per view, and joules of the setting `metered` if the machine reports them."""
         if timer.error or not timer.ms:
             if self._processes.get(process.name) is process:  # it may have ended
                 self._processes.pop(process.name).close()
@@ -409,10 +411,10 @@ class Suite:
         if "device" in timer.parts:
             result["device_ms"] = timer.part_medians["device"] / per_call
         meter = energy_meter(process.facts.get("kind", "cpu"))
-        if meter is not None and scene.x is None:
+        if meter is not None and metered and scene.x is None:
             before = meter()
             views = list(range(count)) if scene.batch else [0]
-            burst = process.ask("burst", setting=setting, views=views, seconds=self._effort.burst)
+            burst = process.ask("burst", setting=metered, views=views, seconds=self._effort.burst)
             result["joules"] = (meter() - before) / (burst["submissions"] * per_call)
         self.found["results"].append(rounded(result))
 
