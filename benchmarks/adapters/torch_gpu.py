@@ -1,7 +1,15 @@
 """Base of the adapters of PyTorch renderers on an NVIDIA GPU; an adapter has `settings` and `draw`."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
+
+
+def pinned(adapter):
+    """Commit after the last @ of an adapter's requirements.txt, for packages without a version."""
+    text = Path(adapter).with_name("requirements.txt").read_text("utf-8")
+    return text.rpartition("@")[2].partition("#")[0].strip()
 
 
 class TorchAdapter:

@@ -129,6 +129,16 @@ def test_a_renderer_that_cannot_run_has_a_reason_and_one_that_ends_is_started_ag
     assert [one["scene"] for one in later if "frames" in one] == ["one", "one"]
 
 
+def test_a_slow_renderer_is_measured_at_one_setting_and_a_slower_one_left_out(tmp_path, monkeypatch):
+    renderers = toy(tmp_path, TOY.replace("return np.full", "time.sleep(0.02); return np.full"))
+    monkeypatch.setattr(suite, "SLOW", 10.0)
+    (found,) = run(tmp_path / "found.json", ("one",), renderers)
+    assert (found["setting"], found["frames"]) == ("grey", 3)
+    monkeypatch.setattr(suite, "TOO_SLOW", 15.0)
+    (found,) = run(tmp_path / "found.json", ("one",), renderers, overwrite=True)
+    assert found["skipped"].startswith("a frame takes 0.0")
+
+
 @pytest.mark.parametrize(
     "made", [views(poses=2), views(thick=True), regimes.tags(True)], ids=lambda v: v.kind
 )

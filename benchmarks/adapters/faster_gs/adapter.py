@@ -1,12 +1,10 @@
 """Faster-GS (FasterGSCudaBackend of nerficg-project/faster-gaussian-splatting): 3D Gaussians by EWA, one view
 in a call."""
 
-from importlib.metadata import version
-
 import numpy as np
 import torch
 from FasterGSCudaBackend.torch_bindings import RasterizerSettings, rasterize
-from torch_gpu import TorchAdapter
+from torch_gpu import TorchAdapter, pinned
 
 C0 = 0.28209479177387814  # value of the constant spherical harmonic
 
@@ -15,7 +13,7 @@ class Adapter(TorchAdapter):
     settings = {"default": {"ellipsoids": {"ellipsoid": "ewa", "order": "centre"}}}
 
     def __init__(self):
-        super().__init__("Faster-GS", version("FasterGSCudaBackend"))
+        super().__init__("Faster-GS", pinned(__file__))
 
     def prepare(self):
         count = len(self.means)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from example import Rasterizer
-from torch_gpu import TorchAdapter
+from torch_gpu import TorchAdapter, pinned
 
 C0 = 0.28209479177387814  # value of the constant spherical harmonic
 
@@ -15,7 +15,7 @@ class Adapter(TorchAdapter):
     settings = {"fused": {"ellipsoids": {"ellipsoid": "ewa", "order": "centre"}}}
 
     def __init__(self):
-        super().__init__("PolySplat", "main")
+        super().__init__("PolySplat", pinned(__file__))
 
     def prepare(self):
         w, x, y, z = self.quats.T

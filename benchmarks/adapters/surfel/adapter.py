@@ -2,7 +2,7 @@
 
 import torch
 from diff_surfel_rasterization import GaussianRasterizationSettings, GaussianRasterizer
-from torch_gpu import TorchAdapter
+from torch_gpu import TorchAdapter, pinned
 
 NEAR, FAR = 0.2, 100.0  # metres, the authors' values
 
@@ -11,7 +11,7 @@ class Adapter(TorchAdapter):
     settings = {"default": {"disks": {"order": "centre"}}}
 
     def __init__(self):
-        super().__init__("2DGS authors", "diff-surfel-rasterization")
+        super().__init__("2DGS authors", pinned(__file__))
 
     def prepare(self):
         slopes = self.width / (2 * float(self.K[0, 0])), self.height / (2 * float(self.K[1, 1]))
