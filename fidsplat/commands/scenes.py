@@ -74,14 +74,14 @@ Cameras = Annotated[
 
 
 def load_user_scenes(
-    files: tuple[str, ...], cameras: str | None, named: tuple[str, ...]
+    files: tuple[str, ...], cameras: str | None, named: tuple[str, ...], most_views: int | None = None
 ) -> dict[str, BenchScene]:
-    """Scenes of --scene, rendered from the poses of --cameras; empty without --scene.
+    """Scenes of --scene, rendered from poses of --cameras, by default at most 8; empty without --scene.
 
     Raises:
         InputError: --scenes in addition, --cameras without --scene, or an unreadable file.
     """
-    from fidsplat.experiments.bench.catalogue import own_scenes
+    from fidsplat.experiments.bench.catalogue import MOST_VIEWS, own_scenes
     from fidsplat.formats import load_trajectory
     from fidsplat.scenes.sources import load_source
 
@@ -93,5 +93,5 @@ def load_user_scenes(
     found: dict[str, BenchScene] = {}
     for name in files:
         with delayed_progress() as progress:
-            found |= own_scenes(name, load_source(name, None, progress), path)
+            found |= own_scenes(name, load_source(name, None, progress), path, most_views or MOST_VIEWS)
     return found

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import statistics
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Devices, Folders, Json, ReportTo, check_plot, require_packages
-from fidsplat.commands.output import report
+from fidsplat.commands.output import console, print_lines, print_table, report
+from fidsplat.commands.progress_lines import duration
 from fidsplat.commands.scenes import Cameras, UserScenes, load_user_scenes
 from fidsplat.commands.sweeps import point_label, run_sweeps
 from fidsplat.experiments.tradeoff.run import TradeoffSettings
+from fidsplat.util import interrupts
+
+if TYPE_CHECKING:
+    from fidsplat.experiments.sweep import Sweep
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
 
@@ -68,7 +75,9 @@ class Tradeoff:
     compared with a float64 reference without cut-offs. Markers are also compared with the ideal printed
     texture, and tilted until no detector reads them. Results are JSON lines, written immediately; an
     interrupted run resumes. Several devices are measured one after the other, each into a folder of its name
-    in DIR. Keep the machine idle. --scene measures your own scene, as in `fidsplat bench`.
+    in DIR. Keep the machine idle. --scene measures the splats of your own scene from its camera, or from
+    eight poses of --cameras, with --quick from two. The command first estimates its time; its table shows
+    what was measured, also after Ctrl-C. --quick stops after 3 minutes; the same command continues.
 
       r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
       r100k_720p_3d, r1m_1080p_3d      3D Gaussians, with each method of rendering them
@@ -104,7 +113,7 @@ class Tradeoff:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.tradeoff.run import prepared
+        from fidsplat.experiments.tradeoff.run import QUICK_VIEWS, prepared
         from fidsplat.experiments.tradeoff.scenes import user_views
         from fidsplat.render.renderer import default_device
 
@@ -112,7 +121,8 @@ class Tradeoff:
             check_plot(self.plot, "pandas")
         folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.measurement.quick else ""))
         devices = tuple(dict.fromkeys(self.device)) or (default_device(),)
-        own = user_views(load_user_scenes(self.scene, self.cameras, self.measurement.scenes or ()))
+        most = QUICK_VIEWS if self.measurement.quick else None
+        own = user_views(load_user_scenes(self.scene, self.cameras, self.measurement.scenes or (), most))
         folders = [folder / name.replace(":", "-") for name in devices] if len(devices) > 1 else [folder]
         with ExitStack() as stack:
             # open all devices first, so that a missing one is reported before another is measured
@@ -120,7 +130,16 @@ class Tradeoff:
                 stack.enter_context(prepared(self.measurement, out, device, own))
                 for out, device in zip(folders, devices, strict=True)
             ]
-            measured = run_sweeps(sweeps)
+            for sweep in sweeps:
+                _print_estimate(sweep)
+            try:
+                measured = run_sweeps(sweeps)
+            except KeyboardInterrupt:
+                with interrupts.postponed():
+                    _print_results(sweeps, self.json)
+                raise
+        if not self.json:
+            _print_results(sweeps, False)
         if self.plot is not None:
             from fidsplat.experiments.tradeoff.report import write_plot
 
@@ -131,7 +150,46 @@ class Tradeoff:
             if record.failed
         ]
         files = [str(sweep.results.file) for sweep in sweeps]
-        points = sum(len(sweep.points) for sweep in sweeps)
+        points, left = (
+            sum(map(len, each)) for each in zip(*((s.points, s.left) for s in sweeps), strict=True)
+        )
         lines = [*(f"not measured: {line}" for line in refused), *files]
+        if left > len(refused):  # by the time limit
+            lines.append(f"{left} of {points} points are not measured yet; the same command continues")
         lines.append(f"a page of them: fidsplat tradeoff report {' '.join(map(str, folders))}")
         return report(self.json, {"files": files, "points": points, "refused": refused}, *lines)
+
+
+def _print_estimate(sweep: Sweep) -> None:
+    """Print the number of missing points and the estimated time on stderr."""
+    if sweep.estimate is None or not (left := len(sweep.left)):
+        return
+    seconds = sweep.estimate()
+    line = f"{sweep.name}: {left} points, about {duration(seconds)}"
+    if sweep.limit is not None and seconds > sweep.limit.seconds:
+        line += f"; --quick stops after {duration(sweep.limit.seconds)}, the same command continues"
+    print_lines(console(True), line)
+
+
+def _print_results(sweeps: Sequence[Sweep], as_json: bool) -> None:
+    """Print the measured points of each device: time relative to the baseline and largest error."""
+    from fidsplat.experiments.tradeoff.run import POINT
+
+    for sweep in sweeps:
+        found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        for record in sweep.records:
+            if record.key["what"] == POINT and not record.failed:
+                found.setdefault((record.key["knob"], record.key["value"]), []).append(record.result)
+        if found:
+            rows = [
+                (
+                    *names,
+                    len(results),
+                    f"{statistics.median(result['ratio'] for result in results):.2f}",
+                    f"{max(result['maximum'] for result in results):.2g}",
+                )
+                for names, results in found.items()
+            ]
+            title = f"{sweep.name}: {len(sweep.records)} of {len(sweep.points)} points"
+            heads = ("setting", "value", "views", "time / baseline", "largest error")
+            print_table(console(as_json), title, heads, rows)

@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 import os
 import re
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import groupby, zip_longest
 from pathlib import Path
@@ -103,6 +104,27 @@ class Results:
         return record
 
 
+class TimeLimit:
+    """Time limit of a run: no batch begins that would exceed it if it took as long as the longest so far."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds, self._longest = seconds, 0.0
+        self._begun: float | None = None
+
+    def allows(self) -> bool:
+        """Whether another batch may begin. The first call starts the time."""
+        now = time.monotonic()
+        self._begun = now if self._begun is None else self._begun
+        return now - self._begun + self._longest < self.seconds
+
+    @contextmanager
+    def batch(self) -> Iterator[None]:
+        """Time a batch."""
+        begun = time.monotonic()
+        yield
+        self._longest = max(self._longest, time.monotonic() - begun)
+
+
 @dataclass(frozen=True, eq=False)
 class Sweep:
     """Points with their measurement."""
@@ -118,6 +140,16 @@ class Sweep:
     """runs the host work of a batch in parallel"""
     record_errors: bool = False
     """store a FidsplatError of the device work as the result `error`"""
+    limit: TimeLimit | None = None
+    """limit of a run, which leaves the other points to the next run"""
+    estimate: Callable[[], float] | None = None
+    """estimates the seconds of the missing points"""
+
+    @property
+    def records(self) -> list[Record]:
+        """Records of its points, also of earlier runs."""
+        done = self.results.done
+        return [done[name] for name in map(name_of, self.points) if name in done]
 
     @property
     def left(self) -> list[Key]:
@@ -130,10 +162,13 @@ class Sweep:
     def run_batch(self, keys: Sequence[Key]) -> Iterator[Record]:
         """Measure the missing points of a batch."""
         keys = self.results.left(keys)
-        work = [self._begin(key) for key in keys]
-        results = map(_call, work) if self.pool is None else self.pool.map(_call, work)
-        for key, result in zip(keys, results, strict=True):
-            yield self.results.append(key, result)
+        if not keys or (self.limit is not None and not self.limit.allows()):
+            return
+        with nullcontext() if self.limit is None else self.limit.batch():
+            work = [self._begin(key) for key in keys]
+            results = map(_call, work) if self.pool is None else self.pool.map(_call, work)
+            for key, result in zip(keys, results, strict=True):
+                yield self.results.append(key, result)
 
     def _begin(self, key: Key) -> Work:
         try:

@@ -1,12 +1,14 @@
 """`fidsplat tradeoff` as a command: how a run survives, own scenes, several devices, wrong words."""
 
 import json
+import re
+import time
 
 import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.experiments.sweep import read_records
+from fidsplat.experiments.sweep import TimeLimit, read_records
 from fidsplat.experiments.tradeoff import compare, run
 from fidsplat.experiments.tradeoff.scenes import NAMES, scene_names
 from fidsplat.experiments.tradeoff.summary import load
@@ -30,7 +32,12 @@ def test_an_interrupted_run_continues(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(run.TradeoffSettings, "workers", 1)
     monkeypatch.setattr(compare, "QUICK_TILTS", "0:40:20")
     assert main(words) == 130
-    assert "interrupted" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "interrupted" in err
+    assert re.search(r"tradeoff on auto: \d+ points, about \d+ s", err)  # the estimate
+    assert re.search(r"tradeoff on auto: 2 of \d+ points", err)  # what is measured so far
+    assert re.search(r"^base +base +2 +\d", err, re.MULTILINE)
     file = tmp_path / run.FILE
     first = file.read_text()
     assert [record.key for record in read_records(file)] == begun[:2]
@@ -52,6 +59,35 @@ def test_an_interrupted_run_continues(capsys, tmp_path, monkeypatch):
     assert file.read_bytes() == before
 
 
+def test_a_quick_run_stops_in_time_and_continues(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "QUICK_SECONDS", 0.0)
+    words = [*WORDS, "-o", str(tmp_path)]
+    assert main(words) == 0
+    out, err = capsys.readouterr()
+    assert "--quick stops after 0 s, the same command continues" in err
+    total = int(re.search(r"(\d+) of \1 points are not measured yet", out)[1])
+    assert read_records(tmp_path / run.FILE) == []
+
+    monkeypatch.setattr(run, "QUICK_SECONDS", 150.0)
+    monkeypatch.setattr(run, "_begin", lambda session, key, quick: lambda: {"ratio": 1.0, "maximum": 0.1})
+    assert main(words) == 0
+    assert "not measured yet" not in capsys.readouterr().out
+    assert len(read_records(tmp_path / run.FILE)) == total
+
+
+def test_no_batch_begins_that_would_exceed_the_limit(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    limit = TimeLimit(100.0)
+    for seconds in (10.0, 30.0, 20.0):
+        assert limit.allows()
+        with limit.batch():
+            now[0] += seconds
+    assert limit.allows()  # 60 s passed, at most 30 s more
+    now[0] += 10.0
+    assert not limit.allows()
+
+
 def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene_file = tmp_path / "own.toml"
@@ -60,12 +96,12 @@ def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, mon
         "[camera]\nwidth = 64\nheight = 48\nfov_x_deg = 60.0\nposition = [0.0, 0.0, 0.0]\n"
         'look_at = [0.0, 0.0, 1.0]\n[[splats]]\nfile = "own.ply"\n'
     )
-    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0.2 0 0 0 0 0 1\n")
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0.1 0 0 0 0 0 1\n2 0.2 0 0 0 0 0 1\n")
     words = ["tradeoff", "--quick", "--scene", "own.toml", "--cameras", "poses.tum", "-o", "out"]
     words += ["--knobs", "opacity_ceiling"]
     assert main(words) == 0
     records = read_records(tmp_path / "out" / run.FILE)
-    views = ("own.toml@0", "own.toml@1")
+    views = ("own.toml@0", "own.toml@2")  # --quick measures two
     found = {(r.key["scene"], r.key["what"], r.key.get("value")): r.result for r in records}
     assert {key[0] for key in found} == set(views)
     assert {key[1] for key in found} == {"point", "truth"}

@@ -382,8 +382,8 @@ def test_ones_own_scene_with_everything_it_requests(tmp_path, monkeypatch, capsy
     assert less["lens"].capture.camera.lens is None
     assert not less["shutter"].capture.exposed
     assert less["outputs"].capture.outputs == ("rgb",)
-    assert len(less["markers"].cloud) == 20
-    assert all(one.cloud is None for name, one in less.items() if name != "markers")
+    assert len(less["markers"].cloud()) == 20
+    assert all(one.cloud() is None for name, one in less.items() if name != "markers")
 
 
 def test_a_scenes_shutter_moves_along_the_cameras(tmp_path, monkeypatch):

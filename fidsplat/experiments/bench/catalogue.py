@@ -87,7 +87,9 @@ MOST_VIEWS = 8
 """maximum views of a user's scene, evenly spread over the trajectory"""
 
 
-def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, BenchScene]:
+def own_scenes(
+    name: str, scene: Scene, path: Trajectory | None, most_views: int = MOST_VIEWS
+) -> dict[str, BenchScene]:
     """Benchmark scenes of a user's scene by name, such as `room.toml@2`, with everything that it requests.
 
     The view is its camera, or poses of a trajectory (camera to world), along which its shutter moves.
@@ -102,7 +104,7 @@ def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, Be
         captures = {name: scene.capture}
     else:
         poses = len(path)
-        some = sorted({round(k) for k in np.linspace(0, poses - 1, min(poses, MOST_VIEWS))})
+        some = sorted({round(k) for k in np.linspace(0, poses - 1, min(poses, most_views))})
         flight = Flight(scene, path, np.asarray(path.times)[some], scene.capture)
         captures = {f"{name}@{k}": capture for k, capture in zip(some, flight.captures, strict=True)}
     return {

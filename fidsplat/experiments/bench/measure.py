@@ -193,7 +193,8 @@ class SceneRun:
             self.result.first_frame_ms = Timer(self._first).run()
             self._count(cloud)
             for name, less in without.items():
-                resident = self.resident if less.cloud is None else self.renderer.upload(less.cloud)
+                rest = less.cloud()
+                resident = self.resident if rest is None else self.renderer.upload(rest)
                 self.result.without[name] = frame_timer(
                     self.renderer, resident, less.capture, catch_errors=True
                 )

@@ -18,8 +18,12 @@ class Reduced:
     """A frame without an effect."""
 
     capture: Capture
-    cloud: SplatCloud | None = None
-    """None: all splats"""
+    scene: Scene | None = None
+    """scene of its splats, if some are left out"""
+
+    def cloud(self) -> SplatCloud | None:
+        """Its splats; None: all."""
+        return None if self.scene is None else self.scene.cloud()
 
 
 def without_effects(scene: Scene, capture: Capture) -> dict[str, Reduced]:
@@ -46,7 +50,7 @@ def without_effects(scene: Scene, capture: Capture) -> dict[str, Reduced]:
     if scene.markers and (scene.clouds or scene.stores):
         rest = replace(scene, markers=())
         motion = Motion(capture.motion.camera, rest.motion.groups)
-        found["markers"] = Reduced(replace(capture, motion=motion), rest.cloud())
+        found["markers"] = Reduced(replace(capture, motion=motion), rest)
     return found
 
 

@@ -10,14 +10,16 @@ from importlib.metadata import version
 from pathlib import Path
 
 from fidsplat.accuracy.error import REFERENCE_CUTOFF
+from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.run import device_name
-from fidsplat.experiments.sweep import Key, Results, Sweep, Work, thread_pool
+from fidsplat.experiments.sweep import Key, Results, Sweep, TimeLimit, Work, thread_pool
 from fidsplat.experiments.tradeoff import compare, points, scenes
 from fidsplat.experiments.tradeoff.points import ABLATION, BASE, MARKER, PRESET, Point
-from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Session, time_point
+from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Effort, Session, time_point
 from fidsplat.render.renderer import Renderer
 from fidsplat.util.errors import InputError
 from fidsplat.util.provenance import run_facts
+from fidsplat.util.timing import frame_timer
 from fidsplat.vision.metrics import metric_versions
 from fidsplat.vision.readers import reader_versions
 
@@ -27,6 +29,12 @@ POINT, DECODE, REFERENCE = "point", "decode", "truth"
 """measurements in stored keys: of a quality, of the largest readable tilt, of a reference image"""
 IDEAL = "ideal"
 _EARLY = ("base", PRESET, ABLATION, "alpha_cutoff", "transmittance_stop", MARKER)
+QUICK_SECONDS = 150.0
+"""time limit of the measurement of --quick, which promises 3 minutes with loading and the last batch"""
+QUICK_VIEWS = 2
+"""maximum number of views of a user's scene with --quick"""
+OVERHEAD, REFERENCE_FRAMES = 0.7, 8
+"""estimates: seconds of a point for compilation and evaluation; time of a reference image, in frames"""
 _BATCH = 16
 """maximum number of points whose images wait for evaluation"""
 
@@ -40,7 +48,8 @@ class TradeoffSettings:
     settings: tuple[str, ...] | None = None
     """Quality settings to vary, see `points.SETTINGS`. By default all."""
     quick: bool = False
-    """Measure few values, few frames and four scenes."""
+    """Measure few values and frames, four scenes or two of your views, for at most 3 minutes per device; the
+    same command continues."""
     overwrite: bool = False
     """Replace existing results."""
     workers: int = min(_BATCH, os.cpu_count() or 1)
@@ -79,7 +88,37 @@ def prepared(
             options.workers,
             pool,
             record_errors=True,
+            limit=TimeLimit(QUICK_SECONDS) if quick else None,
+            estimate=lambda: estimated_seconds(session, results.left(keys), QUICK if quick else FULL),
         )
+
+
+def estimated_seconds(session: Session, keys: list[Key], effort: Effort) -> float:
+    """Estimated seconds of points, from the time of one frame of the baseline per scene."""
+    frames: dict[str, float] = {}
+    total = 0.0
+    for key in keys:
+        name = key["scene"].partition("@")[0]
+        if key["what"] == DECODE:
+            total += OVERHEAD * len(parse_tilts(key["tilts"]))
+            continue
+        if name not in frames:
+            session.render(key["scene"], BASE).wait()  # compiles
+            frames[name] = frame_timer(
+                session.renderer,
+                session.resident(key["scene"], BASE.marker),
+                session.scene(key["scene"], BASE.marker).capture,
+                quality=BASE,
+            ).run()
+        frame = 1e-3 * frames[name]
+        if key["what"] == REFERENCE:
+            total += OVERHEAD + REFERENCE_FRAMES * frame * key["samples"] ** 2
+            continue
+        samples = key["quality"].get("samples", 1) ** 2
+        rounds = min(max(effort.minimum, effort.seconds / max(frame * (1 + samples), 1e-6)), effort.maximum)
+        # own frames: the image, its memory, warm-up and rounds; of the baseline: warm-up and rounds
+        total += OVERHEAD + frame * ((rounds + 3) * samples + rounds + 1)
+    return total
 
 
 def all_points(names: tuple[str, ...], settings: tuple[str, ...], quick: bool) -> list[Key]:

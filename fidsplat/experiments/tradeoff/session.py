@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -89,6 +90,8 @@ class Effort:
 
 
 FULL, QUICK = Effort(), Effort(3, 5, 0.2)
+SLOW = 3.0
+"""seconds of a first frame, with compilation, above which a quick measurement has one round"""
 
 
 def time_point(session: Session, view: str, quality: Quality, effort: Effort) -> tuple[Frame, dict]:
@@ -99,7 +102,9 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
     image; None if the backend does not report it), `splats`, `pairs`.
     """
     memory = memory_of(session, view, quality)
-    frame = session.render(view, quality)
+    begun = time.perf_counter()
+    frame = session.render(view, quality).wait()
+    slow = effort is QUICK and time.perf_counter() - begun > SLOW
     own, base = (
         frame_timer(
             session.renderer,
@@ -110,7 +115,11 @@ def time_point(session: Session, view: str, quality: Quality, effort: Effort) ->
         for timed in (quality, BASE)
     )
     time_interleaved(
-        [own, base], effort.maximum, min_rounds=effort.minimum, seconds=effort.seconds, warm_up=1
+        [own, base],
+        effort.maximum,
+        min_rounds=1 if slow else effort.minimum,
+        seconds=effort.seconds,
+        warm_up=1,
     )
     result: dict = {"repeats": len(own.ms), "stages_ms": own.part_medians, "memory_bytes": memory}
     for name, values in (("ms", own.ms), ("base_ms", base.ms), ("ratio", ratios(own, base))):
