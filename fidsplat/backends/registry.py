@@ -13,6 +13,7 @@ from fidsplat.backends.caches import ensure_caches
 from fidsplat.backends.interface import Backend, DeviceInfo
 from fidsplat.util.errors import DeviceError, UnknownDeviceError, unknown
 from fidsplat.util.limits import check_driver
+from fidsplat.util.markup import html_table
 
 FAMILIES = {
     "opencl": "fidsplat.backends.opencl.device",
@@ -48,7 +49,15 @@ def open_backend(name: str) -> Backend:
     return import_module(FAMILIES[family]).open_device(selector)
 
 
-def devices() -> list[DeviceInfo]:
+class Devices(list[DeviceInfo]):
+    """Devices, which notebooks show as a table."""
+
+    def _repr_html_(self) -> str:
+        rows = ((one.name, one.title, "yes" if one.usable else "no", one.reason) for one in self)
+        return html_table(("device", "title", "usable", "remark"), rows)
+
+
+def devices() -> Devices:
     """List all devices: those that can be opened, and those that cannot, with the reason.
 
     Raises:
@@ -56,7 +65,7 @@ def devices() -> list[DeviceInfo]:
     """
     for family in FAMILIES:
         _prepare(family)
-    return [info for module in FAMILIES.values() for info in import_module(module).devices()]
+    return Devices(info for module in FAMILIES.values() for info in import_module(module).devices())
 
 
 def _open_first() -> Backend:

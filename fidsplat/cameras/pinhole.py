@@ -10,6 +10,7 @@ from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens
 from fidsplat.splats.rotations import check_similarity
 from fidsplat.util.arguments import LARGEST, PickledByFields, invalid, real_array
 from fidsplat.util.errors import InputError
+from fidsplat.util.markup import Summarised, point
 
 MAX_SIZE = 32767
 """largest width and height in pixels: pixel numbers fit 16 bits on every device"""
@@ -19,7 +20,7 @@ FOCAL_LENGTHS = 1e-6, 1e18
 
 
 @dataclass(frozen=True, eq=False)
-class Camera(PickledByFields):
+class Camera(PickledByFields, Summarised):
     """Camera: a pinhole, or one with a lens. A pinhole projects a point (X, Y, Z) of the camera frame to
     x = fx X / Z + cx, y = fy Y / Z + cy; a lens replaces X / Z and Y / Z.
 
@@ -220,6 +221,20 @@ class Camera(PickledByFields):
         return replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=cy
         )
+
+    def summary(self) -> dict[str, str]:
+        """Size, intrinsics, lens and pose in words, for notebooks."""
+        lens = self.lens
+        changes = [] if lens is None else [(f.name, getattr(lens, f.name)) for f in fields(lens)]
+        values = ", ".join(f"{name} = {value:g}" for name, value in changes if value)
+        return {
+            "size": f"{self.width} x {self.height} pixels",
+            "focal length": f"{self.fx:.6g}, {self.fy:.6g} pixels",
+            "principal point": f"{self.cx:.6g}, {self.cy:.6g} pixels",
+            "lens": "none" if lens is None else f"{lens.kind} {values}".strip(),
+            "position": f"{point(self.position)} m",
+            "looks along": point(self.world_to_camera[2, :3]),
+        }
 
     @property
     def matrix(self) -> np.ndarray:

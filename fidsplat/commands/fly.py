@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Json, Overwrite, RayAddress, Workers, check_workers, writable_file
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from fidsplat.cameras import Trajectory
     from fidsplat.render.flight import Flight, FlightFolder
     from fidsplat.scenes import Scene
+    from fidsplat.vision.bop import BopScene
+    from fidsplat.vision.truth import Truth
 
 DEFAULT_FOLDER = "fidsplat-flight"
 CAMERA = "camera"
@@ -63,6 +65,11 @@ class Fly(RenderInput):
     """FILE.mcap|BAG: also write a ROS 2 log of images, intrinsics and poses (extra: logs)"""
     coco: str | None = None
     """FILE.json: also write the markers in each image as COCO annotations"""
+    bop: str | None = None
+    """DIR: also write a scene of a BOP data set, e.g. dataset/train/000000 (outputs: rgb, depth, label)"""
+    compress: Annotated[
+        Literal["jpeg", "png"] | None, option("jpeg|png", "compress rgb in the log, as CompressedImage")
+    ] = None
     size: Size = None
     ray: RayAddress = None
     workers: Workers = None
@@ -74,6 +81,7 @@ class Fly(RenderInput):
         from fidsplat.formats import load_trajectory
         from fidsplat.images.video import check_video
         from fidsplat.render.flight import Flight, FlightFolder
+        from fidsplat.vision.coco import CocoAnnotations
 
         self.check()
         check_workers(self.ray, self.workers)
@@ -90,6 +98,7 @@ class Fly(RenderInput):
         scene = self.load(size=self.size)
         path = path or _camera_motion(self.source, scene, self.smooth)
         times = path.sampled(self.rate).times if self.times is None else _parse_times(self.times)
+        bop = None if self.bop is None else self._open_bop(scene)
         flight = Flight(scene, path, times, scene.capture.with_(outputs=self.outputs, quality=self.quality))
         with self._engine(flight) as (title, render):
             log_is_complete = self._log_is_complete(flight.key(title))
@@ -102,10 +111,28 @@ class Fly(RenderInput):
         if self.video is not None:
             list(show_progress("video", folder.write_video(self.video, self.rate), len(flight)))
         if self.log is not None and not log_is_complete:
-            list(show_progress("log", write_log(folder, self.log, self.overwrite), len(flight)))
+            frames = write_log(folder, self.log, self.overwrite, self.compress)
+            list(show_progress("log", frames, len(flight)))
         if self.coco is not None:
-            list(show_progress("truth", write_truth(folder, self.coco), len(flight)))
+            annotations = CocoAnnotations()
+            add = lambda file, _, truth: annotations.add(file, truth)  # noqa: E731
+            list(show_progress("truth", write_truth(folder, add), len(flight)))
+            annotations.save(self.coco)
+        if bop is not None:
+            with bop:
+                add = lambda _, images, truth: bop.add(images, truth)  # noqa: E731
+                list(show_progress("BOP", write_truth(folder, add), len(flight)))
         return self._report(folder, sheet, left, seconds)
+
+    def _open_bop(self, scene: Scene) -> BopScene:
+        """The BOP scene to write; raises InputError for flights that it cannot represent."""
+        from fidsplat.vision.bop import BopScene, check_bop_camera
+
+        if scene.camera is not None:
+            check_bop_camera(scene.camera)
+        if "rgb" not in self.outputs:
+            raise InputError(f"--bop must have rgb among --outputs, got {','.join(self.outputs)}")
+        return BopScene(str(self.bop))
 
     def _log_is_complete(self, source: str) -> bool:
         """Whether an interrupted run of the same flight has already written the log."""
@@ -140,10 +167,11 @@ class Fly(RenderInput):
         facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
         facts |= {"drawn": rendered, "seconds": seconds, "folder": str(folder.folder)}
         facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
+        facts["bop"] = self.bop
         earlier = f" ({frames - rendered} of an earlier run)" if rendered < frames else ""
         rate = f", {rendered / seconds:.1f} per second" if rendered else ""
         lines = [f"{frames} frames{earlier} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)]
-        files = (name for name in (self.video, self.log, self.coco) if name is not None)
+        files = (name for name in (self.video, self.log, self.coco, self.bop) if name is not None)
         return report(self.json, facts, *lines, *files)
 
 
@@ -166,7 +194,7 @@ def _parse_times(text: str) -> list[float]:
         ) from None
 
 
-def write_log(folder: FlightFolder, path: str, overwrite: bool) -> Iterator[int]:
+def write_log(folder: FlightFolder, path: str, overwrite: bool, compress: str | None = None) -> Iterator[int]:
     """Write rgb, outputs that are arrays, intrinsics and poses to a log; yields the number of each frame."""
     from fidsplat.logs import RobotLog
 
@@ -178,20 +206,21 @@ def write_log(folder: FlightFolder, path: str, overwrite: bool) -> Iterator[int]
         for k, (seconds, pose) in enumerate(zip(flight.path.times, flight.path.poses, strict=True)):
             moment = float(seconds) - start
             for name, image in _load_images(folder, k).items():
-                log.image(moment, CAMERA, image, name)
+                log.image(moment, CAMERA, image, name, compress if name == "rgb" else None)
             log.camera_info(moment, CAMERA, camera)
             log.transform(moment, CAMERA, pose)
             yield k
 
 
-def write_truth(folder: FlightFolder, path: str) -> Iterator[int]:
-    """Write the markers in each image as COCO annotations; yields the number of each frame."""
+def write_truth(
+    folder: FlightFolder, add: Callable[[str, Mapping[str, np.ndarray], Truth], object]
+) -> Iterator[int]:
+    """Call `add` with file, images and truth of each frame; yields its number."""
     from fidsplat.images.files import read_image
     from fidsplat.render.output_files import suffixes_of
-    from fidsplat.vision.coco import CocoAnnotations
     from fidsplat.vision.truth import truth_of
 
-    annotations, flight = CocoAnnotations(), folder.flight
+    flight = folder.flight
     for k, capture in enumerate(flight.captures):
         scene = replace(flight.scene, shutter=capture.shutter)
         assert capture.camera is not None
@@ -199,9 +228,8 @@ def write_truth(folder: FlightFolder, path: str) -> Iterator[int]:
         name = flight.capture.outputs[0]
         file = folder.file(k, name, suffixes_of(name)[-1])
         images = _load_images(folder, k) or {name: read_image(file)}
-        annotations.add(str(file.relative_to(folder.folder)), truth_of(images, scene, camera))
+        add(str(file.relative_to(folder.folder)), images, truth_of(images, scene, camera))
         yield k
-    annotations.save(path)
 
 
 def _load_images(folder: FlightFolder, k: int) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.cameras import Camera, Trajectory
+from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, Trajectory
 from fidsplat.cameras.trajectory import check_rate
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import image_poses
@@ -32,6 +32,7 @@ RATE = 10.0
 ROUNDED = 1e-3
 """tolerance of rotations: files often have six digits"""
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenGL's and OpenCV's camera axes
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _SUFFIXES = ".tum and .txt (TUM), .kitti, .json (transforms.json), or a folder (COLMAP)"
 
 
@@ -115,7 +116,7 @@ def save_trajectory(
     elif suffix == ".kitti":
         text = _rows(trajectory.poses[:, :3, :].reshape(-1, 12))
     elif suffix == ".json":
-        text = json.dumps(_transforms_json(trajectory, _pinhole(camera, file), names), indent=2) + "\n"
+        text = json.dumps(_transforms_json(trajectory, _camera(camera, file), names), indent=2) + "\n"
     else:
         raise InputError(f"the suffix of a trajectory must be one of {_SUFFIXES}, got {file}")
     with atomic_write(file) as stream:
@@ -127,12 +128,30 @@ def _rows(rows: np.ndarray) -> str:
     return "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
 
 
-def _pinhole(camera: Camera | None, file: Path) -> Camera:
+def _camera(camera: Camera | None, file: Path) -> Camera:
     if not isinstance(camera, Camera):
         raise InputError(f"{file} needs a Camera for size and focal lengths, got {camera!r}; give camera=")
+    return camera
+
+
+def _pinhole(camera: Camera | None, file: Path) -> Camera:
+    camera = _camera(camera, file)
     if camera.lens is not None:
         raise InputError(f"the camera of {file} must be a pinhole, got the lens {camera.lens.kind}")
     return camera
+
+
+def lens_table(lens: Lens | None) -> dict[str, Any] | None:
+    """A lens in nerfstudio's transforms.json; None if it has no such model."""
+    if lens is None:
+        return {"camera_model": "OPENCV"}
+    values = {name: value for name, value in vars(lens).items() if name in _COEFFICIENTS and value}
+    if isinstance(lens, Fisheye):
+        return {"camera_model": "OPENCV_FISHEYE"} | values
+    if not isinstance(lens, BrownConrady) or any((lens.s1, lens.s2, lens.s3, lens.s4)):
+        return None
+    rational = any((lens.k4, lens.k5, lens.k6))
+    return {"camera_model": "FULL_OPENCV" if rational else "OPENCV"} | values
 
 
 def _transforms_json(trajectory: Trajectory, camera: Camera, names: Sequence[str]) -> dict[str, Any]:
@@ -144,7 +163,13 @@ def _transforms_json(trajectory: Trajectory, camera: Camera, names: Sequence[str
     ]
     intrinsics = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
     intrinsics |= {"cx": camera.cx, "cy": camera.cy}
-    return {"camera_model": "OPENCV"} | intrinsics | {"frames": frames}
+    lens = lens_table(camera.lens)
+    if lens is None:
+        raise InputError(
+            "the lens of a transforms.json must be a fisheye, or brown_conrady without s1 to s4, got "
+            f"{camera.lens}; write .tum"
+        )
+    return lens | intrinsics | {"frames": frames}
 
 
 def _of_folder(folder: Path) -> Path:

@@ -34,12 +34,24 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.spec import Spec
-from fidsplat.util.arguments import PickledByFields, flag, instance, number, text, whole_number
+from fidsplat.util.arguments import (
+    PickledByFields,
+    flag,
+    instance,
+    invalid,
+    number,
+    real_array,
+    text,
+    whole_number,
+)
 from fidsplat.util.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
 from fidsplat.splats.cloud import SplatCloud
+
+Ink = tuple[float, float, float]
+_INKS: tuple[Ink, Ink] = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
 MAX_MODULES = 4096
 """Maximum edge of a grid with its quiet zone, in modules."""
@@ -117,11 +129,22 @@ class Marker(PickledByFields):
     """maximum number of splats"""
     outside: int = 0
     """modules of the code on each side of the square that `size` and `corners` measure"""
+    inks: tuple[Ink, Ink] | None = None
+    """RGB of the dark and of the light modules, as given; None: black and white, or a drawing's colours"""
 
     def __repr__(self) -> str:
         return (
             f"Marker({self.spec!r}, {self.size:g} m, {len(self.boxes)} rectangles, {len(self.cloud)} splats)"
         )
+
+    def _repr_png_(self) -> bytes:
+        """PNG of the printed code for notebooks; modules without paper are grey."""
+        from fidsplat.images.files import encode_png  # here, since it imports OpenCV
+
+        holes = (self.grid == HOLE)[..., None]
+        modules = np.where(holes, 0.5, self.palette[np.where(self.grid == HOLE, 0, self.grid)])
+        pixels = max(1, 256 // max(self.grid.shape))
+        return encode_png(modules.repeat(pixels, 0).repeat(pixels, 1))
 
     @property
     def module(self) -> float:
@@ -155,7 +178,8 @@ class Marker(PickledByFields):
     @property
     def is_dark(self) -> np.ndarray:
         """Which rectangles are nearer to black than to white, (n,) bool."""
-        return (self.palette.mean(1) < 0.5)[self.values]
+        limit = 0.5 if self.inks is None else self.palette.mean()
+        return (self.palette.mean(1) < limit)[self.values]
 
     @cached_property
     def polygons(self) -> list[Polygon]:
@@ -185,6 +209,8 @@ def marker(
     duplicates: bool | None = None,
     growth: float | None = None,
     template: int | None = None,
+    black: Ink | None = None,
+    white: Ink | None = None,
     quality: MarkerQuality | None = None,
     max_splats: int = MAX_SPLATS,
     progress: Progress | None = None,
@@ -206,6 +232,8 @@ def marker(
             rectangle, 1, 5, 9, 13, 25, 41, 121 or 562; default 25.
         growth: modules, 0 to 1, by which a rectangle extends across a side that borders only its own colour,
             against seams; default the value that the fitted templates were optimised with, and 0 for paper.
+        black, white: RGB of the dark and light modules in [0, 1], black darker than white; default (0, 0, 0)
+            and (1, 1, 1). Printed ink and paper are nearer to (0.05, 0.05, 0.05) and (0.85, 0.85, 0.85).
         quality: defaults of mixture, levels, density, growth and template (`Quality.marker`); settings of
             other mixtures are ignored.
         max_splats: maximum number of splats; an image of noise can need tens of millions.
@@ -228,7 +256,8 @@ def marker(
     quiet = _quiet_zone(spec, parsed, bits, quiet_zone)
     grid = np.pad(bits, quiet)
     each = 1 if chosen.mixture == "exact" else min(len(template.gaussians) for template in templates)
-    palette = np.array(parsed.colors or ((1, 1, 1), (0, 0, 0)), np.float32)
+    inks = None if black is None and white is None else _inks(parsed, black, white)
+    palette = np.array(parsed.colors or (inks or _INKS)[::-1], np.float32)
     if chosen.mixture == "facets":
         refuse_more(spec, count_facets(grid.shape), max_splats)
     elif len(palette) == 2 and grid.max() <= 1:
@@ -275,7 +304,25 @@ def marker(
         seconds=time.perf_counter() - start,
         max_splats=max_splats,
         outside=parsed.outside,
+        inks=inks,
     )
+
+
+def _inks(parsed: Spec, black: Ink | None, white: Ink | None) -> tuple[Ink, Ink]:
+    """Validated RGB of the dark and light modules."""
+    if parsed.colors is not None:
+        raise InputError(
+            f"black and white must be left out for a drawing with own colours, got {parsed.text}"
+        )
+    found = []
+    for name, given, default in zip(("black", "white"), (black, white), _INKS, strict=True):
+        color = real_array(name, default if given is None else given, "three numbers from 0 to 1")
+        if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
+            raise invalid(name, "three numbers from 0 to 1", given)
+        found.append(tuple(color.tolist()))
+    if not np.mean(found[0]) < np.mean(found[1]):
+        raise InputError(f"black must be darker than white, got {found[0]} and {found[1]}")
+    return found[0], found[1]
 
 
 def _quiet_zone(spec: str, parsed: Spec, bits: np.ndarray, modules: int | None) -> int:

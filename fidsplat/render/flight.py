@@ -18,6 +18,7 @@ from fidsplat.backends.view import NO_CAMERA
 from fidsplat.cameras import Motion, Shutter, Trajectory
 from fidsplat.capture.capture import Capture
 from fidsplat.formats import load_trajectory, save_trajectory
+from fidsplat.formats.trajectories import lens_table
 from fidsplat.images.files import read_image, write_png
 from fidsplat.images.video import write_video
 from fidsplat.images.visualize import contact_sheet
@@ -95,7 +96,7 @@ class FlightFolder:
     """Output folder of a flight: frames, camera poses and the record flight.json.
 
     Frames are OUTPUT/000000.png and so on, in the formats of `fidsplat render`. Poses are in trajectory.tum
-    and, for a pinhole camera, in transforms.json, which makes the folder a training data set.
+    and, for the lenses of nerfstudio, in transforms.json, which makes the folder a training data set.
 
     Args:
         overwrite: whether frames of another flight are replaced.
@@ -221,7 +222,7 @@ class FlightFolder:
     def _save_poses(self) -> None:
         save_trajectory(self.flight.path, self.folder / POSES)
         camera, names = self.flight.capture.camera, self.previews()
-        if camera is not None and camera.lens is None:
+        if camera is not None and lens_table(camera.lens) is not None:
             images = [str(file.relative_to(self.folder)) for file in names]
             save_trajectory(self.flight.path, self.folder / "transforms.json", camera, images)
 

@@ -38,7 +38,18 @@ CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale", "motion")
-MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion", "bundle")
+MARKER = (
+    "spec",
+    "size",
+    "position",
+    "quaternion",
+    "quiet_zone",
+    "max_splats",
+    "black",
+    "white",
+    "motion",
+    "bundle",
+)
 MARKERS = (*MARKER, *setting_types(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 
@@ -213,6 +224,7 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
     from fidsplat.markers import marker, with_file  # late: it imports heavy packages
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
+    limit |= {name: table.numbers(name, 3) for name in ("black", "white") if name in table}
     known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}
     with table.at():
         spec = with_file(spec, lambda name: str(folder / name))

@@ -74,6 +74,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
     spec = with_file(marker.spec, lambda name: os.path.relpath(name, folder))
     motion = {} if placed.motion is None else {"motion": keyframe_tables(placed.motion, marker.spec)}
     limit = {} if marker.max_splats == MAX_SPLATS else {"max_splats": marker.max_splats}
+    inks = {} if marker.inks is None else dict(zip(("black", "white"), map(list, marker.inks), strict=True))
     bundle = {} if placed.bundle is None else {"bundle": placed.bundle}
     return {
         "spec": spec,
@@ -83,6 +84,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
         **marker_settings(marker.quality, quality),
         "quiet_zone": int(marker.quiet_zone),
         **limit,
+        **inks,
         **bundle,
         **motion,
     }

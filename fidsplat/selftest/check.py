@@ -177,18 +177,24 @@ def worst_image(worst: Worst) -> np.ndarray:
     The difference and the certificate are scaled by a power of ten.
     """
     from fidsplat.images.files import to_uint8
-    from fidsplat.images.visualize import contact_sheet
+    from fidsplat.images.visualize import contact_sheet, write
 
     difference = np.abs(worst.device - worst.reference)
     certificate = np.repeat(worst.certificate[:, :, None], 3, axis=2)
-    panels = [(worst.title, worst.device), ("reference, float64", worst.reference)]
-    for name, plane in (("difference", difference), ("certificate", certificate)):
+    panels = [("device", worst.device), ("reference, float64", worst.reference)]
+    for name, plane in (("difference", difference), ("allowed by rounding", certificate)):
         peak = float(np.nan_to_num(plane, posinf=1.0).max(initial=0.0))
         factor = 10.0 ** np.clip(np.floor(-np.log10(peak)), 0, 9) if peak > 0 else 1.0
         panels.append((f"{name} x {factor:.0e}, at most {peak:.1e}", plane * factor))
     times = -(-400 // worst.device.shape[1])
     shown = [(name, to_uint8(plane).repeat(times, axis=0).repeat(times, axis=1)) for name, plane in panels]
-    return contact_sheet([shown[:2], shown[2:]], width=times * worst.device.shape[1])
+    sheet = contact_sheet([shown[:2], shown[2:]], width=times * worst.device.shape[1])
+    verdict = "FAILS: beyond rounding" if worst.rank[0] else "Agrees: the difference is due to rounding"
+    lines = (f"Case {worst.title}", f"{verdict} and decisions that rounding can flip (the certificate).")
+    caption = np.full((24 * len(lines) + 8, sheet.shape[1], 3), sheet[0, 0], np.uint8)
+    for row, line in enumerate(lines):
+        write(caption, line, (8, 24 * row + 18), size=0.45)
+    return np.concatenate([caption, sheet])
 
 
 def _in_words(number: int, difference: Difference) -> str:

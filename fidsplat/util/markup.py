@@ -2,6 +2,7 @@
 
 import html
 import re
+from collections.abc import Iterable
 
 _ACTIVE = re.compile(r"[&<>\[\]!|\\]")
 _SPACE = re.compile(r"\s+")
@@ -30,6 +31,15 @@ class Summarised:
             for name, words in self.summary().items()
         )
         return f"<b>{type(self).__name__}</b><table>{rows}</table>"
+
+
+def html_table(heads: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """An HTML table of texts with a header."""
+    lines = [("th", heads), *(("td", row) for row in rows)]
+    return "".join(
+        "<tr>" + "".join(f"<{tag}>{html.escape(str(cell))}</{tag}>" for cell in cells) + "</tr>"
+        for tag, cells in lines
+    ).join(("<table>", "</table>"))
 
 
 def point(values) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.cameras import Camera
 from fidsplat.images.files import write_png
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import atomic_write, from_json, read_text, writable_folder
@@ -63,10 +64,7 @@ class BopScene:
             InputError: a camera with a lens, which BOP does not support.
         """
         camera = truth.camera
-        if camera.lens is not None:
-            raise InputError(
-                "a BOP scene must have a pinhole camera without lens; render without one, or undistort"
-            )
+        check_bop_camera(camera)
         number = len(self._cameras)
         name = f"{number:06d}"
         write_png(self._folder / "rgb" / f"{name}.png", frame["rgb"])
@@ -119,6 +117,14 @@ class BopScene:
         ):
             _write(self._folder / name, content)
         _write(models, known | self._models)
+
+
+def check_bop_camera(camera: Camera) -> None:
+    """Raise InputError for a camera with a lens."""
+    if camera.lens is not None:
+        raise InputError(
+            "a BOP scene must have a pinhole camera without lens; render without one, or undistort"
+        )
 
 
 def _visibility(marker: MarkerTruth, truth: Truth, mask: np.ndarray) -> dict[str, Any]:

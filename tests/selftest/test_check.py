@@ -1,6 +1,7 @@
 """`fidsplat check`: reports of correct and of faulty devices."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,7 +79,10 @@ def test_a_bad_device_fails(renderer, spoil, words):
     assert any(words in failure for failure in result.failures), result.failures
     assert result.worst is not None
     assert result.worst.rank[0]
-    assert check.worst_image(result.worst).ndim == 3
+    sheet = check.worst_image(result.worst)
+    other = check.worst_image(replace(result.worst, rank=(False, 0.0)))
+    assert (sheet[:52] != other[:52]).any(), "the caption says whether it fails"
+    np.testing.assert_array_equal(sheet[56:], other[56:])
 
 
 def test_findings_that_do_not_hold(renderer):

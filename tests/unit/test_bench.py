@@ -414,7 +414,7 @@ def test_the_plot_has_a_bar_for_each_scene_and_device(tmp_path):
     words = ("--device", "reference", "--device", "opencl:pocl")
     assert bench("--scenes", "small", "other", *words, "--plot", file) == 0
     rendered = xml.dom.minidom.parse(str(file)).toxml()
-    for words in ("small", "other", "opencl:pocl", "reference", "ms per frame"):
+    for words in ("small", "other", "opencl:pocl", "reference", "ms per frame", "quartiles", "roofline:"):
         assert f"<!-- {words}" in rendered, words
 
 

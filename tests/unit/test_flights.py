@@ -118,6 +118,29 @@ def test_a_flights_log_is_read_from_where_its_camera_was(here, capsys):
     assert "in /tf at the time of /camera/image_raw 0.500 s" in capsys.readouterr().err
 
 
+def test_a_flight_is_written_as_bop_and_a_compressed_log(here, capsys):
+    logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
+    words = ("--times", "0,0.5", "--outputs", "rgb,label", "--log", "run.mcap", "--compress", "png")
+    assert fly(*words, "--bop", "set/train/000000") == 0
+    scene = here / "set" / "train" / "000000"
+    (pose,) = json.loads((scene / "scene_gt.json").read_text())["1"]
+    matrix = np.reshape(json.loads((scene / "scene_camera.json").read_text())["1"]["cam_K"], (3, 3))
+    half = 1000 * 0.4 / 2 * 8 / 6  # millimetres, with the quiet zone
+    sheet = np.array([(x, y, 0.0) for x in (-half, half) for y in (-half, half)])
+    turn, _ = cv2.Rodrigues(np.reshape(pose["cam_R_m2c"], (3, 3)))
+    corners = cv2.projectPoints(sheet, turn, np.array(pose["cam_t_m2c"]), matrix, None)[0][:, 0] + 0.5
+    y, x = np.nonzero(cv2.imread(str(scene / "mask_visib" / "000001_000000.png"), 0))
+    np.testing.assert_allclose([x.min(), x.max() + 1, y.min(), y.max() + 1],
+                               [*corners[[0, 2], 0], *corners[[0, 1], 1]], atol=1)  # fmt: skip
+    first, second = logs.log_images("run.mcap")
+    assert first.name.startswith("/camera/image_raw/compressed")
+    np.testing.assert_array_equal(second.image, read_image("out/rgb/000001.png"))
+    capsys.readouterr()
+    for options, says in ((words, "must not have a scene yet"), (("--outputs", "depth"), "must have rgb")):
+        assert fly(*options, "--bop", "set/train/000000") == 2
+        assert says in capsys.readouterr().err
+
+
 def test_poses_of_a_log_are_those_of_frames_in_the_world(here):
     logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
     pose = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])

@@ -51,6 +51,7 @@ def fake_marker(
         quality=knobs,
         quiet_zone=quiet_zone,
         max_splats=max_splats,
+        inks=None,
         cloud=cloud,
         corners=corners,
     )

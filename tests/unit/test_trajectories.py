@@ -4,6 +4,7 @@ import json
 import math
 import struct
 
+import cv2
 import numpy as np
 import pytest
 
@@ -251,13 +252,30 @@ def test_files_that_hold_no_trajectory(tmp_path):
             fs.load_trajectory(tmp_path / name)
 
 
+def test_lenses_of_transforms_json_are_those_of_opencv(tmp_path):
+    points, still = np.random.default_rng(3).uniform((-1, -1, 2), (1, 1, 3), (20, 3)), np.zeros(3)
+    brown = fs.Camera.pinhole(64, 48, 50.0, 52.0, 31.0, 25.0, lens=fs.BrownConrady(k1=-0.1, p2=0.01, k4=0.02))
+    for camera in (fs.Camera.fisheye(64, 48, 2.0, coefficients=(0.1, -0.02, 0.003, 0.001)), brown):
+        fs.save_trajectory(some(), tmp_path / "a.json", camera)
+        said = json.loads((tmp_path / "a.json").read_text())
+        fisheye = said["camera_model"] == "OPENCV_FISHEYE"
+        names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        matrix = np.array([[said["fl_x"], 0, said["cx"]], [0, said["fl_y"], said["cy"]], [0, 0, 1]])
+        project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+        values = np.array([said.get(name, 0.0) for name in names])
+        theirs, _ = project(points[:, None], still, still, matrix, values)
+        np.testing.assert_allclose(theirs[:, 0], camera.project(points), atol=1e-9)
+
+
 def test_what_cannot_be_written(tmp_path):
     lens = fs.Camera.fisheye(64, 48, 2.0)
+    prism = fs.Camera.pinhole(64, 48, 50.0, 50.0, 32.0, 24.0, lens=fs.BrownConrady(s1=0.01))
     for name, camera, images, words in (
         ("a.csv", CAMERA, None, "the suffix of a trajectory must be one of .tum and .txt .TUM., .kitti,"),
         ("a.json", None, None, "needs a Camera for size and focal lengths, got None; give camera="),
         ("model", None, None, "needs a Camera for size and focal lengths, got None; give camera="),
-        ("a.json", lens, None, r"must be a pinhole, got the lens fisheye"),
+        ("model", lens, None, r"must be a pinhole, got the lens fisheye"),
+        ("a.json", prism, None, r"without s1 to s4, got BrownConrady"),
         ("a.json", CAMERA, ["x"], "a name for each of 6 poses"),
     ):
         with pytest.raises(fs.InputError, match=words):

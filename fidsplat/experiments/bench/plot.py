@@ -30,19 +30,29 @@ def write_plot(results: Sequence[Result], file: Path) -> None:
     width = max(5.0, 1.6 + 0.9 * len(scenes) * len(devices))
     with chart(file, size=(width, 4.2)) as (figure, (axes,)):
         bars(axes, scenes, series, logarithmic=True)
+        named = {"roofline": "roofline: least time of the device's arithmetic and memory"}
+        named["quartiles"] = "quartiles"
         for device, container in zip(devices, list(axes.containers), strict=True):
             for scene, bar in zip(scenes, container, strict=True):
                 if (scene, device) not in measured:
                     continue
                 x, result = bar.get_x() + bar.get_width() / 2, measured[scene, device]
                 low, middle, high = result.timer.quartiles
-                axes.errorbar(x, middle, [[middle - low], [high - middle]], color="black", capsize=3)
+                axes.errorbar(
+                    x,
+                    middle,
+                    [[middle - low], [high - middle]],
+                    color="black",
+                    capsize=3,
+                    label=named.pop("quartiles", None),
+                )
                 if roofline := sum(result.rooflines.values()):
-                    axes.plot(x, roofline, marker="_", markersize=18, color="black")
-        axes.set_ylabel("ms per frame (_: roofline)")
+                    axes.plot(
+                        x, roofline, "_", markersize=18, color="black", label=named.pop("roofline", None)
+                    )
+        axes.set_ylabel("ms per frame")
         plain_ticks(axes.yaxis)
         axes.tick_params(axis="x", labelrotation=15 if len(scenes) > 3 else 0)
-        if len(devices) > 1:
-            legend_above(figure, axes)
-        else:
+        legend_above(figure, axes)
+        if len(devices) == 1:
             axes.set_title(next(iter(measured.values())).device.title, fontsize=10)
