@@ -181,7 +181,7 @@ class View:
             )
         plain = isinstance(backdrop, tuple)
         rotation = camera.world_to_camera[:3, :3]
-        # the difference first, then the rotation: nothing large is ever rotated (docs/correctness.md, B5)
+        # subtract before the rotation: rotating large coordinates loses precision (devlog/hard-cases.md, B5)
         eye = camera.position - np.asarray(origin, dtype=np.float64)
         lens, grid = camera.lens, (camera.width * n, camera.height * n)
         intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n

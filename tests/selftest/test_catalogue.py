@@ -1,4 +1,4 @@
-"""All cases of docs/correctness.md on every device."""
+"""All cases of the self-test (devlog/hard-cases.md) on every device."""
 
 import pytest
 from agreement import reference_images

@@ -1,5 +1,5 @@
 """Mutated splat files: each load ends quickly in a cloud of valid splats or in an InputError, within
-twice the memory of the file's contents (docs/correctness.md, E1 and E3).
+twice the memory of the file's contents (devlog/hard-cases.md, E1 and E3).
 """
 
 import re
