@@ -30,11 +30,11 @@ typedef struct {             // state of bin_emit; lists of the tiles of the ban
     global uint *lists;
 } Emission;
 
-// Counts a splat's tile or, with an emission, writes the splat to its list: one function for both, so they agree.
+// Counts a tile of a splat or, with an emission, writes the splat to the tile's list: one function for both, so they agree.
 static inline void bin_tile(int tile, uint index, const Chunk *c, const Emission *e) {
     if (e) {
         if (tile < e->first || tile >= e->end) return;
-        // modulo 2^32: indices within the band are right even if the frame has more pairs than that
+        // differences modulo 2^32 are correct within the band, even if the frame has more pairs
         uint place = e->starts[tile] - e->base + c->row[tile];
         e->lists[place] = index;
     }

@@ -1,6 +1,6 @@
 // Backward pass of compositing, per fragment. A loss L depends on a pixel's colour
 //   C = sum_k T_k alpha_k c_k + T_end C_behind,   T_k = prod_{j<k} (1 - alpha_j).
-// With g = dL / dC and B_k = the gradient by the transmittance behind fragment k, back to front:
+// With g = dL / dC and B_k = the gradient with respect to the transmittance behind fragment k, back to front:
 //   B_end = g C_behind,   B_k-1 = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k).
 // Nothing is divided by 1 - alpha, so opaque fragments need no special case.
 // The schedules (schedule/*_backward.cl) process a tile's list forward for T, with the arithmetic and decisions of blending, and
@@ -73,8 +73,8 @@ typedef struct {            // sums over the fragments of a lane
 
 typedef struct {
     vfloat nu, nv, inverse_d;
-    vfloat half_rho;        // where `on_plane`
-    vint on_plane;          // the weight is that of the plane, not of the low-pass
+    vfloat half_rho;        // valid where `on_plane`
+    vint on_plane;          // the weight is that of the plane intersection, not of the low-pass disc
 //@@ geometry
 } Geometry;
 
@@ -91,7 +91,7 @@ static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vflo
     return g;
 }
 
-// Gradient by the fragment's weight: g c_k.
+// Gradient with respect to the fragment's weight: g c_k.
 static inline vfloat fragment_by_weight(const Splat *s, const PixelGradient *gradient, const Geometry *g) {
     vfloat by_weight = FMA(gradient->r, (vfloat)s->r, FMA(gradient->g, (vfloat)s->g, gradient->b * s->b));
 //@@ by_weight
@@ -105,7 +105,7 @@ static inline vfloat backward_opacity(PixelGradient *gradient, vfloat by_weight,
     return weight * gain;
 }
 
-// Adds the gradients of a fragment. by_log: by ln(opacity); (x, y): position relative to the anchor.
+// Adds the gradients of a fragment. by_log: with respect to ln(opacity); (x, y): position relative to the anchor.
 static inline void add_fragment(Sums *sums, const Splat *s, const PixelGradient *gradient, const Geometry *g, vfloat weight, vfloat by_log,
                                 vfloat screen, vfloat x, vfloat y, const BlendConstants *constants) {
     sums->r = FMA(weight, gradient->r, sums->r);
@@ -169,7 +169,7 @@ typedef Moments Parts;
 #endif
 
 static inline Parts moments_of(const Sums *sums, const BlendConstants *constants) {
-    Parts m = {0};          // padding too
+    Parts m = {0};          // zeroes the padding too
     MOMENT(nu0, sums->nu);
     MOMENT(nux, sums->nu_x);
     MOMENT(nuy, sums->nu_y);
@@ -228,8 +228,8 @@ static inline void put_rows(global uint *rows, uint stride, const Bounds *b, int
 }
 #endif
 
-// Reserves a gradient buffer offset for each tile of each visible splat. Offsets depend on the order of the groups; the sums of
-// gradients do not.
+// Reserves a gradient buffer offset for each tile of each visible splat. Offsets depend on the order in which work-groups run; the sums
+// of gradients do not.
 // Index space: one work-item per splat, in groups of RESERVE_ITEMS.
 // Reads: keys, windows, big_bounds. Writes: splat_slots, big_rows; adds to reserved.
 #define RESERVE_ITEMS 64

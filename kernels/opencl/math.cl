@@ -1,4 +1,4 @@
-// Vectors of LANES pixels, and the functions whose spelling depends on LANES. `wide` is the scalar type of fragments: the host
+// Vectors of LANES pixels, and functions with different names for vectors and scalars. `wide` is the scalar type of fragments: the host
 // prints float, or double for the effect blend_double (one lane). WIDE(1.5) is a constant of that type.
 
 #define GLUE_(a, b) a##b
@@ -110,7 +110,7 @@ static inline vfloat VMAX(vfloat a, vfloat b) { return VSELECT(b, a, a > b); }
 #ifndef RESERVE
 #define RESERVE(length, count) atomic_add(length, count)
 #endif
-// Within 3 ulp: for culling, not for what reaches the image.
+// Within 3 ulp: for culling only, not for values that affect the image.
 #ifndef FAST_SQRT
 #define FAST_SQRT(x) sqrt(x)
 #define FAST_RECIPROCAL(x) (1.0f / (x))

@@ -86,7 +86,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         activated_opacities[i] = sigmoid(logits[i]);
     }
 
-    // the rendered colours are the parameters themselves unless a degree is left out or they are plain
+    // the rendered colours are the SH parameters, unless some degrees are not rendered or degree 0 is rendered as plain colours
     const bool separate = PLAIN || SH_TERMS < all;
 #if LANES > 1 && !PLAIN
     if (i < count && !skipped[item]) {
@@ -115,7 +115,7 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         }
     }
 #else
-    // the group's coefficients in the order of memory
+    // the group's coefficients in memory order
     for (uint k = item; k < min(count - first, (uint)STEP_ITEMS) * VALUES; k += STEP_ITEMS) {
         uint which = k / VALUES, within = k % VALUES;
         if (skipped[which]) continue;

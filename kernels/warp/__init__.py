@@ -1,6 +1,6 @@
-"""The stages as Warp kernels (NVIDIA Warp, CPU and CUDA), made by factories that take a FeatureSet.
+"""Kernels of all stages for NVIDIA Warp (CPU and CUDA), made by factories from the effects of a FeatureSet.
 
 Written from the definition (docs/rendering.md), not from the OpenCL text, as an independent implementation.
-What is absent from a FeatureSet is absent from the generated source: `wp.static` conditions are decided while
-Warp writes it.
+Generated source contains only the code of the requested effects: Warp evaluates `wp.static` conditions while
+it generates the source.
 """

@@ -20,13 +20,13 @@ KINDS = {
 
 @cache
 def struct_of_surroundings(kind: str):
-    """The struct of the numbers of this kind of background."""
+    """The struct of the parameters of this kind of background."""
     return struct_of("Surroundings", "The background.", KINDS[kind])
 
 
 @cache
 def make_backdrop(kind: str, bent: bool):
-    """The kernel that adds this kind of background to the samples; bent: rays are a lens's own."""
+    """The kernel that adds this kind of background to the samples. bent: whether the camera has a lens."""
     Surroundings, rays = struct_of_surroundings(kind), make_rays(bent)
     Rays, ray_of = rays.Rays, rays.ray_of
 

@@ -25,8 +25,8 @@ _NONE, _ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
 def samples_each(effects: tuple[str, ...]) -> int:
-    """Samples of a column per thread on a GPU: two, which share the reading of a record, unless each has its
-    own ray, k-buffer or layers.
+    """Samples per thread on a GPU: two in a column, which share the reading of a record; one with a lens, a
+    k-buffer or coplanar layers.
     """
     return 2 if {"rays", "compose_pixel", "compose_coplanar"}.isdisjoint(effects) else 1
 
@@ -35,8 +35,8 @@ def samples_each(effects: tuple[str, ...]) -> int:
 def make_blend(
     effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool, area: int, k_buffer_size: int
 ):
-    """The kernel for these effects and outputs, the struct of a sample's state, and the threads of a block on
-    a GPU. area: samples of a tile.
+    """Make the blend kernel for these effects and outputs; also returns the struct of a sample's state and
+    the number of threads of a block on a GPU. area: samples of a tile.
     """
     splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
     each = samples_each(effects)

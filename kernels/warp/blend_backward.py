@@ -1,10 +1,12 @@
-"""Backward pass of blending. Each tile evaluates its list forward once more, for the transmittance in front
-of every CHUNK splats, then backward, a chunk at a time, and stores the sums over its samples for each of its
-splats at a place of their own (fragment_backward.py has the formulae). Without
-atomics a sum has one order, so results are bit-identical on every run.
+"""Backward pass of blending (fragment_backward.py has the formulas).
 
-On a GPU a block of threads per tile, a sample per thread: fragments' sums are taken over a warp by shuffles,
-over the warps in shared memory. On a CPU a thread per tile that walks each splat's box within it.
+Each tile evaluates its list forward again, for the transmittance in front of every CHUNK splats, then
+backward, a chunk at a time. For each of its splats it stores the sums over its samples in a separate slot.
+There are no atomics, so sums have a fixed order and results are bit-identical on every run.
+
+On a GPU a block of threads processes a tile, one sample per thread; sums are computed over a warp by shuffles
+and over the warps in shared memory. On a CPU a thread processes a tile, splat by splat within its bounding
+box.
 """
 
 from functools import cache
@@ -18,9 +20,9 @@ from .fragment_backward import make_fragments
 from .staging import with_numbers
 
 CHUNK = 32
-"""splats of a tile's list that are walked forward and then back"""
+"""splats of a tile's list that are evaluated forward and then backward at once"""
 BLOCK_W, BLOCK_H = 8, 4
-"""samples that the 32 threads of a warp draw, one each"""
+"""rows and columns of samples of a warp, one sample per thread"""
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 _WINDOW, _BITS = wp.constant(wp.uint64(32)), wp.constant(wp.uint64(0xFFFFFFFF))
 
@@ -46,7 +48,7 @@ _POOL = """
     return 0;
 #endif
 """
-# On the CPU the threads of a block run one after the other: they add to the slot, in their order.
+# on the CPU the threads of a block run one after another, so they add to the slot in a fixed order
 _LEAVE = """
 #if defined(__CUDA_ARCH__)
     float* parts = reinterpret_cast<float*>(__cvta_shared_to_generic(pool));
@@ -82,8 +84,8 @@ _GATHER = """
 
 @cache
 def make_slots(screen: bool):
-    """The kernel that computes the place of the sums of each pair of a splat and a tile; screen: as
-    make_bounds.
+    """Make the kernel that computes the slot for the sums of each pair of a splat and a tile. screen: as in
+    `make_bounds`.
 
     A splat has as many slots as it has tiles, in their order, after those of the splats before it.
     """
@@ -127,8 +129,8 @@ def make_slots(screen: bool):
 def make_blend_backward(
     effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...], on_gpu: bool, threads: int
 ) -> SimpleNamespace:
-    """The kernel; By, Loss, Moments: structs of its inputs, of the state of a sample, and of its results.
-    effects, outputs, on_gpu, threads: as make_blend; losses: outputs with derivatives."""
+    """Make the kernel, with the structs By (inputs), Loss (state of a sample) and Moments (results). effects,
+    outputs, on_gpu, threads: as in `make_blend`; losses: outputs with derivatives."""
     made = make_fragments(effects, outputs, losses)
     By, Samples, Loss, Moments = made.By, made.Samples, made.Loss, made.Moments
     read, box_of, loss_at = made.read, made.box_of, made.loss_at

@@ -1,4 +1,4 @@
-"""Image bounds of splats: an ellipse, or a box if the disk crosses the near plane, and the low-pass disc. The
+"""Image bounds of splats: an ellipse, or a box if the disk crosses the near plane; and the low-pass disc. The
 tiles of most splats are stored as a window: a bit mask of 8 x 4 tiles.
 
 Everything here is conservative; the test of each sample decides.

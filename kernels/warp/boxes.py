@@ -1,8 +1,9 @@
 """Boxes: rectangles |u| <= 1, |v| <= 1 of a splat plane with filtered edges (docs/primitives.md).
 
-D + n_u, D - n_u, D + n_v, D - n_v over their gradients are the sample's distances from the four edges,
-inwards, in samples. Where they are affine in the sample, gradients are the splat's own; where a lens gives
-each sample its own ray, edges are curves, and gradients follow from the ray's derivatives.
+D + n_u, D - n_u, D + n_v and D - n_v, divided by the lengths of their gradients, are the distances of a
+sample from the four edges, inwards, in samples. For a pinhole they are affine in the sample, so each splat
+has constant gradients. Behind a lens edges are curves, and gradients follow from the derivatives of each
+sample's ray.
 """
 
 from functools import cache

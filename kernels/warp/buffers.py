@@ -24,7 +24,7 @@ def light_of(outputs: tuple[str, ...]) -> frozenset[str]:
 def make_samples(fields: tuple[tuple[str, type], ...]):
     """The struct of sample buffers with these fields, (rows columns) of the padded grid each."""
     arrays = {name: wp.array(dtype=dtype) for name, dtype in fields}
-    return struct_of("Samples", "What blending leaves of each sample.", arrays)
+    return struct_of("Samples", "Results of blending for each sample.", arrays)
 
 
 @cache
@@ -38,4 +38,4 @@ def make_images(images: tuple[tuple[str, type], ...], outputs: tuple[str, ...]):
         **output.fields(outputs, "view_arrays"),
     }
     arrays = {name: wp.array(dtype=dtype) for name, dtype in fields.items()}
-    return struct_of("Images", "What resolving leaves of each pixel.", arrays)
+    return struct_of("Images", "Results of resolving for each pixel.", arrays)

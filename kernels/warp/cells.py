@@ -1,12 +1,12 @@
-"""Cells of a tile that a splat can touch: a cell is 2 x 4 samples, and a bit of a word. The test is
-conservative; that of each sample decides.
+"""Culling by cells of a tile: which cells, of 2 x 4 samples, a splat can touch, as bits of a word. The test
+is conservative; the test of each sample decides.
 
-Fragments of a disk lie where f = n_u^2 + n_v^2 - h D^2 <= 0, h half the squared radius, and n_u, n_v, D are
-affine in the sample. So along a row, with a = (n_u, n_v, D) per x and b = (n_u, n_v, D) at x = 0,
-f = <a, a> x^2 + 2 <a, b> x + <b, b> in the product <a, b> = a_u b_u + a_v b_v - h a_D b_D, and the row meets
-it where q = <a, b>^2 - <a, a> <b, b> = h |(a x b)_uD, (a x b)_vD|^2 - (a x b)_uv^2 >= 0. a x b is affine in
-y, so that nothing large cancels in q. Where rays are a lens's own, and of boxes, the record's box alone says
-which.
+A disk has fragments where f = n_u^2 + n_v^2 - h D^2 <= 0, with h half the squared radius and n_u, n_v, D
+affine in the sample. Along a row, with a = (n_u, n_v, D) per x and b = (n_u, n_v, D) at x = 0,
+f = <a, a> x^2 + 2 <a, b> x + <b, b> in the product <a, b> = a_u b_u + a_v b_v - h a_D b_D. The row overlaps
+the disk where q = <a, b>^2 - <a, a> <b, b> = h |(a x b)_uD, (a x b)_vD|^2 - (a x b)_uv^2 >= 0. a x b is
+affine in y, so no large terms cancel in q. Behind a lens, and for boxes, only the bounding box of the record
+is tested.
 """
 
 from functools import cache
@@ -20,9 +20,10 @@ from .splat import make_splat
 
 CELL_W, CELL_H = 2, 4
 _SLACK = wp.constant(2e-5)
-"""of the forms' terms: more than rounding can change f by at a sample, here and where fragments are tested"""
+"""slack relative to the terms of the forms: more than the rounding error of f, here and in the per-sample
+test"""
 _PAD, _PAD_RELATIVE = wp.constant(0.02), wp.constant(1e-4)
-"""of chords: samples, and by how far the tile is from the splat's anchor"""
+"""padding of chords: in samples, and relative to the distance of the tile from the splat's anchor"""
 _FLAT, _NO_DISC = wp.constant(1e-12), wp.constant(1e17)
 _ONE, _TWO = wp.constant(wp.uint32(1)), wp.constant(wp.uint32(2))
 
@@ -50,7 +51,7 @@ def half_chord(c: Conic, y: float) -> float:
 
 @cache
 def make_cells(effects: tuple[str, ...], outputs: tuple[str, ...]):
-    """The function that returns the cells of a tile that a splat can touch."""
+    """Make the function that returns the cells of a tile that a splat can touch."""
     splats = make_splat(effects, outputs)
     Splat, screen, thick = splats.Splat, "lowpass_screen" in effects, EXACT in effects
     elliptic = "rays" not in effects and not any(name in effects for name in BOXES)

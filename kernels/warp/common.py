@@ -1,11 +1,10 @@
-"""Shared by all stages: module options, uniforms, fused multiply-adds, packed loads."""
+"""Code shared by all stages: module options, uniforms, fused multiply-adds, packed loads."""
 
 import warp as wp
 
-# Order and culling must not depend on what a compiler fuses: contraction is off everywhere, and fused
-# operations are
-# written out as `fma`. No fast maths: a NaN must fail a comparison.
-# Loops over the functions of outputs are unrolled, however many there are.
+# Order and culling must not depend on the compiler: contraction is off, and fused operations are written as
+# `fma`. Fast maths is off: comparisons with NaN must be false.
+# Loops over the functions of outputs are always unrolled.
 STRICT = {
     **{"fuse_fp": False, "fast_math": False, "enable_backward": False, "default_grid_stride": False},
     "max_unroll": 64,
@@ -58,8 +57,8 @@ class View:
     ray: wp.vec4  # a sample's ray is ((column - [2]) / [0], (row - [3]) / [1], 1), or (0, 0, 1) for distances
 
 
-# The compiler does not see that it is the same number, and loads again what stands there: a GPU's thread has
-# fewer registers than a view has numbers.
+# Hides from the compiler that the number is the same, so that it reloads uniforms from memory: a view has
+# more numbers than a GPU thread has registers.
 @wp.func_native("""
     int same = number;
 #if defined(__CUDA_ARCH__)
@@ -109,8 +108,8 @@ def fma_dot(a: wp.vec3, b: wp.vec3) -> float:
     return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2]))
 
 
-# One 16-byte load where the device has it: Warp's vectors are not known to be aligned, so the compiler would
-# take four.
+# One 16-byte load on CUDA: the compiler does not know that Warp's vectors are aligned, and would use four
+# loads.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const float4 quad = __ldg(reinterpret_cast<const float4*>(lines.data) + at);
@@ -124,7 +123,7 @@ def line_of(lines: wp.array(dtype=wp.vec4), at: int) -> wp.vec4:
     ...
 
 
-# One 16-byte store, likewise: four would each touch a warp's 32 records.
+# One 16-byte store on CUDA: each of four stores would touch all 32 records of a warp.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     reinterpret_cast<float4*>(lines.data)[at] = make_float4(value[0], value[1], value[2], value[3]);

@@ -1,8 +1,9 @@
-"""Splats of one plane are one layer at a sample (docs/correctness.md): its colour and depth are means of its
-fragments by optical depth.
+"""Coplanar groups as layers (docs/correctness.md): the colour and depth of a layer are means of its
+fragments, weighted by optical depth.
 
-They are the first splats of a tile's list, group after group. A pass over the list finds the nearest layer
-behind that of the previous pass, composites the fragments of other splats between the two, then the layer.
+Splats of groups are the first splats of a tile's list, group after group. A pass over the list finds the
+nearest layer behind that of the previous pass, composites the fragments of other splats between the two, then
+the layer.
 """
 
 from types import SimpleNamespace
@@ -14,9 +15,9 @@ from .common import fma, fma3, struct_of
 from .fast import fast_log
 
 FAINT = wp.constant(1e-3)
-"""below it 1 - opacity rounds, and the optical depth is that of its series, to 3e-7"""
+"""opacity below which the optical depth is computed by a series (to 3e-7), as 1 - opacity is rounded"""
 DARKEST = wp.constant(wp.float32(2.0**-24))
-"""transmittance of an opaque fragment, whose optical depth would be infinite"""
+"""minimum transmittance, so that the optical depth of an opaque fragment is finite"""
 
 
 NEARER = wp.constant(wp.float32(-(2.0**-16)))
@@ -29,7 +30,7 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
     """
     log = fast_log if "arithmetic_fast" in effects else wp.log
     accumulators = output.functions(outputs, "accumulate")
-    # tau: optical depth; `mean`: weighted by optical depths; of boxes, by opacities
+    # tau: optical depth; mean: weighted by optical depths, for boxes by opacities
     fields = {
         "group": wp.int32,
         "opacity": wp.float32,
@@ -38,8 +39,9 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
     }
     fields |= output.fields(outputs, "layer")
     Layer = struct_of("Layer", "Fragments of one coplanar group at a sample; group -1: none.", fields)
-    # exist: whether the tile has groups; open: the layer that still accumulates; next: the nearest of this
-    # pass, at an infinite depth if there is none; after: depth and group of that of the previous pass
+    # exist: whether the tile has groups; open: the layer that still accumulates; next: the nearest layer of
+    # this pass, with an infinite depth if there is none; after: depth and group of the layer of the previous
+    # pass
     passing = {
         "exist": wp.int32,
         "open": Layer,

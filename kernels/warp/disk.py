@@ -11,8 +11,8 @@ from .common import View
 
 @cache
 def make_disk(real) -> SimpleNamespace:
-    """Functions for bounds of a disk: perspective(a, b, p, radius, reach, view), reach half its range of
-    depths, and parallel.
+    """Functions for bounds of a disk: perspective(a, b, p, radius, reach, view) and parallel. reach: half of
+    the disk's depth range.
     """
     vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
     one, zero = real(1.0), real(0.0)

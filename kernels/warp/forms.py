@@ -4,7 +4,7 @@ With rows T_u, T_v, T_w of the projection of tangents and centre, (n_u, n_v, D) 
 T_u x T_v + x (T_v x T_w) + y (T_w x T_u): kernels/opencl/splat.cl. All three are affine in the sample. They
 are scaled by one factor: D > 0 in front of the camera, the steepest slope is 1; n_u, n_v also by sqrt(1/2),
 so that (n_u^2 + n_v^2) / D^2 is rho / 2. Operations and their order are those of kernels/opencl/project.cl,
-and so are the bits.
+so results are bit-identical.
 """
 
 import math
@@ -21,7 +21,7 @@ from .records import BOXES, Layout
 
 @cache
 def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
-    """The function that fills a record of these effects and outputs."""
+    """Make the function that fills a record for these effects and outputs."""
     layout = Layout(effects, outputs)
     vec3 = wp.types.vector(3, real)
     words = wp.types.vector(4 * layout.lines, wp.float32)
@@ -35,7 +35,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     bent = camera is not None
     edged = not bent and any(name in effects for name in BOXES)
     flagged = bent and "footprint_mixed" in effects
-    """whether records say of a box where its edges are, or of any splat whether it is a box"""
+    """whether records have the edges of boxes; whether they tell boxes from Gaussians"""
     of_box, optics = make_boxes(real), make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
     at_disc, at_depth, at_edges, at_ray, at_plane, at_flag, at_bulge = (

@@ -1,9 +1,10 @@
-"""Derivatives of compositing, fragment by fragment. A pixel shows C = sum_k T_k alpha_k c_k + T_end C_behind.
-With g = dL / dC, and B_k what the light is worth that fragment k lets through, from the back to the front
+"""Derivatives of compositing, fragment by fragment. The colour of a pixel is
+C = sum_k T_k alpha_k c_k + T_end C_behind. With g = dL / dC, and B_k the gradient with respect to the
+transmittance behind fragment k, from back to front
 
-    B_end = g C_behind,   B_(k-1) = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k):
+    B_end = g C_behind,   B_(k-1) = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k).
 
-nothing is divided by 1 - alpha, so that opaque fragments have derivatives as all others.
+Nothing is divided by 1 - alpha, so opaque fragments need no special case.
 """
 
 from functools import cache
@@ -22,10 +23,10 @@ _FORMS = ("nu0", "nux", "nuy", "nv0", "nvx", "nvy", "d0", "dx", "dy", "log_opaci
 
 
 def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
-    """Contributions of a fragment to a loss's derivatives by its splat's record: by each form and by
-    z_numerator its derivative times 1, x, y from the anchor; by ln(opacity), by the colour, by the further
-    numbers of the record. That by D is at constant z_numerator - z_center D: the rest cancels most of that by
-    z_numerator, so `make_project_backward` adds it in float64."""
+    """Names of the sums (moments) that a fragment adds to for its splat: derivatives of the loss with respect
+    to each form and z_numerator, times 1, x and y relative to the anchor; to ln(opacity); to the colour; to
+    further numbers of the record. The derivative with respect to D is at constant z_numerator - z_center D,
+    to avoid cancellation with that of z_numerator; `make_project_backward` adds the rest in float64."""
     names = list(_FORMS)
     names += ("disc_x", "disc_y") if "lowpass_screen" in effects else ()
     names += ("z_numerator", "z_numerator_x", "z_numerator_y", "z_center") if "ray_depth" in effects else ()
@@ -35,8 +36,8 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
 
 @cache
 def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...]):
-    """By (a struct of the derivatives by the images named in `losses`), Samples, Splat, Loss, Moments; read,
-    loss_at, opacity_at, back. effects and outputs: as blending has them.
+    """Make the structs By (derivatives with respect to the images named in `losses`), Samples, Splat, Loss
+    and Moments, and the functions read, loss_at, opacity_at and back. effects, outputs: as for blending.
     """
     splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
     Splat, Intersection = splats.Splat, intersection.Intersection
@@ -58,7 +59,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     rows_line, rows_lane = layout.place("rows")
     Samples = make_samples(tuple(sample_fields(outputs).items()))
     arrays = {name: wp.array(dtype=wp.float32) for name in losses}
-    By = struct_of("By", "A loss's derivatives by the images, (h w channels) each.", arrays)
+    By = struct_of("By", "Derivatives of a loss with respect to the images, (h w channels) each.", arrays)
     fields = {"light": wp.vec3, "behind": wp.float32}
     fields |= {"depth": wp.float32, "depth_weight": wp.float32} if depth else {}
     fields |= {"normal": wp.vec3} if normal else {}

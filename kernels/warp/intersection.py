@@ -15,7 +15,7 @@ from .records import BOXES, Layout
 from .splat import make_splat
 
 HALF_RHO_OF_RANGE = wp.constant(wp.float32(math.log(255.0)))
-"""half the squared distance at which a splat has 1/255 of its opacity"""
+"""half of the rho at which a splat has 1/255 of its opacity"""
 
 
 @cache

@@ -1,10 +1,10 @@
-"""K-buffer: the fragments of a sample by their own depth, where the ray meets the splats.
+"""K-buffer: sorts the fragments of a sample by their depth at the ray.
 
-Lists are sorted by the nearest depth that any fragment of a splat can have, as blending rounds it
-(`nearest`). So no later fragment is nearer than the current splat, and buffered fragments nearer than that
-are composited, by depth, ties in the order of the list. When the buffer is full the furthest fragment is
-dropped, with all that is behind it (`until`), and another pass over the list composites what was dropped
-(`after`), until nothing is. The image does not depend on the size of the buffer.
+Lists are sorted by a lower bound of the fragment depths of each splat (`nearest`), rounded as in blending. So
+no later fragment is nearer than that of the current splat, and buffered fragments in front of it are
+composited by depth, ties in list order. When the buffer is full, the farthest fragment is dropped, with all
+behind it (`until`), and another pass over the list composites the dropped fragments (`after`), until none is
+left. The image does not depend on the size of the buffer.
 """
 
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ import warp as wp
 from .common import View, struct_of
 
 _EMPTY = wp.constant(-1)
-"""list place of an empty entry"""
+"""list position of an empty entry"""
 
 
 def make_k_buffer_struct(size: int):
@@ -24,7 +24,7 @@ def make_k_buffer_struct(size: int):
         "z": wp.types.vector(size, wp.float32),
         "opacity": wp.types.vector(size, wp.float32),
         "place": wp.types.vector(size, wp.int32),
-        # range of this pass: depth, and list place of equal depths
+        # range of this pass: depths, and list positions for equal depths
         "after_z": wp.float32,
         "after": wp.int32,
         "until_z": wp.float32,

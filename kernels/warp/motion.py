@@ -25,7 +25,7 @@ def make_motion(moves: bool) -> SimpleNamespace:
         "groups": wp.array(dtype=wp.int32),  # (groups) their labels
         "poses": wp.array(dtype=Pose),  # (views groups)
     }
-    Moving = struct_of("Moving", "What moves, and how.", fields if moves else {})
+    Moving = struct_of("Moving", "Moving groups and their poses.", fields if moves else {})
 
     @wp.func
     def group_of(moving: Moving, i: int) -> int:

@@ -23,7 +23,7 @@ from .splat import make_splat
 
 @cache
 def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size: int) -> SimpleNamespace:
-    """The structs Rays and Pixel, and functions of a sample: start, unfinished, blend, end (None
+    """Make the structs Rays and Pixel, and functions of a sample: start, unfinished, blend, end (None
     without a second pass), cover (None without an opaque surface), finish.
     """
     Splat, intersection = make_splat(effects, outputs).Splat, make_intersection(effects, outputs)

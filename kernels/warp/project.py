@@ -24,9 +24,10 @@ from .splat_pose import make_splat_pose
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
 BLOCK = 128
 """threads of a block on a GPU"""
-LIMITS = (BLOCK, 5)  # so many blocks at once: at most 96 registers, of 116 that it would take
+LIMITS = (BLOCK, 5)  # threads per block, blocks at once: limits the kernel to 96 registers instead of 116
 GROUP_KEYS = wp.constant(wp.uint32(0x00800000))
-"""key of the first coplanar group, below those of all depths: groups are first in each list, one by one"""
+"""key of the first coplanar group; keys of groups are below those of all depths, so groups are first in
+lists"""
 NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 
 
@@ -34,9 +35,9 @@ NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 def make_project(
     effects: tuple[str, ...], outputs: tuple[str, ...], sh_terms: int, precision: str, every_bounds: bool
 ):
-    """The kernel for these effects and outputs that matter to records; sh_terms: coefficients per colour, 0
-    for plain colours; every_bounds: bounds are written of all that is visible, not only of splats that touch
-    more than a window.
+    """Make the kernel for the effects and outputs that affect records. sh_terms: coefficients per colour, 0
+    for plain colours. every_bounds: write the bounds of all visible splats, not only of those that touch more
+    tiles than a window.
     """
     layout = Layout(effects, outputs)
     lines_each = layout.lines

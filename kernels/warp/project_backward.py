@@ -1,9 +1,10 @@
-"""Backward pass of the projection: from the derivatives by a splat's record, which its tiles have stored, to
-those by its mean, rotation, scales, opacity and colour, and by the camera's pose. Decisions are constant.
+"""Backward pass of the projection: from derivatives with respect to a splat's record, which its tiles have
+stored, to those with respect to mean, rotation, scales, opacity, colour and camera pose. Decisions are
+constant.
 
-With a = s_u t_u, b = s_v t_v a ray r meets the splat where n_u = (b x p) r, n_v = (p x a) r, D = (a x b) r,
-but for a common factor, on which nothing depends. A moment over the ray, g = sum dL/dn_u r, is by b then
-p x g, by p then g x b, and so on.
+With a = s_u t_u and b = s_v t_v, a ray r meets the splat where n_u = (b x p) r, n_v = (p x a) r, D = (a x b)
+r, up to a common factor, which has no effect. The moment over the rays g = sum dL/dn_u r gives the
+derivatives p x g with respect to b and g x b with respect to p, and so on.
 """
 
 import math
@@ -17,7 +18,7 @@ from .project import SMALLEST_SCALE
 from .records import Layout
 
 SIX = wp.types.vector(6, wp.float64)
-"""of a motion after world_to_camera: rotation vector [1 / rad], translation [1 / m]"""
+"""gradient with respect to a motion after world_to_camera: rotation vector [1 / rad], translation [1 / m]"""
 _ZERO, _HALF, _ONE, _TWO = (wp.constant(wp.float64(x)) for x in (0.0, 0.5, 1.0, 2.0))
 _SQRT_HALF = wp.constant(wp.float64(math.sqrt(0.5)))
 
@@ -66,8 +67,8 @@ def basis_slope(k: int, d: wp.vec3) -> wp.vec3:
 def make_project_backward(
     effects: tuple[str, ...], outputs: tuple[str, ...], names: tuple[str, ...], sh_terms: int
 ):
-    """The kernel; effects, outputs: of the record; names: of its moments; sh_terms: coefficients per colour,
-    0 for plain colours."""
+    """Make the kernel. effects, outputs: those of the record; names: of its moments; sh_terms: coefficients
+    per colour, 0 for plain colours."""
     layout = Layout(effects, outputs)
     each, fields = layout.lines, len(names)
     at = {name: place for place, name in enumerate(names)}

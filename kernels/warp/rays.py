@@ -1,5 +1,4 @@
-"""Inputs of a sample by its position in the image: its ray, from the view or from the buffer of a lens, and
-the external depth image."""
+"""Rays of samples, from the view or from the buffer of a lens, and the external depth image."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -9,7 +8,7 @@ import warp as wp
 from .common import View, fma, struct_of
 
 SLOPES = wp.types.matrix((2, 3), wp.float32)
-"""a ray's derivatives by the sample's column, and by its row"""
+"""derivatives of a ray with respect to the sample's column, and to its row"""
 
 
 @cache

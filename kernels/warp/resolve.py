@@ -1,4 +1,4 @@
-"""Pixels from their samples: rgb over the background, and each output's image (output/)."""
+"""Resolve stage: pixels from their samples: rgb over the background, and the images of outputs (output/)."""
 
 from functools import cache
 
@@ -15,8 +15,8 @@ from .rays import make_rays
 def make_resolve(
     images: tuple[tuple[str, type], ...], outputs: tuple[str, ...], stretched: bool, samples: int
 ):
-    """The kernel for these output images and outputs, with samples x samples per pixel; stretched: a lens
-    gives rays their lengths.
+    """Make the kernel for these output images and outputs, with samples x samples per pixel. stretched:
+    whether ray lengths are read from the buffer of a lens.
     """
     Samples, Images = make_samples(tuple(sample_fields(outputs).items())), make_images(images, outputs)
     rays = make_rays(stretched, stretched)

@@ -10,11 +10,11 @@ from .common import STRICT, struct_of
 
 @cache
 def make_sensor(steps: tuple[str, ...]):
-    """The kernel of these steps, in their order, and the struct of their inputs."""
+    """Make the kernel of these steps, applied in order, and the struct of their inputs."""
     declared = [post.declared(name) for name in steps]
     fields = {name: kind for step in declared for name, kind in step.numbers.items()}
     fields |= {name: wp.array(dtype=kind) for step in declared for name, kind in step.arrays.items()}
-    Settings = struct_of("Settings", "What the steps read.", fields)
+    Settings = struct_of("Settings", "Inputs of the steps.", fields)
     applied = tuple(step.apply for step in declared)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)

@@ -1,5 +1,4 @@
-"""Accumulation of sub-frames: samples of the poses of a shutter are added up in buffers of the complete
-frame."""
+"""Accumulation of sub-frames: the samples of all poses of a shutter are added up in the frame's buffers."""
 
 from functools import cache
 
@@ -10,7 +9,7 @@ from .common import STRICT
 
 @cache
 def make_expose(dtype):
-    """The kernel that adds the weighted light of a sub-frame's sample buffer to that of the frame."""
+    """Make the kernel that adds a sub-frame's weighted sample buffer to that of the frame."""
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def expose(

@@ -1,4 +1,4 @@
-"""Derivatives of the image coordinates of a point by its position, for each camera."""
+"""Derivatives of the projection of a point with respect to its position, for each camera."""
 
 from functools import cache
 
@@ -17,7 +17,7 @@ def make_slopes(camera: str | None, real):
     Lens = make_lens(camera if camera in LENSES else None)
     vec3 = wp.types.vector(3, real)
     zero, one, two, three = (real(float(k)) for k in range(4))
-    polar = real(1e-6)  # of the distance: so far from a panorama's axis its poles end
+    polar = real(1e-6)  # a point nearer to a panorama's axis, relative to its distance, is at a pole
 
     @wp.func
     def slopes_pinhole(p: vec3, view: View, lens: Lens):

@@ -13,14 +13,14 @@ static inline float ptx_fast_reciprocal(float x) {
 #define FAST_SQRT(x) ptx_fast_sqrt(x)
 #define FAST_RECIPROCAL(x) ptx_fast_reciprocal(x)
 
-// The driver's own division is not correctly rounded, and scales its argument for the sake of subnormal numbers.
+// The driver's division is not correctly rounded, and scales its argument to support subnormal numbers.
 static inline float ptx_reciprocal(float x) {
     float y = ptx_fast_reciprocal(x);
     return fma(fma(-x, y, 1.0f), y, y);
 }
 #define RECIPROCAL(x) ptx_reciprocal(x)
 
-// Transposes 32 x 32 bits, of which each lane of a warp has a row.
+// Transposes a matrix of 32 x 32 bits; each lane of a warp has a row.
 static inline uint ptx_transpose_bits(uint bits) {
     uint lane = get_local_id(0) % 32, low = 0x0000FFFFu;
     for (uint step = 16; step != 0; step >>= 1, low ^= low << step) {
@@ -33,7 +33,7 @@ static inline uint ptx_transpose_bits(uint bits) {
 #define TRANSPOSE_BITS(bits) ptx_transpose_bits(bits)
 #define WARP_BARRIER() asm volatile("bar.warp.sync 0xffffffff;" ::: "memory")
 
-// By one atomic for each warp, since atomics on one address are serialised.
+// Uses one atomic per warp, since atomics on one address are serialised.
 static inline uint ptx_reserve(local uint *length, uint count) {
     uint lane = get_local_id(0) % 32, sum = count, first = 0;
     for (uint step = 1; step < 32; step *= 2) {

@@ -1,6 +1,6 @@
 // depth_median (h, w): depth [m] of the last fragment with transmittance above 1/2 in front of it; 0 where alpha is below 1/255.
-// Fragments of weight below 1/255 count together, at the depth of the fragment whose cumulative weight reaches it. The lower
-// median over the samples that hit something.
+// Consecutive fragments of weight below 1/255 count together, at the depth of the fragment at which their sum reaches it. For a pixel:
+// the lower median over its samples that have one.
 //@ state
     vfloat depth_median;
     vfloat median_light;    // transmittance behind the fragment that counted last

@@ -17,7 +17,7 @@
 //@ light_transmit
 #if LANES == 1
     pixel->t = pixel->t - weight;
-#else       // in the order of fragments; `live` is computed in parallel
+#else       // sequential in the order of fragments; `live` is computed in parallel
     pixel->t = VSELECT(pixel->t, pixel->t - full_weight, live);
 #endif
 //@ light_functions

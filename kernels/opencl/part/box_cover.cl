@@ -24,7 +24,7 @@
 //@ footprint_opacity
     if (IS_BOX(s)) opacity = VMIN(EXP((vfloat)s->log_opacity), (vfloat)constants->ceiling) * c.cover;
 //@ footprint_tau
-    // the optical depth of adjacent boxes is the area that they cover, and their colour its mean
+    // in a layer, boxes add up opacities, where Gaussians add up optical depths
     if (IS_BOX(s)) tau = opacity;
 //@ footprint_layer
     if (IS_BOX(s)) layer->opacity = fmin(layer->optical_depth, (vfloat)1.0f);

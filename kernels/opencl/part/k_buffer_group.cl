@@ -20,7 +20,7 @@ typedef struct {
     Queue *queue;
     uint head, count;               // of the queue
     bool bounded;                   // fragments outside of [from, until) are skipped
-    wide from, until;               // depths; at `from`: splats from `from_splat` on, at `until`: those before
+    wide from, until;               // depths; at depth `from` only splats from `from_splat` on, at depth `until` only splats before
     uint from_splat, until_splat;   // `until_splat`
 } KBuffer;
 
@@ -163,7 +163,7 @@ static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opac
     k_buffer->from = k_buffer->until;
     k_buffer->from_splat = k_buffer->until_splat;
     k_buffer->until = INFINITY;
-    k_buffer->bounded = true;        // if nothing was dropped here, another pass (for other pixels) includes no fragment
+    k_buffer->bounded = true;        // in another pass (for other pixels), a pixel that dropped nothing skips all fragments
     repeats = VMASK(k_buffer->from < INFINITY);
 //@ layer_passed
         if (ready) k_buffer->from = -INFINITY;

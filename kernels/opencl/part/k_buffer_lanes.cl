@@ -29,7 +29,7 @@ typedef struct {                    // not in registers
     uchar order[K_BUFFER_SIZE];           // indices of entries: `count` used ones, nearest first, then the free ones
     int count;
     int bounded;                    // fragments outside of [from, until) are skipped
-    vfloat from, until;             // depths; at `from`: positions from `from_place` on, at `until`: those before
+    vfloat from, until;             // depths; at depth `from` only positions from `from_place` on, at depth `until` only positions before
     vint from_place, until_place;
 } Queue;
 typedef struct {
@@ -38,7 +38,7 @@ typedef struct {
 } KBuffer;
 
 static inline void k_buffer_start(KBuffer *k_buffer) {
-    const Entry none = {(vfloat)NO_FRAGMENT};      // other fields are 0, which contributes nothing
+    const Entry none = {(vfloat)NO_FRAGMENT};      // other fields are 0, so that it contributes nothing
     k_buffer->farthest = none;
 }
 

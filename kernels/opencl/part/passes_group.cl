@@ -11,5 +11,5 @@
         for (int row = 0; row < ROWS; row++)
             if (px < width && py + row < height && pass_finish(&pixels[row], splats, &constants)) repeat_pass = 1;
         barrier(CLK_LOCAL_MEM_FENCE);
-        // uniform: every work-item reads the same vote
+        // uniform control flow: every work-item reads the same vote
     } while (repeat_pass);

@@ -1,5 +1,5 @@
-// Backward pass of fragment depth: z_numerator / D, or the depth of the centre where the ray does not intersect the plane. Outside
-// of the splat's depth range, which only rounding leaves, the gradient is that of the centre.
+// Backward pass of fragment depth: z_numerator / D, or the depth of the centre where the ray does not intersect the plane. Depths that
+// rounding moves out of the splat's depth range have the gradient of the centre's depth.
 //@ geometry
     vfloat d, z;
     vint hit;               // the depth is z_numerator / D

@@ -1,6 +1,6 @@
-// Image bounds of a region of ray directions, for lenses. The lens's chart (two coordinates of a direction) is a grid of cells;
-// `ray_map` holds for each cell the first and last column and row of the samples whose rays are inside, followed by coarser grids
-// of half the resolution each. The bounds hold for arbitrary rays.
+// Image bounds of a region of ray directions, for lenses. The lens's chart (two coordinates of a direction) is divided into a grid of
+// cells. For each cell `ray_map` stores the first and last column and row of the samples whose rays are inside; coarser grids, each of
+// half the resolution, follow. The bounds are valid for arbitrary rays.
 //@ camera
 // Bounds of the samples whose rays are in [x0, x1] x [y0, y1] of the chart; empty if there are none. numbers: low corner, cells per
 // unit along x and y, cells per side, first row of this image in the map.

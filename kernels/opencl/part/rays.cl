@@ -15,7 +15,7 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     return c;
 }
 //@ camera_forms
-    // any ray can be the anchor: the direction of the centre, if the centre is not imaged or its sample has no ray
+    // any ray can be the anchor; if the centre is not imaged or its sample has no ray, use the direction of the centre
     size_t ray_stride = (width + TILE_W - 1) / TILE_W * TILE_W;
     size_t ray_plane = ray_stride * ((height + TILE_H - 1) / TILE_H * TILE_H);
     bool imaged = center_x == center_x;

@@ -1,4 +1,4 @@
-// Termination depths of tiles for GPUs (part/termination_depth_lanes.cl), per batch of splats. The last batch is followed by no vote.
+// Termination depths of tiles for GPUs (part/termination_depth_lanes.cl), per batch of splats. There is no vote after the last batch.
 //@ group_start
     if (item == 0) termination_depths[tile] = UINT_MAX;
 //@ voted

@@ -265,7 +265,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             fragments[which * STRIDE + (top + 4 * each) * TILE_W + column] = (float2)(transmittance, opacity);
         }
     }
-    // a work-item reads only its own writes, but without a barrier NVIDIA's compiler (driver 580) moved the read before the write
+    // each work-item reads only what it wrote, but without a barrier NVIDIA's compiler (driver 580) moved the read before the write
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint bits = mine, which; bits != 0; bits ^= 1u << which) {
         which = 31 - clz((int)bits);

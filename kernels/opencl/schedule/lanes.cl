@@ -14,7 +14,7 @@ kernel void blend(
     uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
 
-    // in a tile without splats all blocks are equal, so one is computed
+    // in a tile without splats all blocks are equal, so only one is computed
     const uint base = starts[band_first];
     const bool empty = starts[tile] == starts[tile + 1]
 //@@ empty

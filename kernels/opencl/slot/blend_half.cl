@@ -55,7 +55,7 @@ static inline uint pack_halves(float low, float high) {
 #define COLOR_B1(attributes) (attributes)->b1
 #define COLOR_WORDS
 #endif
-static inline float within_half(float color) { return clamp(color, -65504.0f, 65504.0f); }     // their range
+static inline float within_half(float color) { return clamp(color, -65504.0f, 65504.0f); }     // the range of halves
 //@ splat_view
     wide unpacked_r, unpacked_g, unpacked_b;
 //@ project

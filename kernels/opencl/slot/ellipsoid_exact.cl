@@ -48,7 +48,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         third.x = towards.x * inverse_m; third.y = towards.y * inverse_m; third.z = towards.z * inverse_m;
         if (!parallel) inverse_m2 = inverse_m * inverse_m;
         offset = dot3(facet, towards);
-        su = area;                                      // only su * sv is used, and the low-pass's scaling of it
+        su = area;                                      // only the product su * sv is used, and scaled by the low-pass
         sv = 1;
     }
 //@ footprint_reach
@@ -66,13 +66,13 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
 //@ footprint_bounds
     radius = own_radius;
 //@ footprint_disc
-        // the test of the disk ignores fragments that `near` removes from the ellipsoid
+        // the disk's test does not account for fragments of the ellipsoid that `near` removes
         if (THICK_HERE && pz >= near && pz - reach < near) record.disc_x = (wide)(center_x - anchor_x);
 //@ footprint_cross
     if (s->bulge > 0.0f) {
         vfloat squared = FMA((vfloat)s->bulge, c.q, c.d * c.d);      // D^2 (1 + rho_disk / m^2)
         c.inside = VMASK(c.q <= half_r2 * squared) & VMASK(c.d > 0.0f) & VMASK(squared <= s->d_near * c.d);
-        // expressed as a disk's fragment: rho / 2 = q / d^2, depth = z_numerator / d
+        // expressed as a fragment of a disk: rho / 2 = q / d^2, depth = z_numerator / d
         vfloat inverse = RECIPROCAL(c.d);
         c.d = squared * inverse;
         c.q = c.q * c.d * inverse;

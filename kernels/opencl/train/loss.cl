@@ -1,6 +1,6 @@
 // Training loss for GPUs, image by image (loss_values.cl). A work-item computes LANES values of a row.
 
-// Rows per work-item in the passes over columns, which share their reads.
+// Rows per work-item in the passes over columns; the rows share their reads.
 #define EACH_ROWS 4
 
 // Declares a work-item's position in an image, `rows` rows of LANES values; returns outside of the image.

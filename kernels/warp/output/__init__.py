@@ -1,4 +1,4 @@
-"""Outputs: one file for each, which declares an `Output`: fields and functions that it adds to the stages.
+"""Outputs, one file each. A file declares an `Output`: fields and functions that it adds to the stages.
 
 A file is found by its name. Kernels of frames without an output contain nothing of it.
 """
@@ -17,7 +17,7 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """Additions of one output, or of a part that several need, to the stages; by default none.
+    """Additions of an output, or of a part shared by several outputs, to the stages; by default none.
 
     Fields are name: type. Functions are Warp's; their parameters are given here. `pixel`, `attributes`,
     `layer`, `samples` and `out` are structs with the fields of all outputs of a frame, so their types are
@@ -27,12 +27,12 @@ class Output:
     needs: tuple[str, ...] = ()
     """other files here whose fields this one reads"""
     depth: bool = False
-    """whether `attributes.z` is read: depth of the fragment [m]"""
+    """whether `attributes.z`, the depth of the fragment [m], is read"""
     length: bool = False
-    """whether lengths of rays are read, which turn a depth into a distance"""
+    """whether ray lengths are read, which convert depths to distances"""
 
     record: tuple[str, ...] = ()
-    """numbers of a splat's record"""
+    """numbers that are added to a splat's record"""
     project: Any = None
     """(record, at, normal, height): stores them in record[at], record[at + 1] ...; normal: of the splat's
     plane in the camera frame; height: signed height of the camera above it [m]"""
@@ -48,9 +48,9 @@ class Output:
     layer's, to a layer"""
 
     state: Mapping[str, Any] = field(default_factory=dict)
-    """state of a sample while its list is composited; 0 before the first fragment"""
+    """fields added to the state of a sample while its list is composited; initially 0"""
     start: Any = None
-    """(pixel, length, view): other first values; length: of the sample's ray, 1 unless `length`"""
+    """(pixel, length, view): sets other initial values; length: of the sample's ray, 1 unless `length`"""
     fragment: Any = None
     """(pixel, s, c, x, y, disc, opacity, view): a splat of the tile's list before it is composited, whether
     it contributes to the sample or not (c.contributes); x, y: from the anchor; disc: squared distance from
@@ -67,7 +67,7 @@ class Output:
     store: Any = None
     """(pixel, at, samples): fills them"""
     light: bool = False
-    """whether they are light: averaged over sub-frames, not taken from one pose"""
+    """whether these buffers are averaged over sub-frames, like colours; otherwise they are from one pose"""
 
     cloud_arrays: Mapping[str, Any] = field(default_factory=dict)
     """arrays of the cloud that resolving reads as out.NAME, by the type of an element"""

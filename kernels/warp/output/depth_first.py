@@ -1,4 +1,4 @@
-"""Depth of the first hit [m]: where the transmittance falls below the threshold of a first hit; the minimum
+"""Depth of the first hit [m]: where the transmittance falls below the first-hit threshold; the minimum
 over the samples of a pixel, 0 if none is hit."""
 
 from typing import Any

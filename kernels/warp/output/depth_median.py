@@ -1,4 +1,4 @@
-"""Median depth [m]: where the transmittance of a sample falls below one half; of a pixel the lower median of
+"""Median depth [m]: where the transmittance of a sample falls below one half; for a pixel the lower median of
 its samples that have one, 0 if none has."""
 
 from typing import Any

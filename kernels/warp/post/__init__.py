@@ -1,5 +1,6 @@
-"""Steps of a sensor, which change rgb pixel by pixel after resolving: one file for each, which declares a
-`Step`. A file is found by its name.
+"""Sensor steps, one file each, which declares a `Step`. They change rgb pixel by pixel after resolving.
+
+A file is found by its name.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ class Step:
     arrays: Mapping[str, Any] = field(default_factory=dict)
     """arrays of the view (`View.array`): name in `s`: type of an element"""
     apply: Any
-    """(v, x, y, channel, s): the channel's light after the step; s: a struct with the numbers and arrays of
-    all of a picture's steps"""
+    """(v, x, y, channel, s): returns the channel's value after the step; s: a struct with the numbers and
+    arrays of all steps"""
 
 
 def known() -> frozenset[str]:
