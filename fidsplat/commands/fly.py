@@ -197,18 +197,22 @@ def _parse_times(text: str) -> list[float]:
 def write_log(folder: FlightFolder, path: str, overwrite: bool, compress: str | None = None) -> Iterator[int]:
     """Write rgb, outputs that are arrays, intrinsics and poses to a log; yields the number of each frame."""
     from fidsplat.logs import RobotLog
+    from fidsplat.scenes.sources import scene_up
 
     flight = folder.flight
     camera = flight.capture.camera
     assert camera is not None
     start = min(0.0, float(flight.path.times[0]))  # the times of a log are not negative
-    with RobotLog(path, overwrite=overwrite, source=folder.key) as log:
+    up = scene_up(flight.scene)
+    with RobotLog(path, up=up, overwrite=overwrite, source=folder.key) as log:
         for k, (seconds, pose) in enumerate(zip(flight.path.times, flight.path.poses, strict=True)):
             moment = float(seconds) - start
-            for name, image in _load_images(folder, k).items():
+            images = _load_images(folder, k)
+            for name in {"rgb": None} | images:
+                log.camera_info(moment, CAMERA, camera, name)
+            for name, image in images.items():
                 log.image(moment, CAMERA, image, name, compress if name == "rgb" else None)
-            log.camera_info(moment, CAMERA, camera)
-            log.transform(moment, CAMERA, pose)
+            log.camera_pose(moment, CAMERA, pose)
             yield k
 
 

@@ -268,13 +268,13 @@ def write_log(
     run = drive.run()
     indices, camera = drive.image_indices(run), replace(drive.camera, lens=variant.lens)
     detections = []
-    with RobotLog(path, overwrite=overwrite, source=source) as log:
+    with RobotLog(path, up=(0, 0, 1), overwrite=overwrite, source=source) as log:
         for k, image in zip(indices.tolist(), drive.images(variant, run, renderer), strict=True):
             time, codes = float(run.times[k]), detect(image, (FAMILY,), qr=False)
             detections.append(codes)
             log.image(time, CAMERA, image, compress="jpeg")
             log.camera_info(time, CAMERA, camera)
-            log.transform(time, CAMERA, run.camera.poses[k])
+            log.camera_pose(time, CAMERA, run.camera.poses[k])
             log.detections(time, CAMERA, codes)
             yield image
         estimate, _ = drive.localise(run, detections, camera)

@@ -19,6 +19,10 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+MAX_DEPTH = 16
+"""maximum number of frames between a frame and the world"""
+SCENE = "scene"
+"""frame of a scene's own axes in an upright world"""
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _ENCODINGS = {
     "rgb8": (3, [0, 1, 2]),
@@ -71,7 +75,8 @@ def log_images(path: str | os.PathLike[str], topic: str | None = None) -> Iterat
 
 
 def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]:
-    """Poses in the world (4, 4) by frame and nanoseconds, from `/tf`, of frames whose parent has no parent.
+    """Poses (4, 4) in the scene by frame and nanoseconds, from `/tf`: relative to the frame `scene`, or else
+    to the frame without a parent. Frames between must have a pose of the same time.
 
     Raises:
         InputError: not a log, a damaged log, or an invalid pose.
@@ -82,7 +87,21 @@ def log_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int], np.ndarray]
             for one in store.deserialize_cdr(data, kind).transforms if kind == _TRANSFORMS else ():
                 found[one.child_frame_id, _stamp(one.header)] = one
     children = {frame for frame, _ in found}
-    return {key: _pose(one.transform) for key, one in found.items() if one.header.frame_id not in children}
+    poses = {}
+    for frame, stamp in found:
+        pose, parent = np.eye(4), frame
+        for _ in range(MAX_DEPTH):
+            one = found.get((parent, stamp))
+            if one is None:
+                break
+            pose, parent = _pose(one.transform) @ pose, one.header.frame_id
+        if parent not in children:
+            poses[frame, stamp] = pose
+    scenes = {stamp: np.linalg.inv(pose) for (frame, stamp), pose in poses.items() if frame == SCENE}
+    return {
+        (frame, stamp): scenes[stamp] @ pose if stamp in scenes else pose
+        for (frame, stamp), pose in poses.items()
+    }
 
 
 @contextmanager

@@ -12,12 +12,15 @@ import numpy as np
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
 from fidsplat.effects import IMAGES
 from fidsplat.images.files import encode_image, pixels_of, to_uint8
+from fidsplat.logs.reader import SCENE
 from fidsplat.logs.writers import log_file, typestore
 from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.util.arguments import instance, invalid, items, number, real_array, text
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.vision.detect import Detection
 
+OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+"""link_from_optical: REP-103's body axes (x forward, y left, z up) from OpenCV's"""
 PIXEL = 0.5
 """offset to the pixel coordinates of ROS and OpenCV, whose first pixel centre is at 0"""
 
@@ -31,6 +34,9 @@ class RobotLog:
     Args:
         path: NAME.mcap, or a new folder.
         world: name of the reference frame of poses.
+        up: (3,) direction that points up in the scene. With it, frames follow REP-103 and REP-105: the z axis
+            of the world points up, the scene's own axes are the frame `scene`, and data of a camera have the
+            frame CAMERA_optical_frame, for which `camera_pose` writes the poses.
         overwrite: whether an existing log is replaced.
         source: identifies the source of the log in its metadata, so that `check_log` recognises it.
 
@@ -43,9 +49,11 @@ class RobotLog:
         path: str | os.PathLike[str],
         *,
         world: str = "map",
+        up: Any = None,
         overwrite: bool = False,
         source: str = "",
     ) -> None:
+        self._world_from_scene = None if up is None else _upright(up)
         self._store = typestore()
         self._file = log_file(path, self._store, overwrite, source)
         self._path, self.world = path, world
@@ -75,14 +83,16 @@ class RobotLog:
         pixels = pixels_of(image)
         if pixels.ndim not in (2, 3) or not pixels.size or (output == "rgb" and pixels.shape[2:] != (3,)):
             raise InputError(f"an image must be (h, w) or (h, w, k), rgb (h, w, 3), got {pixels.shape}")
-        topic = f"/{camera}/image_raw" if output == "rgb" else f"/{camera}/{output}/image_raw"
+        topic = f"{_namespace(camera, output)}/image_raw"
         if compress is not None:
             if not isinstance(compress, str) or compress not in ("jpeg", "png") or output != "rgb":
                 raise InputError(
                     f"compress must be 'jpeg' or 'png', for rgb only, got {compress!r} for {output}"
                 )
             data = np.frombuffer(encode_image(pixels, compress), np.uint8)
-            message = self._of("sensor_msgs/msg/CompressedImage")(self._header(time, camera), compress, data)
+            message = self._of("sensor_msgs/msg/CompressedImage")(
+                self._header(time, self._frame(camera)), compress, data
+            )
             self._write(f"{topic}/compressed", time, message)
             return
         pixels = to_uint8(pixels) if output == "rgb" else pixels
@@ -96,13 +106,13 @@ class RobotLog:
             topic,
             time,
             self._of("sensor_msgs/msg/Image")(
-                self._header(time, camera), height, width, kind, 0, data.size // height, data
+                self._header(time, self._frame(camera)), height, width, kind, 0, data.size // height, data
             ),
         )
 
-    def camera_info(self, time: float, name: str, camera: Camera) -> None:
-        """A camera's intrinsics and distortion as `/CAMERA/camera_info`: plumb_bob, rational_polynomial or
-        equidistant.
+    def camera_info(self, time: float, name: str, camera: Camera, output: str = "rgb") -> None:
+        """A camera's intrinsics and distortion as `/CAMERA/camera_info`, or `/CAMERA/OUTPUT/camera_info` for
+        all but rgb: plumb_bob, rational_polynomial or equidistant.
 
         Raises:
             InputError: a lens without a ROS model.
@@ -111,20 +121,37 @@ class RobotLog:
         k = camera.matrix - [[0, 0, PIXEL], [0, 0, PIXEL], [0, 0, 0]]
         roi = self._of("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
         message = self._of("sensor_msgs/msg/CameraInfo")(
-            self._header(time, name), camera.height, camera.width, model, np.array(factors, np.float64),
-            k.ravel(), np.eye(3).ravel(), np.column_stack([k, np.zeros(3)]).ravel(), 0, 0, roi,
+            self._header(time, self._frame(name)), camera.height, camera.width, model,
+            np.array(factors, np.float64), k.ravel(), np.eye(3).ravel(),
+            np.column_stack([k, np.zeros(3)]).ravel(), 0, 0, roi,
         )  # fmt: skip
-        self._write(f"/{name}/camera_info", time, message)
+        self._write(f"{_namespace(name, output)}/camera_info", time, message)
+
+    def camera_pose(self, time: float, camera: str, pose: Any) -> None:
+        """Pose of a camera in the scene (4, 4), with OpenCV's axes, as `/tf`.
+
+        With `up` of the log: of CAMERA_link, whose x axis points forward and z up, in the world, of
+        CAMERA_optical_frame in it, and of the scene in the world. Without it: of CAMERA in the world.
+        """
+        if self._world_from_scene is None:
+            return self.transform(time, camera, pose)
+        check_similarity(pose, f"the pose of {text('the name of a frame', camera)}", rigid=True)
+        link = self._world_from_scene @ np.asarray(pose, np.float64) @ np.linalg.inv(OPTICAL)
+        self._transforms(
+            time,
+            (self.world, SCENE, self._world_from_scene),
+            (self.world, f"{camera}_link", link),
+            (f"{camera}_link", self._frame(camera), OPTICAL),
+        )
 
     def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
         """Pose of a frame in its parent (4, 4), by default the world, as `/tf`. A camera's frame has OpenCV's
         axes, like ROS's optical frames."""
-        position, turn = self._pose_parts(f"the pose of {text('the name of a frame', frame)}", pose)
-        made = self._of("geometry_msgs/msg/Transform")(self._of("geometry_msgs/msg/Vector3")(*position), turn)
-        stamped = self._of("geometry_msgs/msg/TransformStamped")(
-            self._header(time, self.world if parent is None else parent), frame, made
+        check_similarity(pose, f"the pose of {text('the name of a frame', frame)}", rigid=True)
+        given = np.asarray(pose, np.float64)
+        self._transforms(
+            time, (self.world, frame, self._in_world(given)) if parent is None else (parent, frame, given)
         )
-        self._write("/tf", time, self._of("tf2_msgs/msg/TFMessage")([stamped]))
 
     def odometry(
         self, time: float, pose: Any, velocity: Any = (0, 0, 0), angular_velocity: Any = (0, 0, 0),
@@ -132,7 +159,8 @@ class RobotLog:
     ) -> None:  # fmt: skip
         """Pose of the body in the world (4, 4), velocities (3,) in m/s and rad/s in the body's axes, and the
         covariance of the pose (6, 6)."""
-        position, turn = self._pose_parts("the pose of odometry", pose)
+        check_similarity(pose, "the pose of odometry", rigid=True)
+        position, turn = self._pose_parts(self._in_world(np.asarray(pose, np.float64)))
         spread = np.zeros((6, 6)) if covariance is None else real_array("covariance", covariance)
         if spread.shape != (6, 6):
             raise invalid("covariance", "(6, 6) numbers", covariance)
@@ -180,7 +208,9 @@ class RobotLog:
             middle = point(*(np.asarray(code.corners).mean(0) - PIXEL).tolist())
             family, number = (code.payload or "", -1) if code.id is None else (code.family or "", code.id)
             tags.append(tag(family, number, 0, 0.0, 0.0, middle, corners, np.zeros(9)))
-        message = self._of("apriltag_msgs/msg/AprilTagDetectionArray")(self._header(time, camera), tags)
+        message = self._of("apriltag_msgs/msg/AprilTagDetectionArray")(
+            self._header(time, self._frame(camera)), tags
+        )
         self._write(f"/{camera}/detections", time, message)
 
     def _of(self, kind: str) -> Any:
@@ -191,10 +221,31 @@ class RobotLog:
         seconds, rest = divmod(_nanoseconds(time), 10**9)
         return self._of("std_msgs/msg/Header")(self._of("builtin_interfaces/msg/Time")(seconds, rest), frame)
 
-    def _pose_parts(self, name: str, pose: Any) -> tuple[list[float], Any]:
-        _, _, position = check_similarity(pose, name, rigid=True)
-        w, x, y, z = matrix_to_quaternion(np.asarray(pose, np.float64)[:3, :3]).tolist()
-        return position.tolist(), self._of("geometry_msgs/msg/Quaternion")(x, y, z, w)
+    def _frame(self, camera: str) -> str:
+        """The frame of a camera's data."""
+        text("the name of a frame", camera)
+        return camera if self._world_from_scene is None else f"{camera}_optical_frame"
+
+    def _in_world(self, pose: np.ndarray) -> np.ndarray:
+        """A pose in the scene as a pose in the world."""
+        return pose if self._world_from_scene is None else self._world_from_scene @ pose
+
+    def _transforms(self, time: float, *transforms: tuple[str, str, np.ndarray]) -> None:
+        """Write one `/tf` message of parents, frames and poses."""
+        stamped = []
+        for parent, frame, pose in transforms:
+            position, turn = self._pose_parts(pose)
+            made = self._of("geometry_msgs/msg/Transform")(
+                self._of("geometry_msgs/msg/Vector3")(*position), turn
+            )
+            stamped.append(
+                self._of("geometry_msgs/msg/TransformStamped")(self._header(time, parent), frame, made)
+            )
+        self._write("/tf", time, self._of("tf2_msgs/msg/TFMessage")(stamped))
+
+    def _pose_parts(self, pose: np.ndarray) -> tuple[list[float], Any]:
+        w, x, y, z = matrix_to_quaternion(pose[:3, :3]).tolist()
+        return pose[:3, 3].tolist(), self._of("geometry_msgs/msg/Quaternion")(x, y, z, w)
 
     def _write(self, topic: str, time: float, message: Any) -> None:
         text("topic", topic)
@@ -210,6 +261,25 @@ class RobotLog:
             self._file.write(topic, kind, _nanoseconds(time), data)
         except OSError as error:
             raise InputError(f"cannot write {self._path}: {error.strerror or error}") from error
+
+
+def _namespace(camera: str, output: str) -> str:
+    return f"/{camera}" if output == "rgb" else f"/{camera}/{text('output', output)}"
+
+
+def _upright(up: Any) -> np.ndarray:
+    """The smallest rotation (4, 4) that maps a direction to the z axis."""
+    axis = real_array("up", up, "three finite numbers, not all 0")
+    if axis.shape != (3,) or not np.isfinite(axis).all() or not np.any(axis):
+        raise invalid("up", "three finite numbers, not all 0", up)
+    x, y, z = axis / np.linalg.norm(axis)
+    pose = np.eye(4)
+    if z < -1 + 1e-12:  # half a turn about x
+        pose[:3, :3] = np.diag([1, -1, -1])
+    else:
+        cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+        pose[:3, :3] += cross + cross @ cross / (1 + z)
+    return pose
 
 
 def _encoding(output: str, channels: int) -> str:

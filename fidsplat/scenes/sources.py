@@ -134,6 +134,11 @@ def framing_camera(
     return pose.applied(camera, middle)
 
 
+def scene_up(scene: Scene) -> np.ndarray:
+    """Direction (3,) that points up in a scene, as `fidsplat info` guesses it."""
+    return guess_up(_sampled(scene.stores[0] if scene.stores else scene.cloud())).direction
+
+
 def _sampled(cloud: SplatCloud | Store) -> SplatCloud:
     """The cloud, or some chunks of a store."""
     if not isinstance(cloud, Store):

@@ -147,9 +147,10 @@ def test_poses_of_a_log_are_those_of_frames_in_the_world(here):
     with logs.RobotLog("run.mcap") as log:
         log.transform(0.5, "robot", pose)
         log.transform(0.5, "camera", pose, "robot")
-    (found,) = logs.log_poses("run.mcap").items()
-    assert found[0] == ("robot", 500_000_000)
-    np.testing.assert_allclose(found[1], pose, atol=1e-12)
+    found = logs.log_poses("run.mcap")
+    assert list(found) == [("robot", 500_000_000), ("camera", 500_000_000)]
+    for moved, expected in zip(found.values(), (pose, pose @ pose), strict=True):
+        np.testing.assert_allclose(moved, expected, atol=1e-12)
 
 
 def test_a_video_does_not_say_where_its_camera_was(here, capsys):

@@ -204,6 +204,43 @@ def test_a_disk_that_is_full_leaves_nothing(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0, 0, -2), (0.6, 0, 0.8)])
+def test_frames_follow_rep_103_and_105(tmp_path, up):
+    from scipy.spatial.transform import RigidTransform, Rotation
+
+    from fidsplat.logs import RobotLog, log_poses
+
+    with RobotLog(tmp_path / "bag", up=up) as log:
+        log.image(1.0, "front", DEPTH, "depth")
+        log.camera_info(1.0, "front", LENS, "depth")
+        log.camera_pose(1.0, "front", POSE)
+    messages = {topic: message for topic, _, message in by_rosbags(tmp_path / "bag")}
+    for topic in ("image_raw", "camera_info"):
+        assert messages[f"/front/depth/{topic}"].header.frame_id == "front_optical_frame"
+    tree = {}
+    for one in messages["/tf"].transforms:
+        at, turn = one.transform.translation, one.transform.rotation
+        pose = RigidTransform.from_components(
+            [at.x, at.y, at.z], Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+        )
+        tree[one.header.frame_id, one.child_frame_id] = pose
+    map_from_scene, map_from_link = tree["map", "scene"], tree["map", "front_link"]
+    optical = tree["front_link", "front_optical_frame"]
+    np.testing.assert_allclose(map_from_scene.apply(up) / np.linalg.norm(up), (0, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(optical.apply(np.eye(3)), [(0, -1, 0), (0, 0, -1), (1, 0, 0)], atol=1e-12)
+    there = map_from_scene.inv() * map_from_link * optical
+    np.testing.assert_allclose(there.as_matrix(), POSE, atol=1e-12)
+    np.testing.assert_allclose(log_poses(tmp_path / "bag")["front_optical_frame", 10**9], POSE, atol=1e-12)
+
+
+def test_up_is_checked(tmp_path):
+    from fidsplat.logs import RobotLog
+
+    for up in ((0, 0, 0), (1, 2), "up"):
+        with pytest.raises(fs.InputError, match="up must be"):
+            RobotLog(tmp_path / "a.mcap", up=up)
+
+
 @pytest.mark.parametrize("name", ["run.mcap", "bag"])
 def test_damaged_logs(tmp_path, name):
     from fidsplat.logs import log_images
