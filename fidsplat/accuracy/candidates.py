@@ -15,7 +15,8 @@ from fidsplat.capture.quality import Quality
 
 FILE = Path(__file__).with_name("candidates.json")
 MARGIN = 1.5
-"""factor between a promised error and the largest measured one, which other scenes slightly exceed"""
+"""factor between a promised error and the largest measured one, as other scenes may slightly exceed the
+latter"""
 
 DEFAULTS: dict[str, Any] = {
     "alpha_cutoff": 1.0 / 255.0,
@@ -26,11 +27,11 @@ DEFAULTS: dict[str, Any] = {
 }
 """Quality settings that `quality_within` chooses, and their values unless a candidate differs.
 
-Settings that only add error are off (opacity ceiling, exclusive stop). The others define the image, and stay
-those of the base quality.
+Settings that only add errors (opacity ceiling, exclusive stop) are always off. All others define the image,
+and are taken from the base quality.
 """
 PORTABLE = ("alpha_cutoff", "transmittance_stop", "arithmetic")
-"""the settings among them that every device supports"""
+"""names of the settings of `DEFAULTS` that every device supports"""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ class Candidate:
 def load(kind: str) -> tuple[Candidate, ...]:
     """The candidates for a kind of device (cpu, gpu), the fastest first.
 
-    A kind without measurements uses those of CPUs: float32 errors are alike, and costs have the same order.
+    A kind without measurements uses those of CPUs: errors in float32 are similar, and costs have the same
+    order.
     """
     classes = json.loads(FILE.read_text("utf-8"))["classes"]
     rows = classes.get(kind, classes["cpu"])["candidates"]

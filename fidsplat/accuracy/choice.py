@@ -10,7 +10,7 @@ from fidsplat.capture.quality import Quality
 
 @dataclass(frozen=True)
 class Choice:
-    """A quality, with its error and time and how they are known."""
+    """A chosen quality, with its error and time, and the origin of these numbers."""
 
     quality: Quality
     error: float
@@ -31,7 +31,7 @@ class Choice:
     """class of scenes of a promise, or why there is no certificate"""
 
     def as_dict(self) -> dict[str, Any]:
-        """All but the quality, for JSON."""
+        """All fields except the quality, for JSON."""
         keys = ("error", "ms", "ms_late", "source", "device", "settings", "certified", "remark")
         return {key: getattr(self, key) for key in keys}
 

@@ -29,7 +29,7 @@ class Capture(PickledByFields):
     """
 
     camera: Camera | None = None
-    """None: to be set before rendering"""
+    """None: must be set before rendering"""
     outputs: tuple[str, ...] = ("rgb",)
     """names of the output images; a single name may be a str"""
     quality: Quality = field(default_factory=Quality)
@@ -37,15 +37,15 @@ class Capture(PickledByFields):
     background: Background = (0.0, 0.0, 0.0)
     """behind the splats: RGB in display space, a Gradient or a Panorama"""
     motion: Motion = field(default_factory=Motion)
-    """motion of the camera and of groups of splats; None: none"""
+    """motion of the camera and of groups of splats; None: nothing moves"""
     shutter: Shutter = field(default_factory=Shutter)
     """time, exposure and readout; None: at time 0, without duration"""
     sensor: Sensor = field(default_factory=Sensor)
-    """sensor applied to rgb; None: none"""
+    """sensor applied to rgb; None: no sensor"""
     fog: Fog | None = None
     """fog between the camera and the splats"""
     external_depth: ExternalDepth | None = None
-    """image with depths of another renderer, an opaque surface among the splats; of the camera's size"""
+    """external depth image from another renderer, of the camera's size: an opaque surface among the splats"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__

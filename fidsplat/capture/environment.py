@@ -108,10 +108,10 @@ class ExternalDepth(PickledByFields):
     rgb: np.ndarray
     """(h, w, 3) float32 in display space, read-only; uint8 is divided by 255"""
     depth: np.ndarray
-    """(h, w) float32 metres, as the camera's depths are (along z; along the ray for a fisheye or panorama);
-    infinite where there is nothing, also given as 0 or NaN"""
+    """(h, w) float32 metres, along z (along the ray for a fisheye or panorama); infinite where there is no
+    surface, which may also be given as 0 or NaN"""
     label: np.ndarray | int = 0
-    """(h, w) int32, or one for all"""
+    """(h, w) int32, or one label for all pixels"""
 
     def __post_init__(self) -> None:
         rgb, depth, label = (

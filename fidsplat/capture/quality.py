@@ -78,8 +78,8 @@ class MarkerQuality:
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality settings of a frame. No bound on their error holds for every scene; the output `error` is a
-    bound for one frame (docs/accuracy.md).
+    """Quality settings of a frame. They do not bound the error for every scene; the output `error` bounds it
+    for one frame (docs/accuracy.md).
 
     Raises:
         InputError: a value is out of range.

@@ -35,9 +35,9 @@ class Sensor:
     """up to three numbers a, b, c: light times 1 + a r^2 + b r^4 + c r^6, with r the distance from the
     principal point in half diagonals of the image"""
     full_well: float = math.inf
-    """electrons of the value 1, at least 1: n electrons have a shot noise of sqrt(n); inf has none"""
+    """electrons at the value 1, at least 1: n electrons have a shot noise of sqrt(n); inf: no shot noise"""
     read_noise: float = 0.0
-    """standard deviation of each read-out in electrons, 0 to full_well; needs full_well"""
+    """standard deviation of the read-out noise in electrons, 0 to full_well; requires full_well"""
     seed: int = 0
     """seed of the noise, 0 to 2^32 - 1; use another one for each frame"""
     gain: float = 1.0

@@ -56,7 +56,7 @@ class FrameBatch(Mapping):
         On an OpenCL device it is a pyopencl.array.Array. On a Warp device it is a wp.array, which DLPack
         converts to a tensor.
 
-        The batch owns them: the next batch has other arrays.
+        The batch owns the arrays; the next batch has new ones.
 
         Raises:
             InputError: an output that was not requested, or the backend shares no arrays.
@@ -105,12 +105,12 @@ class FrameBatch(Mapping):
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage, of all views together."""
+        """Milliseconds on the device by stage, for all views together."""
         return self._images.timings
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """splats (in the cloud), visible, pairs: of all views together."""
+        """Number of splats in the cloud, and of visible splats and pairs of all views together."""
         return self._images.stats
 
 

@@ -143,7 +143,7 @@ class ErrorImage:
 
 
 def ideal_of(data: Any, capture: Capture, backend: Backend) -> Ideal:
-    """Features, view and error bound of the second rendering, for an uploaded cloud.
+    """Prepare the second rendering of an uploaded cloud: its features, view and error bound.
 
     Raises:
         InputError: an effect of the capture has no bound, on any device or on this one.

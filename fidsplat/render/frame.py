@@ -74,7 +74,7 @@ class Frame(Mapping):
     def device_array(self, name: str) -> Any:
         """The image on its device, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
 
-        The frame owns it: the next frame has another array. `wp.to_torch`, DLPack and
+        The frame owns the array; the next frame has a new one. `wp.to_torch`, DLPack and
         `__cuda_array_interface__` convert it to a tensor on the same device.
 
         Raises:
@@ -245,7 +245,8 @@ class Frame(Mapping):
 
     @property
     def stats(self) -> Mapping[str, int]:
-        """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
+        """Number of splats in the cloud, of visible (not culled) splats, and of pairs of a splat and a
+        tile."""
         return self._images.stats if self._images.views == 1 else {}
 
 

@@ -30,7 +30,7 @@ from fidsplat.util.arguments import invalid, items
 from fidsplat.util.errors import InputError
 
 _MAX_IMBALANCE = 1.1
-"""maximum ratio of the slowest band's time to the mean; above it, bands are balanced again"""
+"""ratio of the slowest band's time to the mean above which bands are balanced again"""
 
 _IN_FLIGHT = 3
 """frames in flight per device: one is copied to the host, one rendered, and one has its chunks prefetched"""
@@ -257,8 +257,8 @@ class _BandImages(Images):
 
     @property
     def stats(self) -> dict[str, Any]:
-        """splats: maximum over the devices. visible, pairs: sums over the bands; a splat counts once in each
-        band in which it is visible."""
+        """splats: maximum over the devices. visible, pairs: sums over the bands; a splat counts in every band
+        in which it is visible."""
         each = [frame.stats for frame in self.frames]
         most = max(one["splats"] for one in each)
         return {"splats": most} | {name: sum(one[name] for one in each) for name in ("visible", "pairs")}

@@ -80,7 +80,7 @@ class SceneParts(PickledByFields):
     """splats in the world, with labels of their own (0 unless given)"""
     camera: Camera | None = None
     markers: tuple[PlacedMarker, ...] = ()
-    """marker i has the label i + 1, whatever label it came with"""
+    """markers; marker i gets the label i + 1, whatever label it had"""
     background: Background = (0.0, 0.0, 0.0)
     """RGB in display space, a Gradient or a Panorama"""
     outputs: tuple[str, ...] = ("rgb",)

@@ -63,7 +63,7 @@ def marker_settings(quality: MarkerQuality, scene: Quality | str | None) -> dict
     changes = _changes(quality, Quality.of(scene).marker)
     if (
         "growth" in changes and quality.growth is None
-    ):  # the default of the mixture, which a file cannot express
+    ):  # a file cannot express None, the default of the mixture
         from fidsplat.markers.mixture import fitted_growth
 
         changes["growth"] = fitted_growth() if quality.mixture == "fitted" else 0.0

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 PERIOD = 0.1
 """seconds between two checks of the flag while waiting"""
 REPEAT = 0.5
-"""seconds in which a second signal is a duplicate: `timeout` and shells signal a process and its group"""
+"""seconds in which a second signal counts as a duplicate: `timeout` and shells signal a process and its
+group"""
 
 _number: int | None = None
 """number of the received signal"""

@@ -87,8 +87,8 @@ def check_holes(path: Path | str) -> None:
 
 
 _IMPORTS, _DRIVER, _PER_CORE, _SPARE = 640 * 2**20, 640 * 2**20, 2**24, 2**28
-"""bytes of address space: NumPy, OpenCV and so on; a driver with its compiler; the threads of a core; further
-imports of a command and a small scene"""
+"""bytes of address space for: NumPy, OpenCV and so on; a driver with its compiler; the threads of each core;
+further imports of a command and a small scene"""
 _FILE = 2**24
 """largest file of a driver's compiler in bytes"""
 _OPEN_FILES = 32

@@ -1,7 +1,7 @@
 """Safe readers of untrusted .npy and .npz files.
 
-`numpy.load` allocates the size that a header declares, may skip the checksums of a .npz file, and raises any
-error of Python's parser for a damaged header. These readers allocate no more than the size of the file.
+`numpy.load` allocates the size that a header declares, may skip the checksums of a .npz file, and raises
+arbitrary errors for a damaged header. These readers allocate at most the size of the file.
 """
 
 from __future__ import annotations

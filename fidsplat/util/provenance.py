@@ -19,7 +19,7 @@ from fidsplat.util.files import kernels_folder
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _REBUILDING = {"fidsplat", "numpy", "copyreg"}
-"""packages whose functions pickle calls to restore data"""
+"""packages whose functions are allowed in pickles, as they restore data"""
 _WITHOUT_SOURCES = {"__pycache__", "_kernels"}
 """folders of the package without sources of its own; a wheel has the kernels in one of them"""
 

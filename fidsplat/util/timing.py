@@ -101,8 +101,8 @@ def frame_timer(
     clock: Callable[[], float] = time.perf_counter,
     **how,
 ) -> Timer:
-    """A timer of frames of a resident scene, whose image stays on the device. A time ends when the device is
-    done; its parts are the stages by the device's clock.
+    """A timer of frames of a resident scene; the image stays on the device. A run ends when the device is
+    done; its parts are the stages, by the device's clock.
 
     Args:
         renderer, scene, camera, how: arguments of `renderer.render(scene, camera, **how)`.

@@ -14,7 +14,7 @@ import numpy as np
 ITERATIONS = 8  # maximum steps of the three rounds: blurred, sharp, sharp with robust weights
 SETTLED = 0.003  # pixels: maximum motion of a corner in the last step
 FINE_BLUR = 0.7  # pixels, standard deviation of the blur
-# difference from the model, as a share of the contrast, at which the weight of a pixel falls (occlusion)
+# difference from the model, as a share of the contrast, above which a pixel has less weight (occlusion)
 TOLERANCE = 0.25
 # a fit with a lower correlation has converged to another place
 MIN_CORRELATION = 0.7
@@ -180,7 +180,7 @@ def _step(model: _Model, smooth: np.ndarray, homography: np.ndarray, blur: float
         gain, base = _contrast(ideal, observed, weight)
     if gain < 0.02:
         return None
-    # the mean of both gradients makes the step second order; outside it is the plain derivative
+    # the mean of the gradients of model and image makes the step second order (ESM)
     slope = np.stack([np.gradient(gain * rendered + smooth, axis=axis) for axis in (1, 0)])
     slope = 0.5 * slope.reshape(2, -1)[:, keep].astype(np.float64)
     x, y, z = homography @ np.stack([s, t, np.ones_like(s)])

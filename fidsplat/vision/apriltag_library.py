@@ -13,7 +13,7 @@ MANY_CODES = 10_000
 """Codes of a family from which one wrong bit is corrected, instead of two: a table for two bits has 4 GB."""
 
 _idle: dict[str, deque] = {}
-"""detectors that no thread uses, by family"""
+"""idle detectors by family"""
 
 
 def read_tags(grey: np.ndarray, family: str) -> list[tuple[int, np.ndarray]]:

@@ -27,8 +27,8 @@ def board_pose(
 
     Returns the detection and pose, or None, and the tags of other markers.
 
-    image: (h, w, 3) uint8. tags: detections in it; of several with one id the nearest to the true position is
-    used.
+    image: (h, w, 3) uint8. tags: detections in it; if several have the same id, the nearest to the true
+    position is used.
     """
     marker, left = placed.marker, list(tags)
     spec = parse_spec(marker.spec)

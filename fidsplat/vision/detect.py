@@ -20,8 +20,9 @@ from fidsplat.util.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.apriltag_library import read_tags
 
-# One family for each common grid; a random dark square decodes as a tag of them less than once in 300 times.
-# 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or have more false positives: only on request.
+# One family for each common grid size; less than one in 300 random dark squares decodes as a tag of these
+# families. 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or have more false positives: only
+# on request.
 DEFAULT_FAMILIES = ("36h11", "25h9", "4x4_50", "5x5_100", "6x6_250", "7x7_250")
 
 MIN_SIDE = 8
@@ -41,13 +42,14 @@ class Detection:
     """A detected code."""
 
     kind: str
-    """"apriltag", "aruco", "qr" or a kind of another package; of `read_back` also a kind of board"""
+    """"apriltag", "aruco", "qr" or a kind of another package; in results of `read_back` also a kind of
+    board"""
     family: str
-    """the tag's dictionary, e.g. "36h11"; of a QR code its version and error level, e.g. "v2-L" """
+    """the tag's dictionary, e.g. "36h11"; for a QR code its version and error level, e.g. "v2-L" """
     id: int | None
     """id of a tag; None for QR codes and boards"""
     payload: str | None
-    """text of a QR code, "7x5:4x4_50" of a board; None for a tag"""
+    """text of a QR code; for a board e.g. "7x5:4x4_50"; None for a tag"""
     corners: np.ndarray
     """(4, 2) float64, pixels: TL, TR, BR, BL as printed, on the code's outer edge; pixel (i, j) has its
     centre at (j + 0.5, i + 0.5)"""
@@ -127,7 +129,7 @@ def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
         # corners can be modules away from the true ones, outside the window of the refinement. Fitting lines
         # to the sides solves this, but dark lines that touch the tag rotate them.
         _read_tags(grey, kind, family, cv2.aruco.CORNER_REFINE_CONTOUR, 0.0, found, loose)
-    # the fit converges from none of the corners: use those with the best correlation
+    # if the fit converges from none of the candidate corners, use those with the best correlation
     bits = {tag.id: dictionary_bits(kind, family, int(tag.id or 0)) for tag in loose}
     for tag in sorted(loose, key=lambda tag: -fit(grey, tag.corners, bits[tag.id])):
         if not _known(tag, found):

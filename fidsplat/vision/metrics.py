@@ -87,8 +87,8 @@ _EPSILON = 1e-10
 
 
 def weights_name(file: Path) -> str:
-    """Identity of LPIPS weights in results: the start of the file's hash. Raises InputError for an unreadable
-    file."""
+    """Name of LPIPS weights in results: the first digits of the file's hash. Raises InputError for an
+    unreadable file."""
     try:
         return hashlib.sha256(read_input(file)).hexdigest()[:12]
     except InputError as error:

@@ -57,7 +57,7 @@ class ReadBack(NamedTuple):
     """Result of `read_back`: readings of the scene's markers, and other detections."""
 
     readings: list[Reading]
-    """one of each marker of the scene, in order"""
+    """one reading for each marker of the scene, in order"""
     others: list[Detection]
     """detected codes that are not in the scene"""
 
@@ -78,7 +78,7 @@ def read_back(
             images by name; or (h, w, 3) uint8, or float in [0, 1].
         scene, camera: as in `truth_of`: the poses of camera and markers are those of the frame's capture, or
         of the scene's capture for other images.
-        families: tag families to detect, see `detect`; default the scene's.
+        families: tag families to detect, see `detect`; by default those of the scene's markers.
 
     Raises:
         InputError: no camera, or one of another size than the image.
@@ -102,9 +102,8 @@ def match(
 ) -> tuple[list[tuple[Detection, np.ndarray] | None], list[Detection]]:
     """Assign detections to markers.
 
-    A detection can belong to a marker of the same kind and id or payload; of several, the nearest pairs are
-    assigned first. Returns the detection and camera_from_marker of each marker, or None, and the unassigned
-    detections.
+    A detection is assigned to a marker of the same kind and id or payload, nearest pairs first. Returns for
+    each marker the detection and camera_from_marker, or None, and the unassigned detections.
     """
     left = list(detections)
     expected = [camera.project(placed.corners) for placed in markers]

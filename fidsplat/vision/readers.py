@@ -1,4 +1,4 @@
-"""Off-the-shelf detectors with their defaults, for experiments on what each one detects and decodes.
+"""Off-the-shelf detectors with their defaults, for experiments that compare what they detect and decode.
 
 `detect` combines detectors and refines corners.
 """
@@ -36,7 +36,7 @@ class Target:
     kind: str
     """"apriltag" or "qr\""""
     family: str
-    """tag family, e.g. "36h11"; anything for a QR code"""
+    """tag family, e.g. "36h11"; ignored for QR codes"""
     id: int | None
     payload: str | None
     corners: np.ndarray

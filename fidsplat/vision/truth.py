@@ -30,8 +30,8 @@ class MarkerTruth:
     corners: np.ndarray
     """(4, 2) pixels of the code's corners, NaN behind the camera"""
     visible: float
-    """visible share of the marker, a module of its quiet zone included, 0 to 1; with a label image
-    occlusion counts too"""
+    """visible share, 0 to 1, of the marker with one module of its quiet zone; accounts for occlusion if there
+    is a label image"""
     box: Box | None
     """bounding box of the visible part; None if nothing is visible"""
 
@@ -67,7 +67,7 @@ class Truth:
     camera: Camera
     """camera of the image, at its pose"""
     markers: list[MarkerTruth]
-    """one of each marker of the scene, in order"""
+    """one for each marker of the scene, in order"""
     groups: dict[int, GroupTruth]
     """groups in the image by label; empty for a frame without labels"""
 
@@ -77,7 +77,7 @@ def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | Non
 
     Args:
         frame: a Frame, whose own capture has the poses of camera and markers; or images by name,
-            rendered with the scene's capture. `label` brings occlusion and masks.
+            rendered with the scene's capture. With `label`, occlusion and masks are included.
         scene: the rendered scene; poses are those at the shutter's time.
         camera: replaces the capture's camera, with its pose.
 
