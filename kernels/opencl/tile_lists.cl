@@ -24,61 +24,65 @@ enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 // Classes of lists by decreasing length, of which there are SCAN_ITEMS.
 static inline uint length_class(uint length) { return SCAN_ITEMS - 1 - min(length / 4, SCAN_ITEMS - 1u); }
 
-// Lengths of the lists of four tiles from `first` on; 0 beyond the last tile.
-static inline uint4 tile_lengths(global const uint *tallies, uint first, uint tiles) {
+// Lengths of the lists of four tiles from `first` on; 0 from tile `end` on.
+static inline uint4 tile_lengths(global const uint *tallies, uint first, uint end) {
     uint length[4];
-    for (uint k = 0; k < 4; k++) length[k] = first + k < tiles ? tallies[TALLIES + first + k] : 0;
+    for (uint k = 0; k < 4; k++) length[k] = first + k < end ? tallies[TALLIES + first + k] : 0;
     return (uint4)(length[0], length[1], length[2], length[3]);
 }
 
-// Index space: one work-group of SCAN_ITEMS.
-// Reads: tallies, zeroed for the next frame if `clear`. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts,
-// to which `emit` adds the number of visible splats; tile_order[tiles]: tiles by the classes of their lists, so that blending begins
-// with the longest, in any order within a class.
+// Index space: work-groups of SCAN_ITEMS. The first one orders the tiles, the others have a share of the tiles each; each adds up the
+// lists of all tiles, so that none waits for another.
+// Reads: tallies. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts, to which `emit` adds the number of visible
+// splats; tile_order[tiles]: tiles by the classes of their lists, so that blending begins with the longest, in any order within a class.
 // All lists are empty if there are more pairs than `capacity`, unless that is 2^32 - 1.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 //@@ arguments tile_starts
 ) {
     local ulong partial[SCAN_ITEMS];
     local uint classes[SCAN_ITEMS];
-    uint item = get_local_id(0);
-    ulong total, running = 0;
-    classes[item] = 0;
-    barrier(CLK_LOCAL_MEM_FENCE);
+    uint item = get_local_id(0), group = get_group_id(0), shares = get_num_groups(0) - 1;
+    ulong before = 0, pairs = 0, total;
+    if (group == 0) {
+        classes[item] = 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint tile = item; tile < tiles; tile += SCAN_ITEMS) atomic_inc(classes + length_class(tallies[TALLIES + tile]));
+        barrier(CLK_LOCAL_MEM_FENCE);
+        classes[item] = (uint)scan_group(partial, item, classes[item], &total);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint tile = item; tile < tiles; tile += SCAN_ITEMS)
+            tile_order[atomic_inc(classes + length_class(tallies[TALLIES + tile]))] = tile;
+        return;
+    }
+    uint share = (tiles + 4 * shares - 1) / (4 * shares) * 4, from = min((group - 1) * share, tiles);
+    uint to = min(from + share, tiles);
     for (uint first = 4 * item; first < tiles; first += 4 * SCAN_ITEMS) {
         uint4 lengths = tile_lengths(tallies, first, tiles);
-        atomic_inc(classes + length_class(lengths.x));
-        atomic_inc(classes + length_class(lengths.y));
-        atomic_inc(classes + length_class(lengths.z));
-        atomic_inc(classes + length_class(lengths.w));
+        ulong sum = (ulong)lengths.x + lengths.y + lengths.z + lengths.w;
+        pairs += sum;
+        if (first < from) before += sum;
     }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    classes[item] = (uint)scan_group(partial, item, classes[item], &total);
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint round = 0; round < tiles; round += 4 * SCAN_ITEMS) {
+    scan_group(partial, item, pairs, &pairs);
+    scan_group(partial, item, before, &before);
+    bool fits = capacity == 0xFFFFFFFFu || pairs <= capacity;
+    for (uint round = from; round < to; round += 4 * SCAN_ITEMS) {
         uint first = round + 4 * item;
-        uint4 lengths = tile_lengths(tallies, first, tiles);
+        uint4 lengths = tile_lengths(tallies, first, to);
         uint length[4] = {lengths.x, lengths.y, lengths.z, lengths.w};
-        uint place = (uint)(running + scan_group(partial, item, (ulong)lengths.x + lengths.y + lengths.z + lengths.w, &total));
-        for (uint k = 0; k < 4 && first + k < tiles; k++) {
-            starts[first + k] = cursors[first + k] = place;
+        uint place = (uint)(before + scan_group(partial, item, (ulong)lengths.x + lengths.y + lengths.z + lengths.w, &total));
+        for (uint k = 0; k < 4 && first + k < to; k++) {
+            cursors[first + k] = place;
+            starts[first + k] = fits ? place : 0;
             place += length[k];
-            tile_order[atomic_inc(classes + length_class(length[k]))] = first + k;
-            if (clear) tallies[TALLIES + first + k] = 0;
         }
-        running += total;
+        before += total;
     }
-    if (item == 0) {
-        starts[tiles] = (uint)running;
+    if (from == 0 && item == 0) {
+        starts[tiles] = fits ? (uint)pairs : 0;
         counts[COUNT_BIG] = tallies[TALLY_BIG];
-        if (clear) tallies[TALLY_BIG] = 0;
         counts[COUNT_VISIBLE] = 0;   // added up by `emit`
-        counts[COUNT_PAIRS] = (uint)running;
-        counts[COUNT_PAIRS + 1] = (uint)(running >> 32);
-    }
-    if (capacity != 0xFFFFFFFFu && running > capacity) {
-        barrier(CLK_GLOBAL_MEM_FENCE);
-        for (uint tile = item; tile <= tiles; tile += SCAN_ITEMS) starts[tile] = 0;
+        counts[COUNT_PAIRS] = (uint)pairs;
+        counts[COUNT_PAIRS + 1] = (uint)(pairs >> 32);
     }
 }
 
@@ -254,7 +258,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 
 // Sorts each tile's list by (depth key, splat); all keys differ.
 // Index space: work-groups of SORT_ITEMS, one per tile of the band.
-// Reads: starts. Consumes: pairs. Writes: lists.
+// Reads: starts. Consumes: pairs. Writes: lists; tallies, zeroed for the next frame if `clear`.
 //
 // A list that fits local memory is bucket-sorted by depth. Short and long lists, and those with an overfull bucket, go through a
 // bitonic network; every comparator moves the smaller key to the front, as if the list were padded with infinities.
@@ -385,6 +389,10 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
     uint start = starts[tile] - starts[band_first], length = starts[tile + 1] - starts[tile];
     global ulong *list = pairs + start;
+    if (clear && item == 0) {
+        tallies[TALLIES + tile] = 0;
+        if (tile == 0) tallies[TALLY_BIG] = 0;
+    }
     if (length > SHORT && length <= SORT_LOCAL && bucket_sort(list, length, items, &buckets, lists + start)) return;
     uint padded = 1;
     while (padded < length) padded *= 2;

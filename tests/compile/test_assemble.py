@@ -220,9 +220,9 @@ TAKEN = {
         "blend": (19, 7, 15508),
         "emit": (17, 8, 18708),
         "project": (14, 12, 0),
-        "sort_tiles": (4, 3, 20556),
+        "sort_tiles": (6, 4, 20556),
         "tally_big": (7, 3, 272),
-        "tile_starts": (8, 5, 12288),
+        "tile_starts": (7, 5, 12288),
     },
 }
 

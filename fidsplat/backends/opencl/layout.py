@@ -161,7 +161,9 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "bin_emit": takes(
         *(_WALK, "in uint starts", "int band_first band_end", "out uint lists"),
     ),
-    "tile_starts": takes("uint tiles capacity clear", "out uint tallies starts cursors counts tile_order"),
+    "tile_starts": takes(
+        "uint tiles capacity", "in uint tallies", "out uint starts cursors counts tile_order"
+    ),
     "tally_big": takes("uint count", _SIZE, _BIG, "in uint big", "out uint tallies"),
     "emit": takes(
         *(
@@ -178,7 +180,9 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("uint count first_band", _SIZE, "int band_first band_end", "uint capacity"),
         *("in uint2 windows", "in uint keys starts", "out uint counts cursors", "out uint2 pairs"),
     ),
-    "sort_tiles": takes("int band_first", "in uint starts", "out ulong pairs", "out uint lists"),
+    "sort_tiles": takes(
+        "int band_first", "uint clear", "in uint starts", "out ulong pairs", "out uint lists tallies"
+    ),
     "blend": _BLEND,
     "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
     "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),

@@ -161,13 +161,13 @@ class OpenCLProbe(Probe):
         sums = buffer_of(workspace, np.zeros(8, np.uint32))
         given = {"starts": starts}
         if pipeline.shape.lists != "ordered":
-            kernel, place = "tile_starts", 1
-            given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "clear": 0, "counts": sums}
+            kernel, place, size = "tile_starts", 1, (3 * items[0],)
+            given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
             tallies = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
             given |= {"tallies": tallies, "cursors": buffer_of(workspace, lengths)}
             given["tile_order"] = buffer_of(workspace, np.empty_like(lengths))
         else:
-            kernel, place = "scan_bins", 4
+            kernel, place, size = "scan_bins", 4, items
             given |= {
                 "bins": len(lengths),
                 "totals": buffer_of(workspace, lengths),
@@ -176,7 +176,7 @@ class OpenCLProbe(Probe):
             }
         arguments = pipeline.source.arguments[kernel]
         values = [given[one.name] for one in arguments]
-        CommandList(pipeline.program).launch(workspace.queue, kernel, items, items, values)
+        CommandList(pipeline.program).launch(workspace.queue, kernel, size, items, values)
         places = contents(workspace, starts).view(np.uint32)
         words = contents(workspace, sums).view(np.uint32)
         return places, int(words[place]) | int(words[place + 1]) << 32

@@ -30,6 +30,8 @@ _GROUP_SPLATS = 4096
 """splats per work-group of the strategy `local`"""
 _ITEMS = 256
 """work-group size: BIN_ITEMS and SORT_ITEMS of the kernels"""
+_START_TILES, _START_SHARES = 512, 32
+"""tiles of a share of tile_starts, and most shares: each reads the lengths of all lists"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -47,7 +49,7 @@ def allocate_tallies(frame: DeviceFrame, words: int, big: int = 0) -> None:
     frame.numbers["big_capacity"] = capacity
     frame.take("big", 4 * capacity)
     frame.take("big_bounds", frame.source.records["Bounds"].itemsize * capacity)
-    if not frame.waits:  # the kernel tile_starts clears them for the next replay
+    if not frame.waits:  # the kernel sort_tiles clears them for the next replay
         frame.bind("tallies", frame.pool.zeroed("tallies", 4 * words, frame.queue))
         return
     tallies = frame.take("tallies", 4 * words)
@@ -239,8 +241,9 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     frame.take("starts", 4 * (frame.tiles + 1))
     frame.take("cursors", 4 * frame.tiles)
     frame.take("tile_order", 4 * frame.tiles)
-    given = {"tiles": frame.tiles, "capacity": capacity, "clear": not frame.waits}
-    return frame.launch("bin", "tile_starts", (items,), (items,), **given)
+    groups = 1 + min(-(-frame.tiles // _START_TILES), _START_SHARES)
+    given = {"tiles": frame.tiles, "capacity": capacity}
+    return frame.launch("bin", "tile_starts", (groups * items,), (items,), **given)
 
 
 def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
@@ -260,7 +263,8 @@ def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band:
         frame.launch(
             "bin", "emit", (items,), (_ITEMS,), views, count=count, splat_groups=splat_groups, **given
         )
-    frame.launch("sort", "sort_tiles", ((band.end - band.first) * _ITEMS,), (_ITEMS,), band_first=band.first)
+    given = {"band_first": band.first, "clear": not frame.waits}
+    frame.launch("sort", "sort_tiles", ((band.end - band.first) * _ITEMS,), (_ITEMS,), **given)
 
 
 def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
