@@ -1,6 +1,6 @@
 """Compare batches of disks of fidsplat and gsplat on one NVIDIA GPU, with the same views in the same run.
 
-    pip install . torch gsplat       # 1.5.3
+    pip install . torch gsplat       # 1.5.3 or 1.6
     python benchmarks/peers/gsplat_batches.py --rows scenes --json gsplat-batches.json
 
 gsplat_cuda.py has the requirements and the differences of constants. gsplat renders the fastest number of
@@ -34,6 +34,9 @@ CAMERAS = 4, 16, 64, 256
 """cameras per call of gsplat"""
 SAME = fs.Quality.named("gsplat").with_(opacity_ceiling=0.999)
 """the constants of gsplat 1.5.3"""
+PACKED = gsplat.__version__ >= "1.6"
+"""whether gsplat's packed mode is used: from 1.6 on the other one fails with several cameras ("opacities must
+be contiguous")"""
 ITS_OUTPUTS = "rgb", "alpha", "normal", "depth_median"
 """outputs that gsplat always computes, by fidsplat's names"""
 
@@ -60,6 +63,7 @@ def peer(cloud: fs.SplatCloud, capture: fs.Capture, poses: np.ndarray) -> Callab
         "opacities": on_gpu(cloud.opacities),
         "width": camera.width,
         "height": camera.height,
+        "packed": PACKED,
     }
     rgb = on_gpu(colors)
 
