@@ -22,7 +22,7 @@ from fidsplat.util.errors import DeviceError, InputError
 from fidsplat.util.timing import Timer, frame_timer, time_interleaved
 
 REPEATS = 9
-"""timed frames of each quality, interleaved with those of the others"""
+"""number of timed frames of each quality; frames of all qualities are interleaved"""
 MIN_REPEATS = 3
 MAX_SECONDS = 10.0
 """limit on the time of a comparison of qualities, with at least `MIN_REPEATS` frames of each"""

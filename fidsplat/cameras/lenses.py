@@ -117,7 +117,7 @@ class BrownConrady:
         return np.where(visible[:, None], np.stack([a, b], 1), np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Jacobian of the image coordinates by X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
+        """Jacobian of the image coordinates with respect to X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
         points = _rows("points", points, 3)
         z = points[:, 2]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -201,12 +201,12 @@ class Fisheye:
         return angle * (1 + q * (self.k1 + q * (self.k2 + q * (self.k3 + q * self.k4))))
 
     def _slope(self, angle):
-        """Derivative of the distance by the angle."""
+        """Derivative of the distance with respect to the angle."""
         q = angle * angle
         return 1 + q * (3 * self.k1 + q * (5 * self.k2 + q * (7 * self.k3 + q * 9 * self.k4)))
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Jacobian of the image coordinates by X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
+        """Jacobian of the image coordinates with respect to X, Y, Z, (n, 2, 3), at visible points (n, 3)."""
         points = _rows("points", points, 3)
         x, y, z = points.T
         across = np.hypot(x, y)
@@ -272,8 +272,8 @@ class Equirectangular:
         return np.where(np.any(points != 0, axis=1)[:, None], image, np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Jacobian (n, 2, 3) of the image coordinates by X, Y, Z, at points (n, 3). At a pole, where the
-        longitude jumps, it is the Jacobian of a point 1e-6 rad away towards z."""
+        """Jacobian (n, 2, 3) of the image coordinates with respect to X, Y, Z, at points (n, 3). At a pole,
+        where the longitude jumps, it is the Jacobian of a point 1e-6 rad away towards z."""
         points = _rows("points", points, 3)
         x, y, z = points.T
         far = np.linalg.norm(points, axis=1)
@@ -309,7 +309,7 @@ class Orthographic:
         return np.where(points[:, 2:] > 0, points[:, :2], np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Jacobian (n, 2, 3) of the image coordinates by X, Y, Z, at points (n, 3)."""
+        """Jacobian (n, 2, 3) of the image coordinates with respect to X, Y, Z, at points (n, 3)."""
         points = _rows("points", points, 3)
         return np.tile(np.eye(2, 3), (len(points), 1, 1))
 

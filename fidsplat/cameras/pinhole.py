@@ -46,7 +46,7 @@ class Camera(PickledByFields, Summarised):
     """metres along z (along the ray for a fisheye or panorama), above 0; nearer parts of a splat are
     clipped"""
     far: float = math.inf
-    """metres, likewise, above near; a splat completely beyond it is not rendered"""
+    """metres, measured like near and above it; a splat completely beyond it is not rendered"""
 
     position: np.ndarray = None  # type: ignore[assignment]
     """(3,) float64, centre of projection in the world, metres, read-only. By default it follows from

@@ -53,7 +53,7 @@ class RayRaster:
 
     @cached_property
     def slopes(self) -> np.ndarray:
-        """(h, w, 2, 3) float32: derivatives of the rays by x and by y, per sample; NaN outside
+        """(h, w, 2, 3) float32: derivatives of the rays with respect to x and y, per sample; NaN outside
         the field of view."""
         if self.whole is not None:
             return self.whole.slopes[self.top : self.top + self.height]

@@ -45,7 +45,8 @@ def plane_image(
 
 
 def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Segments (n, 2) and (n, 2) in modules between modules of different value, with their jumps.
+    """Find the edges between modules of different value: start and end points (n, 2), in modules, and jumps
+    (n,).
 
     A jump is the value on the right of the direction (y down) minus that on the left.
 

@@ -185,7 +185,7 @@ def _train(
     training = TrainSettings(
         iterations=settings.iterations,
         seed=settings.seed,
-        sh_degree=0,  # plants are rotated, with light from above
+        sh_degree=0,  # copies of plants are rotated, so colours must not depend on the direction
         densify_until=0,
         position_steps=settings.iterations,
     )

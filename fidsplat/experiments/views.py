@@ -80,7 +80,7 @@ class ImageCache:
         self._lock = Lock()  # evaluation threads make the ground truths
 
     def get(self, kind: str, subject: tuple, number: int, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """Image `number` of a subject, made if missing; one subject per kind is cached."""
+        """Return image `number` of a subject; make it if it is missing. One subject per kind is cached."""
         with self._lock:
             if kind not in self._images or self._images[kind][0] != subject:
                 self._images[kind] = subject, {}

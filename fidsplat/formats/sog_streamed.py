@@ -114,7 +114,7 @@ def _leaves(path: Path, tree: dict[str, Any], levels: int, files: int) -> Iterat
             level, span = int(name), Span(*(int(said[key]) for key in ("file", "offset", "count")))
             if not (0 <= level < levels and 0 <= span.file < files and min(span.first, span.count) >= 0):
                 raise InputError(
-                    f"{path}: a leaf must have levels below {levels} of {files} files, got {said}"
+                    f"{path}: a leaf must refer to levels below {levels} and files below {files}, got {said}"
                 )
             if span.count:
                 spans[level] = span

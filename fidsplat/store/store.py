@@ -198,7 +198,7 @@ class Store(Summarised):
         return int(self.nodes["level"].max(initial=0))
 
     def cell_sizes(self, quality: Quality) -> tuple[float, ...]:
-        """For each level from 0 the projected cell size [samples] below which its cells are rendered; 0:
+        """Projected cell size [samples] below which cells of a level are rendered, for each level from 0; 0:
         never.
 
         Determined by the quality's `detail_error`. Raises InputError if the errors were not measured.

@@ -85,7 +85,7 @@ class DeviceModel:
         return lambda: Loss(*value()), gradient
 
     def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, Any]:
-        """Gradients of the weighted normal loss by `depth` and `normal`."""
+        """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
         return self._kernels.normal_loss_gradients(images, view, self._cameras[view], weight)
 
     def backward_to_tiles(self, pipeline: Any, images: Images, gradients: Mapping[str, Any]) -> Any:

@@ -70,7 +70,7 @@ class HostModel:
         return lambda: loss, gradient
 
     def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
-        """Gradients of the weighted normal loss by `depth` and `normal`."""
+        """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
         of = self._views[view]
         camera, weights = of.camera, np.float32(weight) * images.read("alpha", 0)
         if of.mask is not None:

@@ -6,7 +6,7 @@ from typing import Any
 
 
 def compress(data: bytes) -> bytes:
-    """One frame, the same for the same bytes."""
+    """Compress to one frame; deterministic."""
     return _library().ZstdCompressor(level=12).compress(data)
 
 
@@ -23,7 +23,9 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
     except library.ZstdError as error:
         raise ValueError(str(error)) from None
     if len(found) != size:
-        raise ValueError(f"a frame of {size} bytes has {'more' if len(found) > size else len(found)}")
+        raise ValueError(
+            f"a frame must expand to {size} bytes, got {'more' if len(found) > size else len(found)}"
+        )
     return found
 
 

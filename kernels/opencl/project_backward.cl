@@ -1,7 +1,7 @@
-// Gradients by the cloud's arrays and the camera pose, from those of set_up_backward.cl.
+// Gradients with respect to the cloud's arrays and the camera pose, from those of set_up_backward.cl.
 // Index space: one work-item per splat, in groups of POSE_ITEMS.
 // Reads:  view, the cloud, splats, keys, windows, big_bounds, splat_slots, moments.
-// Writes: gradients by the cloud's arrays, 0 for culled splats; group_sums, by the pose.
+// Writes: gradients with respect to the cloud's arrays, 0 for culled splats; group_sums, with respect to the pose.
 #define POSE_ITEMS 64
 kernel __attribute__((reqd_work_group_size(POSE_ITEMS, 1, 1))) void project_backward(
 //@@ arguments project_backward

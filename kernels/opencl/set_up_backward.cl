@@ -35,7 +35,7 @@ static inline real3_ rotate_to_world(global const View *view, real3_ v) {
     return c;
 }
 
-typedef struct {            // gradients by the parameters of one splat
+typedef struct {            // gradients with respect to the parameters of one splat
     float mean[3], quat[4], scale[2], opacity;
     float color[3], basis[SH_TERMS];    // by coefficient k of the colour: basis[k] times `color`
     float screen;

@@ -64,7 +64,11 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     fields |= {"depth": wp.float32, "depth_weight": wp.float32} if depth else {}
     fields |= {"normal": wp.vec3} if normal else {}
     fields |= {"distortion": wp.float32, "spread": wp.vec4} if distortion else {}
-    Loss = struct_of("Loss", "Of a pixel: derivatives by what it shows; what light is worth behind.", fields)
+    Loss = struct_of(
+        "Loss",
+        "Derivatives of a pixel: with respect to its outputs, and to the transmittance behind.",
+        fields,
+    )
 
     @wp.func
     def box_of(lines: wp.array(dtype=wp.vec4), index: int) -> wp.vec4i:

@@ -138,7 +138,7 @@ def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: P
 
 
 def center_backward(view: View, p: np.ndarray, by_center: np.ndarray) -> np.ndarray:
-    """Derivatives (n, 3) by centres, from those (n, 2) by their projections."""
+    """Derivatives (n, 3) with respect to centres, from those (n, 2) with respect to their projections."""
     with np.errstate(divide="ignore", invalid="ignore"):
         across = by_center * (view.focal_x, view.focal_y) / p[:, 2:]
         by_p = np.column_stack([across, -(across * p[:, :2]).sum(1) / p[:, 2]])

@@ -69,7 +69,8 @@ class Launcher:
     """Launches of one frame, with arguments by the names of the kernels' parameters."""
 
     def __init__(self, cache: LaunchCache, timed: bool = True, divided: bool = True) -> None:
-        """timed: measure the stages. divided: divide CPU launches over threads; a capture needs one."""
+        """timed: measure the stages. divided: divide CPU launches over threads; captures require one
+        thread."""
         self._wp, self.timed = load(), timed
         self._device, self._workers, self._cache = cache.device, cache.workers, cache
         self.pieces = 8 * cache.threads if divided else 1
@@ -125,7 +126,7 @@ class Launcher:
             self._wp.synchronize_stream(self._stream)
 
     def stage(self, name: str | None) -> None:
-        """Start the stage `name`; None ends the last."""
+        """Start timing the stage `name`, and end the current one. None: only end it."""
         if not self.timed:
             return
         if self._workers is None:

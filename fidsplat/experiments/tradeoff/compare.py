@@ -69,7 +69,8 @@ def scan(session: Session, name: str, quality: Quality | None, tilts: str) -> Ca
 
 
 def compare_image(image: np.ndarray, reference: np.ndarray, scene: TradeScene, quality: Quality) -> dict:
-    """Errors of rgb (h, w, 3) against the reference image of the same definition.
+    """Errors of rgb (h, w, 3) relative to a reference image with the same image definition (order, low-pass
+    ...).
 
     Returns `maximum`, `p999`, `rmse`, `psnr` (None for equal images), `maximum_sure` (see
     `beyond_certificates`), `flip`; for the hard cases `cells`, the largest error in each; for markers the

@@ -68,7 +68,7 @@ def scene_names(names: Iterable[str], quick: bool = False) -> tuple[str, ...]:
 
 
 def views_of(name: str) -> tuple[str, ...]:
-    """Views of a scene name: itself, or a marker at each tilt."""
+    """Names of the views of a scene: the scene itself, or a marker at each tilt."""
     return tuple(f"{name}@{tilt}" for tilt in TILTS) if name in MARKERS else (name,)
 
 

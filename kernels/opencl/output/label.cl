@@ -12,7 +12,7 @@
 //@ attribute_values
     attributes.label = s->label;
 //@ layer_fields
-    vfloat label_tau;       // maximum optical depth of its fragments, whose label the layer has
+    vfloat label_tau;       // maximum optical depth of a fragment of the layer; the layer has its label
 //@ layer_accumulate
     layer->mean.label = VSELECT(layer->mean.label, attributes->label, VMASK(tau > layer->label_tau));
     layer->label_tau = fmax(layer->label_tau, tau);

@@ -13,7 +13,7 @@
 //@ attribute_values
     attributes.splat_id = s->splat_id;
 //@ layer_fields
-    vfloat splat_id_tau;    // maximum optical depth of its fragments, whose index the layer has
+    vfloat splat_id_tau;    // maximum optical depth of a fragment of the layer; the layer has its index
 //@ layer_accumulate
     layer->mean.splat_id = VSELECT(layer->mean.splat_id, attributes->splat_id, VMASK(tau > layer->splat_id_tau));
     layer->splat_id_tau = fmax(layer->splat_id_tau, tau);

@@ -1,7 +1,7 @@
 // Boxes: opaque or uniformly translucent rectangles |u| <= 1, |v| <= 1 in a splat's plane, with edges antialiased by a filter as
 // wide as a sample.
 //
-// h is a sample's signed distance from the projected edge, in samples: (D -+ n_u) / |grad(D -+ n_u)|, with the gradient by the
+// h is a sample's signed distance from the projected edge, in samples: (D -+ n_u) / |grad(D -+ n_u)|, with the gradient with respect to the
 // sample's position. The ramp clamp(1/2 + h) is the covered share of the sample. Coverage between two edges is the sum of their
 // ramps minus 1; a box's coverage is the product along u and v. Ramps belong to edges, not to boxes: the forms of two boxes at a
 // shared edge differ by a factor only, so their ramps add up to 1, and the coverages of a partition of a rectangle into boxes

@@ -14,7 +14,7 @@
 //@ sums
     vfloat z_numerator, z_center;
 //@ fragment_functions
-// Adds the gradient by a fragment's depth at (x, y) from the anchor; returns the gradient by D.
+// Adds the gradient with respect to a fragment's depth at (x, y) from the anchor; returns the gradient with respect to D.
 static inline vfloat add_depth(Sums *sums, const Splat *s, const Geometry *g, vfloat by_z, vfloat screen, vfloat x, vfloat y,
                                vfloat *by_nu, vfloat *by_nv) {
     vfloat by_numerator = VSELECT((vfloat)0.0f, by_z * g->inverse_d, g->hit), by_d = -by_numerator * g->z;

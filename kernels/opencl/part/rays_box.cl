@@ -1,5 +1,5 @@
 // Edges of boxes (part/box_cover.cl) for lenses with one ray per sample: curves, approximated by lines within a sample. Gradients of the
-// forms use the ray's derivatives by the sample's position, from the buffer `ray_slopes`: 6 channels dX/dx, dY/dx, dZ/dx, dX/dy,
+// forms use the ray's derivatives with respect to the sample's position, from the buffer `ray_slopes`: 6 channels dX/dx, dY/dx, dZ/dx, dX/dy,
 // dY/dy, dZ/dy.
 //@ footprint_functions
 // Ramp of a form over one sample: 1 half a sample inside of the edge, 0 half a sample outside.
@@ -19,7 +19,7 @@ static inline vfloat along_ray(wide x, wide y, wide z, vfloat to_x, vfloat to_y,
     return FMA((vfloat)z, to_z, FMA((vfloat)y, to_y, (vfloat)x * to_x));
 }
 //@ ray_cross_parameters
-    , vfloat xx, vfloat yx, vfloat zx, vfloat xy, vfloat yy, vfloat zy   // derivatives of the ray by x and by y
+    , vfloat xx, vfloat yx, vfloat zx, vfloat xy, vfloat yy, vfloat zy   // derivatives of the ray with respect to x and y
 //@ ray_cross
     if (IS_BOX(s)) {
         vfloat d_x = along_ray(s->dx, s->dy, s->dz, xx, yx, zx), d_y = along_ray(s->dx, s->dy, s->dz, xy, yy, zy);

@@ -1,5 +1,5 @@
 // Backward pass of blending for GPUs, in two kernels. `blend_checkpoints` loops over each tile's list once, front to back, and stores a
-// checkpoint per pixel and CHUNK splats: the transmittance in front of them, and the gradient by the light behind them. Chunks are
+// checkpoint per pixel and CHUNK splats: the transmittance in front of them, and the gradient with respect to the one behind. Chunks are
 // then independent: each work-group of `blend_backward` processes one, so that long lists occupy many groups. Sums over
 // work-items are per splat, in a fixed order and without atomics.
 // Barriers are only where the complete group reaches them.
@@ -143,7 +143,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
     }
     atomic_max(&max_reached, reached_chunks);
     barrier(CLK_LOCAL_MEM_FENCE);
-    // gradient by the light behind each chunk; behind terminated pixels, that of the background
+    // gradient with respect to the transmittance behind each chunk; for terminated pixels, that of the background
     for (int row = 0; row < ROWS; row++) {
         vfloat behind = gradients[row].behind, shown_behind = pixels[row].t * behind;
         for (int last = (int)max_reached - 1; last >= 0; last -= PREFETCH_CHUNKS) {
@@ -195,7 +195,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 ) {
     local Staged staged[CHUNK];
     local float scratch[SCRATCH];
-    local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, opacity; then weight, gradient by ln(opacity)
+    local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, opacity; then weight, gradient of ln(opacity)
     local PixelGradient shared[PIXELS];
     local uint slots[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};

@@ -11,7 +11,7 @@
 #define SHARE (STAGED / ITEMS)               // staged splats per work-item of a cell: 32
 #define CELLS_STRIDE (STAGED + 4)             // bytes; padded against bank conflicts
 #define CELLS_PAD 0.02f                      // padding of chords, in samples
-enum { VECTORS = sizeof(Splat) / 16 };       // of 16 bytes per record
+enum { VECTORS = sizeof(Splat) / 16 };       // vectors of 16 bytes per record
 
 typedef union {              // a staged record, as vectors for fewer reads
     Splat splat;

@@ -15,7 +15,7 @@ typedef struct {            // fragments in the order of compositing, block by b
     vfloat transmittance[TAPE_FRAGMENTS], opacity[TAPE_FRAGMENTS];
     uint blocks[TAPE_SPLATS];      // per splat, as bits: blocks with fragments
     uint slots[TAPE_SPLATS];
-    uint length;            // blocks
+    uint length;            // number of blocks
 } Tape;
 
 typedef struct {

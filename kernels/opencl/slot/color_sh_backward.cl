@@ -1,9 +1,9 @@
-// Spherical harmonics: gradients by the coefficients and, through the direction, by the centre and the camera's position.
+// Spherical harmonics: gradients with respect to the coefficients and, through the direction, the centre and the camera's position.
 //@ functions
 #define PLAIN 0
 #define CLOUD_TERMS sh
 #define BY_TERMS by_sh
-// Gradient of sum_k by[k] Y_k by the direction.
+// Gradient of sum_k by[k] Y_k with respect to the direction.
 static inline real3_ sh_basis_backward(real3_ d, const wide *by) {
     wide x = (wide)d.x, y = (wide)d.y, z = (wide)d.z, by_x = 0.0f, by_y = 0.0f, by_z = 0.0f;
 #if SH_DEGREE > 0

@@ -1,5 +1,5 @@
 // Backward pass of exact 3D Gaussians. With `bulge` b and h = q / (D^2 + b q), D and q of the disk: the sums of blend_backward.cl
-// are the gradients by n_u, n_v and D of h, which is the rho / 2 of the fragment.
+// are the gradients with respect to n_u, n_v and D of h, which is the rho / 2 of the fragment.
 //@ sums
     vfloat bulge;
 //@ fragment_backward
@@ -8,7 +8,7 @@
     MOMENT(bulge, sums->bulge);
 //@ footprint_add_depth
     {
-        // by_d is by d = D (1 + t), by_q by q (1 + t) (times 2), with t = b q / D^2 = b h / (1 - b h)
+        // by_d: gradient with respect to d = D (1 + t); by_q: twice that with respect to q (1 + t); with t = b q / D^2 = b h / (1 - b h)
         vint ahead = VMASK(g->inverse_d > 0.0f);
         vfloat half_rho = VSELECT((vfloat)0.0f, g->half_rho, ahead), d = VSELECT((vfloat)0.0f, g->d, ahead);
         vfloat bh = s->bulge * half_rho, rest = max(1.0f - bh, (vfloat)1e-6f), t = bh / rest, hd = half_rho * d;

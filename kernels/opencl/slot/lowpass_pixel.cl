@@ -12,7 +12,7 @@
 #define BOX_HERE false
 #endif
     bool filtered = !BOX_HERE && pz >= near;
-    // derivatives by u, v of the sample's x, of its y, and of depth relative to depth; z is unused
+    // derivatives with respect to u, v of the sample's x, of its y, and of depth relative to depth; z is unused
     real3_ gx = {0, 0, 0}, gy = {0, 0, 0}, gz = {0, 0, 0};
     if (filtered) {
 //@@ camera_derivative

@@ -61,7 +61,7 @@ static inline void columns_of(global const float *from, int count, int stride, u
         }
 }
 
-// Index space: (LANES values, EACH_ROWS rows). Reads: images 2 to 6. Writes: images 7 to 9, the gradients of the SSIM by the means of
+// Index space: (LANES values, EACH_ROWS rows). Reads: images 2 to 6. Writes: images 7 to 9, the gradients of the SSIM with respect to the means of
 // a, a a and a b; image 10, the SSIM.
 kernel void loss_columns(
 //@@ arguments loss_columns

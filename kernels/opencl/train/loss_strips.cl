@@ -38,7 +38,7 @@ static inline real sum_of(vfloat v) {
     return sum;
 }
 
-// Reads: the render, the target, the mask. Writes: images 0 to 2, the gradients of the SSIM by the means of a, a a and a b; each
+// Reads: the render, the target, the mask. Writes: images 0 to 2, the gradients of the SSIM with respect to the means of a, a a and a b; each
 // work-group's sums of |a - b|, (a - b)^2 and the SSIM.
 kernel __attribute__((reqd_work_group_size(1, 1, 1))) void loss_strips(
 //@@ arguments loss_strips

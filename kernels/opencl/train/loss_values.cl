@@ -1,4 +1,4 @@
-// Shared by loss.cl (GPUs) and loss_strips.cl (CPUs): the training loss (1 - w) L1 + w (1 - SSIM) and its gradient by each value.
+// Shared by loss.cl (GPUs) and loss_strips.cl (CPUs): the training loss (1 - w) L1 + w (1 - SSIM) and its gradient with respect to each value.
 // NumPy reference with formulas: fidsplat/train/losses.py.
 //
 // An image is rows of `stride` floats with interleaved channels, with MARGIN_ROWS rows and MARGIN floats of zeros around it, so
@@ -18,7 +18,7 @@ constant float WINDOW[2 * RADIUS + 1] = {
 // 0 for values behind the last column.
 #define INSIDE(v) VSELECT((vfloat)(0.0f), v, VMASK((vfloat)((float)column) + VLANE < (vfloat)((float)width)))
 
-// SSIM of a window's means, and its gradients by the means of a, a a and a b.
+// SSIM of a window's means, and its gradients with respect to the means of a, a a and a b.
 typedef struct {
     vfloat ssim, by_mean, by_variance, by_shared;
 } Ssim;

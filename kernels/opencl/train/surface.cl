@@ -12,7 +12,7 @@ static inline float3 point_at(
 #define POINT(x, y) point_at(x, y, width, depth, inverse_x, inverse_y, middle_x, middle_y)
 #define HAS_DEPTH(x, y) (depth[(y) * (size_t)width + (x)] > 0.0f)
 
-// Index space: (columns, rows). Reads: the images, the mask. Writes: the gradients by normals and, for each pixel, by the
+// Index space: (columns, rows). Reads: the images, the mask. Writes: the gradients with respect to normals and, for each pixel, the
 // differences of the points below and above it, right and left of it.
 kernel void surface_normals(
 //@@ arguments surface_normals
@@ -41,7 +41,7 @@ kernel void surface_normals(
     vstore3(by_across, 2 * at + 1, differences);
 }
 
-// Index space: (columns, rows). Reads: differences. Writes: the gradients by depths.
+// Index space: (columns, rows). Reads: differences. Writes: the gradients with respect to depths.
 kernel void surface_depths(
 //@@ arguments surface_depths
 ) {
