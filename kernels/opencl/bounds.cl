@@ -21,7 +21,7 @@ static inline Bounds box_bounds(real x0, real x1, real y0, real y1) {
 
 // Projected ellipse of an R-sigma disk in front of the near plane, from its dual conic about the projected centre. tu, tv are
 // relative to the projected centre (their z is 0).
-static inline Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center_x, real center_y, real r2) {
+INLINE Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center_x, real center_y, real r2) {
     real d = r2 * (tw.x * tw.x + tw.y * tw.y) - tw.z * tw.z;   // < 0
     real r2_d = r2 / d;
     real mx = r2_d * (tu.x * tw.x + tu.y * tw.y);
@@ -47,7 +47,7 @@ static inline Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center
 }
 
 // Chord [*x0, *x1] of the bounds between heights y0 <= y1; empty if *x0 > *x1.
-static inline void bounds_span(const Bounds *b, float y0, float y1, float *x0, float *x1) {
+INLINE void bounds_span(const Bounds *b, float y0, float y1, float *x0, float *x1) {
     *x0 = INFINITY;
     *x1 = -INFINITY;
     float low = fmax(y0 - b->ey, -b->hy), high = fmin(y1 - b->ey, b->hy);
@@ -63,7 +63,7 @@ static inline void bounds_span(const Bounds *b, float y0, float y1, float *x0, f
 }
 
 // Rows of samples [*y0, *y1) whose centres are inside the bounds.
-static inline void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
+INLINE void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
     float low = b->ey - b->hy, high = b->ey + b->hy;
 //@@ bounds_rows
     *y0 = max(pixel_above(low - 0.5f, height), 0);
@@ -73,7 +73,7 @@ static inline void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
 typedef struct { int first, last; } TileSpan;   // inclusive; empty if first > last
 
 // Tiles in one row of tiles that the bounds overlap. Counting and listing both call this, so they agree.
-static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) {
+INLINE TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) {
     float y0 = (float)(tile_row * TILE_H) + 0.5f, y1 = (float)min(tile_row * TILE_H + TILE_H, height) - 0.5f;
     float x0, x1;
     bounds_span(b, y0, y1, &x0, &x1);
@@ -84,10 +84,15 @@ static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int h
 
 #define WINDOW_W 8
 #define WINDOW_H 4
+#if BATCH > 1       // a constant number of rows, for vectors across splats
+#define WINDOW_ROWS(rows) WINDOW_H
+#else
+#define WINDOW_ROWS(rows) rows
+#endif
 
 // Tiles that the bounds overlap, as bits of a window of WINDOW_W x WINDOW_H tiles with its corner at tile
 // (*corner & 0xFFFF, *corner >> 16); 0 if they do not fit a window. Columns [x0, x1) and rows [y0, y1) enclose them.
-static inline uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, int width, int height, uint *corner) {
+INLINE uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, int width, int height, uint *corner) {
     int left = x0 / TILE_W, columns = (x1 - 1) / TILE_W - left + 1;
     int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
     *corner = (uint)left | (uint)top << 16;
@@ -95,12 +100,15 @@ static inline uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, 
     if (rows == 1) return (1u << columns) - 1u;
     if (columns == 1) return 0x01010101u >> (WINDOW_W * (WINDOW_H - rows));
     uint mask = 0;
-    for (int row = 0; row < rows; row++) {
+    UNROLLED for (int row = 0; row < WINDOW_ROWS(rows); row++) {
         TileSpan span = tile_span(b, top + row, width, height);
         // a chord between two rows of pixels may be wider than the chords at the rows
         int first = max(span.first - left, 0), last = min(span.last - left, columns - 1);
         if (first <= last) mask |= ((2u << (last - first)) - 1u) << first << (row * WINDOW_W);
     }
+#if BATCH > 1
+    mask &= 0xFFFFFFFFu >> (WINDOW_W * (WINDOW_H - rows));
+#endif
     return mask;
 }
 

@@ -1,6 +1,7 @@
 // Build constants, which `assemble` prints above this file, and the numeric types derived from them.
 // LANES          pixels that one work-item computes as a vector (1 on a GPU, 8 or 16 on a CPU)
 // TILE_W TILE_H  pixels of a tile; the lanes schedule requires TILE_W == LANES
+// BATCH          splats that a work-item of `project` sets up (1 on a GPU)
 // CHUNKS         contiguous pieces of a list in the stable counting sorts
 //   RADIX_BITS     digit width of the depth sort
 // SCAN_ITEMS     work-items of the single work-group of a scan
@@ -18,6 +19,16 @@ typedef double real;
 #else
 typedef float real;
 #define REAL(x) x##f
+#endif
+
+// Functions and loops that CPU compilers vectorise across a batch of splats.
+#if BATCH > 1
+#define INLINE static inline __attribute__((always_inline))
+#define VECTORISE _Pragma("clang loop vectorize(enable) vectorize_width(8) interleave_count(1)")
+#define UNROLLED _Pragma("unroll")
+#else
+#define UNROLLED
+#define INLINE static inline
 #endif
 
 #define CULLED 0xFFFFFFFFu   // sort key of a culled splat

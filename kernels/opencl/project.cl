@@ -48,30 +48,58 @@ static inline real3_ rotate_to_camera(global const View *view, real3_ v) {
 typedef union {
     Splat splat;
     float4 words[sizeof(Splat) / 16];
+#if BATCH > 1
+    uint scalars[sizeof(Splat) / 4];
+#endif
 } SplatWords;
 
 //@@ camera
 //@@ functions
 //@@ footprint_here
 
+#define RETURN_CULLED return
+#if BATCH > 1
+// CPUs: set-up of splat i, written to column k of `batch`, in a loop that compilers vectorise. Only splats that cross the near plane
+// need a loop of their own: with `crossing` unset, their key becomes CROSSING.
+#define CROSSING 0xFFFFFFFDu
+#define KEY batch->keys[k]
+typedef struct {
+    uint keys[BATCH], corners[BATCH], windows[BATCH], records[sizeof(Splat) / 4][BATCH], bounds[sizeof(Bounds) / 4][BATCH];
+} Batch;
+typedef union {
+    Bounds bounds;
+    uint scalars[sizeof(Bounds) / 4];
+} BoundsWords;
+
+INLINE void set_up(
+//@@ arguments project
+    , uint i, uint number, Batch *batch, uint k, bool crossing) {
+#else
+#define KEY keys[at]
+
 kernel void project(
 //@@ arguments project
 ) {
     uint i = get_global_id(0), number = get_global_id(1);
     if (i >= count) return;
+#endif
     uint at = number * count + i;
     view += number;
-    keys[at] = CULLED;
+    KEY = CULLED;
 //@@ splat_view
 
     // read before the first test, so that memory latency is paid once; arrays are aligned for vector loads (Resident)
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+#if BATCH > 1       // no vectors, which prevent vectors across splats
+    struct { float x, y, z, w; } quat = {quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]};
+    struct { float x, y; } scale_uv = {scales[2 * i], scales[2 * i + 1]};
+#else
     float4 quat = ((global const float4 *)quats)[i];
     float2 scale_uv = ((global const float2 *)scales)[i];
+#endif
     float opacity = opacities[i];
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
-//@@ cull_frustum
     wide log_opacity = (wide)ln((real)opacity);
     wide half_r2 = log_opacity - (wide)view->log_cut;
     if (!(half_r2 > 0.0f && opacity > 0.0f && opacity < INFINITY)) return;        // a NaN culls
@@ -117,7 +145,7 @@ kernel void project(
     if (!(y0 < y1 && x0 <= x1 && first < width && last >= 0 && first <= last)) return;
 
     if (y1 <= (int)view->band || y0 >= (int)view->band_end) {
-        keys[at] = OUT_OF_BAND;
+        KEY = OUT_OF_BAND;
         return;
     }
 
@@ -150,12 +178,48 @@ kernel void project(
     record.y1 = (short)y1;
     record.x0 = (short)max(first, 0);
     record.x1 = (short)min(last + 1, width);
+#if BATCH > 1
+//@@ project
+    float key = (float)pz;
+//@@ key
+//@@ coplanar_key
+    KEY = sortable(key);
+    batch->windows[k] = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &batch->corners[k]);
+    SplatWords words = {record};
+    BoundsWords bounds_words = {bounds};
+    UNROLLED for (uint n = 0; n < sizeof(Splat) / 4; n++) batch->records[n][k] = words.scalars[n];
+    UNROLLED for (uint n = 0; n < sizeof(Bounds) / 4; n++) batch->bounds[n][k] = bounds_words.scalars[n];
+}
+
+// Writes a splat that is set up.
+INLINE void write_splat(
+//@@ arguments project
+    , uint i, uint number, const Batch *batch, uint k) {
+    uint at = number * count + i;
+    keys[at] = batch->keys[k];
+    if (batch->keys[k] >= OUT_OF_BAND) return;
+    view += number;
+//@@ splat_view
+    real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+    SplatWords words;
+    BoundsWords bounds_words;
+    for (uint n = 0; n < sizeof(Splat) / 4; n++) words.scalars[n] = batch->records[n][k];
+    for (uint n = 0; n < sizeof(Bounds) / 4; n++) bounds_words.scalars[n] = batch->bounds[n][k];
+    Splat record = words.splat;
+    Bounds bounds = bounds_words.bounds;
+//@@ color
+#else
 //@@ color
 //@@ project
+#endif
     // vector stores
     SplatWords packed = {record};
     for (uint part = 0; part < sizeof(Splat) / 16; part++) ((global float4 *)(splats + at))[part] = packed.words[part];
+#if BATCH > 1
+    uint corner = batch->corners[k], window = batch->windows[k];
+#else
     uint corner, window = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &corner);
+#endif
     if (window == 0) {
         // in any order, since lists are sorted later
         corner = atomic_inc(tallies + TALLY_BIG);
@@ -165,9 +229,62 @@ kernel void project(
         }
     }
     windows[at] = (uint2)(corner, window);
+#if BATCH == 1
 //@@ list
     float key = (float)pz;
 //@@ key
 //@@ coplanar_key
-    keys[at] = sortable(key);
+    KEY = sortable(key);
+#endif
 }
+
+#if BATCH > 1
+// Key of a splat that is culled by its bounding sphere; 0 for others.
+#undef RETURN_CULLED
+#define RETURN_CULLED return CULLED
+INLINE uint sphere_key(
+//@@ arguments project
+    , uint i, uint number) {
+    view += number;
+//@@ splat_view
+    real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+    real3_ p = rotate_to_camera(view, mean);
+    p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
+//@@ cull_frustum
+    return 0;
+}
+
+kernel void project(
+//@@ arguments project
+) {
+    uint number = get_global_id(1), first = get_global_id(0) * BATCH, visible[BATCH], length = 0;
+    if (first >= count) return;
+    Batch batch;
+    VECTORISE for (uint k = 0; k < BATCH; k++)
+        batch.keys[k] = sphere_key(
+//@@ passed project
+            , min(first + k, count - 1), number);
+    for (uint k = 0; k < min(count - first, (uint)BATCH); k++) {
+        keys[number * count + first + k] = batch.keys[k];
+        visible[length] = first + k;
+        length += batch.keys[k] == 0;
+    }
+    if (length == 0) return;
+    // complete vectors
+    uint padded = (length + 7) & ~7u;
+    for (uint k = length; k < padded; k++) visible[k] = visible[0];
+    VECTORISE for (uint k = 0; k < padded; k++)
+        set_up(
+//@@ passed project
+            , visible[k], number, &batch, k, false);
+    for (uint k = 0; k < length; k++) {
+        if (batch.keys[k] == CROSSING)
+            set_up(
+//@@ passed project
+                , visible[k], number, &batch, k, true);
+        write_splat(
+//@@ passed project
+            , visible[k], number, &batch, k);
+    }
+}
+#endif

@@ -176,7 +176,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     files += [*_dialect(shape, _scalars(features), features.slots), LAYOUTS["resolve_pixel"].file]
     if not half:
         files.append(LAYOUTS["blend_float"].file)
-    if shape.schedule == "lanes" and "camera_pinhole" in layouts:
+    if shape.batch > 1 and "camera_pinhole" in layouts:
         # not for mixtures of disks and 3D Gaussians, whose bounds are computed in another way
         if "lowpass_screen" in layouts and "thickness" not in layouts:
             files.append(LAYOUTS["cull_frustum"].file)
@@ -305,6 +305,7 @@ def _scalars(features: FeatureSet) -> Scalars:
 def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
     """The build constants, by their names in the kernels."""
     numbers = {
+        "BATCH": shape.batch,
         "CHUNKS": shape.chunks,
         "FAST_FMA": int(shape.fast_fma),
         "LANES": shape.lanes,
@@ -329,7 +330,7 @@ class Assembler:
         """files: effect files below kernels/opencl/, in the order in which they fill a hook."""
         self._sections = {file: sections_of(file) for file in files if file}
         self._declared, self._defines = declared, defines
-        self._used: dict[str, list[str]] = {"struct": [], "arguments": []}
+        self._used: dict[str, list[str]] = {"struct": [], "arguments": [], "passed": []}
         """names of the structs and kernels of the texts"""
 
     def source(self, programs: Mapping[str, Iterable[str]]) -> Source:
@@ -429,13 +430,16 @@ class Declarations:
         return tuple(found.values())
 
     def text(self, hook: str, subject: str) -> str:
-        """C for `//@@ struct NAME` or `//@@ arguments KERNEL`."""
+        """C for `//@@ struct NAME`, `//@@ arguments KERNEL` or `//@@ passed KERNEL`."""
         if hook == "struct":
             return self.structs[subject].text(self.scalars)
         text, arguments = "", self.arguments(subject)
         for one in arguments:
             comma = "," if one is not arguments[-1] else ""
-            text += f"    {one.text}{comma}{f'  // {one.note}' if one.note else ''}\n"
+            if hook == "passed":
+                text += f"        {one.name}{comma}\n"
+            else:
+                text += f"    {one.text}{comma}{f'  // {one.note}' if one.note else ''}\n"
         return text
 
 

@@ -35,6 +35,8 @@ class DeviceShape:
     tape: int = 1024
     """capacity of the tape (`lanes`): splats of a tile whose fragments the forward pass stores for the
     backward pass, 2 KiB each for each core; longer lists are evaluated twice"""
+    batch: int = 1
+    """splats that a work-item of the project stage sets up: more than one are vectorised (`lanes`)"""
     dialect: str = ""
     """file of kernels/opencl/dialect/ with a vendor's instructions; empty: portable, bit-identical kernels"""
 
@@ -51,7 +53,9 @@ class DeviceShape:
 
 def cpu_shape(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> DeviceShape:
     """The shape for CPUs: a tile per work-item, in the widest vectors."""
-    return DeviceShape("lanes", "ordered", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma, 32)
+    return DeviceShape(
+        "lanes", "ordered", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma, 32, batch=64
+    )
 
 
 def gpu_shape(scan_items: int = 1024, fast_fma: bool = True, dialect: str = "") -> DeviceShape:
@@ -64,6 +68,9 @@ def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
     if "blend_double" in features.slots and shape.schedule == "lanes":
         # float64 kernels are not vectorised
         shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, k_buffer_size=8)
+    if shape.schedule == "group" or "camera_pinhole" not in features.slots:
+        # the set-up of lenses has loops and branches that compilers do not vectorise
+        shape = replace(shape, batch=1)
     if not {"compose_pixel", "compose_coplanar_pixel"}.isdisjoint(features.slots):
         # the k-buffer needs the registers of a second pixel
         shape = replace(shape, rows=1)
@@ -105,4 +112,4 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
 def _groups(own: DeviceShape, side: int) -> DeviceShape:
     """The schedule of a GPU with tiles of side x side pixels."""
     groups = replace(own, schedule="group", tile_width=side, tile_height=side)
-    return replace(groups, lists="tiled", lanes=1, scan_items=64, k_buffer_size=8)
+    return replace(groups, lists="tiled", lanes=1, scan_items=64, k_buffer_size=8, batch=1)

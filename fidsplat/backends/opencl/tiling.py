@@ -67,7 +67,9 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOWS * size)
     if count:
         arrays = {name: frame.resident.part(name, first, end) for name in frame.source.cloud_arrays}
-        frame.launch("project", "project", (count,), (64,), frame.views, count=count, **arrays)
+        batch = frame.shape.batch
+        items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
+        frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
 
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:

@@ -14,4 +14,4 @@
     if (!BOX_HERE && opacities[i] <= 1.0f && (to_x + left * p.z < -sphere * (view->focal_x + fabs(left))
                                               || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
                                               || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))
-                                              || to_y + below * p.z > sphere * (view->focal_y + fabs(below)))) return;
+                                              || to_y + below * p.z > sphere * (view->focal_y + fabs(below)))) return CULLED;

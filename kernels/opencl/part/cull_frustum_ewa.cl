@@ -10,4 +10,4 @@
     if (opacities[i] <= 1.0f && (p.z < view->near || to_x + (view->center_x + margin) * p.z < -wide_x
                                  || to_x + (view->center_x - view->width - margin) * p.z > wide_x
                                  || to_y + (view->center_y + margin) * p.z < -wide_y
-                                 || to_y + (view->center_y - view->height - margin) * p.z > wide_y)) return;
+                                 || to_y + (view->center_y - view->height - margin) * p.z > wide_y)) return CULLED;

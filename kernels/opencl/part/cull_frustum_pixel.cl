@@ -16,11 +16,8 @@
     if (!BOX_HERE && opacities[i] <= 1.0f) {
         if (to_x + left * p.z < -sphere * (view->focal_x + fabs(left)) || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
             || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))
-            || to_y + below * p.z > sphere * (view->focal_y + fabs(below))) return;
+            || to_y + below * p.z > sphere * (view->focal_y + fabs(below))) return CULLED;
         // not for a complete image, whose last row of tiles may reach below it
         if ((view->band > 0 && to_y + above_band * p.z < -sphere * (view->focal_y + fabs(above_band)))
-            || (view->band_end < view->height && to_y + below_band * p.z > sphere * (view->focal_y + fabs(below_band)))) {
-            keys[at] = OUT_OF_BAND;
-            return;
-        }
+            || (view->band_end < view->height && to_y + below_band * p.z > sphere * (view->focal_y + fabs(below_band)))) return OUT_OF_BAND;
     }

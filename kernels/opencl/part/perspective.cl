@@ -18,6 +18,11 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
         real3_ cu = image_row(view->focal_x, view->center_x - center_x, row_x, tw);
         real3_ cv = image_row(view->focal_y, view->center_y - center_y, row_y, tw);
         bounds = ellipse_bounds(cu, cv, tw, center_x, center_y, radius * radius);
+#if BATCH > 1
+    } else if (!crossing) {
+        KEY = CROSSING;
+        return;
+#endif
     } else {
         real box[4];
         if (!clipped_box(tu, tv, tw, radius, near, box)) return;

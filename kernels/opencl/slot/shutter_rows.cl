@@ -14,6 +14,6 @@
         real above = view->center_y + disc, below = view->center_y - view->height - disc;
         // rounding, also in float32; a NaN is not culled
         real slack = REAL(1e-5) * (fabs(fy * down) + (fabs(above) + fabs(below)) * fabs(ahead));
-        if (fy * down + above * ahead + reach * sqrt(fy * fy + above * above) + slack < 0) return;
-        if (fy * down + below * ahead - reach * sqrt(fy * fy + below * below) - slack > 0) return;
+        if (fy * down + above * ahead + reach * sqrt(fy * fy + above * above) + slack < 0) RETURN_CULLED;
+        if (fy * down + below * ahead - reach * sqrt(fy * fy + below * below) - slack > 0) RETURN_CULLED;
     }
