@@ -38,6 +38,7 @@ _HOME = {
     "save_ply": "fidsplat.formats",
     "load_splats": "fidsplat.formats",
     "save_splats": "fidsplat.formats",
+    "load_cameras": "fidsplat.formats",
     "load_trajectory": "fidsplat.formats",
     "save_trajectory": "fidsplat.formats",
     "Store": "fidsplat.store.store",

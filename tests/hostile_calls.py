@@ -319,6 +319,17 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         fs.Camera.orthographic, {"width": 24, "height": 16, "metres_wide": 3.0, "near": 0.1, "far": 50.0}, _seen_by
     ),
     "Camera.equirectangular": lambda _: (fs.Camera.equirectangular, {"width": 24, "height": 12}, _seen_by),
+    "Camera.from_colmap": lambda _: (
+        fs.Camera.from_colmap,
+        {"camera": ("PINHOLE", 24, 16, [20.0, 20.0, 12.0, 8.0]), "world_to_camera": np.eye(4)},
+        _seen_by,
+    ),
+    "Camera.from_nerfstudio": lambda _: (
+        fs.Camera.from_nerfstudio,
+        {"transforms": {"w": 24, "h": 16, "fl_x": 20.0, "frames": [{"transform_matrix": np.eye(4).tolist()}]}, "frame": 0},
+        _seen_by,
+    ),
+    "Camera.with_size": lambda _: (CAMERA.with_size, {"width": 12, "height": 8}, _seen_by),
     "Camera.project": lambda _: (CAMERA.project, {"points": MEANS}, None),
     "Camera.rays": lambda _: (CAMERA.rays, {"pixels": np.ones((2, 2))}, None),
     "BrownConrady": lambda _: (

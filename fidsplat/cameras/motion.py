@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fidsplat.cameras.pinhole import Camera
-from fidsplat.splats.rotations import check_similarity
+from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import as_float, instance, invalid, number, own_scalars, whole_number
 from fidsplat.util.errors import InputError
 
@@ -153,5 +153,6 @@ class _PoseTable:
 
 def _checked(matrix, who: str, time: float) -> np.ndarray:
     """A rigid pose as float64. Raises InputError."""
+    matrix = pose_matrix(matrix, f"the pose of {who} at {time:g} s")
     check_similarity(matrix, f"the pose of {who} at {time:g} s", rigid=True)
     return np.asarray(matrix, np.float64)

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from fidsplat.cameras.foreign import colmap_parts, nerfstudio_parts, ros_parts
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
-from fidsplat.splats.rotations import check_similarity
+from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.util.arguments import LARGEST, PickledByFields, invalid, real_array
 from fidsplat.util.errors import InputError
 from fidsplat.util.markup import Summarised, point
@@ -41,7 +42,8 @@ class Camera(PickledByFields, Summarised):
     cy: float
     """pixels, anywhere; height / 2 is the middle"""
     world_to_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """(4, 4) float64, rigid, read-only"""
+    """(4, 4) float64, rigid, read-only; or given as (position, quaternion w, x, y, z) of the world in the
+    camera's frame"""
     near: float = 0.01
     """metres along z (along the ray for a fisheye or panorama), above 0; nearer parts of a splat are
     clipped"""
@@ -75,8 +77,9 @@ class Camera(PickledByFields, Summarised):
                 raise InputError(f"camera {name} must be finite, got {getattr(self, name)!r}")
         if not self.far > self.near:
             raise InputError(f"camera far must be above near ({self.near!r}), got {self.far!r}")
-        check_similarity(self.world_to_camera, "camera world_to_camera", rigid=True)
-        matrix = np.array(self.world_to_camera, dtype=np.float64)
+        given = pose_matrix(self.world_to_camera, "camera world_to_camera")
+        check_similarity(given, "camera world_to_camera", rigid=True)
+        matrix = np.array(given, dtype=np.float64)
         rotation, moved = matrix[:3, :3], matrix[:3, 3]
         if self.position is None:
             # by the inverse, not the transpose: a rotation from a float32 file is orthonormal to 1e-7 only
@@ -86,7 +89,7 @@ class Camera(PickledByFields, Summarised):
             if np.abs(rotation @ position + moved).max() > 1e-6 * (1 + np.abs(position).max()):
                 raise InputError(
                     f"camera position must be that of world_to_camera, got {tuple(position.tolist())}; leave "
-                    "it out"
+                    "it out, or move a camera by camera.with_pose(world_to_camera)"
                 )
         for name, array in (("world_to_camera", matrix), ("position", position)):
             array.flags.writeable = False
@@ -179,11 +182,68 @@ class Camera(PickledByFields, Summarised):
         pose = look_at_matrix(position, target, up)
         return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, position)
 
-    def with_pose(self, world_to_camera=None, *, position=None, target=None, up=(0.0, -1.0, 0.0)) -> "Camera":
+    @staticmethod
+    def from_colmap(camera, world_to_camera=None) -> "Camera":
+        """A camera of COLMAP, whose axes and pixels are ours.
+
+        Args:
+            camera: a `pycolmap.Camera`, or (model, width, height, parameters) as in cameras.txt.
+            world_to_camera: its pose, also a `pycolmap.Image` or `Rigid3d`; by default the identity.
+
+        Raises:
+            InputError: another kind of object, or a lens that is not supported. `load_cameras` reads files.
+        """
+        return Camera.pinhole(**colmap_parts(camera, world_to_camera)._asdict())
+
+    @staticmethod
+    def from_nerfstudio(transforms, frame=0) -> "Camera":
+        """The camera of a frame of nerfstudio's transforms.json; its poses have OpenGL's axes.
+
+        Args:
+            transforms: its content, a dict. It must have the size of the images, w and h.
+            frame: number of the frame, or its file_path.
+
+        Raises:
+            InputError: another content, or a lens that is not supported. `load_cameras` reads files.
+        """
+        return Camera.pinhole(**nerfstudio_parts(transforms, frame)._asdict())
+
+    @staticmethod
+    def from_ros_camera_info(info, world_to_camera=None, *, rectified: bool = False) -> "Camera":
+        """The camera of a `sensor_msgs/CameraInfo` of ROS 1 or 2, or of a calibration file of ROS as a dict.
+
+        Args:
+            info: the message. Its pixel coordinates are smaller by 0.5 than ours.
+            world_to_camera: pose of the world in the camera's optical frame; by default the identity.
+            rectified: the camera of rectified images, from P without distortion, instead of K and D.
+
+        Raises:
+            InputError: another kind of object, a distortion model that is not supported, binning or a region
+                of interest.
+        """
+        return Camera.pinhole(**ros_parts(info, world_to_camera, rectified)._asdict())
+
+    @property
+    def camera_to_world(self) -> np.ndarray:
+        """(4, 4) float64, the inverse of world_to_camera: the pose of the camera in the world."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.world_to_camera[:3, :3].T, self.position
+        return pose
+
+    def with_pose(
+        self,
+        world_to_camera=None,
+        *,
+        camera_to_world=None,
+        position=None,
+        target=None,
+        up=(0.0, -1.0, 0.0),
+    ) -> "Camera":
         """The same camera (size, intrinsics, lens, near, far) at another pose.
 
         Args:
-            world_to_camera: (4, 4), rigid. Instead of the others.
+            world_to_camera, camera_to_world: (4, 4), rigid, or (position, quaternion w, x, y, z). One of
+                them instead of the others.
             position: (3,) metres, centre of projection; by default the camera's own.
             target: (3,) metres, a point on the new optical axis; without it the rotation stays.
             up: (3,) world direction that points up in the image, with a target.
@@ -191,11 +251,19 @@ class Camera(PickledByFields, Summarised):
         Raises:
             InputError: no pose, two poses, or one that is not rigid.
         """
-        if (world_to_camera is None) == (position is None and target is None):
+        looks = position is not None or target is not None
+        ways = (world_to_camera is not None) + (camera_to_world is not None) + looks
+        if ways != 1:
             raise InputError(
-                "the pose of a camera must be given as world_to_camera, or as position, target or both, got "
-                + ("none of them" if world_to_camera is None else "both")
+                "the pose of a camera must be given as world_to_camera, as camera_to_world, or as position, "
+                f"target or both, got {'none of them' if ways == 0 else 'both' if ways == 2 else 'all'}"
             )
+        if camera_to_world is not None:
+            pose = pose_matrix(camera_to_world, "camera_to_world")
+            rotation, _, position = check_similarity(pose, "camera_to_world", rigid=True)
+            world_to_camera = np.eye(4)
+            world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation.T, -rotation.T @ position
+            return replace(self, world_to_camera=world_to_camera, position=position)
         if world_to_camera is not None:
             return replace(self, world_to_camera=world_to_camera, position=None)
         position = self.position if position is None else _vector("position", position)

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from fidsplat.cameras.screw import between, exponential, twist
-from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, rigid_matrix
+from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, pose_matrix, rigid_matrix
 from fidsplat.util.arguments import PickledByFields, as_float, flag, invalid, number, real_array
 from fidsplat.util.errors import InputError
 
@@ -35,7 +35,7 @@ class Trajectory(PickledByFields):
     times: Sequence[float] | np.ndarray
     """(k,) seconds, increasing"""
     poses: np.ndarray
-    """(k, 4, 4) rigid; or given as (k, 7): x, y, z in metres and a unit quaternion w, x, y, z"""
+    """(k, 4, 4) rigid; or given as pairs of a position and a unit quaternion w, x, y, z, or as (k, 7)"""
     smooth: bool = False
     """continuous velocity: a cubic Bezier curve of screw motions between keyframes. The velocity at a
     keyframe is that of the parabola through it and its neighbours, limited where rotations are fast.
@@ -56,9 +56,10 @@ class Trajectory(PickledByFields):
         if isinstance(first, Sequence | np.ndarray) and len(first) == 7:
             poses = np.array([_of_vector(k, vector) for k, vector in enumerate(self.poses)])
         else:
-            for k, pose in enumerate(self.poses):
+            given = [pose_matrix(pose, f"pose {k} of a trajectory") for k, pose in enumerate(self.poses)]
+            for k, pose in enumerate(given):
                 check_similarity(pose, f"pose {k} of a trajectory", rigid=True)
-            poses = np.array(self.poses, np.float64)
+            poses = np.array(given, np.float64)
         times.flags.writeable = poses.flags.writeable = False
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "poses", poses)

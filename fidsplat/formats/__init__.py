@@ -1,6 +1,7 @@
 """Reading and writing of splat files (PLY, .splat, SPZ, glTF, OpenUSD, SOG) and trajectories (TUM, KITTI,
 COLMAP, transforms.json)."""
 
+from fidsplat.formats.cameras import load_cameras
 from fidsplat.formats.collect import Progress
 from fidsplat.formats.files import load_splats, losses, save_splats
 from fidsplat.formats.ply import load_ply
@@ -9,6 +10,7 @@ from fidsplat.formats.trajectories import load_trajectory, save_trajectory
 
 __all__ = [
     "Progress",
+    "load_cameras",
     "load_ply",
     "load_splats",
     "load_trajectory",

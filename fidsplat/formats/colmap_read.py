@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens
+from fidsplat.cameras import Camera
 from fidsplat.splats.rotations import quaternion_to_matrix
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import read_input, read_text
@@ -29,18 +29,6 @@ _MODELS = {
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
 """name and number of parameters of COLMAP's camera models by id"""
-_LENSES: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
-    "SIMPLE_PINHOLE": (BrownConrady, ()),
-    "PINHOLE": (BrownConrady, ()),
-    "SIMPLE_RADIAL": (BrownConrady, ("k1",)),
-    "RADIAL": (BrownConrady, ("k1", "k2")),
-    "OPENCV": (BrownConrady, ("k1", "k2", "p1", "p2")),
-    "FULL_OPENCV": (BrownConrady, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    "OPENCV_FISHEYE": (Fisheye, ("k1", "k2", "k3", "k4")),
-    "SIMPLE_RADIAL_FISHEYE": (Fisheye, ("k1",)),
-    "RADIAL_FISHEYE": (Fisheye, ("k1", "k2")),
-}
-"""supported camera models: lens and its parameters, which follow f or fx, fy, and cx, cy"""
 
 
 @dataclass(frozen=True)
@@ -76,7 +64,7 @@ def load_colmap(folder: Path) -> ColmapModel:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
         try:
-            cameras.append(_camera(lenses[number], matrix))
+            cameras.append(Camera.from_colmap(lenses[number], matrix))
         except InputError as error:
             raise InputError(f"{folder}: image {name}: {error}") from error
     values = np.array(found, np.float64).reshape(-1, 6)
@@ -211,17 +199,3 @@ def _text_points(lines: list[str]) -> Iterator[tuple]:
     for line in filter(None, lines):
         _, x, y, z, r, g, b, *_ = line.split()
         yield tuple(map(float, (x, y, z, r, g, b)))
-
-
-def _camera(intrinsics: _Intrinsics, pose: np.ndarray) -> Camera:
-    model, width, height, values = intrinsics
-    if model not in _LENSES:
-        raise InputError(
-            f"the camera model must be one of {', '.join(_LENSES)}, got {model}; undistort the images, "
-            "e.g. by colmap image_undistorter"
-        )
-    kind, names = _LENSES[model]
-    own = len(values) - len(names)
-    lens: Lens = kind(**dict(zip(names, values[own:], strict=True)))
-    fx, fy, cx, cy = values[:own] if own == 4 else (values[0], *values[:3])
-    return Camera.pinhole(width, height, fx, fy, cx, cy, pose, lens=lens)

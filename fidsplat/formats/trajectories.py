@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, Trajectory
+from fidsplat.cameras.foreign import COEFFICIENTS, OPENGL
 from fidsplat.cameras.trajectory import check_rate
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import image_poses
@@ -31,8 +32,6 @@ RATE = 10.0
 """poses a second for files without times, the rate of KITTI"""
 ROUNDED = 1e-3
 """tolerance of rotations: files often have six digits"""
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenGL's and OpenCV's camera axes
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _SUFFIXES = ".tum and .txt (TUM), .kitti, .json (transforms.json), or a folder (COLMAP)"
 
 
@@ -145,7 +144,7 @@ def lens_table(lens: Lens | None) -> dict[str, Any] | None:
     """A lens in nerfstudio's transforms.json; None if it has no such model."""
     if lens is None:
         return {"camera_model": "OPENCV"}
-    values = {name: value for name, value in vars(lens).items() if name in _COEFFICIENTS and value}
+    values = {name: value for name, value in vars(lens).items() if name in COEFFICIENTS and value}
     if isinstance(lens, Fisheye):
         return {"camera_model": "OPENCV_FISHEYE"} | values
     if not isinstance(lens, BrownConrady) or any((lens.s1, lens.s2, lens.s3, lens.s4)):
@@ -156,7 +155,7 @@ def lens_table(lens: Lens | None) -> dict[str, Any] | None:
 
 def _transforms_json(trajectory: Trajectory, camera: Camera, names: Sequence[str]) -> dict[str, Any]:
     frames = [
-        {"file_path": name, "time": time, "transform_matrix": (pose @ _FLIP + 0.0).tolist()}
+        {"file_path": name, "time": time, "transform_matrix": (pose @ OPENGL + 0.0).tolist()}
         for name, time, pose in zip(
             names, np.asarray(trajectory.times).tolist(), trajectory.poses, strict=True
         )
@@ -252,7 +251,7 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
             matrix = np.vstack([matrix, (0, 0, 0, 1)])
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
             raise InputError(f"{where} must be 4 x 4 finite numbers")
-        poses.append(_rigid(where, matrix) @ _FLIP)
+        poses.append(_rigid(where, matrix) @ OPENGL)
     if any(time is None for time, _ in pairs):
         return None, poses
     return _numbers(f"{file}, the times of its frames", [time for time, _ in pairs]), poses

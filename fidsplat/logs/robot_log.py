@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Fisheye
+from fidsplat.cameras.foreign import PIXEL
 from fidsplat.effects import IMAGES
 from fidsplat.images.files import encode_image, pixels_of, to_uint8
 from fidsplat.logs.reader import SCENE
 from fidsplat.logs.writers import log_file, typestore
-from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion
+from fidsplat.splats.rotations import check_similarity, matrix_to_quaternion, pose_matrix
 from fidsplat.util.arguments import instance, invalid, items, number, real_array, text
 from fidsplat.util.errors import InputError, unknown
 from fidsplat.vision.detect import Detection
 
 OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 """link_from_optical: REP-103's body axes (x forward, y left, z up) from OpenCV's"""
-PIXEL = 0.5
-"""offset to the pixel coordinates of ROS and OpenCV, whose first pixel centre is at 0"""
 
 
 class RobotLog:
@@ -135,8 +134,8 @@ class RobotLog:
         """
         if self._world_from_scene is None:
             return self.transform(time, camera, pose)
-        check_similarity(pose, f"the pose of {text('the name of a frame', camera)}", rigid=True)
-        link = self._world_from_scene @ np.asarray(pose, np.float64) @ np.linalg.inv(OPTICAL)
+        given = _rigid(pose, f"the pose of {text('the name of a frame', camera)}")
+        link = self._world_from_scene @ given @ np.linalg.inv(OPTICAL)
         self._transforms(
             time,
             (self.world, SCENE, self._world_from_scene),
@@ -147,8 +146,7 @@ class RobotLog:
     def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
         """Pose of a frame in its parent (4, 4), by default the world, as `/tf`. A camera's frame has OpenCV's
         axes, like ROS's optical frames."""
-        check_similarity(pose, f"the pose of {text('the name of a frame', frame)}", rigid=True)
-        given = np.asarray(pose, np.float64)
+        given = _rigid(pose, f"the pose of {text('the name of a frame', frame)}")
         self._transforms(
             time, (self.world, frame, self._in_world(given)) if parent is None else (parent, frame, given)
         )
@@ -159,8 +157,7 @@ class RobotLog:
     ) -> None:  # fmt: skip
         """Pose of the body in the world (4, 4), velocities (3,) in m/s and rad/s in the body's axes, and the
         covariance of the pose (6, 6)."""
-        check_similarity(pose, "the pose of odometry", rigid=True)
-        position, turn = self._pose_parts(self._in_world(np.asarray(pose, np.float64)))
+        position, turn = self._pose_parts(self._in_world(_rigid(pose, "the pose of odometry")))
         spread = np.zeros((6, 6)) if covariance is None else real_array("covariance", covariance)
         if spread.shape != (6, 6):
             raise invalid("covariance", "(6, 6) numbers", covariance)
@@ -299,6 +296,13 @@ def _three(name: str, value: Any) -> list[float]:
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
         raise invalid(name, "three finite numbers", value)
     return numbers.tolist()
+
+
+def _rigid(pose: Any, name: str) -> np.ndarray:
+    """A rigid matrix (4, 4) or pair as float64. Raises InputError."""
+    given = pose_matrix(pose, name)
+    check_similarity(given, name, rigid=True)
+    return np.asarray(given, np.float64)
 
 
 def _distortion(camera: Camera) -> tuple[str, list[float]]:

@@ -16,7 +16,7 @@ from fidsplat.capture.environment import Background, Fog, background_of
 from fidsplat.capture.quality import Quality
 from fidsplat.capture.sensor import Sensor
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.splats.rotations import check_similarity
+from fidsplat.splats.rotations import check_similarity, pose_matrix
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
 from fidsplat.util.arguments import PickledByFields, invalid
@@ -36,7 +36,7 @@ class PlacedMarker(PickledByFields):
 
     marker: Marker
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """(4, 4) float64, world_from_marker, rigid, read-only"""
+    """(4, 4) float64, world_from_marker, rigid, read-only; or given as (position, quaternion w, x, y, z)"""
     label: int = 1
     """label of its splats; a Scene numbers its markers 1, 2, ..."""
     motion: Pose | None = None
@@ -45,7 +45,8 @@ class PlacedMarker(PickledByFields):
     """name of the rigid object that it is attached to; markers of a bundle are detected as one pose"""
 
     def __post_init__(self) -> None:
-        check_similarity(self.pose, "a marker's pose", rigid=True)
+        given = pose_matrix(self.pose, "a marker's pose")
+        check_similarity(given, "a marker's pose", rigid=True)
         if self.motion is not None and not callable(self.motion):
             raise InputError(
                 "a marker's motion must be an fs.Trajectory or a function of time, got a "
@@ -57,7 +58,7 @@ class PlacedMarker(PickledByFields):
             raise InputError(
                 f"marker must be an fs.Marker, got {self.marker!r}; e.g. fs.marker('apriltag:36h11:5')"
             )
-        pose = np.array(self.pose, dtype=np.float64)
+        pose = np.array(given, dtype=np.float64)
         pose.flags.writeable = False
         object.__setattr__(self, "pose", pose)
 

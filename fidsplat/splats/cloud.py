@@ -29,6 +29,7 @@ from fidsplat.splats.harmonics import C0, MAX_DEGREE, rotation_of_coefficients, 
 from fidsplat.splats.rotations import (
     check_similarity,
     matrix_to_quaternion,
+    pose_matrix,
     quaternion_multiply,
     quaternion_to_matrix,
 )
@@ -294,12 +295,13 @@ class SplatCloud(PickledByFields, Summarised):
         return self._replaced(labels=whole_numbers(labels, len(self)))
 
     def transformed(self, matrix) -> "SplatCloud":
-        """The cloud transformed by a 4x4 rotation, uniform scale and translation; SH colours rotate too.
+        """The cloud transformed by a 4x4 rotation, uniform scale and translation, or by a pose (position,
+        quaternion w, x, y, z); SH colours rotate too.
 
         A cloud with an origin keeps its means small: the origin moves. Raises InputError for any other
         matrix, such as a reflection.
         """
-        rotation, scale, translation = check_similarity(matrix, "the transform")
+        rotation, scale, translation = check_similarity(pose_matrix(matrix, "the transform"), "the transform")
         local = self.means @ (scale * rotation).T
         if self.origin.any():
             means, origin = as_single(local), scale * rotation @ self.origin + translation

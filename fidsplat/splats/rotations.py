@@ -106,6 +106,30 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     return rotation, scale, m[:3, 3]
 
 
+def pose_matrix(pose, name: str) -> np.ndarray:
+    """The matrix of a pose: a 4x4 matrix, which is returned unchecked, a pair (position, quaternion w, x, y,
+    z), or both in 7 numbers.
+
+    Raises InputError, naming ``name``, for a pair or 7 numbers without a unit quaternion (within 1e-3).
+    """
+    pair = isinstance(pose, tuple | list) and len(pose) == 2
+    try:
+        vector = not pair and np.shape(pose) == (7,)
+    except (TypeError, ValueError):  # rows of unequal length
+        vector = False
+    if not (pair or vector):
+        return pose
+    what = f"position and quaternion of {name}"
+    parts = [real_array(what, part) for part in (pose if pair else (pose[:3], pose[3:]))]
+    if [part.shape for part in parts] != [(3,), (4,)] or not all(np.isfinite(part).all() for part in parts):
+        raise InputError(
+            f"{name} must be a 4x4 matrix, or a position (3,) and a quaternion (4,), got {pose!r}"
+        )
+    if abs(np.linalg.norm(parts[1]) - 1) > 1e-3:
+        raise InputError(f"the quaternion w, x, y, z of {name} must have length 1, got {parts[1].tolist()}")
+    return rigid_matrix(*parts)
+
+
 def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) -> np.ndarray:
     """4x4 float64 matrix: scale, then rotation by a quaternion (w, x, y, z) of any length, then translation.
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.cameras import BrownConrady, Camera, Fisheye, Lens, focal_length
+from fidsplat.cameras import Camera
 from fidsplat.formats.colmap_read import byte_colors
 from fidsplat.formats.ply_header import read_header
 from fidsplat.images.files import read_image, read_on_background
@@ -21,14 +21,6 @@ from fidsplat.util.files import from_json, path_of, read_text
 _NAMES = ("transforms.json", "transforms_train.json")
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 """suffixes of image files; the NeRF authors' files omit them"""
-_BROWN = ("k1", "k2", "k3", "p1", "p2")
-_LENSES: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), _BROWN),
-    "FULL_OPENCV": (*_BROWN, "k4", "k5", "k6"),
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-}
-"""values of `camera_model`, each with its coefficients"""
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _BLACK = (0.0, 0.0, 0.0)
 
 
@@ -84,20 +76,15 @@ def _views(file: Path, table: dict, progress: Callable[[str, float], None], word
     for number, frame in enumerate(table["frames"]):
         progress(words, number / len(table["frames"]))
         try:
-            name, matrix = str(frame["file_path"]), np.array(frame["transform_matrix"], float)
-            if matrix.shape == (3, 4):
-                matrix = np.vstack([matrix, (0, 0, 0, 1)])
-            if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-                raise ValueError
-        except (KeyError, TypeError, ValueError, OverflowError):
+            name, _ = str(frame["file_path"]), frame["transform_matrix"]
+        except (KeyError, TypeError):
             raise InputError(
                 f"{file}: frame {number} must have a file_path and a transform_matrix of 4 x 4 finite numbers"
             ) from None
         image, mask = _image(file, name, others), None
         if "mask_path" in frame:
             mask = read_image(file.parent / str(frame["mask_path"])).max(axis=2) > 0
-        given = {**table, **frame}
-        views.append(undistorted_view(name, _camera(f"{file}: {name}", given, image, matrix), image, mask))
+        views.append(undistorted_view(name, _camera(f"{file}: {name}", table, number, image), image, mask))
     return sorted(views, key=lambda view: view.name)
 
 
@@ -137,42 +124,12 @@ def check_other_image(image: Path, others: set[tuple[int, int]]) -> None:
     others.add((status.st_dev, status.st_ino))
 
 
-def _camera(what: str, given: dict, image: np.ndarray, camera_to_world: np.ndarray) -> Camera:
+def _camera(what: str, table: dict, number: int, image: np.ndarray) -> Camera:
     height, width = image.shape[:2]
     try:
-        stated = int(given.get("w", width)), int(given.get("h", height))
-        if "fl_x" in given:
-            fx = float(given["fl_x"])
-        else:
-            fx = focal_length(stated[0], float(given["camera_angle_x"]))
-        fy = float(given.get("fl_y", fx))
-        cx, cy = float(given.get("cx", stated[0] / 2)), float(given.get("cy", stated[1] / 2))
-    except (KeyError, TypeError, ValueError, OverflowError):
-        raise InputError(f"{what}: fl_x, or camera_angle_x, must be a finite number") from None
-    pose = camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
-    rotation = pose[:3, :3].T
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation, -rotation @ pose[:3, 3]
-    try:
-        return Camera.pinhole(*stated, fx, fy, cx, cy, world_to_camera, lens=_lens(given))
+        return Camera.from_nerfstudio({"w": width, "h": height} | table, number)
     except InputError as error:
         raise InputError(f"{what}: {error}") from error
-
-
-def _lens(given: dict) -> Lens:
-    model = given.get("camera_model", "OPENCV_FISHEYE" if given.get("is_fisheye") else "PINHOLE")
-    if not isinstance(model, str) or model not in _LENSES:
-        raise InputError(
-            f"camera_model must be one of {', '.join(_LENSES)}, got {model!r}; undistort the images first"
-        )
-    values = {name: given[name] for name in _COEFFICIENTS if given.get(name)}
-    if others := values.keys() - _LENSES[model]:
-        name = min(others)
-        raise InputError(
-            f"coefficients of the camera_model {model} must be {', '.join(_LENSES[model])}, got {name} = "
-            f"{values[name]!r}; undistort the images first"
-        )
-    return (Fisheye if model == "OPENCV_FISHEYE" else BrownConrady)(**values)
 
 
 def _points(file: Path, table: dict) -> tuple[np.ndarray, np.ndarray]:

@@ -366,7 +366,7 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
             "of the camera_model PINHOLE must be .*, got k4 = 0.1; undistort the images",
         ),
         ({"fl_x": "far"}, "fl_x, or camera_angle_x, must be a finite"),
-        ({"w": float("inf")}, "fl_x, or camera_angle_x, must be a finite"),
+        ({"w": float("inf")}, "w and h must be the size of the images"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of .*, got 'EQUIRECTANGULAR'"),
     ):
         table = json.loads((nerf / "transforms.json").read_text())

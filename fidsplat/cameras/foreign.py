@@ -1,0 +1,194 @@
+"""Cameras of COLMAP, nerfstudio and ROS: their intrinsics, lenses and conventions of axes and pixels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.cameras.lenses import BrownConrady, Fisheye, Lens
+from fidsplat.util.errors import InputError, unknown
+
+PIXEL = 0.5
+"""offset to the pixel coordinates of ROS and OpenCV, whose first pixel centre is at 0"""
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""rotation between OpenGL's camera axes (y up, z backwards) and OpenCV's"""
+_COLMAP: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": (BrownConrady, ()),
+    "PINHOLE": (BrownConrady, ()),
+    "SIMPLE_RADIAL": (BrownConrady, ("k1",)),
+    "RADIAL": (BrownConrady, ("k1", "k2")),
+    "OPENCV": (BrownConrady, ("k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": (BrownConrady, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "OPENCV_FISHEYE": (Fisheye, ("k1", "k2", "k3", "k4")),
+    "SIMPLE_RADIAL_FISHEYE": (Fisheye, ("k1",)),
+    "RADIAL_FISHEYE": (Fisheye, ("k1", "k2")),
+}
+"""supported camera models: lens and its parameters, which follow f or fx, fy, and cx, cy"""
+_BROWN = ("k1", "k2", "k3", "p1", "p2")
+_NERFSTUDIO: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), _BROWN),
+    "FULL_OPENCV": (*_BROWN, "k4", "k5", "k6"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+"""values of `camera_model`, each with its coefficients"""
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+"""coefficients of lenses in transforms.json"""
+_ROS: dict[str, tuple[type[BrownConrady | Fisheye], tuple[str, ...]]] = {
+    "": (BrownConrady, ()),
+    "plumb_bob": (BrownConrady, ("k1", "k2", "p1", "p2", "k3")),
+    "rational_polynomial": (
+        BrownConrady,
+        ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+    ),
+    "equidistant": (Fisheye, ("k1", "k2", "k3", "k4")),
+}
+"""values of `distortion_model`: lens and the order of its coefficients"""
+
+
+class Parts(NamedTuple):
+    """Arguments of `Camera.pinhole`."""
+
+    width: Any
+    height: Any
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: Any
+    lens: Lens | None
+
+
+def colmap_parts(camera: Any, pose: Any) -> Parts:
+    """The camera of objects of pycolmap, or of (model, width, height, parameters) and a pose."""
+    try:
+        if hasattr(camera, "params"):
+            model = getattr(camera.model, "name", camera.model)
+            camera = (model, camera.width, camera.height, camera.params)
+        model, width, height, given = camera
+        parameters = [float(number) for number in given]
+    except (AttributeError, TypeError, ValueError):
+        raise InputError(
+            "camera must be a pycolmap.Camera, or (model, width, height, parameters), "
+            f"got {camera!r}; fs.load_cameras reads files"
+        ) from None
+    if callable(getattr(pose, "cam_from_world", None)):  # pycolmap.Image
+        pose = pose.cam_from_world()
+    if callable(getattr(pose, "matrix", None)):  # pycolmap.Rigid3d: (3, 4)
+        pose = np.vstack([pose.matrix(), (0.0, 0.0, 0.0, 1.0)])
+    if not isinstance(model, str) or model not in _COLMAP:
+        raise InputError(
+            f"the camera model must be one of {', '.join(_COLMAP)}, got {model}; undistort the images, "
+            "e.g. by colmap image_undistorter"
+        )
+    kind, names = _COLMAP[model]
+    own = len(parameters) - len(names)
+    if own not in (3, 4):
+        raise InputError(
+            f"the parameters of COLMAP's model {model} must be f or fx, fy, then cx, cy"
+            f"{''.join(f', {name}' for name in names)}, got {len(parameters)} numbers"
+        )
+    lens = kind(**dict(zip(names, parameters[own:], strict=True)))
+    fx, fy, cx, cy = parameters[:own] if own == 4 else (parameters[0], *parameters[:3])
+    return Parts(width, height, fx, fy, cx, cy, pose, lens)
+
+
+def nerfstudio_parts(transforms: Any, frame: Any) -> Parts:
+    """The camera of a frame of transforms.json, by its number or file_path."""
+    try:
+        frames = list(transforms["frames"])
+        paths = [one.get("file_path") for one in frames]
+    except (TypeError, KeyError, IndexError, AttributeError):
+        raise InputError(
+            "transforms must be the content of a transforms.json, with frames; fs.load_cameras reads files"
+        ) from None
+    number = paths.index(frame) if isinstance(frame, str) and frame in paths else frame
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < len(frames):
+        raise InputError(
+            f"frame must be a number from 0 to {len(frames) - 1} or a file_path of transforms, got {frame!r}"
+        )
+    given = {**transforms, **frames[number]}
+    try:
+        matrix = np.array(given["transform_matrix"], np.float64)
+        if matrix.shape == (3, 4):
+            matrix = np.vstack([matrix, (0, 0, 0, 1)])
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise ValueError
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise InputError("transform_matrix must be 4 x 4 finite numbers") from None
+    try:
+        width, height = int(given["w"]), int(given["h"])
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise InputError("w and h must be the size of the images in pixels") from None
+    try:
+        if "fl_x" in given:
+            fx = float(given["fl_x"])
+        else:
+            angle = float(given["camera_angle_x"])
+            if not 0 < angle < math.pi:
+                raise InputError(f"camera_angle_x must be between 0 and pi radians, got {angle:g}")
+            fx = width / 2 / math.tan(angle / 2)
+        fy = float(given.get("fl_y", fx))
+        cx, cy = float(given.get("cx", width / 2)), float(given.get("cy", height / 2))
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise InputError("fl_x, or camera_angle_x, must be a finite number") from None
+    pose = matrix @ OPENGL
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+    return Parts(width, height, fx, fy, cx, cy, world_to_camera, _nerfstudio_lens(given))
+
+
+def ros_parts(info: Any, world_to_camera: Any, rectified: bool) -> Parts:
+    """The camera of a sensor_msgs/CameraInfo, or of a calibration file of ROS as a dict."""
+    try:
+        if isinstance(info, Mapping):
+            width, height = info["image_width"], info["image_height"]
+            k, p = (info[f"{name}_matrix"]["data"] for name in ("camera", "projection"))
+            factors, model = info["distortion_coefficients"]["data"], info["distortion_model"]
+            reduced = False
+        else:  # ROS 1 has capital letters
+            k, d, p = (getattr(info, name, None) for name in "kdp")
+            k, factors, p = (
+                getattr(info, name.upper()) if v is None else v
+                for name, v in zip("kdp", (k, d, p), strict=True)
+            )
+            width, height, model = info.width, info.height, info.distortion_model
+            reduced = max(info.binning_x, info.binning_y) > 1 or info.roi.x_offset or info.roi.y_offset
+        matrix = np.array(p, np.float64).reshape(3, 4) if rectified else np.array(k, np.float64).reshape(3, 3)
+        coefficients = [] if rectified else [float(number) for number in factors]
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError):
+        raise InputError(
+            "info must be a sensor_msgs/CameraInfo, or the dict of a calibration file with image_width, "
+            f"camera_matrix and so on, got {type(info).__name__}"
+        ) from None
+    if reduced:
+        raise InputError("info must be of the complete image, got binning or a region of interest")
+    if model not in _ROS:
+        raise InputError(unknown("distortion_model of CameraInfo", model, tuple(filter(None, _ROS))))
+    kind, names = _ROS[model]
+    if any(coefficients[len(names) :]):
+        raise InputError(
+            f"the coefficients d of {model or 'no model'} must be {', '.join(names) or 'none'}, got "
+            f"{coefficients}; rectify the images, and set rectified=True"
+        )
+    lens = None if rectified else kind(**dict(zip(names, coefficients, strict=False)))
+    (fx, _, cx), (_, fy, cy) = matrix[0, :3], matrix[1, :3]
+    return Parts(width, height, fx, fy, cx + PIXEL, cy + PIXEL, world_to_camera, lens)
+
+
+def _nerfstudio_lens(given: Mapping[str, Any]) -> Lens:
+    model = given.get("camera_model", "OPENCV_FISHEYE" if given.get("is_fisheye") else "PINHOLE")
+    if not isinstance(model, str) or model not in _NERFSTUDIO:
+        raise InputError(
+            f"camera_model must be one of {', '.join(_NERFSTUDIO)}, got {model!r}; undistort the images first"
+        )
+    values = {name: given[name] for name in COEFFICIENTS if given.get(name)}
+    if others := values.keys() - _NERFSTUDIO[model]:
+        name = min(others)
+        raise InputError(
+            f"coefficients of the camera_model {model} must be {', '.join(_NERFSTUDIO[model])}, got {name} = "
+            f"{values[name]!r}; undistort the images first"
+        )
+    return (Fisheye if model == "OPENCV_FISHEYE" else BrownConrady)(**values)
