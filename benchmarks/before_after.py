@@ -2,21 +2,27 @@
 
     python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device D] [--repeats 15] [--cpu-time]
                                       [--json FILE]
+    python benchmarks/before_after.py COMMIT --pytest [WORDS] [--device D]
 
 Both processes render a scene of this tree with equal constants (alpha cut-off 1/255, stop 1e-4, precise
 arithmetic); splats and images stay on the device. The trees alternate frame by frame, and the first of a pair
 changes. Reported are the median and quartiles of the ratio of this tree's time to the commit's, and median
 stage times by the device clock. --cpu-time measures CPU time of all threads, which other processes disturb
 less.
+
+--pytest runs `pytest benchmarks/` with both trees, one after the other, and compares them by
+`pytest-benchmark compare`; WORDS are arguments of pytest, such as "-k tag".
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
 
@@ -121,6 +127,22 @@ def checked_out(commit: str, folder: Path) -> Path:
     return folder
 
 
+def compare_suites(commit: str, words: Sequence[str]) -> int:
+    """Run the suite of pytest-benchmark with a commit and with this tree; returns the status of the first
+    failed command, or 0."""
+    with tempfile.TemporaryDirectory() as folder:
+        old = checked_out(commit, Path(folder))
+        files = [f"{folder}/before.json", f"{folder}/now.json"]
+        for tree, file in zip((old, ROOT), files, strict=True):
+            path = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])
+            command = [sys.executable, "-m", "pytest", "benchmarks", "-q", f"--benchmark-json={file}", *words]
+            status = subprocess.run(command, cwd=tree, env=os.environ | {"PYTHONPATH": path}).returncode
+            if status:
+                return status
+        compare = [sys.executable, "-m", "pytest_benchmark", "compare", *files, "--group-by=fullname"]
+        return subprocess.run([*compare, "--columns=min,median,iqr,rounds"]).returncode
+
+
 def measure(commit: str, scene: str, device: str, repeats: int, clock: str) -> dict:
     """Times of both trees and the ratio of this tree to the commit."""
     with tempfile.TemporaryDirectory() as folder:
@@ -157,7 +179,11 @@ def main() -> None:
     parser.add_argument(
         "--cpu-time", action="store_true", help="CPU time of all threads instead of wall time"
     )
+    parser.add_argument("--pytest", metavar="WORDS", nargs="?", const="", help="compare the pytest suites")
     arguments = parser.parse_args()
+    if arguments.pytest is not None:
+        words = [f"--device={arguments.device}", *shlex.split(arguments.pytest)]
+        raise SystemExit(compare_suites(arguments.commit, words))
     clock = "process_time" if arguments.cpu_time else "perf_counter"
     row = measure(arguments.commit, arguments.scene, arguments.device, max(arguments.repeats, 2), clock)
     if keep(row, arguments.json):

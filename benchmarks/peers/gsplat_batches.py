@@ -3,12 +3,12 @@
     pip install . torch gsplat       # 1.5.3 or 1.6
     python benchmarks/peers/gsplat_batches.py --rows scenes --json gsplat-batches.json
 
-gsplat_cuda.py has the requirements and the differences of constants. gsplat renders the fastest number of
-cameras per call of CAMERAS by `rasterization_2dgs`, with colours and the outputs that it always computes,
-median depth included (mean depth takes longer); it has no labels. fidsplat renders the outputs of the row as
-in benchmarks/batches.py, the same with gsplat's constants and a float32 set-up, and gsplat's outputs with
-these. gsplat's images are discarded after each call, fidsplat's are retained. Times are from the first call
-until the GPU is done.
+Requires CUDA with a compiler. gsplat renders with its constants (opacity ceiling 0.999, exclusive stop), and
+the fastest number of cameras per call of CAMERAS by `rasterization_2dgs`, with colours and the outputs that
+it always computes, median depth included (mean depth takes longer); it has no labels. fidsplat renders the
+outputs of the row as in benchmarks/batches.py, the same with gsplat's constants and a float32 set-up, and
+gsplat's outputs with these. gsplat's images are discarded after each call, fidsplat's are retained. Times are
+from the first call until the GPU is done.
 """
 
 from __future__ import annotations
