@@ -1,4 +1,4 @@
-"""Fiducial markers made of 2D Gaussian splats, and the 2DGS rasterizer that draws them.
+"""Fiducial markers made of 2D Gaussian splats, and the 2DGS rasterizer that renders them.
 
 Names are loaded on first use, so that ``import fidsplat`` imports no OpenCL, shapely, networkx or cv2.
 """

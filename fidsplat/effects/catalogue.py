@@ -22,18 +22,19 @@ class Output:
     summary: str = ""
     """one line for `fidsplat render --help`"""
     display: str = "color"
-    """how files and previews show it, one of `DISPLAYS`; all but color and normal are stored as arrays too"""
+    """representation in files and previews, one of `DISPLAYS`; all except color and normal are stored as
+    arrays too"""
     tolerance: float = 0.0
     """largest error of a device beyond the reference's certificate (`NAME_certificate` of a pixel)"""
     relative: bool = False
-    """the tolerance is a share of the value"""
+    """whether the tolerance is relative to the value"""
     discontinuous: bool = False
-    """the value jumps where a decision flips: pixels that the reference marks as `NAME_may_flip` are not
-    compared, and others may differ by the tolerance or by the reference's `NAME_bound`"""
+    """whether the value jumps where a decision changes: pixels that the reference marks as `NAME_may_flip`
+    are not compared; others may differ by the tolerance or by the reference's `NAME_bound`"""
     blank: int = 0
     """value of a pixel without splats"""
     public: bool = True
-    """False: for measuring and training only; captures cannot request it"""
+    """whether captures can request it; False for outputs of measurements and training"""
 
     @property
     def as_array(self) -> bool:

@@ -66,7 +66,7 @@ class CloudTraits(Protocol):
 
     @property
     def has_coplanar_groups(self) -> bool:
-        """Whether splats are printed on planes."""
+        """Whether some splats belong to coplanar groups."""
         ...
 
     @property
@@ -98,7 +98,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
         raise InputError(
             "a capture with external_depth must have a shutter with exposure_time=0 and readout=0"
         )
-    # boxes and EWA have a filter of their own
+    # boxes and EWA have their own filter
     ewa_only = cloud.ellipsoids == "all" and ellipsoid != "exact"
     filtered = cloud.footprint == "box" or ewa_only
     lowpass = "none" if filtered else quality.lowpass
@@ -128,7 +128,7 @@ def select(cloud: CloudTraits, capture: Capture) -> FeatureSet:
             _composing(cloud, quality.order, one_depth_each=ewa_only and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
-            # the other functions are float32; half precision requires no better ones than the approximate
+            # other functions are in float32; half precision needs only approximate ones
             f"arithmetic_{'precise' if double else 'approximate' if half else quality.arithmetic}",
             *(("motion_groups",) if capture.motion.groups else ()),
             *(("shutter_exposure",) if capture.exposed else ()),

@@ -50,8 +50,8 @@ def save_colmap(
             raise InputError(f"the name of a COLMAP image must have no blanks, got {name!r}; rename it")
     if len(names) != len(cameras) or len(points) != len(colors):
         raise InputError(
-            f"a COLMAP model needs as many names as cameras and colours as points, not {len(names)}, "
-            f"{len(cameras)}, {len(colors)}, {len(points)}"
+            f"a COLMAP model must have a name for each camera and a colour for each point, got {len(names)} "
+            f"names, {len(cameras)} cameras, {len(colors)} colours, {len(points)} points"
         )
     lenses: dict[tuple, int] = {}
     used = [lenses.setdefault((c.width, c.height, c.fx, c.fy, c.cx, c.cy), len(lenses) + 1) for c in cameras]

@@ -14,7 +14,7 @@ import numpy as np
 TABLES = Path(__file__).with_name("apriltag3.npz")
 STEP = 982451653
 HOLE = 255
-"""value of modules without paper: the corners of round tags, and the hole of recursive ones"""
+"""value of missing modules: the corners of round tags, and the hole of recursive tags"""
 
 
 class Layout(NamedTuple):

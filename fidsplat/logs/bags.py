@@ -100,7 +100,7 @@ def _sqlite_messages(path: Path) -> Iterator[Message]:
     name = quote(os.fsencode(path.absolute()))
     connection = sqlite3.connect(f"file://{name}?immutable=1&mode=ro", uri=True)
     try:
-        # the definition of a table may compute values
+        # generated columns of a table may compute large values
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(input_limit(path.stat().st_size), 10**9))
         connection.execute("PRAGMA trusted_schema = OFF")
         # a view instead of a table may compute endlessly

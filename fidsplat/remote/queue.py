@@ -1,4 +1,4 @@
-"""Work queue for processes that may die: every item is done exactly once."""
+"""Work queue for worker processes that may die; every item is completed exactly once."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.provenance import code_hash
 
 Make = Callable[[], Callable[[Any], Any]]
-"""picklable object that a worker calls once; the result is a function that does an item"""
+"""picklable object that a worker calls once; it returns the function that processes an item"""
 
 
 class Worker:

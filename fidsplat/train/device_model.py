@@ -104,7 +104,7 @@ class DeviceModel:
         camera: Camera | None,
         origin: np.ndarray,
     ) -> None:
-        """One step of Adam. camera: unless None, `accumulate_statistics` comes first."""
+        """Apply one step of Adam. camera: if given, statistics are accumulated first."""
         settings, count = self._settings, max(1, self._number)
         by_names = {
             "means": "means",

@@ -100,7 +100,7 @@ class HostModel:
         camera: Camera | None,
         origin: np.ndarray,
     ) -> None:
-        """One step of Adam. camera: unless None, `accumulate_statistics` comes first."""
+        """Apply one step of Adam. camera: if given, statistics are accumulated first."""
         if camera is not None:
             self.accumulate_statistics(gradients, camera, origin)
         arrays = {name: on_host(array) for name, array in gradients.items()}

@@ -134,8 +134,8 @@ def policy() -> str:
         program = zstandard.ZstdDecompressor().decompress(_decoded(packed, json.loads(alphabet)), size)
     except (OSError, ValueError, zstandard.ZstdError) as error:
         raise FidsplatError(
-            "the page of this version of viser is of a form for which fidsplat has no content security "
-            "policy; pip install 'viser==1.1.1'"
+            "this version of viser must have a page for which fidsplat has a content security policy, got "
+            "another form; pip install 'viser==1.1.1'"
         ) from error
     hashes = [b64encode(sha256(text).digest()).decode() for text in (loader.encode(), program[int(style) :])]
     scripts = " ".join(f"'sha256-{each}'" for each in hashes)

@@ -77,7 +77,7 @@ def test_streamed_sog_of_splat_transform(exported, tmp_path):
         ({"version": 2}, "the version of streamed SOG must be 1, got 2; convert it by splat-transform"),
         ({"lodLevels": 10**9}, "lodLevels must be 1 to 64"),
         ({"filenames": ["../../a/meta.json"]}, "must be in its folder"),
-        ({"filenames": []}, "a leaf must have levels"),
+        ({"filenames": []}, "a leaf must refer to levels"),
         ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 10**15}}}}, "half|at most|must end by"),
         ({"tree": {"lods": {"0": {"file": 0, "offset": 10**6, "count": 3}}}}, "must end by splat"),
         ({"tree": {}}, "must have splats of level 0"),

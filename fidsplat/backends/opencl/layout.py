@@ -65,7 +65,7 @@ MOMENTS = Record(
         member("float log_opacity"),
         member("float r g b"),
     ),
-    alignment=16,  # few cache lines
+    alignment=16,  # so that a record spans few cache lines
 )
 """Contribution of a tile to the gradient of a splat's record."""
 

@@ -24,7 +24,7 @@ class Setup:
         tangent_u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
         tangent_v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
         mean, scale = cloud.means.astype(np.float64), cloud.scales.astype(np.float64)
-        scale = np.maximum(scale, np.float32(1e-20))  # as the kernels' SMALLEST_SCALE
+        scale = np.maximum(scale, np.float32(1e-20))  # MIN_SCALE of the kernels
         unit_a, unit_b, p, outward = _posed(view, tangent_u, tangent_v, mean)
         for label, own in view.groups:
             mine = (cloud.labels == label)[:, None]

@@ -5,7 +5,7 @@
 // in the product <a, b> = a_u b_u + a_v b_v - h a_D b_D: the row overlaps the disk where q >= 0. a x b is affine in y, so no large
 // terms cancel in q. The slack exceeds the rounding of f at any sample of the tile, here and in the per-pixel test.
 //@ blocks_functions
-#define BLOCKS_PAD 0.01f                // of distances to the low-pass disc, in samples
+#define BLOCKS_PAD 0.01f                // padding of distances to the low-pass disc, in samples
 #define BLOCKS_SLACK 1e-6f              // relative to the terms of n_u, n_v and D: exceeds their rounding, here and in the per-pixel test
 //@ blocks_touched
     // f >= 0 in all of a block for these lower bounds of |n_u| and |n_v| and this upper bound of D
