@@ -5,6 +5,7 @@ A plugin of pytest, which conftest.py names.
 """
 
 import gc
+import importlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,9 +37,42 @@ def hardly() -> None:
         # and without its thresholds for inlining. Level 0 compiles in yet half the time, but there an image
         # of 320 x 240 pixels takes 3 s
         config.optimization_level, config.cpu_compiler_flags = 1, "-march=native"
-        # so 0 is for what runs once per splat, a third of all that is compiled
-        project = runtime.kernels("project")
-        project.STRICT = {**project.STRICT, "optimization_level": 0}
+        # so 0 is for what runs once per splat or once per pixel, more than half of all that is compiled
+        for name in (
+            "project",
+            "project_backward",
+            "tile_lists",
+            "resolve",
+            "sensor",
+            "background",
+            "shutter",
+        ):
+            module = runtime.kernels(name)
+            module.STRICT = {**module.STRICT, "optimization_level": 0}
+        _memoise_overloads()
+
+
+def _memoise_overloads() -> None:
+    """Warp compares the types of an argument list with each overload of a builtin function anew at each call,
+    30 times as often as there are different ones."""
+    codegen = importlib.import_module("warp._src.codegen")
+    if not hasattr(codegen, "func_match_args") or hasattr(codegen.func_match_args, "cache_of_tests"):
+        return
+    match, found = codegen.func_match_args, {}
+
+    def matches(function, types, named, *further, **options):
+        try:
+            stripped = map(codegen.strip_reference, types)
+            key = function, (*stripped,), *named.items(), *further, *options.items()
+            known = found.get(key)
+        except TypeError:  # a type that cannot be a key
+            return match(function, types, named, *further, **options)
+        if known is None:
+            known = found[key] = match(function, types, named, *further, **options)
+        return known
+
+    matches.cache_of_tests = found
+    codegen.func_match_args = matches
 
 
 def pytest_collection_finish():

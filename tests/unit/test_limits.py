@@ -7,7 +7,10 @@ import sys
 
 import pytest
 
-RENDER = "marker aruco:4x4_50:7 --mixture refined -o tag.ply"  # refined renders
+import fidsplat as fs
+
+RENDER = "render one.ply -o one.png"
+ONE = fs.SplatCloud([[0, 0, 1]], [[1, 0, 0, 0]], [[0.1, 0.1]], [0.9], colors=[[1, 1, 1]])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
@@ -22,6 +25,7 @@ RENDER = "marker aruco:4x4_50:7 --mixture refined -o tag.ply"  # refined renders
 )
 def test_a_limit_that_is_too_low_is_one_line(tmp_path, limit, says):
     """With empty kernel caches, as PoCL's compiler aborts the process only where it compiles."""
+    fs.save_ply(ONE, tmp_path / "one.ply")
     caches = {"POCL_CACHE_DIR": str(tmp_path / "pocl"), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     command = f"ulimit {limit}; exec {sys.executable} -m fidsplat {RENDER}"
     done = subprocess.run(
