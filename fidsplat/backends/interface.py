@@ -341,9 +341,10 @@ class GradientPipeline(ABC):
 class TrainingKernels(ABC):
     """Device kernels of a training step other than rendering: loss, optimiser, densification, noise.
 
-    The state is n splats before their activation functions, float32: `means` (n, 3), `log_scales` (n, 2),
-    `quats` (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's moments of each as `first_NAME` and `second_NAME`;
-    `gradient_sums` (n,) and `visible_counts` (n,), the statistics of densification.
+    The state is n splats before their activation functions, float32: `means` (n, 3), `log_scales` (n, 2) of
+    disks or (n, 3) of 3D Gaussians, `quats` (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's moments of each as
+    `first_NAME` and `second_NAME`; `gradient_sums` (n,) and `visible_counts` (n,), the statistics of
+    densification.
     """
 
     max_pending_losses: int

@@ -39,6 +39,7 @@ class Train:
       fidsplat demo views -o yard && fidsplat train yard -o yard.ply --iterations 2000
       fidsplat train garden -o garden.ply --strategy mcmc --max-splats 300000 --report garden-report
       fidsplat train photos -o photos.ply --random-points 5000 --within-memory 4
+      fidsplat train photos -o finer.ply --primitive 3d --start capture.ply --sh-every 1 --densify-until 0
     """
 
     dataset: Annotated[tyro.conf.Positional[str], option("DATASET", "folder or transforms.json")]
@@ -50,6 +51,7 @@ class Train:
     hold_out: int | None = None
     """N: hold out every Nth view, 0 for none (default: see above)"""
     random_points: Annotated[int, option("N", "start from N random points instead of the data set's")] = 0
+    start: Annotated[str | None, option("FILE", "splats to refine, instead of one at each point")] = None
     report: str | None = None
     """DIR|FILE.md: write a page with curves and images of the held-out views"""
     overwrite: bool = False
@@ -57,6 +59,7 @@ class Train:
     json: Json = False
 
     def run(self) -> int:
+        from fidsplat.formats.files import load_splats
         from fidsplat.render.renderer import Renderer
         from fidsplat.train import Trainer, load_dataset, splats_within
 
@@ -76,7 +79,8 @@ class Train:
             settings = splats_within(settings, _bytes(self.within_memory), dataset)
         with where.status("opening the device"):
             renderer = Renderer(self.device)
-        trainer = Trainer(dataset, renderer, settings, checkpoint, restart=self.overwrite)
+        start = None if self.start is None else load_splats(self.start)
+        trainer = Trainer(dataset, renderer, settings, checkpoint, start, restart=self.overwrite)
         before, begun = trainer.iteration, time.perf_counter()
         with interrupts.postponed() as stopped, _bar(trainer) as show:
 

@@ -21,7 +21,7 @@ from fidsplat.util.files import atomic_write, from_json
 from fidsplat.util.npy import load_npz
 from fidsplat.util.provenance import code_hash
 
-_FORMAT = 3
+_FORMAT = 4
 _GROUPS = ("values", "first", "second")
 _VALUES = tuple(f"values.{name}" for name in NAMES)
 _HISTORY = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
@@ -83,7 +83,8 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
         if not (origin.shape == background.shape == (3,) and np.isfinite([origin, background]).all()):
             raise ValueError("the origin and the background must be three finite numbers each")
         degree = whole_number("sh_degree", facts["settings"]["sh_degree"], 0, MAX_DEGREE)
-        splats = Splats.of(_group(arrays, "values", len(arrays["values.means"]), degree))
+        axes = 3 if facts["settings"]["primitive"] == "3d" else 2
+        splats = Splats.of(_group(arrays, "values", len(arrays["values.means"]), degree, axes))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"cannot read {file} as a checkpoint of `fidsplat train`: {error}") from error
     values, (red, green, blue) = splats.values, background.tolist()
@@ -141,7 +142,9 @@ def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Spl
     count = len(arrays["values.means"])
     if count > settings.max_splats:
         raise ValueError(f"its splats must be at most max_splats, {settings.max_splats}, got {count}")
-    values, first, second = (_group(arrays, name, count, settings.sh_degree) for name in _GROUPS)
+    values, first, second = (
+        _group(arrays, name, count, settings.sh_degree, settings.axes) for name in _GROUPS
+    )
     gradients, seen = (_checked(arrays, name, (count,)) for name in ("gradients", "seen"))
     for name, array in (second | {"gradients": gradients, "seen": seen}).items():
         if (array < 0).any():
@@ -150,8 +153,8 @@ def _state(arrays: Arrays, settings: TrainSettings, iteration: int) -> tuple[Spl
     return Splats(values, first, second, gradients, seen), history
 
 
-def _group(arrays: Arrays, group: str, count: int, degree: int) -> Arrays:
-    shapes = {"means": (3,), "log_scales": (2,), "quats": (4,), "logits": (), "sh": ((degree + 1) ** 2, 3)}
+def _group(arrays: Arrays, group: str, count: int, degree: int, axes: int) -> Arrays:
+    shapes = {"means": (3,), "log_scales": (axes,), "quats": (4,), "logits": (), "sh": ((degree + 1) ** 2, 3)}
     return {name: _checked(arrays, f"{group}.{name}", (count, *shape)) for name, shape in shapes.items()}
 
 

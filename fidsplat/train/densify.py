@@ -7,6 +7,7 @@ Remaining splats keep their order and new ones are appended, so that a run is re
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ class Densification(NamedTuple):
     means: np.ndarray
     """(m - first_split, 3) float32"""
     log_scales: np.ndarray
-    """(m - first_split, 2) float32"""
+    """(m - first_split, 2) or (m - first_split, 3) float32"""
 
     def apply(self, splats: Splats) -> Splats:
         """The splats after the round."""
@@ -103,8 +104,8 @@ def with_statistics_reset(splats: Splats) -> Splats:
 
 
 def _largest_scales(scales: np.ndarray) -> np.ndarray:
-    """Row maxima of (n, 2); max(axis=1) is ten times as slow."""
-    return np.maximum(scales[:, 0], scales[:, 1])
+    """Row maxima; max(axis=1) is ten times as slow."""
+    return functools.reduce(np.maximum, scales.T)
 
 
 def _within_limit(mean: np.ndarray, mask: np.ndarray, limit: int) -> np.ndarray:
@@ -123,13 +124,15 @@ def _split_values(
     """Means and log_scales of the copies of split splats, all first copies before all second ones: sampled
     from each splat, and smaller."""
     values = {name: splats.values[name][splits] for name in ("means", "quats", "log_scales")}
-    tangents = quaternion_to_matrix(values["quats"])[:, :, :2]
     scales = np.exp(values["log_scales"]).astype(np.float64)
-    draws = normal(settings.seed, Purpose.SPLITS, iteration, splits)
+    axes = scales.shape[1]
+    directions = quaternion_to_matrix(values["quats"])[:, :, :axes]
+    calls = range(-(-COPIES * axes // 4))  # four numbers each
+    draws = np.hstack([normal(settings.seed, Purpose.SPLITS, iteration, splits, draw) for draw in calls])
     means = np.concatenate([values["means"]] * COPIES)
     for copy in range(COPIES):
-        offset = scales * draws[:, 2 * copy : 2 * copy + 2]
-        shift = np.einsum("nij,nj->ni", tangents, offset).astype(np.float32)
+        offset = scales * draws[:, axes * copy : axes * (copy + 1)]
+        shift = np.einsum("nij,nj->ni", directions, offset).astype(np.float32)
         means[copy * len(splits) : (copy + 1) * len(splits)] += shift
     log_scales = values["log_scales"] - np.float32(np.log(_SHRINK))
     return means, np.concatenate([log_scales] * COPIES)

@@ -121,7 +121,7 @@ class DeviceModel:
             **{"beta1": settings.beta1, "beta2": settings.beta2, "epsilon": settings.epsilon},
             "root": math.sqrt(1 - settings.beta2**step),
             "sparse": float(settings.sparse_adam),
-            "scale_penalty": settings.scale_penalty / (2 * count) if mcmc else 0.0,
+            "scale_penalty": settings.scale_penalty / (settings.axes * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
         }
         self._kernels.step(taken, sizes, numbers, camera, origin)

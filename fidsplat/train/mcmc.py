@@ -57,11 +57,12 @@ def add_noise(splats: Splats, settings: TrainSettings, iteration: int, rate: flo
 
     rate: learning rate of the means [m].
     """
-    tangents = quaternion_to_matrix(splats.values["quats"])[:, :, :2]
+    scales = splats.scales.astype(np.float64)
+    axes = quaternion_to_matrix(splats.values["quats"])[:, :, : scales.shape[1]]
     draws = normal(settings.seed, Purpose.NOISE, iteration, len(splats))[:, :3]
     transparent = sigmoid(-NOISE_SLOPE * (splats.opacities.astype(np.float64) - (1 - NOISE_CUTOFF)))
-    inside = np.einsum("nji,nj->ni", tangents, draws) * splats.scales.astype(np.float64) ** 2
-    step = np.einsum("nij,nj->ni", tangents, inside) * (transparent * rate * settings.noise)[:, None]
+    inside = np.einsum("nji,nj->ni", axes, draws) * scales**2
+    step = np.einsum("nij,nj->ni", axes, inside) * (transparent * rate * settings.noise)[:, None]
     splats.values["means"] += step.astype(np.float32)
 
 

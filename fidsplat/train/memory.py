@@ -30,7 +30,7 @@ def splats_within(settings: TrainSettings, budget: int, dataset: Dataset) -> Tra
     images = sum(view.image.nbytes for view in (*dataset.views, *dataset.held_out))
     pixels = max(view.camera.width * view.camera.height for view in dataset.views)
     fixed = images + 4 * _FLOATS_PER_PIXEL * pixels
-    floats = 11 + 3 * (settings.sh_degree + 1) ** 2
+    floats = 9 + settings.axes + 3 * (settings.sh_degree + 1) ** 2
     capacity = (budget - fixed) // (4 * floats * _COPIES + _WORK)
     if capacity < 1:
         raise InputError(

@@ -10,13 +10,13 @@ from fidsplat.effects.differentiable import with_distortion
 from fidsplat.train.settings import TrainSettings
 
 
-class _Disks(NamedTuple):
+class _Splats(NamedTuple):
     """Traits of splats in training, for `select`."""
 
     sh_degree: int
+    ellipsoids: str
     has_coplanar_groups: bool = False
     footprint: str = "gaussian"
-    ellipsoids: str = "none"
 
 
 def next_features(
@@ -33,5 +33,6 @@ def next_features(
     if change is None:
         return None
     by_normals, by_distortions = settings.surface_weights_at(change)
-    features = select(_Disks(settings.degree_at(change)), solid if by_normals else plain)
+    splats = _Splats(settings.degree_at(change), "all" if settings.primitive == "3d" else "none")
+    features = select(splats, solid if by_normals else plain)
     return with_distortion(features) if by_distortions else features

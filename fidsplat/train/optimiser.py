@@ -41,6 +41,8 @@ def parameter_gradients(
     """
     scales, opacities = splats.scales, splats.opacities
     by_scale, by_opacity = gradients["scales"], gradients["opacities"]
+    if "thickness" in gradients:
+        by_scale = np.column_stack([by_scale, gradients["thickness"]])
     if settings.strategy == "mcmc":
         by_scale = by_scale + np.float32(settings.scale_penalty / scales.size)
         by_opacity = by_opacity + np.float32(settings.opacity_penalty / len(splats))

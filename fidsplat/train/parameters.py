@@ -20,6 +20,8 @@ NAMES = (*SHAPES, "sh")
 _MIN_SQUARE_DISTANCE = 1e-7
 """lower limit of the mean squared distance to neighbours, for initial scales [m^2]"""
 
+_FLATNESS = np.float32(1e-3)
+"""initial thickness of a disk that is trained as a 3D Gaussian, relative to its smaller scale"""
 _OPACITY_MARGIN = 1e-6
 """minimum distance of initial opacities from 0 and 1, where gradients vanish"""
 
@@ -35,7 +37,8 @@ class Splats:
     """n splats in training, all arrays float32."""
 
     values: Arrays
-    """means (n, 3) metres relative to the origin, log_scales (n, 2), quats (n, 4) of any length, logits (n,)
+    """means (n, 3) metres relative to the origin, log_scales (n, 2) of disks or (n, 3) of 3D Gaussians, quats
+    (n, 4) of any length, logits (n,)
     of the opacities, sh (n, k, 3)"""
     first: Arrays
     """Adam's first moments, in the same shapes"""
@@ -64,7 +67,7 @@ class Splats:
 
     @property
     def scales(self) -> np.ndarray:
-        """(n, 2) float32, metres."""
+        """(n, 2) or (n, 3) float32, metres."""
         with np.errstate(over="ignore"):  # the cloud drops splats whose scales overflow
             return np.exp(self.values["log_scales"])
 
@@ -105,12 +108,14 @@ class Splats:
         """
         values, coefficients = self.values, slice((degree + 1) ** 2)
         means, sh = values["means"][:], values["sh"][:, coefficients]
+        scales = self.scales
         return SplatCloud.of_checked(
             means if shared else means.copy(),
             values["quats"].copy(),  # SplatCloud normalises them in place
-            self.scales,
+            np.ascontiguousarray(scales[:, :2]),
             self.opacities,
             np.ascontiguousarray(sh) if shared else sh.copy(),
+            thickness=np.ascontiguousarray(scales[:, 2]) if scales.shape[1] == 3 else None,
             origin=origin,
             dropped={},
         )
@@ -136,7 +141,7 @@ def initial_splats(dataset: Dataset, settings: TrainSettings) -> Splats:
     return Splats.of(
         {
             "means": points - dataset.origin,
-            "log_scales": np.repeat(np.log(scale)[:, None], 2, axis=1),
+            "log_scales": np.repeat(np.log(scale)[:, None], settings.axes, axis=1),
             "quats": uniform(settings.seed, Purpose.ROTATIONS, 0, count),
             "logits": np.full(count, logit(settings.start_opacity)),
             "sh": sh,
@@ -148,12 +153,18 @@ def splats_from_cloud(cloud: SplatCloud, settings: TrainSettings, origin: np.nda
     """The splats of a cloud, with missing SH coefficients 0 and those above `sh_degree` dropped.
 
     Raises:
-        InputError: the cloud has boxes or 3D Gaussians, which are not trained, or more than `max_splats`.
+        InputError: the cloud has boxes, 3D Gaussians where disks are trained, or more than `max_splats`.
     """
-    if cloud.boxes is not None or cloud.thickness is not None:
+    scales, solid = cloud.scales, settings.primitive == "3d"
+    if cloud.boxes is not None or (cloud.thickness is not None and not solid):
         raise InputError(
-            "start must be a cloud of disks, got boxes or 3D Gaussians; convert it by flattened()"
+            "start must be a cloud of disks, got boxes or 3D Gaussians; convert it by flattened(), or "
+            "train 3D Gaussians with primitive='3d'"
         )
+    if solid:
+        thickness = np.zeros(len(cloud), np.float32) if cloud.thickness is None else cloud.thickness
+        third = np.where(thickness > 0, thickness, _FLATNESS * scales.min(axis=1))
+        scales = np.column_stack([scales, third])
     if not 0 < len(cloud) <= settings.max_splats:
         raise InputError(
             f"start must have 1 to {settings.max_splats} splats (max_splats), got {len(cloud)}; "
@@ -169,7 +180,7 @@ def splats_from_cloud(cloud: SplatCloud, settings: TrainSettings, origin: np.nda
     return Splats.of(
         {
             "means": cloud.world_means() - origin,
-            "log_scales": np.log(cloud.scales),
+            "log_scales": np.log(scales),
             "quats": cloud.quats,
             "logits": np.log(opacities) - np.log1p(-opacities),
             "sh": sh,

@@ -12,6 +12,7 @@ from fidsplat.util.arguments import as_float, whole_number
 from fidsplat.util.errors import InputError
 
 STRATEGIES = ("default", "mcmc")
+PRIMITIVES = ("2d", "3d")
 MAX_ITERATIONS = 10_000_000
 
 _COUNTS = {
@@ -46,6 +47,9 @@ class TrainSettings:
     """number of steps, one view each; the authors' trainer has 30,000 by default"""
     seed: int = 0
     """seed of all random numbers: order of views, initial rotations, means of split splats"""
+    primitive: str = "2d"
+    """`2d`: disks, as 2DGS; `3d`: 3D Gaussians, as 3DGS, in the projection of `quality`; on OpenCL and the
+    reference"""
     strategy: str = "default"
     """`default`: clone, split and prune by screen gradients, as the authors; `mcmc`: relocation of dead
     splats, growth up to `max_splats`, and noise"""
@@ -144,6 +148,10 @@ class TrainSettings:
             raise InputError(
                 f"training: strategy must be one of {', '.join(STRATEGIES)}, got {self.strategy!r}"
             )
+        if not isinstance(self.primitive, str) or self.primitive not in PRIMITIVES:
+            raise InputError(
+                f"training: primitive must be one of {', '.join(PRIMITIVES)}, got {self.primitive!r}"
+            )
         if not isinstance(self.quality, str):  # checkpoints store it as text
             raise InputError(f"training: quality must be text such as 'surfel', got {self.quality!r}")
         Quality.of(self.quality)
@@ -205,6 +213,11 @@ class TrainSettings:
         every += [self.normal_from + 1] if self.normal_weight else []
         every += [self.distortion_from + 1] if self.distortion_weight else []
         return min((one for one in every if iteration < one <= self.iterations), default=None)
+
+    @property
+    def axes(self) -> int:
+        """Number of scales of a splat."""
+        return 3 if self.primitive == "3d" else 2
 
     @property
     def start_opacity(self) -> float:

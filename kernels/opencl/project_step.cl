@@ -12,7 +12,7 @@
 kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step(
 //@@ arguments project_step
 ) {
-    local float by_means[3 * STEP_ITEMS], by_scales[2 * STEP_ITEMS], by_quats[4 * STEP_ITEMS], by_opacities[STEP_ITEMS];
+    local float by_means[3 * STEP_ITEMS], by_scales[AXES * STEP_ITEMS], by_quats[4 * STEP_ITEMS], by_opacities[STEP_ITEMS];
     local float by_colors[3 * STEP_ITEMS], basis[TERMS_CAPACITY * STEP_ITEMS];
     local uchar skipped[STEP_ITEMS];
     uint i = get_global_id(0), item = get_local_id(0), first = get_group_id(0) * STEP_ITEMS;
@@ -20,10 +20,16 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
         const SplatGradient own = splat_gradient(
             i, view, means, activated_quats, activated_scales, activated_opacities, sh, all, splats, keys, windows, big_capacity,
             big_bounds, width, height, splat_slots, moments
+#if AXES == 3
+            , activated_thickness
+#endif
         );
         if (counted) gradient_sums[i] += own.screen;
         for (int k = 0; k < 3; k++) by_means[3 * item + k] = own.mean[k];
-        for (int k = 0; k < 2; k++) by_scales[2 * item + k] = own.scale[k];
+        for (int k = 0; k < 2; k++) by_scales[AXES * item + k] = own.scale[k];
+#if AXES == 3
+        by_scales[AXES * item + 2] = own.thickness;
+#endif
         for (int k = 0; k < 4; k++) by_quats[4 * item + k] = own.quat[k];
         by_opacities[item] = own.opacity;
         for (int k = 0; k < 3; k++) by_colors[3 * item + k] = own.color[k];
@@ -42,12 +48,14 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
     if (vectorized && item % 16 == 0) {
         for (uint k = 3 * item, at = 3 * i; k < 3 * item + 48; k += 16, at += 16)
             vstore16(ADAM_16(means, at, vload16(0, by_means + k), (float16)size_means), 0, means + at);
+#if AXES == 2
         for (uint k = 2 * item, at = 2 * i; k < 2 * item + 32; k += 16, at += 16) {
             float16 gradient = (vload16(0, by_scales + k) + scale_penalty) * vload16(0, activated_scales + at);
             float16 value = ADAM_16(log_scales, at, gradient, (float16)size_scales);
             vstore16(value, 0, log_scales + at);
             vstore16(exp(value), 0, activated_scales + at);
         }
+#endif
         for (uint k = 4 * item, at = 4 * i; k < 4 * item + 64; k += 16, at += 16) {
             float16 q = vload16(0, quats + at), by = vload16(0, by_quats + k);
             float16 length = sqrt(sums_of_4(q * q)), turn = q / length;
@@ -65,13 +73,23 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
 #else
     bool vectorized = false;
 #endif
+#if AXES == 3
+    if (i < count && !skipped[item])
+        for (uint k = 0; k < 3; k++) {
+            global float *activated = k < 2 ? activated_scales + 2 * i + k : activated_thickness + i;
+            ADAM(log_scales, 3 * i + k, (by_scales[3 * item + k] + scale_penalty) * *activated, size_scales);
+            *activated = EXP(log_scales[3 * i + k]);
+        }
+#endif
     if (i < count && !vectorized && !skipped[item]) {
         for (uint k = 0; k < 3; k++) ADAM(means, 3 * i + k, by_means[3 * item + k], size_means);
+#if AXES == 2
         for (uint k = 0; k < 2; k++) {
             uint at = 2 * i + k;
             ADAM(log_scales, at, (by_scales[2 * item + k] + scale_penalty) * activated_scales[at], size_scales);
             activated_scales[at] = EXP(log_scales[at]);
         }
+#endif
         float4 q = vload4(i, quats), by = vload4(item, by_quats);
         float length = sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w);
         float4 turn = q / length;

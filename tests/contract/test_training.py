@@ -27,7 +27,7 @@ def dataset():
 SOLID = {"distortion_weight": 50.0, "distortion_from": 2, "normal_weight": 0.5, "normal_from": 2}
 
 
-@pytest.mark.parametrize("losses", [{}, SOLID])
+@pytest.mark.parametrize("losses", [{}, SOLID, {"primitive": "3d"}])
 def test_kernels_and_numpy_train_alike(renderer, dataset, monkeypatch, losses):
     """Ten steps by the kernels and by their twins, which round otherwise."""
     steps = {}
@@ -41,6 +41,7 @@ def test_kernels_and_numpy_train_alike(renderer, dataset, monkeypatch, losses):
         steps[name] = trainer.history["losses"]
         assert type(trainer._model).__name__ == {"kernels": "DeviceModel", "numpy": "HostModel"}[name]
     np.testing.assert_allclose(steps["kernels"], steps["numpy"], rtol=1e-4)
+    assert steps["numpy"][-2:].mean() < 0.9 * steps["numpy"][:2].mean()
 
 
 def test_splats_are_made_by_kernels_as_by_numpy(renderer, dataset):

@@ -300,8 +300,14 @@ def test_visibility_statistics(renderer, views, works):
     assert {0.0, 1.0, 2.0, 3.0} >= set(np.rint(counted).tolist()) > {0.0}
 
 
-def test_shaking(renderer, works):
+@pytest.mark.parametrize("axes", [2, 3])
+def test_shaking(renderer, works, axes):
     device, host = works(strategy="mcmc", seed=2**40 + 7)
+    if axes == 3:
+        for work in (device, host):
+            work.load(
+                Splats.of(splats().values | {"log_scales": np.random.default_rng(1).normal(size=(COUNT, 3))})
+            )
     before = host.read().values["means"].copy()
     for work in (device, host):
         work.add_noise(17, 1e-4)  # as after splats were made, when nothing of them has been rendered

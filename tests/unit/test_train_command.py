@@ -46,6 +46,10 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert main([*words[:-1], "3"]) == 2
     assert "number of iterations" in capsys.readouterr().err
     assert main([*words[:-1], "3", "--overwrite"]) == 0
+    solid = [*words[:2], "-o", str(tmp_path / "d.ply"), *words[4:], "--primitive", "3d", "--start"]
+    assert main([*solid, str(tmp_path / "a.ply")]) == 0
+    assert (fs.load_ply(tmp_path / "d.ply").thickness > 0).all()
+    assert main([*solid, str(tmp_path / "none.ply"), "--overwrite"]) == 2
     for wrong, said in (
         (["-o", "a.png"], "-o must be a .ply file, got a.png"),
         (["--random-points", "-1"], "--random-points must be"),

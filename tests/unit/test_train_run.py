@@ -438,6 +438,19 @@ def test_a_run_may_start_from_splats(whole, dataset):
     boxes = cloud.with_boxes(np.arange(len(cloud)) < 1)
     with pytest.raises(fs.InputError, match="start must be a cloud of disks"):
         Trainer(dataset, whole[0].renderer, iterations=5, start=boxes)
+    third = np.where(np.arange(len(cloud)) % 3, 0.05, 0)
+    solid = fs.SplatCloud(
+        cloud.means, cloud.quats, np.column_stack([cloud.scales, third]), cloud.opacities, sh=cloud.sh
+    )
+    with pytest.raises(fs.InputError, match="train 3D Gaussians with primitive='3d'"):
+        Trainer(dataset, whole[0].renderer, iterations=5, start=solid)
+    start = Trainer(
+        dataset, whole[0].renderer, iterations=9, start=solid, primitive="3d", **QUICK | {"max_splats": 60}
+    )
+    np.testing.assert_allclose(start.cloud().thickness[third > 0], 0.05, rtol=1e-5)
+    grown = start.run()
+    assert len(grown) > len(solid)
+    assert (grown.thickness > 0).all()
     with pytest.raises(fs.InputError, match="start must have 1 to 3 splats"):
         Trainer(dataset, whole[0].renderer, iterations=5, max_splats=3, start=cloud)
 

@@ -76,7 +76,10 @@ _SECTION = re.compile(r"//@ (\w+)[ \t]*")
 _WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
 _WIDE = re.compile(r"wide(?<=\bwide)\b")
 _EFFECT_ARGUMENTS = {
-    **{name: name for name in ("project", "emit", "blend", "backdrop", "resolve", "project_backward")},
+    **{
+        name: name
+        for name in ("project", "emit", "blend", "backdrop", "resolve", "project_backward", "project_step")
+    },
     **{"blend_checkpoints": "blend_backward", "blend_backward": "blend_backward"},
 }
 """fields of `Layout` with the arguments that effects add to these kernels"""
@@ -238,6 +241,8 @@ def _assemble_backward(name: str, stages: Sequence[str], features: FeatureSet, s
     kernels = kernels_of(shape)
     declared = Declarations(_scalars(features), layouts, kernels=kernels)
     backward = {"BACK_ITEMS": backward_items(features, shape), "CHUNK": backward_chunk(features, shape)}
+    if stages is _STEP:
+        backward["AXES"] = 3 if "thickness" in layouts else 2
     assembler = Assembler(files, declared, numbers_of(features, shape) | backward)
     return assembler.source({name: [stage.format(shape.schedule) for stage in stages]})
 

@@ -204,6 +204,7 @@ class Layout:
     """fields of `Moments` (layout.py)"""
     blend_backward: tuple[Argument, ...] = ()
     project_backward: tuple[Argument, ...] = ()
+    project_step: tuple[Argument, ...] = ()
     behind: tuple[tuple[str, str], ...] = ()
     """(camera or another slot, part): with that slot, the part replaces this layout"""
 

@@ -185,6 +185,7 @@ LAYOUTS: dict[str, Layout] = {
         project_backward=takes(
             "cloud float thickness  // (n) [m]; 0: a disk", "out float by_thickness  // (n)"
         ),
+        project_step=takes("out float activated_thickness"),
     ),
     "box_cover": Layout("part/box_cover.cl"),
     "box_edges": Layout(

@@ -280,9 +280,9 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "surface_depths": takes(_SURFACE, "in float differences", "out float by_depth"),
     "activate": takes(
-        "uint count",
+        "uint count axes  // number of scales of a splat",
         "in float quats log_scales logits",
-        "out float activated_quats activated_scales activated_opacities",
+        "out float activated_quats activated_scales activated_thickness activated_opacities",
     ),
     "activate_sh": takes(_DRAWN_SH, "in float sh", "out float activated_sh"),
     "gather_rows": takes(
@@ -296,11 +296,12 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _ROTATION,
         "float translation_x translation_y translation_z  // camera-space position of the means' zero [m]",
         "float focal_x focal_y center_x center_y near width height",
-        "in float means activated_scales",
+        "uint axes",
+        "in float means activated_scales activated_thickness",
         "out float visible_counts",
     ),
     "add_position_noise": takes(
-        "uint count seed_low seed_high iteration purpose",
+        "uint count axes seed_low seed_high iteration purpose",
         "float size  // metres times 1 / m^2 of the steps",
         "float slope threshold  // of the opacity above which splats do not move",
         "in float quats log_scales logits",

@@ -53,15 +53,16 @@ Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
 
 
 class ResidentArrays(ResidentData):
-    """Splats in training as a cloud to render; disks without labels and coplanar groups."""
+    """Splats in training as a cloud to render, without labels and coplanar groups."""
 
-    has_coplanar_groups, footprint, ellipsoids = False, "gaussian", "none"
+    has_coplanar_groups, footprint = False, "gaussian"
     streamed = immutable = coherent = False
 
     def __init__(
         self, buffers: Mapping[str, cl.Buffer], count: int, sh_degree: int, origin: np.ndarray
     ) -> None:
         self._buffers, self.count, self.origin = dict(buffers), count, origin
+        self.ellipsoids = "all" if "thickness" in buffers else "none"
         self.capacity, self.buffer_key = count, None
         self.sh_degree = sh_degree
         self.cached_frames: dict[Hashable, Any] = {}
@@ -162,6 +163,7 @@ class OpenCLTraining(TrainingKernels):
     def _splats_changed(self) -> None:
         """Discard the command lists that depend on the buffers of the splats."""
         self._count, self._resident, self._version = self._shapes["means"][0], None, object()
+        self._bound["axes"] = self._shapes["log_scales"][1]
         if math.prod(self._shapes["sh"]) >= 2**32:  # kernels count coefficients in 32 bits
             raise DeviceError(
                 f"splats in training must have less than 2^32 SH coefficients, got {self._count:,} splats; "
@@ -181,17 +183,22 @@ class OpenCLTraining(TrainingKernels):
         if self._resident is None or self._resident[0] != degree:
             count, rendered, every = self._count, (degree + 1) ** 2, self._shapes["sh"][1]
             shared = degree > 0 and rendered == every  # the coefficients are rendered as they are
-            sizes = {"quats": 4, "scales": 2, "opacities": 1} | ({} if shared else {"sh": 3 * rendered})
+            shapes = {"quats": 4, "scales": 2, "opacities": 1} | (
+                {"thickness": 1} if self._bound["axes"] == 3 else {}
+            )
+            sizes = shapes | ({} if shared else {"sh": 3 * rendered})
             for name, floats in sizes.items():
                 size = 4 * count * floats
                 self._bound[f"activated_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
+            if "thickness" not in shapes:  # not used
+                self._bound["activated_thickness"] = self._bound["activated_scales"]
             self._bound |= {"rendered": rendered, "all": every, "plain": int(degree == 0)}
             self._launch("activate", count)
             if shared:
                 self._bound["activated_sh"] = self._bound["sh"]
             else:
                 self._launch("activate_sh", 3 * count * rendered)
-            buffers = {name: self._bound[f"activated_{name}"] for name in ("quats", "scales", "opacities")}
+            buffers = {name: self._bound[f"activated_{name}"] for name in shapes}
             buffers["means"] = self._bound["means"]
             buffers["colors" if degree == 0 else "sh"] = self._bound["activated_sh"]
             self._resident, self._version = (degree, ResidentArrays(buffers, count, degree, origin)), object()

@@ -7,7 +7,8 @@ kernel void activate(
     size_t i = get_global_id(0);
     if (i >= count) return;
     vstore4(unit(vload4(i, quats)), i, activated_quats);
-    for (size_t k = 2 * i; k < 2 * i + 2; k++) activated_scales[k] = EXP(log_scales[k]);
+    for (uint k = 0; k < 2; k++) activated_scales[2 * i + k] = EXP(log_scales[axes * i + k]);
+    if (axes == 3) activated_thickness[i] = EXP(log_scales[axes * i + 2]);
     activated_opacities[i] = sigmoid(logits[i]);
 }
 
@@ -34,6 +35,7 @@ kernel void count_visible(
     float y = rotation_10 * p.x + rotation_11 * p.y + rotation_12 * p.z + translation_y;
     float z = rotation_20 * p.x + rotation_21 * p.y + rotation_22 * p.z + translation_z;
     float reach = 3.0f * fmax(activated_scales[2 * i], activated_scales[2 * i + 1]);
+    if (axes == 3) reach = fmax(reach, 3.0f * activated_thickness[i]);
     // pixels times depth, so that nothing is divided by a depth of 0
     float u = focal_x * x + center_x * z, v = focal_y * y + center_y * z;
     bool inside = z > near && u + focal_x * reach > 0.0f && u - focal_x * reach < width * z && v + focal_y * reach > 0.0f

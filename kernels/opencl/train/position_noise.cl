@@ -1,4 +1,4 @@
-// Position noise of MCMC densification: random steps of means within their disks. Counter-based random numbers: Philox 4x32-10 of
+// Position noise of MCMC densification: random steps of means, with the covariance of the splat. Counter-based random numbers: Philox 4x32-10 of
 // the splat's index, the iteration and the purpose, keyed by the seed. NumPy reference: fidsplat/train/random_numbers.py.
 
 static inline uint4 philox(uint4 c, uint k0, uint k1) {
@@ -26,8 +26,13 @@ kernel void add_position_noise(
     float w = q.x, x = q.y, y = q.z, z = q.w;
     float3 along = {1.0f - 2.0f * (y * y + z * z), 2.0f * (x * y + w * z), 2.0f * (x * z - w * y)};
     float3 across = {2.0f * (x * y - w * z), 1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z + w * x)};
-    float2 s = exp(vload2(i, log_scales));
+    float2 s = exp(vload2(0, log_scales + axes * i));
     float fade = 1.0f / (1.0f + exp(slope * (sigmoid(logits[i]) - threshold)));
     float3 offset = along * (dot(along, sample) * s.x * s.x) + across * (dot(across, sample) * s.y * s.y);
+    if (axes == 3) {
+        float3 outward = cross(along, across);
+        float third = exp(log_scales[axes * i + 2]);
+        offset += outward * (dot(outward, sample) * third * third);
+    }
     vstore3(vload3(i, means) + offset * (fade * size), i, means);
 }
