@@ -175,7 +175,7 @@ def f4(renderer: Renderer) -> Found:
     "tile lists of 0 to 300 splats with 64 staged at a time, pixels that terminate at different times",
 )
 def f5(renderer: Renderer) -> Found:
-    # the schedule with barriers must agree with that without; on a GPU, other work-group sizes must agree
+    # schedules with and without barriers must agree; on a GPU, different work-group sizes must agree
     backend = renderer.backend
     if not backend.traits.probed:
         return

@@ -123,7 +123,7 @@ class MujocoRig(Rig):
 def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:
     """RigCamera of a MuJoCo camera. A camera without a resolution has that of the off-screen buffer.
 
-    default: whether the camera has the outputs of the model.
+    default: whether to use the outputs that the model declares.
     """
     number = model.camera(name).id
     width, height = map(int, model.cam_resolution[number])

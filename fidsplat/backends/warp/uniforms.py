@@ -35,7 +35,7 @@ def uniforms(stack: ViewBatch, shape: WarpShape, splats: int, sloped: bool) -> n
         **{"tiles_x": -(-view.width // shape.tile_width), "tiles_y": -(-view.height // shape.tile_height)},
         **{"per_pixel": 1.0 / view.samples**2, "rotation": stack.rotation[0]},
         **{"translation": stack.translation[0], "eye": stack.eye[0], **stack.numbers},
-        # below
+        # filled below
         **{"per_focal_x": 0.0, "per_focal_y": 0.0, "per_near": 0.0, "ray": 0.0, "ray_step": 0.0},
     }
     filled: Any = np.zeros(len(stack), _record())

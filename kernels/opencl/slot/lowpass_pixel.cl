@@ -20,7 +20,7 @@
     if (filtered) {
         // standard deviation 1/2 sample: a point's energy varies by 1.5 % per axis with its position in the pixel
         const real variance = REAL(0.25);
-        // s / k with k = 1/8: the depth in samples
+        // s / k with s = 1/2 and k = 1/8: scale of the logarithm of depth
         const real depth = REAL(4.0);
         real du = depth * gz.x, dv = depth * gz.y;
         real m11 = gx.x * gx.x + gy.x * gy.x + du * du, m22 = gx.y * gx.y + gy.y * gy.y + dv * dv;

@@ -45,8 +45,8 @@ kernel void loss_rows(
     VSTORE(INSIDE(ab), images + 6 * image_stride + at);
 }
 
-// Column-wise means of `count` images from `from` on, for EACH_ROWS rows. Rows that are read below the last margin belong to rows
-// outside of the image; they are in the next image of the buffer.
+// Column-wise means of `count` images from `from` on, for EACH_ROWS rows. Rows below the last margin, which are in the
+// next image of the buffer, only affect results outside of the image.
 static inline void columns_of(global const float *from, int count, int stride, uint image_stride, vfloat means[][5]) {
     for (int each = 0; each < EACH_ROWS; each++)
         for (int image = 0; image < count; image++) means[each][image] = 0;

@@ -93,7 +93,7 @@ def declared(name: str) -> Output:
 
 
 def with_needed(names: Iterable[str]) -> tuple[str, ...]:
-    """Names and those of their dependencies, sorted."""
+    """Add dependencies to names; returns all, sorted."""
     found: set[str] = set()
     todo = list(names)
     while todo:
