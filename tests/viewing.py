@@ -20,6 +20,7 @@ class Client(SimpleNamespace):
 
     def __init__(self, number=1):
         sent: list = []
+        depths: list = []
         said = SimpleNamespace(content="")
         camera = SimpleNamespace(
             position=(0, 0, -1), wxyz=(1, 0, 0, 0), fov=0.8, image_width=48, image_height=36,
@@ -27,10 +28,12 @@ class Client(SimpleNamespace):
             on_update=lambda callback: setattr(self, "turned", callback),
         )  # fmt: skip
         super().__init__(
-            client_id=number, sent=sent, said=said, files=[], camera=camera,
+            client_id=number, sent=sent, depths=depths, said=said, files=[], camera=camera,
             gui=SimpleNamespace(add_folder=lambda _: _Folder(), add_markdown=lambda _: said),
             scene=SimpleNamespace(
-                set_background_image=lambda image, kind, **_: sent.append((image, kind))
+                set_background_image=lambda image, kind, depth=None, **_: (
+                    depths.append(depth), sent.append((image, kind))
+                )
             ),
             send_file_download=lambda name, content: self.files.append((name, content)),
         )  # fmt: skip

@@ -41,6 +41,11 @@ class Nodes:
             pose = np.linalg.inv(scene.camera.world_to_camera)
             self._shown.append(self._frustum("/scene camera", scene.camera, pose, _CAMERA, 0.1))
 
+    def within(self, position: Iterable[float], distance: float) -> bool:
+        """Whether there are outlines or frusta, and all are within a distance of a position."""
+        places = [np.asarray(node.position, float) for node in (*self._shown, *self._frusta)]
+        return bool(places) and float(np.linalg.norm(np.array(places) - position, axis=1).max()) < distance
+
     def show_keyframes(self, camera: Camera | None, poses: Iterable[np.ndarray]) -> None:
         """Show frusta of camera-to-world poses (4, 4)."""
         for node in self._frusta:
@@ -93,7 +98,7 @@ class Nodes:
         spec = placed.marker.spec
         top = (corners[0] + corners[1]) / 2  # above the upper edge, so that no module is covered
         text = spec if len(spec) <= 40 else f"{spec[:37]}..."
-        self._page.add_label(f"{name}/name", text, position=top, anchor="bottom-center")
+        self._page.add_label(f"{name}/name", text, position=top, anchor="bottom-center", depth_test=True)
         return lines
 
     def _frustum(self, name: str, camera: Camera | None, pose: np.ndarray, color: Any, scale: float) -> Any:

@@ -37,6 +37,8 @@ from fidsplat.vision.readback import read_back
 
 POLL_INTERVAL = 1.0
 """seconds between two checks of the scene file"""
+DEPTH_RANGE = 167.0
+"""metres: viser encodes larger depths as this one, which would occlude everything behind it"""
 JPEG = 75
 """quality of images while moving; images at rest are lossless PNG"""
 
@@ -178,7 +180,9 @@ class Viewer:
 
     def _send_exact(self, client: Any, viewpoint: Viewpoint) -> None:
         view = self.session.render(viewpoint)
-        client.scene.set_background_image(view.frame.to_uint8(), "png")
+        shown = self._overlay and self._nodes.within(viewpoint.position, DEPTH_RANGE)
+        depth = view.occluding_depth() if shown else None
+        client.scene.set_background_image(view.frame.to_uint8(), "png", depth=depth)
         if client.client_id in self._streams:  # else it has disconnected
             self._views[client.client_id] = view
 
@@ -313,6 +317,7 @@ class Viewer:
         """Show or hide outlines, names and frusta."""
         self._nodes.visible = visible
         self._nodes.show(self.session.state.scene, self._overlay)
+        self._refresh()  # with the depth that occludes them, or without
 
     def _move(self, pose: np.ndarray, released: bool) -> None:
         """Move the target while the gizmo is dragged; on release write its pose to the scene file."""

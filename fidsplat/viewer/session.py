@@ -42,6 +42,15 @@ class StillImage:
     state: RenderState
     viewpoint: Viewpoint
 
+    def occluding_depth(self) -> np.ndarray:
+        """Depth (h, w) in metres that occludes outlines: the median depth, infinite where nothing is opaque.
+
+        It is the largest of 3 x 3 pixels and 0.5 % further away, so that outlines on a surface are visible.
+        """
+        depth = self.frame["depth_median"]
+        depth = np.pad(np.where(depth > 0, depth, np.inf), 1, constant_values=-np.inf)
+        return 1.005 * np.lib.stride_tricks.sliding_window_view(depth, (3, 3)).max((2, 3))
+
     def pick(self, x: float, y: float) -> dict[str, object]:
         """Label, depth in metres (None for the background), splat_id and marker spec of a pixel.
 

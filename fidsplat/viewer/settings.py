@@ -17,8 +17,8 @@ from fidsplat.util.errors import InputError
 
 LENSES = ("pinhole", "fisheye", "panorama", "parallel", "scene")
 """`fisheye` has a field of view of 180 degrees; `scene` is the lens of the scene's camera"""
-AT_REST = ("rgb", "depth", "label", "splat_id")
-"""outputs of the exact image, which a click reads"""
+AT_REST = ("rgb", "depth", "depth_median", "label", "splat_id")
+"""outputs of the exact image, which a click reads; the median depth occludes the outlines"""
 _MOVING = Quality.named("fast")
 """limits of the quality while the camera moves"""
 _FOG_COLOR = (0.7, 0.7, 0.7)

@@ -9,7 +9,10 @@ import pytest
 from viewing import Client, until
 
 import fidsplat as fs
+from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.viewer.session import Session
+from fidsplat.viewer.settings import Viewpoint
 
 SCENE = """[[markers]]
 spec = "aruco:4x4_50:7"
@@ -245,6 +248,38 @@ def test_outlines_are_where_the_image_has_the_markers(tmp_path):
         edges = node.values[0] @ turn[:3, :3].T + turn[:3, 3]
         np.testing.assert_allclose(edges[:, 0], placed.corners, atol=1e-12)
         np.testing.assert_allclose(edges[:, 1], np.roll(placed.corners, -1, axis=0), atol=1e-12)
+
+
+def test_splats_occlude_outlines():
+    """Edges on their own marker are in front of the depth that a browser receives, edges behind another are
+    not."""
+    back = fs.marker("aruco:4x4_50:7", size=0.4)
+    front = PlacedMarker(fs.marker("aruco:4x4_50:3", size=0.3), ((-0.12, -0.12, -0.2), (1, 0, 0, 0)))
+    session = Session(fs.Scene(markers=[PlacedMarker(back), front]), "reference")
+    view = Viewpoint((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0), 0.8, 64, 48)
+    image = session.render(view)
+    session.close()
+    depth, camera = image.occluding_depth(), view.camera(image.state.scene)
+    assert depth.shape == (48, 64)
+    assert np.isinf(depth[0, 0])  # nothing occludes there
+    for placed, occluded in zip(image.state.scene.markers, ((0,), ()), strict=True):
+        x, y = camera.project(placed.corners).astype(int).T
+        behind = placed.corners[:, 2] + 1.0 > depth[y, x]
+        assert np.flatnonzero(behind).tolist() == list(occluded)
+
+
+def test_the_depth_comes_with_the_exact_image_where_there_are_outlines(viewer, client):
+    assert until(lambda: any(kind == "png" for _, kind in list(client.sent)))
+    exact = [
+        depth for depth, (_, kind) in zip(client.depths, list(client.sent), strict=False) if kind == "png"
+    ]
+    assert exact[-1].shape == (40, 64)
+    viewer.overlay(False)
+    assert until(lambda: client.depths[-1] is None and client.sent[-1][1] == "png")
+    viewer.overlay(True)
+    assert until(lambda: client.depths[-1] is not None)
+    put(client, rigid_matrix((0, 0, -500)))  # too far for the encoding of depths
+    assert until(lambda: client.sent[-1][1] == "png" and client.depths[-1] is None)
 
 
 @pytest.mark.parametrize(
