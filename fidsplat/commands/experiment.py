@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from fidsplat.commands.calibrate import Calibrate
 from fidsplat.commands.experiment_data import (
     Baseline,
     Blender,
@@ -215,6 +216,7 @@ class Experiment:
         "counts": Counts,
         "localisation": Localisation,
         "localise": Localise,
+        "calibrate": Calibrate,
         "pictures": Pictures,
         "dataset": Dataset,
         "baseline": Baseline,

@@ -53,7 +53,7 @@ def board_pose(
         return None, left
     at, on = np.concatenate(points), np.concatenate(observed)
     if spec.kind == "charuco":
-        squares, corners = _chess_corners(image, spec, side)
+        squares, corners = chess_corners(image, spec, side)
         if len(corners) >= ENOUGH:
             at, on = origin[:2] + squares * marker.module, corners
     pose = plane_pose(at, on, camera)
@@ -65,7 +65,7 @@ def board_pose(
     return (Detection(spec.kind, family, None, text, corners), pose), left
 
 
-def _chess_corners(image: np.ndarray, spec: BoardSpec, side: int) -> tuple[np.ndarray, np.ndarray]:
+def chess_corners(image: np.ndarray, spec: BoardSpec, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Chessboard corners of a ChArUco board detected by OpenCV: (n, 2) modules and (n, 2) pixels."""
     square = side + GAP
     dictionary = predefined(*parse_family(spec.family or ""))
