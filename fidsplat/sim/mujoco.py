@@ -15,7 +15,7 @@ from fidsplat.scenes import Scene
 from fidsplat.sim.rig import Rig, RigCamera, RigImages
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.splats.rotations import matrices_to_quaternions, quaternion_multiply
-from fidsplat.util.arguments import instance
+from fidsplat.util.arguments import instance, whole_number
 from fidsplat.util.errors import InputError, unknown
 
 try:
@@ -27,6 +27,10 @@ mujoco: Any = _mujoco  # type checkers do not know its names
 
 _OPENCV = np.array([0.0, 1.0, 0.0, 0.0])
 """180 degrees about x: MuJoCo's cameras look along -z with y up, ours along z with y down"""
+MESH = -2
+"""label of geom 0 among `meshes`; geom i has MESH - i"""
+MESH_OFFSET = 2e-3
+"""metres by which meshes are moved away from the camera"""
 _OUTPUTS = {
     "mjCAMOUT_RGB": "rgb",
     "mjCAMOUT_DEPTH": "depth",
@@ -80,6 +84,7 @@ class MujocoRig(Rig):
             if name not in names:
                 raise InputError(unknown("body", name, filter(None, names)))
         self._counts = model.nbody, model.ncam
+        self._model, self._renderers = model, dict[tuple[int, int], Any]()
         self._body_ids = [names.index(name) for name in self.bodies]
         self._camera_ids = [names_of_model.index(name) for name in self.cameras]
 
@@ -105,6 +110,7 @@ class MujocoRig(Rig):
         outputs: Iterable[str] | None = None,
         external_depths: Mapping[str, Sequence[ExternalDepth]] | None = None,
         mask: Any = None,
+        meshes: bool | Iterable[int] = False,
     ) -> RigImages:
         """Render the images of all cameras.
 
@@ -112,12 +118,76 @@ class MujocoRig(Rig):
             data: an MjData, a list of MjData, one for each environment, or mujoco_warp's Data; after
                 `mj_forward` or `mj_step`, which compute the poses of bodies and cameras.
             outputs, external_depths, mask: as in `Rig.render`.
+            meshes: whether the model's geoms, rendered by MuJoCo, are composited with the splats by depth; or
+                their geom groups, by default 0, 1 and 2. They have the label `MESH` - id of the geom. They
+                are moved 2 mm away from the camera, so that markers on their surfaces are visible.
 
         Raises:
-            InputError: as `Rig.render`; data without poses.
+            InputError: as `Rig.render`; data without poses; meshes with external_depths, with mujoco_warp's
+                Data, with an orthographic camera, or without OpenGL.
         """
         bodies, cameras = self.poses(data)
+        if meshes is not False:
+            if external_depths is not None:
+                raise InputError("meshes and external_depths exclude each other; give one of them")
+            external_depths = self._meshes(data if isinstance(data, list | tuple) else [data], meshes)
         return super().render(bodies, cameras, outputs=outputs, external_depths=external_depths, mask=mask)
+
+    def _meshes(self, data: Sequence[Any], groups: Any) -> dict[str, list[ExternalDepth]]:
+        """Images of the model's geoms for each camera and environment."""
+        for one in data:
+            instance("data with meshes", one, mujoco.MjData, "a mujoco.MjData")
+        for name, camera in self.cameras.items():
+            if camera.camera.lens is not None:
+                raise InputError(
+                    f"a camera with meshes must be a pinhole, got {name!r} with the lens "
+                    f"{camera.camera.lens.kind}; leave it out by cameras="
+                )
+        option = mujoco.MjvOption()
+        if groups is not True:
+            option.geomgroup[:] = 0
+            for group in groups if isinstance(groups, Iterable) else [groups]:
+                option.geomgroup[
+                    whole_number("a geom group of meshes", group, 0, len(option.geomgroup) - 1)
+                ] = 1
+        found: dict[str, list[ExternalDepth]] = {}
+        for (name, camera), number in zip(self.cameras.items(), self._camera_ids, strict=True):
+            renderer = self._mesh_renderer(camera.camera.width, camera.camera.height)
+            found[name] = [_mesh_image(renderer, one, number, option) for one in data]
+        return found
+
+    def _mesh_renderer(self, width: int, height: int) -> Any:
+        """MuJoCo's renderer for a size, without antialiasing, which would mix surfaces with the sky."""
+        if (width, height) not in self._renderers:
+            visual = self._model.vis
+            before = visual.global_.offwidth, visual.global_.offheight, visual.quality.offsamples
+            visual.global_.offwidth, visual.global_.offheight = max(width, before[0]), max(height, before[1])
+            visual.quality.offsamples = 0
+            try:
+                self._renderers[width, height] = mujoco.Renderer(self._model, height, width)
+            except Exception as error:  # of OpenGL, by its platform
+                raise InputError(
+                    f"meshes need OpenGL, which MuJoCo could not open ({error}); without a display set "
+                    "MUJOCO_GL=egl or MUJOCO_GL=osmesa before MuJoCo is imported"
+                ) from error
+            finally:
+                visual.global_.offwidth, visual.global_.offheight, visual.quality.offsamples = before
+        return self._renderers[width, height]
+
+
+def _mesh_image(renderer: Any, data: Any, camera: int, option: Any) -> ExternalDepth:
+    """Colours, depths and labels of the geoms of an environment; the sky is empty."""
+    renderer.update_scene(data, camera=camera, scene_option=option)
+    rgb = renderer.render()
+    renderer.enable_depth_rendering()
+    depth = renderer.render()
+    renderer.disable_depth_rendering()
+    renderer.enable_segmentation_rendering()
+    objects = renderer.render()[..., 0]
+    renderer.disable_segmentation_rendering()
+    return ExternalDepth(
+        rgb, np.where(objects >= 0, depth + np.float32(MESH_OFFSET), 0.0), np.minimum(MESH - objects, MESH)
+    )
 
 
 def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:
