@@ -1,7 +1,7 @@
 """Measure the cost of each effect: a random scene with and without it, interleaved, splats uploaded.
 
     python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json FILE]
-    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effects.md
+    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of devlog/effect-prices.md
 
 Frames with and without the effect alternate, the images stay on the device, and the queue is drained before
 and after each frame, so that disturbances affect both. The price is the median of the ratios of the two

@@ -94,7 +94,10 @@ def _cloud(path: Path, part: Parts) -> SplatCloud:
         palette = _image(path, part, high_sh["files"][0], MAX_ENTRIES * _COEFFICIENTS[3])
         bands = {_ROW * k: degree for degree, k in _COEFFICIENTS.items()}.get(palette.shape[1])
         if bands is None:
-            raise InputError(f"{path}: the width of the SH palette must fit 1 to 3 bands")
+            widths = ", ".join(str(_ROW * k) for k in _COEFFICIENTS.values())
+            raise InputError(
+                f"{path}: the width of the SH palette must be one of {widths}, got {palette.shape[1]}"
+            )
         high_sh = high_sh | {"bands": bands}
     k = 0 if high_sh is None else _COEFFICIENTS[high_sh["bands"]]
     check_expansion(path, count * (_SPLAT + _BAND * k), f"{count:,} splats")

@@ -77,7 +77,7 @@ _OPTIONS = {
     ),
     "compose_pixel": ("order='pixel'", "order='centre'"),
     "footprint": ("boxes (markers with mixture='exact')", "markers with mixture='fitted'"),
-    "background": ("a gradient or panorama background", "a background of one color"),
+    "background": ("a gradient or panorama background", "a background of one colour"),
     "shutter": (
         "a shutter with an exposure time or a readout",
         "a shutter with exposure_time=0 and readout=0",
@@ -115,7 +115,7 @@ class Ideal:
     color_bound: float
     """range of all colours, or the largest absolute colour if that is larger"""
     relative_bound: float
-    """error bound per unit of color, without that of the output `rounding`"""
+    """error bound per unit of colour, without that of the output `rounding`"""
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def save_page(scene: Scene, path: str | os.PathLike[str], title: str = "fidsplat
 
 
 def _in_script(text: str) -> str:
-    """Text that does not end a script element."""
+    """Escape text so that it cannot end the script element that holds it."""
     return text.replace("</script", "<\\/script").replace("<!--", "<\\!--")
 
 

@@ -25,7 +25,9 @@ _COARSE_MODULE = 4.0  # pixels: smallest module after downsampling
 # the code spans [-1, 1]: well-conditioned parameters
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)
 _LARGEST_MODULE = 64  # samples of the pattern for each module
-_QUIET = 1  # width in modules of the surroundings in the model, in the other color than the code's corners
+_QUIET = (
+    1  # width in modules of the surroundings in the model, in the colour that the code's corners do not have
+)
 
 
 def align(

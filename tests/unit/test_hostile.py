@@ -453,7 +453,7 @@ def test_points_whose_colors_are_no_bytes(tmp_path, color):
     (tmp_path / "sparse/0/points3D.txt").write_text(text)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(fs.InputError, match="must have colors from 0 to 255"):
+        with pytest.raises(fs.InputError, match="must have colours from 0 to 255"):
             use_views(tmp_path)
 
 
