@@ -110,6 +110,8 @@ def test_a_run_resumes_and_measures_only_what_is_missing(tmp_path):
     assert [(one["scene"], one["renderer"]) for one in results[len(first) :: 2]] == [
         ("one", "other"), ("batch", "toy"), ("batch", "other")
     ]  # fmt: skip
+    with pytest.raises(InputError, match="results of another effort"):
+        suite.Suite(file, SCENES, renderers, suite.QUICK, "a test")
     changed = json.loads(file.read_text())
     changed["run"]["code"] = "of another tree"
     file.write_text(json.dumps(changed))

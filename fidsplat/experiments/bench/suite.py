@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -75,22 +76,18 @@ class RendererProcess:
         file: Path,
         device: str | None = None,
         python: str = sys.executable,
-        tree: Path | None = None,
     ) -> None:
         """
         Args:
             file: file of the class `Adapter`.
             python: interpreter of its environment.
-            tree: checkout whose package fidsplat is used instead of the installed one.
         """
-        self.name, self.clock, self.device_ms = name, Clock(), [0.0]
-        path = [str(tree)] if tree else [*filter(None, [os.environ.get("PYTHONPATH")])]
+        self.name, self.clock = name, Clock()
         self._process = subprocess.Popen(
             [python, "-P", adapter.__file__, str(file), *([device] if device else [])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL if not os.environ.get("FIDSPLAT_DEBUG") else None,
-            env=os.environ | ({"PYTHONPATH": os.pathsep.join(path)} if path else {}),
             start_new_session=True,  # Ctrl-C is for this process, which closes the pipes
         )
         assert self._process.stdout is not None
@@ -113,12 +110,11 @@ class RendererProcess:
             self._process.stdin.flush()
         return self._answer()
 
-    def frame(self, setting: str, views: list[int]) -> float:
-        """Render one submission; the clock advances by its time. Returns milliseconds."""
+    def frame(self, setting: str, views: list[int]) -> dict[str, float]:
+        """Render one submission; the clock advances by its time. Returns `ms`, and `device_ms` if known."""
         taken = self.ask("frame", setting=setting, views=views)
         self.clock.seconds += taken["ms"] / 1e3
-        self.device_ms = [taken.get("device_ms")]
-        return taken["ms"]
+        return taken
 
     def _answer(self) -> dict[str, Any]:
         line = next(self._answers, None)
@@ -166,6 +162,64 @@ def other_renderers(folder: Path) -> dict[str, Opener]:
         python = str(own) if own.is_file() else sys.executable
         found[file.parent.name] = partial(RendererProcess, file.parent.name, file, python=python)
     return found
+
+
+class Measurement:
+    """A setting of a renderer in a scene: its result so far, and the timer of its frames."""
+
+    def __init__(
+        self, process: RendererProcess, setting: str, result: dict[str, Any], submissions: list[list[int]]
+    ) -> None:
+        """submissions: views of each frame; after the last one they start again."""
+        self.process, self.setting, self.result, self.submissions = process, setting, result, submissions
+        self.second_ms = 0.0
+        """milliseconds of the second frame of the first view"""
+        self.timer = Timer(self._render, process.clock, catch_errors=True)
+        self._next = cycle(submissions)
+
+    def _render(self) -> dict[str, float]:
+        taken = self.process.frame(self.setting, next(self._next))
+        return {name: ms for name, ms in taken.items() if name == "device_ms"}
+
+    def first(self, references: References, file: Path) -> np.ndarray:
+        """Render the first frames and add the errors of their images; returns the first image (h, w, 3)."""
+        taken, images, memory = [], [], {}
+        for view in references.chosen:
+            taken.append(self.process.frame(self.setting, [view])["ms"])
+            memory = self.process.ask("image", file=str(file))
+            images.append(np.load(file)[0])
+        self.second_ms = self.process.frame(self.setting, references.chosen[:1])["ms"]
+        off = np.abs(np.stack(images) - references.image(self.result["claim"]))
+        if not np.isfinite(off).all():
+            raise AdapterError(f"{self.setting}: the image has values that are not finite")
+        self.result |= {
+            "first_frame_ms": taken[0],
+            **memory,
+            "largest_error": float(off.max()),
+            "mean_error": float(off.mean()),
+            "psnr_db": float(-10 * np.log10(max(np.mean(off**2), 1e-20))),
+        }
+        return images[0]
+
+    def finish(self, burst: float) -> None:
+        """Add the times per view, and if `burst` is above 0 and the machine reports energy, its joules.
+
+        Raises AdapterError.
+        """
+        if self.timer.error or not self.timer.ms:
+            raise AdapterError(self.timer.error)
+        views = len(self.submissions[0])
+        self.result |= {
+            "quartiles_ms": [ms / views for ms in quartiles(self.timer.ms)],
+            "fastest_ms": min(self.timer.ms) / views,
+            "frames": len(self.timer.ms),
+            **{name: ms / views for name, ms in self.timer.part_medians.items()},
+        }
+        meter = energy_meter(self.process.facts["kind"]) if burst else None
+        if meter is not None:
+            before = meter()
+            done = self.process.ask("burst", setting=self.setting, views=self.submissions[0], seconds=burst)
+            self.result["joules"] = (meter() - before) / (done["submissions"] * views)
 
 
 class References:
@@ -228,9 +282,8 @@ class Suite:
         if not isinstance(earlier, dict) or earlier.get("schema") != SCHEMA:
             raise InputError(f"{self._file} must hold results of bench --suite; give another file")
         run = self.found["run"]
-        differ = differences(earlier["run"], run) + (
-            ["machine"] * (earlier["run"]["machine"] != run["machine"])
-        )
+        differ = differences(earlier["run"], run)
+        differ += [name for name in ("machine", "effort") if earlier["run"].get(name) != run[name]]
         if differ:
             raise InputError(
                 f"{self._file} holds results of another {' and '.join(differ)}; give another file, or "
@@ -289,136 +342,79 @@ class Suite:
                 "x": scene.x,
             }
         )
-        chosen = np.unique(
-            np.linspace(0, len(views.poses) - 1, self._effort.compared_views).astype(int)
-        ).tolist()
+        count, compared = len(views.poses), self._effort.compared_views
+        chosen = np.unique(np.linspace(0, count - 1, compared).astype(int)).tolist()
         references = References(self._reference, views, chosen)
-        timers: list[tuple[Timer, dict[str, Any], RendererProcess, str]] = []
+        submissions = [list(range(count))] if scene.batch else [[view] for view in range(count)]
+        found: list[Measurement] = []
         with tempfile.TemporaryDirectory() as folder:
             file = views.save(Path(folder) / "scene.npz")
             for renderer in missing:
                 report(f"first frames of {renderer}")
-                process = self._process(renderer)
-                if process.skipped:
-                    self._add(name, [renderer], {"skipped": process.skipped})
-                    continue
-                settings = {key: claims for key, claims in process.settings.items() if views.kind in claims}
-                if scene.x is not None:
-                    settings = dict(list(settings.items())[:1])
-                if not settings:
-                    self._add(name, [renderer], {"skipped": f"does not render {views.kind}"})
-                    continue
                 try:
-                    loaded = process.ask("load", file=str(file))
-                    for number, (setting, claims) in enumerate(settings.items()):
-                        claim, image = claims[views.kind], Path(folder) / "image.npy"
-                        result = {"scene": name, "renderer": renderer, "setting": setting, "claim": claim}
-                        result |= loaded | self._first(process, setting, claim, references, views, image)
-                        ms = result["first_ms"][-1]
-                        if ms > TOO_SLOW:
-                            reason = f"a frame takes {ms / 1e3:.3g} s, more than {TOO_SLOW / 1e3:g} s"
-                            self._add(name, [renderer], {"setting": setting, "skipped": reason})
-                        else:
-                            timer = self._timer(process, setting, scene, len(views.poses))
-                            # the first setting has the energy
-                            timers.append((timer, result, process, setting if number == 0 else ""))
-                        if ms > SLOW:
-                            break
+                    found += self._first_frames(name, renderer, views, references, file, submissions)
                 except AdapterError as error:
-                    timers = [one for one in timers if one[2] is not process]
-                    self._processes.pop(renderer).close()
+                    self._failed(renderer)
                     self._add(name, [renderer], {"error": str(error)})
-            report("interleaved frames")
-            for slow in (False, True):
-                group = [one[0] for one in timers if (one[1]["first_ms"][-1] > SLOW) == slow]
-                effort = self._effort
-                time_interleaved(
-                    group,
-                    effort.rounds,
-                    min_rounds=effort.min_rounds,
-                    seconds=effort.seconds * (0.5 if scene.x is not None else 1.0),
-                    warm_up=0 if slow else 1,
-                    tick=interrupts.check,
-                )
-            for timer, result, process, metered in timers:
-                self._finish(timer, result, process, metered, scene, len(views.poses))
-
-    def _first(
-        self,
-        process: RendererProcess,
-        setting: str,
-        claim: Mapping[str, Any],
-        references: References,
-        views: Views,
-        file: Path,
-    ) -> dict[str, Any]:
-        """First frames of a setting, and the errors of its images."""
-        taken, images = [], []
-        for view in references.chosen:
-            taken.append(process.frame(setting, [view]))
-            memory = process.ask("image", file=str(file))
-            images.append(np.load(file)[0])
-        image, reference = np.stack(images), references.image(claim)
-        off = np.abs(image - reference)
-        if not np.isfinite(off).all():
-            raise AdapterError(f"{setting}: the image has values that are not finite")
-        facts = {
-            "first_ms": [taken[0], process.frame(setting, [references.chosen[0]])],
-            **memory,
-            "largest_error": float(off.max()),
-            "mean_error": float(off.mean()),
-            "psnr_db": float(-10 * np.log10(max(np.mean(off**2), 1e-20))),
-        }
-        if views.scene is not None:
-            readings, _ = read_back(np.clip(images[0], 0, 1), views.scene, views.camera)
-            facts["tags"] = means(readings)
-        return facts
-
-    def _timer(self, process: RendererProcess, setting: str, scene: SuiteScene, count: int) -> Timer:
-        """Timer of a setting: all views of a batch, else the next view at each call."""
-        number = iter(range(sys.maxsize))
-        views = lambda: list(range(count)) if scene.batch else [next(number) % count]  # noqa: E731
-
-        def render() -> dict[str, float]:
-            process.frame(setting, views())
-            device = process.device_ms[0]
-            return {} if device is None else {"device": device}
-
-        return Timer(render, process.clock, catch_errors=True)
-
-    def _finish(
-        self,
-        timer: Timer,
-        result: dict[str, Any],
-        process: RendererProcess,
-        metered: str,
-        scene: SuiteScene,
-        count: int,
-    ) -> None:
-        """Add a result: times per view, and joules of the setting `metered` if the machine reports them."""
-        if timer.error or not timer.ms:
-            if self._processes.get(process.name) is process:  # it may have ended
-                self._processes.pop(process.name).close()
-            self.found["results"].append(
-                {key: result[key] for key in ("scene", "renderer", "setting")} | {"error": timer.error}
+        report("interleaved frames")
+        for slow in (False, True):
+            time_interleaved(
+                [one.timer for one in found if (one.second_ms > SLOW) == slow],
+                self._effort.rounds,
+                min_rounds=self._effort.min_rounds,
+                seconds=self._effort.seconds * (0.5 if scene.x is not None else 1.0),
+                warm_up=0 if slow else 1,
+                tick=interrupts.check,
             )
-            return
-        per_call = count if scene.batch else 1
-        result["first_frame_ms"] = result.pop("first_ms")[0]
-        result |= {
-            "quartiles_ms": [ms / per_call for ms in quartiles(timer.ms)],
-            "fastest_ms": min(timer.ms) / per_call,
-            "frames": len(timer.ms),
-        }
-        if "device" in timer.parts:
-            result["device_ms"] = timer.part_medians["device"] / per_call
-        meter = energy_meter(process.facts.get("kind", "cpu"))
-        if meter is not None and metered and scene.x is None:
-            before = meter()
-            views = list(range(count)) if scene.batch else [0]
-            burst = process.ask("burst", setting=metered, views=views, seconds=self._effort.burst)
-            result["joules"] = (meter() - before) / (burst["submissions"] * per_call)
-        self.found["results"].append(rounded(result))
+        metered: set[str] = set()
+        for one in found:
+            # the energy of each renderer's first setting
+            first = one.process.name not in metered and scene.x is None
+            metered.add(one.process.name)
+            try:
+                one.finish(self._effort.burst if first else 0.0)
+                self.found["results"].append(rounded(one.result))
+            except AdapterError as error:
+                self._failed(one.process.name)
+                self._add(name, [one.process.name], {"setting": one.setting, "error": str(error)})
+
+    def _first_frames(
+        self,
+        name: str,
+        renderer: str,
+        views: Views,
+        references: References,
+        file: Path,
+        submissions: list[list[int]],
+    ) -> list[Measurement]:
+        """Load a scene and render the first frames of each setting. Raises AdapterError."""
+        process, found = self._process(renderer), []
+        settings = {key: claims for key, claims in process.settings.items() if views.kind in claims}
+        reason = process.skipped or ("" if settings else f"does not render {views.kind}")
+        if reason:
+            self._add(name, [renderer], {"skipped": reason})
+            return []
+        loaded = process.ask("load", file=str(file))
+        for setting, claims in settings.items():
+            result = {"scene": name, "renderer": renderer, "setting": setting, "claim": claims[views.kind]}
+            one = Measurement(process, setting, result | loaded, submissions)
+            image = one.first(references, file.with_name("image.npy"))
+            if views.scene is not None:
+                readings, _ = read_back(np.clip(image, 0, 1), views.scene, views.camera)
+                one.result["tags"] = means(readings)
+            if one.second_ms > TOO_SLOW:
+                reason = f"a frame takes {one.second_ms / 1e3:.3g} s, more than {TOO_SLOW / 1e3:g} s"
+                self._add(name, [renderer], {"setting": setting, "skipped": reason})
+            else:
+                found.append(one)
+            if one.second_ms > SLOW or self._scenes[name].x is not None:
+                break
+        return found
+
+    def _failed(self, renderer: str) -> None:
+        """End the process of a renderer that failed; the next scene starts it again."""
+        if renderer in self._processes:
+            self._processes.pop(renderer).close()
 
     def _add(self, scene: str, renderers: Sequence[str], fact: dict[str, str]) -> None:
         self.found["results"] += [{"scene": scene, "renderer": name, **fact} for name in renderers]
