@@ -35,6 +35,7 @@
 //@ coplanar_disc_depth
         if (s->group >= 0) on_plane = -1;           // also in the low-pass disc
 //@ compose_types
+#define IN_LAYER(s) ((s)->group >= 0)
 typedef struct {
     int group;                  // -1: no layer
     vfloat opacity;             // 1 - the product of transmittances, accumulated directly to stay exact for faint layers
@@ -191,6 +192,8 @@ static inline const float *blocks_until(Pixel *pixels, const BlendConstants *con
         mask &= VMASK(attributes.z >= layers->from) & VMASK(attributes.z < layers->next_z);
         if (!VANY(mask)) return;
     }
+//@ pass_from
+    if (pixel->layers) from = fmax(from, pixel->layers->from);
 //@ layers_finish
     if (pixel->layers) {
         Layers *layers = pixel->layers;

@@ -165,6 +165,10 @@ static inline void k_buffer_insert(Pixel *pixel, wide nearest, wide z, wide opac
     k_buffer->until = INFINITY;
     k_buffer->bounded = true;        // in another pass (for other pixels), a pixel that dropped nothing skips all fragments
     repeats = VMASK(k_buffer->from < INFINITY);
+//@ batch_open
+            && staged[0].splat.nearest <= pixels[row].k_buffer.until      // else the buffer is full of nearer fragments
+//@ pass_from
+    from = pixel->k_buffer.from;
 //@ layer_passed
         if (ready) k_buffer->from = -INFINITY;
 //@ blend_arguments

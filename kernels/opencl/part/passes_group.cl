@@ -1,15 +1,37 @@
-// Several passes through a tile's list, for GPUs: until all fragments and layers of all pixels are composited.
+// Several passes through a tile's list, for GPUs: until all fragments and layers of all pixels are composited. A pass skips splats that
+// end in front of the depth at which it begins (`from`).
 //@ unfinished
 //@@ pass_unfinished
+//@ compose_types
+#ifndef IN_LAYER
+#define IN_LAYER(s) false
+#endif
+//@ compose_functions
+// Fragments in front of this depth belong to earlier passes.
+static inline wide pass_from(const Pixel *pixel) {
+    wide from = -INFINITY;
+//@@ pass_from
+    return from;
+}
+//@ group_start
+    local uint next_from;
+    wide from = -INFINITY;
+//@ cells_parameters
+                                 , wide from
+//@ cells_arguments
+                          , from
+//@ cells_occluded
+    if (!IN_LAYER(s) && s->z_center + s->z_reach < from) return;
 //@ pass
-    local int repeat_pass;
     do {
 //@ pass_end
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (item == 0) repeat_pass = 0;
+        if (item == 0) next_from = 0xFFFFFFFFu;     // of no depth
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int row = 0; row < ROWS; row++)
-            if (px < width && py + row < height && pass_finish(&pixels[row], splats, &constants)) repeat_pass = 1;
+            if (px < width && py + row < height && pass_finish(&pixels[row], splats, &constants))
+                atomic_min(&next_from, sortable(convert_float_rtn(pass_from(&pixels[row]))));
         barrier(CLK_LOCAL_MEM_FENCE);
-        // uniform control flow: every work-item reads the same vote
-    } while (repeat_pass);
+        from = key_depth(next_from);
+        // uniform: every work-item reads the same depth
+    } while (next_from != 0xFFFFFFFFu);

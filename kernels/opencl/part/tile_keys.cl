@@ -14,6 +14,7 @@
             if ((s->y1 - 1) / TILE_H - s->y0 / TILE_H >= WINDOW_H || (s->x1 - 1) / TILE_W - s->x0 / TILE_W >= WINDOW_W)
                 s->nearest = tile_nearest(*s, x0, y0);
         }
+        barrier(CLK_LOCAL_MEM_FENCE);
 //@ compose_types
 // Equal depths are ordered by the keys of splats, then by index, as in lists without keys by tile.
 #define TIE_IN_FRONT(splat, other) precedes(splats, splat, other)

@@ -44,7 +44,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         barrier(CLK_LOCAL_MEM_FENCE);
 //@@ staged
         for (int row = 0; row < ROWS; row++)
-            if (px < width && py + row < height && pixel_unfinished(&pixels[row], &constants)) alive = 1;
+            if (px < width && py + row < height && pixel_unfinished(&pixels[row], &constants)
+//@@ batch_open
+            ) alive = 1;
         find_cells(staged, length, x0, y0, &constants, cells, touched
 //@@ cells_arguments
         );
@@ -55,7 +57,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
         // skipped if all pixels of the work-item are terminated
         bool unfinished = false;
-        for (int row = 0; row < ROWS; row++) unfinished |= pixel_unfinished(&pixels[row], &constants) != 0;
+        for (int row = 0; row < ROWS; row++)
+            unfinished |= pixel_unfinished(&pixels[row], &constants)
+//@@ batch_open
+                ;
         if (!unfinished) listed = 0;
         for (uint k = 0; k < listed; k++) {
             uint which = places[cell][k];
