@@ -13,6 +13,7 @@ cut-off 1/255 and the stop 1e-4, captured scenes with all constants of gsplat, a
 from __future__ import annotations
 
 import gc
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -21,8 +22,6 @@ import numpy as np
 import torch
 from gsplat.experimental.render.components.gaussian_inference_renderer import GaussianInferenceRenderer
 from gsplat.scene import GaussianInferenceScene
-from gsplat_cuda import tensors
-from interleaved import PROGRESS, keep, options, show
 
 import fidsplat as fs
 from fidsplat.capture.quality import Quality
@@ -30,6 +29,9 @@ from fidsplat.formats import load_splats
 from fidsplat.scenes.random_clouds import SCENES, load_scene
 from fidsplat.util.timing import Timer, frame_timer, ratios, time_interleaved
 from fidsplat.vision.metrics import psnr
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from measuring import PROGRESS, keep, options, show
 
 RANDOM, CAPTURED = f"alpha_cutoff={1 / 255}", "gsplat"
 """fidsplat's settings for both kinds of scenes"""
@@ -64,6 +66,27 @@ def captured(file: str) -> Iterator[tuple[str, fs.SplatCloud, fs.Camera]]:
             plain,
             fs.Camera.look_at(1920, 1080, 1.0, position=position, target=tuple(middle)),
         )
+
+
+def tensors(cloud: fs.SplatCloud, camera: fs.Camera) -> dict:
+    """Arguments of both rasterizations on the GPU: one camera, plain colours, three scales (disks ignore the
+    last)."""
+    colors = cloud.colors
+    assert colors is not None
+    third = np.ones(len(cloud)) if cloud.thickness is None else cloud.thickness
+    arrays = {
+        "means": cloud.means + cloud.origin,
+        "quats": cloud.quats,
+        "scales": np.column_stack([cloud.scales, third]),
+        "opacities": cloud.opacities,
+        "colors": colors[None],  # for each camera
+        "viewmats": camera.world_to_camera[None],
+        "Ks": camera.matrix[None],
+    }
+    on_gpu = {
+        name: torch.tensor(np.asarray(array, np.float32), device="cuda") for name, array in arrays.items()
+    }
+    return on_gpu | {"width": camera.width, "height": camera.height}
 
 
 def peers(cloud: fs.SplatCloud, camera: fs.Camera) -> dict[str, Callable[[], torch.Tensor]]:
