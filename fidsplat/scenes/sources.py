@@ -92,6 +92,9 @@ def load_source(
                 "look_at"
             )
         camera = scene.camera if size is None else scene.camera.with_size(*size)
+        if pose != OWN_POSE:  # a moving camera would not be there
+            camera = scene.capture.motion.moved(camera, scene.capture.shutter.time)
+            scene = replace(scene, camera_motion=None)
         return replace(scene, camera=pose.applied(camera))
     if suffix == SUFFIX:
         store = Store(source)

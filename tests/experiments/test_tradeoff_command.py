@@ -75,6 +75,16 @@ def test_a_quick_run_stops_in_time_and_continues(capsys, tmp_path, monkeypatch):
     assert len(read_records(tmp_path / run.FILE)) == total
 
 
+def test_a_scene_that_a_device_refuses_does_not_stop_the_estimate(monkeypatch):
+    def refuse(self, view, quality):
+        raise fs.DeviceError("no memory for this")
+
+    monkeypatch.setattr(run.Session, "render", refuse)
+    keys = run.all_points(("hard",), ("alpha_cutoff",), True)
+    session = run.Session(fs.Renderer("opencl:pocl"))
+    assert 0 < run.estimated_seconds(session, keys, run.QUICK) < 60
+
+
 def test_no_batch_begins_that_would_exceed_the_limit(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])

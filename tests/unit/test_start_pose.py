@@ -122,6 +122,21 @@ def test_options_change_only_what_they_name():
     assert abs(splats.project([[0, 0, 0.5]])[0] - (640, 360)).max() < 60  # towards the middle
 
 
+def test_a_moving_camera_stays_at_the_pose_of_the_options(here):
+    motion = "".join(
+        f"[[camera.motion]]\ntime = {t}.0\nposition = [{t}.0, -5.0, 1.0]\nlook_at = [{t}.0, 0.0, 1.0]\n"
+        "up = [0.0, 0.0, 1.0]\n"
+        for t in (0, 1)
+    )
+    still = SCENE.split("position = ")[0] + motion + "[camera.shutter]\ntime = 0.5\n"
+    (here / "yard.toml").write_text(still + SCENE[SCENE.index("[[splats]]") :])
+    scene = load_source("yard.toml", pose=StartPose(look_at=(0.5, 0, 0)))
+    camera = scene.capture.motion.moved(scene.camera, 0.5)
+    np.testing.assert_allclose(camera.position, (0.5, -5, 1), atol=1e-9)
+    np.testing.assert_allclose(camera.project([[0.5, 0, 0]]), [[camera.cx, camera.cy]])
+    assert load_source("yard.toml").camera_motion is not None
+
+
 def test_panoramas_keep_their_sphere_at_another_size():
     camera = fs.Camera.equirectangular(64, 32).with_size(100, 80)
     same = fs.Camera.equirectangular(100, 80)

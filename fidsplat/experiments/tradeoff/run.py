@@ -17,7 +17,7 @@ from fidsplat.experiments.tradeoff import compare, points, scenes
 from fidsplat.experiments.tradeoff.points import ABLATION, BASE, MARKER, PRESET, Point
 from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Effort, Session, time_point
 from fidsplat.render.renderer import Renderer
-from fidsplat.util.errors import InputError
+from fidsplat.util.errors import FidsplatError, InputError
 from fidsplat.util.provenance import run_facts
 from fidsplat.util.timing import frame_timer
 from fidsplat.vision.metrics import metric_versions
@@ -103,13 +103,7 @@ def estimated_seconds(session: Session, keys: list[Key], effort: Effort) -> floa
             total += OVERHEAD * len(parse_tilts(key["tilts"]))
             continue
         if name not in frames:
-            session.render(key["scene"], BASE).wait()  # compiles
-            frames[name] = frame_timer(
-                session.renderer,
-                session.resident(key["scene"], BASE.marker),
-                session.scene(key["scene"], BASE.marker).capture,
-                quality=BASE,
-            ).run()
+            frames[name] = _frame_ms(session, key["scene"])
         frame = 1e-3 * frames[name]
         if key["what"] == REFERENCE:
             total += OVERHEAD + REFERENCE_FRAMES * frame * key["samples"] ** 2
@@ -119,6 +113,16 @@ def estimated_seconds(session: Session, keys: list[Key], effort: Effort) -> floa
         # own frames: the image, its memory, warm-up and rounds; of the baseline: warm-up and rounds
         total += OVERHEAD + frame * ((rounds + 3) * samples + rounds + 1)
     return total
+
+
+def _frame_ms(session: Session, view: str) -> float:
+    """Milliseconds of the second frame of the baseline; 0 if the device refuses it."""
+    try:
+        session.render(view, BASE).wait()  # compiles
+        resident, scene = session.resident(view, BASE.marker), session.scene(view, BASE.marker)
+        return frame_timer(session.renderer, resident, scene.capture, quality=BASE).run()
+    except FidsplatError:  # reported with the points
+        return 0.0
 
 
 def all_points(names: tuple[str, ...], settings: tuple[str, ...], quick: bool) -> list[Key]:
