@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from fidsplat.commands.declarations import option, switch
 from fidsplat.commands.options import Device, Json
-from fidsplat.commands.output import console, delayed_progress, print_json, print_lines, print_table
+from fidsplat.commands.output import (
+    console,
+    delayed_progress,
+    print_json,
+    print_lines,
+    print_table,
+    steps_shown,
+)
 from fidsplat.util.errors import InputError, several
 from fidsplat.util.files import writable_folder
 
@@ -65,8 +72,8 @@ class Check:
         from fidsplat.selftest.catalogue import all_cases
         from fidsplat.selftest.check import run_check, worst_image
 
-        with where.status("starting") as status:
-            result = run_check(renderer, all_cases(), status.update)
+        with steps_shown(where, "starting") as update:
+            result = run_check(renderer, all_cases(), update)
         file = None if result.worst is None else write_png(folder / "worst.png", worst_image(result.worst))
         if self.json:
             print_json({**result.as_dict(), "picture": file and str(file)})

@@ -13,6 +13,7 @@ from fidsplat.commands.output import (
     print_lines,
     print_table,
     report,
+    steps_shown,
 )
 from fidsplat.experiments.demo_views import DemoViewSettings
 
@@ -76,8 +77,8 @@ class Demo:
         from fidsplat.experiments.demo import run_demo
 
         where = console(self.json)
-        with where.status("starting") as status:
-            result = run_demo(self.out, self.device, status.update, self.mixture, self.captured)
+        with steps_shown(where, "starting") as update:
+            result = run_demo(self.out, self.device, update, self.mixture, self.captured)
         if self.json:
             print_json(result.as_dict())
         else:

@@ -18,7 +18,7 @@ from fidsplat.commands.options import (
     repeatable,
     require_packages,
 )
-from fidsplat.commands.output import console, delayed_progress, report, show_progress
+from fidsplat.commands.output import console, delayed_progress, report, show_progress, steps_shown
 from fidsplat.commands.sweeps import run_interleaved
 from fidsplat.experiments.plants import PlantSettings
 from fidsplat.experiments.settings import BlenderSettings, DatasetSettings
@@ -107,8 +107,8 @@ class Blender(BlenderSettings):
 
         environment = self.environment or blender.default_environment()
         if self.install:
-            with console(self.json).status("") as status:
-                python = blender.install(environment, status.update)
+            with steps_shown(console(self.json), "installing Blender") as update:
+                python = blender.install(environment, update)
             return report(self.json, {"python": str(python)}, f"Blender is in {environment}")
         self.check()
         views, done = self.view or blender.VIEW_NAMES, 0

@@ -86,6 +86,19 @@ def progress_bar(where: Console, *columns: Any) -> Any:
 
 
 @contextmanager
+def steps_shown(where: Console, first: str) -> Iterator[Callable[[str], None]]:
+    """A callback that shows the current step of work of unknown length; for files and pipes, a line on stderr
+    every 30 s."""
+    if where.is_interactive:
+        with where.status(first) as status:
+            yield status.update
+        return
+    with progress_bar(where) as lines:
+        task = lines.add_task(first, total=None)
+        yield lambda step: lines.update(task, description=step)
+
+
+@contextmanager
 def delayed_progress(
     where: Console | None = None, after: float = 1.0
 ) -> Iterator[Callable[[str, float], None]]:

@@ -18,7 +18,8 @@ class Task:
     """A task and its progress."""
 
     description: str
-    total: float
+    total: float | None
+    """None: unknown"""
     completed: float
     fields: dict[str, Any]
     first: float = field(init=False)
@@ -29,13 +30,15 @@ class Task:
 
     def line(self) -> str:
         """Description, amount done and time left, for example `training: 200 of 700, 1 min 20 s left`."""
-        done, share = self.completed - self.first, self.completed / max(self.total, 1e-300)
-        amount = f"{100 * share:.0f} %"
-        if self.total > 1:
+        elapsed, done = time.monotonic() - self.begun, self.completed - self.first
+        if self.total is None:
+            amount = f"{duration(elapsed)} so far"
+        elif self.total > 1:
             amount = f"{self.completed:,.0f} of {self.total:,.0f}"
-        if done > 0:
-            rest = (time.monotonic() - self.begun) * (self.total - self.completed) / done
-            amount += f", {duration(max(rest, 0.0))} left"
+        else:
+            amount = f"{100 * self.completed:.0f} %"
+        if self.total is not None and done > 0:
+            amount += f", {duration(max(elapsed * (self.total - self.completed) / done, 0.0))} left"
         head = f"{self.description.strip()}: " if self.description.strip() else ""
         now = str(self.fields.get("now", "")).strip()
         return head + amount + (f" ({now})" if now else "")
@@ -48,7 +51,7 @@ class ProgressLines:
         self._tasks: list[Task] = []
         self._ended: threading.Event | None = None
 
-    def add_task(self, description: str, total: float, completed: float = 0.0, **fields: Any) -> int:
+    def add_task(self, description: str, total: float | None, completed: float = 0.0, **fields: Any) -> int:
         """Add a task; returns its number."""
         self._tasks.append(Task(description, total, completed, fields))
         return len(self._tasks) - 1

@@ -15,7 +15,7 @@ import tyro
 
 from fidsplat.commands.declarations import option
 from fidsplat.commands.options import Device, Json, check_request
-from fidsplat.commands.output import console, delayed_progress, report
+from fidsplat.commands.output import console, delayed_progress, report, steps_shown
 from fidsplat.commands.scenes import RenderInput, Size
 from fidsplat.effects.extensions import outputs_help
 from fidsplat.scenes.sources import StartPose
@@ -127,11 +127,11 @@ class Render(RenderInput):
         from fidsplat.accuracy.quality_within import choose
 
         capture = scene.capture.with_(quality=self.quality)
-        with console(self.json).status("measuring") as status, _option_names():
-            choice = choose(self.max_error, self.max_ms, scene, capture, renderer, report=status.update)
+        with steps_shown(console(self.json), "measuring") as update, _option_names():
+            choice = choose(self.max_error, self.max_ms, scene, capture, renderer, report=update)
             if self.max_error is None:
                 return choice
-            return certify(choice, self.max_error, self.max_ms, scene, capture, renderer, status.update)
+            return certify(choice, self.max_error, self.max_ms, scene, capture, renderer, update)
 
     def _render(self, renderer: Renderer, scene: Scene, quality: Quality | str | None) -> Frame:
         """The frame; the slow reference device shows its progress."""

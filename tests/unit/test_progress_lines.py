@@ -11,7 +11,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands import progress_lines
-from fidsplat.commands.output import delayed_progress, show_progress
+from fidsplat.commands.output import console, delayed_progress, show_progress, steps_shown
 from fidsplat.commands.progress_lines import Task, duration
 
 
@@ -47,6 +47,14 @@ def test_long_work_between_two_calls_is_reported(capsys):
         progress("reading tag.ply", 0.25)
         time.sleep(0.1)
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.usefixtures("often")
+def test_work_of_unknown_length_shows_its_step(capsys):
+    with steps_shown(console(True), "starting") as update:
+        update("measuring samples=2")
+        time.sleep(0.1)
+    assert re.search(r"^measuring samples=2: \d s so far$", capsys.readouterr().err, re.MULTILINE)
 
 
 def test_the_time_left_is_that_of_this_run():
