@@ -11,11 +11,12 @@ import numpy as np
 
 from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.views import Views
+from fidsplat.render.array_export import ArrayExport
 from fidsplat.render.frame import Frame, SceneIds, check_process, refuse_scene_ids, with_scene_ids
 from fidsplat.util.errors import InputError, MissingOutputError
 
 
-class FrameBatch(Mapping):
+class FrameBatch(ArrayExport):
     """Rendered views: a mapping from output names to read-only NumPy arrays (views, h, w) or
     (views, h, w, channels), which are copied from the device on first use.
 
@@ -31,6 +32,8 @@ class FrameBatch(Mapping):
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = views.captures[0].outputs
         """Names of the images, in the requested order."""
+
+    _noun = "batch"
 
     def __repr__(self) -> str:
         camera = self._views.captures[0].camera
@@ -65,6 +68,10 @@ class FrameBatch(Mapping):
         check_process(self._process, "batch")
         refuse_scene_ids(name, self._ids)
         return self._images.device_array(name)
+
+    def _is_shared(self, name: str) -> bool:
+        """Whether the device shares an array of these images."""
+        return self._images.shares_arrays and not (name == "splat_id" and self._ids is not None)
 
     def frame(self, number: int) -> Frame:
         """One view as a Frame, without timings and stats. Images are copied to the host on first use.

@@ -11,6 +11,7 @@ import numpy as np
 from fidsplat.backends.gradients import DifferentiableImages, on_host
 from fidsplat.backends.interface import GradientPipeline, Images
 from fidsplat.capture.capture import Capture
+from fidsplat.render.array_export import host_array
 from fidsplat.render.frame import Frame
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import flag, instance, real_array
@@ -41,7 +42,8 @@ class DifferentiableFrame(Frame):
         Args:
             gradients: derivatives of the loss with respect to the outputs, float32 arrays, by output name:
                 `rgb` (h, w, 3), `alpha` (h, w), `depth` (h, w) [1/m], `normal` (h, w, 3), `distortion`
-                (h, w). NumPy arrays, or arrays of the device (pyopencl, Warp), which are not copied.
+                (h, w). NumPy arrays, arrays of the device (pyopencl, Warp), or arrays with DLPack (torch,
+                JAX, CuPy) on the host or on the device of Warp. Device arrays are not copied.
                 Outputs without an entry have a gradient of 0.
             on_device: return arrays of the device (pyopencl, Warp; NumPy float64 of the reference), which are
                 valid until the next call, instead of NumPy float32.
@@ -63,6 +65,8 @@ class DifferentiableFrame(Frame):
         interrupts.check()
         flag("on_device", on_device)
         instance("gradients", gradients, Mapping, "arrays by the name of their output")
+        if not self._images.shares_arrays:
+            gradients = {name: host_array(f"the gradient of {name}", by) for name, by in gradients.items()}
         given = {name: _numeric_array(name, value) for name, value in gradients.items()}
         with self._lock:
             results = self._pipeline.backward(self._forward, given)

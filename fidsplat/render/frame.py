@@ -10,6 +10,7 @@ import numpy as np
 
 from fidsplat.backends.interface import HostImages, Images
 from fidsplat.capture.capture import Capture
+from fidsplat.render.array_export import ArrayExport
 from fidsplat.util.arguments import invalid, whole_number
 from fidsplat.util.errors import InputError, MissingOutputError
 
@@ -31,7 +32,7 @@ class ComputedImage(Protocol):
         ...
 
 
-class Frame(Mapping):
+class Frame(ArrayExport):
     """A rendered frame: a mapping from output names to read-only NumPy arrays, which are copied from the
     device on first use.
 
@@ -60,6 +61,8 @@ class Frame(Mapping):
         """The capture of this frame. `read_back` and `truth_of` use its camera, shutter and motion."""
         self.outputs = capture.outputs
         """Names of the images, in the requested order."""
+
+    _noun = "frame"
 
     def __getitem__(self, name: str) -> np.ndarray:
         self._check(name)
@@ -107,65 +110,10 @@ class Frame(Mapping):
 
         return to_uint8(self["rgb"])
 
-    def to_torch(self, name: str = "rgb") -> Any:
-        """The image as a torch tensor: on its device without a copy if the backend shares arrays
-        (`device_array`), else copied to the host.
-
-        Raises:
-            InputError: an output that was not requested, or torch is not installed.
-        """
-        self._check(name)
-        try:
-            import torch  # type: ignore[import-not-found]
-        except ImportError:
-            raise InputError("to_torch needs torch, which is not installed; pip install torch") from None
-        if self._is_shared(name):
-            return torch.from_dlpack(self.device_array(name))
-        return torch.from_numpy(self[name].copy())  # torch has no read-only tensors
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """The image of a frame with one output, for NumPy, PIL and OpenCV.
-
-        Raises:
-            InputError: the frame has several outputs.
-        """
-        image = self[self._only_output()]
-        return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
-
-    def __dlpack__(self, **options: Any) -> Any:
-        """The image of a frame with one output, for `from_dlpack` of torch, CuPy, JAX and NumPy.
-
-        It is not copied if the backend shares arrays; otherwise it is copied to the host.
-
-        Raises:
-            InputError: the frame has several outputs.
-        """
-        return self._exported().__dlpack__(**options)
-
-    def __dlpack_device__(self) -> tuple[int, int]:
-        """DLPack's device type and id of the image."""
-        return self._exported().__dlpack_device__()
-
-    def _exported(self) -> Any:
-        """The image of the only output as an array that exports DLPack."""
-        name = self._only_output()
-        if self._is_shared(name):
-            return self.device_array(name)
-        return self[name].copy()  # NumPy exports no read-only arrays by DLPack
-
     def _is_shared(self, name: str) -> bool:
         """Whether the device shares an array of this image."""
         on_host = name == "error" or (name == "splat_id" and self._ids is not None)
         return self._images.shares_arrays and not on_host
-
-    def _only_output(self) -> str:
-        """The name of the only output."""
-        if len(self.outputs) != 1:
-            raise InputError(
-                f"the frame must have one output, got {len(self.outputs)} ({', '.join(self.outputs)}); take "
-                "one by its name, for example frame['rgb']"
-            )
-        return self.outputs[0]
 
     def __repr__(self) -> str:
         took = sum(self.timings.values())

@@ -51,7 +51,7 @@ HOME_OF = {
     "viser": ("viewer.server", "viewer.guard"),
     "zstandard": ("viewer.guard", "logs.bags", "util.zstd"),
     "websockets": ("viewer.guard",),
-    "torch": ("render.frame", "train.torch_bridge"),
+    "torch": ("render.array_export", "train.torch_bridge"),
     "ray": ("remote.ray_engine",),
     "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("images.video",),

@@ -104,6 +104,72 @@ def test_what_a_tape_cannot_record_is_an_error(renderer, render):
         tape.backward(grads={images["rgb"]: wp.zeros((43, 61, 3), dtype=float, device="cpu")})
 
 
+class Library:
+    """An array library: reads DLPack, makes an array of a NumPy array, and has its address."""
+
+    def __init__(self, name):
+        if name == "numpy":
+            self.read, self.make = np.from_dlpack, np.array
+            self.address = lambda array: array.ctypes.data
+        elif name == "warp":
+            self.read, self.make = wp.from_dlpack, lambda given: wp.array(given, device="cpu")
+            self.address = lambda array: array.ptr
+        elif name == "torch":
+            torch = pytest.importorskip("torch", reason="torch is not installed")
+            self.read, self.make = torch.from_dlpack, torch.tensor
+            self.address = lambda array: array.data_ptr()
+        else:
+            jax = pytest.importorskip("jax", reason="jax is not installed")
+            self.read, self.make = jax.dlpack.from_dlpack, jax.numpy.asarray
+            self.address = lambda array: array.unsafe_buffer_pointer()
+
+
+@pytest.mark.parametrize("name", ["numpy", "warp", "torch", "jax"])
+def test_other_libraries_share_the_memory(renderer, name):
+    """The table of docs/backends.md: frames, batches, gradients and splats on the same device."""
+    cloud, capture = picture()
+    library, weights = Library(name), np.random.default_rng(2).normal(size=(43, 61, 3)).astype(np.float32)
+    frame = renderer.render_differentiable(cloud, capture)
+    rgb, shared = frame["rgb"], library.read(frame)
+    assert library.address(shared) == frame.device_array("rgb").ptr
+    truth = frame.backward({"rgb": weights})
+    found = frame.backward({"rgb": library.make(weights)}, on_device=True)
+    by_means = library.read(found["means"])
+    assert library.address(by_means) == found["means"].ptr
+    np.testing.assert_array_equal(np.from_dlpack(by_means), truth["means"])
+    del frame
+    batch = renderer.render_batch(cloud, [capture.with_(background=(1.0, 1.0, 1.0)), capture])
+    np.testing.assert_array_equal(np.from_dlpack(shared), rgb)  # its memory is not used again
+    both = library.read(batch)
+    assert library.address(both) == batch.device_array("rgb").ptr
+    np.testing.assert_array_equal(np.from_dlpack(both)[1], rgb)
+    if name == "numpy":
+        return  # adopted NumPy arrays are copied
+    splats = {part: library.make(np.array(getattr(cloud, part))) for part in TYPES}
+    resident = renderer.adopt(**splats)
+    np.testing.assert_array_equal(renderer.render(resident, capture)["rgb"], rgb)
+    if name != "jax":  # whose arrays are immutable
+        splats["colors"].numpy()[:] = 0.0
+        assert np.abs(renderer.render(resident, capture)["rgb"] - rgb).max() > 0.01
+
+
+def test_on_other_devices_arrays_of_the_host_are_read():
+    cloud, capture = picture()
+    frame = fs.Renderer("reference").render_differentiable(cloud, capture)
+    weights = np.random.default_rng(2).normal(size=(43, 61, 3)).astype(np.float32)
+    truth, found = (frame.backward({"rgb": by}) for by in (weights, wp.array(weights, device="cpu")))
+    np.testing.assert_array_equal(found["means"], truth["means"])
+
+    class Elsewhere:
+        shape = (43, 61, 3)
+
+        def __dlpack__(self, **options):
+            raise BufferError("not on this device")
+
+    with pytest.raises(fs.InputError, match=r"gradient of rgb must be on the host.*not on this device"):
+        frame.backward({"rgb": Elsewhere()})
+
+
 def test_derivatives_that_cannot_be_taken_are_errors(renderer):
     """Images in bands; arrays of another type, which would be read as something else."""
     cloud, capture = picture()
@@ -121,7 +187,7 @@ def test_derivatives_that_cannot_be_taken_are_errors(renderer):
         pipeline.backward(images, {"rgb": wp.zeros((43, 61), dtype=float, device="cpu")})
     before, backend.pair_budget = backend.pair_budget, images.stats["pairs"] - 1
     try:
-        with pytest.raises(fs.DeviceError, match="rendered in bands"):
+        with pytest.raises(fs.DeviceError, match="must fit the memory budget without bands"):
             pipeline.forward(resident, view)
     finally:
         backend.pair_budget = before

@@ -162,6 +162,11 @@ class _Backward:
     def _device_gradient(self, name: str, given: Any) -> Any:
         """A gradient as a flat device array; no copy if it is on the device."""
         wp, pool = self._wp, self._frame.pool
+        if hasattr(given, "__dlpack__") and not isinstance(given, (np.ndarray, wp.array)):
+            try:
+                given = wp.from_dlpack(given)
+            except Exception as error:  # of the library that exports it, such as BufferError of torch
+                raise InputError(f"the gradient of {name} must be detached, got {error}") from None
         if not isinstance(given, wp.array):
             return pool.filled(f"by {name}", np.ascontiguousarray(given, np.float32).ravel(), wp.float32)
         scalar = getattr(given.dtype, "_wp_scalar_type_", given.dtype)
