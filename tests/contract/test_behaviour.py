@@ -92,7 +92,7 @@ def test_opaque_splats_hide_what_is_behind(renderer):
 def test_labels_depth_and_normals_of_a_wall(renderer):
     wall = fs.SplatCloud([[0, 0, 2.5]], [[1, 0, 0, 0]], [[5.0, 5.0]], [1.0], colors=[[1, 1, 1]], labels=42)
     camera = fs.Camera.pinhole(32, 24, 40.0, 40.0, 16.0, 12.0)
-    frame = renderer.render(wall, camera, outputs=("depth", "depth_median", "normal", "label"))
+    frame = renderer.render(wall, camera, outputs=ALL_OUTPUTS)
     assert np.allclose(frame["depth"], 2.5, rtol=1e-6)
     assert np.allclose(frame["depth_median"], 2.5, rtol=1e-6)
     assert np.allclose(frame["normal"], (0, 0, -1), atol=1e-6)

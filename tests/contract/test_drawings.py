@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from agreement import ALL_OUTPUTS
 
 import fidsplat as fs
 
@@ -18,9 +19,8 @@ def test_a_drawing_is_as_smooth_as_its_outlines(renderer):
     scale = 160 / 64
     height, width = (round(side * scale) for side in made.grid.shape)
     camera = fs.Camera.pinhole(width, height, 4.0 * width, 4.0 * width, width / 2, height / 2, pose_at(4.0))
-    frame = renderer.render(
-        made.cloud, camera, ("rgb", "alpha"), fs.Quality(lowpass="none"), background=(0.0, 1.0, 0.0)
-    )
+    green, quality = (0.0, 1.0, 0.0), fs.Quality(lowpass="none")
+    frame = renderer.render(made.cloud, camera, ALL_OUTPUTS, quality, background=green)
     y, x = (np.indices((height * 16, width * 16)) + 0.5) / 16 / scale
     ideal = np.zeros((height, width, 3))
     for color, region in zip(made.palette, made.regions, strict=True):

@@ -188,9 +188,9 @@ def test_disks_far_outside_the_image_that_are_widened_into_it(renderer):
 def test_splats_that_reach_into_a_band(renderer):
     """From above, from below and from behind the camera: a band shows them as the whole image does."""
     cloud, camera = random_splats(600, 3, depth=(-1.0, 4.0), scale=(0.01, 0.5)), CAMERA
-    whole = renderer.render(cloud, camera, quality=PIXEL)["rgb"]
+    whole = renderer.render(cloud, camera, ALL_OUTPUTS, PIXEL)["rgb"]
     for band in ((0, 16), (16, 40), (40, 59)):
-        rows = renderer.render_band(band, cloud, camera, quality=PIXEL)["rgb"][slice(*band)]
+        rows = renderer.render_band(band, cloud, camera, ALL_OUTPUTS, PIXEL)["rgb"][slice(*band)]
         assert np.array_equal(rows, whole[slice(*band)]), band
 
 

@@ -7,6 +7,7 @@ beyond each side of the image.
 
 import numpy as np
 import pytest
+from agreement import ALL_OUTPUTS
 
 import fidsplat as fs
 
@@ -66,10 +67,8 @@ def test_images_follow_their_scenes(renderer, kind, name, way):
     quality = fs.Quality(ellipsoid="exact" if kind == "exact" else "ewa", setup_precision="float64")
     parts, images = arrays(kind != "disks"), {}
     for each in ("as it is", way):
-        frame = renderer.render(
-            cloud(parts, each), camera(each, lens), ("rgb", "alpha", "depth"), quality=quality
-        )
-        images[each] = {output: np.asarray(frame[output]) for output in frame.outputs}
+        frame = renderer.render(cloud(parts, each), camera(each, lens), ALL_OUTPUTS, quality=quality)
+        images[each] = {output: np.asarray(frame[output]) for output in ("rgb", "alpha", "depth")}
     for output, image in images["as it is"].items():
         back = images[way][output]
         back = back[:, ::-1] if way == "mirrored" else np.swapaxes(back, 0, 1)
