@@ -38,10 +38,10 @@ class Server:
         return {"load_ms": 1e3 * (time.perf_counter() - begun)}
 
     def frame(self, setting: str, views: list[int]) -> dict:
-        """Render views as one submission; milliseconds until they are complete."""
-        begun = time.perf_counter()
+        """Render views as one submission; milliseconds until they are complete, and processor time."""
+        begun, busy = time.perf_counter(), time.process_time()
         self.rendered = self.adapter.render(setting, views)
-        taken = {"ms": 1e3 * (time.perf_counter() - begun)}
+        taken = {"ms": 1e3 * (time.perf_counter() - begun), "cpu_ms": 1e3 * (time.process_time() - busy)}
         device = getattr(self.adapter, "device_ms", None)
         return taken if device is None else taken | {"device_ms": device(self.rendered)}
 

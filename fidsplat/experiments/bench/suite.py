@@ -111,7 +111,8 @@ class RendererProcess:
         return self._answer()
 
     def frame(self, setting: str, views: list[int]) -> dict[str, float]:
-        """Render one submission; the clock advances by its time. Returns `ms`, and `device_ms` if known."""
+        """Render one submission; the clock advances by its time. Returns `ms`, `cpu_ms`, and `device_ms` if
+        known."""
         taken = self.ask("frame", setting=setting, views=views)
         self.clock.seconds += taken["ms"] / 1e3
         return taken
@@ -179,7 +180,7 @@ class Measurement:
 
     def _render(self) -> dict[str, float]:
         taken = self.process.frame(self.setting, next(self._next))
-        return {name: ms for name, ms in taken.items() if name == "device_ms"}
+        return {name: ms for name, ms in taken.items() if name != "ms"}
 
     def first(self, references: References, file: Path) -> np.ndarray:
         """Render the first frames and add the errors of their images; returns the first image (h, w, 3)."""
