@@ -150,9 +150,8 @@ class Tradeoff:
             if record.failed
         ]
         files = [str(sweep.results.file) for sweep in sweeps]
-        points, left = (
-            sum(map(len, each)) for each in zip(*((s.points, s.left) for s in sweeps), strict=True)
-        )
+        points = sum(len(sweep.points) for sweep in sweeps)
+        left = sum(len(sweep.left) for sweep in sweeps)
         lines = [*(f"not measured: {line}" for line in refused), *files]
         if left > len(refused):  # by the time limit
             lines.append(f"{left} of {points} points are not measured yet; the same command continues")

@@ -61,10 +61,11 @@ def test_an_interrupted_run_continues(capsys, tmp_path, monkeypatch):
 
 def test_a_quick_run_stops_in_time_and_continues(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(run, "QUICK_SECONDS", 0.0)
+    monkeypatch.setattr(run, "estimated_seconds", lambda session, keys, effort: 200.0)
     words = [*WORDS, "-o", str(tmp_path)]
     assert main(words) == 0
     out, err = capsys.readouterr()
-    assert "--quick stops after 0 s, the same command continues" in err
+    assert "about 3 min 20 s; --quick stops after 0 s, the same command continues" in err
     total = int(re.search(r"(\d+) of \1 points are not measured yet", out)[1])
     assert read_records(tmp_path / run.FILE) == []
 

@@ -404,6 +404,8 @@ def test_the_table_shows_the_share_of_each_effect():
     device = fs.Renderer("reference").device
     result = measure.Result("own", device, 8, 8, timer, counts={"splats": 5}, without={"fog": less})
     assert result.effects == {"fog": 6.0}
+    less.ms.append(90.0)  # interrupted before the last frame of the scene
+    assert result.effects == {"fog": 6.0}
     assert ["of which fog", "6.00 (50 %)", ""] in scene_table([result])[1]
 
 

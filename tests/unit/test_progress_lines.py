@@ -83,7 +83,7 @@ def test_a_flight_prints_lines_next_to_its_json(tmp_path, monkeypatch, capsys):
     )
     fs.save_ply(cloud, "few.ply")
     (tmp_path / "path.tum").write_text("".join(f"{k} 0 0 {-4 - k} 0 0 0 1\n" for k in range(6)))
-    words = ["--trajectory", "path.tum", "--rate", "1", "--size", "48", "36", "--device", "reference"]
+    words = ["--trajectory", "path.tum", "--rate", "1", "--size", "24", "18", "--device", "reference"]
     assert main(["fly", "few.ply", *words, "--json"]) == 0
     out, err = capsys.readouterr()
     assert out.startswith("{")

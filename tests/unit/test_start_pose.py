@@ -168,11 +168,11 @@ def test_fly_and_view_render_the_same_image_from_a_pose(here):
     pose = np.linalg.inv(start.world_to_camera)
     w, x, y, z = quaternion = matrix_to_quaternion(pose[:3, :3])
     (here / "one.tum").write_text(" ".join(map(repr, map(float, (0, *pose[:3, 3], x, y, z, w)))) + "\n")
-    words = ["--trajectory", "one.tum", "--size", "64", "36", "--device", "reference", "-o", "flight"]
+    words = ["--trajectory", "one.tum", "--size", "32", "18", "--device", "reference", "-o", "flight"]
     assert main(["fly", "yard.ply", *words]) == 0
     session = Session(load_source("yard.ply"), "reference")
     fov_y = 2 * math.atan(start.height / 2 / start.fy)
-    viewed = session.render(Viewpoint(tuple(pose[:3, 3]), tuple(quaternion), fov_y, 64, 36)).frame
+    viewed = session.render(Viewpoint(tuple(pose[:3, 3]), tuple(quaternion), fov_y, 32, 18)).frame
     session.close()
     flown = read_image("flight/rgb/000000.png").astype(int)
     assert flown.max() > 100

@@ -75,9 +75,10 @@ class Result:
     def effects(self) -> dict[str, float]:
         """Milliseconds that each effect adds to the frame: medians of interleaved differences."""
         return {
-            name: float(np.median(np.subtract(self.timer.ms[: len(less.ms)], less.ms)))
+            # after an interrupt, one of them may have a frame more
+            name: float(np.median([own - other for own, other in zip(self.timer.ms, less.ms, strict=False)]))
             for name, less in self.without.items()
-            if less.ms
+            if less.ms and self.timer.ms
         }
 
     def as_dict(self) -> dict:
