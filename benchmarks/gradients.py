@@ -1,6 +1,7 @@
 """Measure gradients: differences from the reference renderer, and time (docs/gradients.md).
 
-    PYTHONPATH=.:tests python benchmarks/gradients.py [--device D] [--scenes 200] [--json FILE]
+    PYTHONPATH=.:tests python benchmarks/gradients.py [--device D] [--scenes 200] [--solid SHARE]
+        [--quality Q] [--json FILE]
     PYTHONPATH=.:tests python benchmarks/gradients.py --time r100k_720p r1m_1080p [--quality surfel]
 
 Errors are of the random scenes of tests/contract/test_gradients.py: for the array of each parameter the
@@ -35,11 +36,11 @@ from fidsplat.util.errors import InputError
 from fidsplat.util.timing import Timer, time_interleaved
 
 
-def errors(backend: Backend, scenes: int) -> list[dict[str, float | str]]:
+def errors(backend: Backend, scenes: int, solid: float, quality: str | None) -> list[dict[str, float | str]]:
     """Median and largest error of each parameter over all scenes."""
     reference, found, beyond = ReferenceBackend(), defaultdict(list), defaultdict(list)
     for seed in track(range(scenes), "Scenes", console=PROGRESS):
-        cloud, capture = random_picture(seed)
+        cloud, capture = random_picture(seed, solid=solid, quality=quality)
         truth = derivatives(reference, cloud, capture)
         off = list(differences(derivatives(backend, cloud, capture), truth))
         for one in off:
@@ -83,7 +84,8 @@ def main() -> None:
     parser = options(__doc__, repeats=15)
     parser.add_argument("--scenes", type=int, default=200, help="random scenes (default: 200)")
     parser.add_argument("--time", nargs="+", metavar="SCENE", help="time these standard scenes instead")
-    parser.add_argument("--quality", help="of what is timed (default: standard)")
+    parser.add_argument("--solid", type=float, default=0.0, help="share of 3D Gaussians (default: 0)")
+    parser.add_argument("--quality", help="render quality (default: standard)")
     given = parser.parse_args()
     renderer = fs.Renderer(given.device)
     if not renderer.backend.traits.differentiates:
@@ -93,7 +95,7 @@ def main() -> None:
         rows = [times(backend, scene, given.quality, given.repeats) for scene in given.time]
         heads, title = list(rows[0]), "Milliseconds of a frame and its gradients"
     else:
-        rows = errors(backend, given.scenes)
+        rows = errors(backend, given.scenes, given.solid, given.quality)
         heads, title = list(rows[0]), f"Derivatives of {given.scenes} random scenes against float64"
     if not keep({**facts(renderer), "figures": rows}, given.json):
         cells = [[one if isinstance(one, str) else f"{one:.3g}" for one in row.values()] for row in rows]
