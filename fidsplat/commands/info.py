@@ -19,8 +19,8 @@ class Info:
 
     Bounds are those of all splats, and of the middle 99 % of their centres along each axis, as captures have
     strays far away. The up axis is a guess: away from the level areas, or along a side that is by far the
-    longest. The command suggests a size for a first marker and a position at which `fidsplat render FILE.ply`
-    shows it.
+    longest. The command suggests size and pose of a first marker that faces the camera of `fidsplat render
+    FILE.ply`.
 
     Examples:
       fidsplat info scene.ply
@@ -63,9 +63,8 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     scales, opacities = (" / ".join(f"{v:.3g}" for v in facts[key]) for key in ("scales", "opacities"))
     shares = " / ".join(map(str, SHARES))
     low, high = facts["middle_bounds"]
-    place = (
-        f"position = {point(facts['marker_position'])}: a tenth of the scene, in front of its middle from -z"
-    )
+    place = f"position = {point(facts['marker_position'])}, quaternion = {point(facts['marker_quaternion'])}"
+    place += ": a tenth of the scene, in front of its middle"
     return [
         *rows,
         ("bounds", " to ".join(map(point, facts["bounds"])) + " m"),

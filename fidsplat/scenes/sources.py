@@ -14,7 +14,7 @@ from fidsplat.formats.collect import Progress
 from fidsplat.formats.files import FORMATS, NAMED, load_splats
 from fidsplat.scenes.scene import Scene
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.splats.statistics import guess_up
+from fidsplat.splats.statistics import guess_up, level_rotation
 from fidsplat.store.layout import SUFFIX
 from fidsplat.store.partial_cloud import PartialCloud, concatenated
 from fidsplat.store.store import Store
@@ -121,12 +121,9 @@ def framing_camera(
     up = guess.direction if pose.up is None else np.array(pose.up)
     low, high = _extent(cloud)
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-6)
-    ahead = np.cross(
-        up, (0.0, 1.0, 0.0) if np.abs(up[1:]).max() < 1e-6 * np.abs(up).max() else (1.0, 0.0, 0.0)
-    )
-    ahead /= max(np.linalg.norm(ahead), 1e-300)
+    ahead = level_rotation(up)[:, 2]
     if guess.ground or pose.up is not None:
-        ahead -= math.tan(ELEVATION) * up / max(np.linalg.norm(up), 1e-300)
+        ahead = ahead - math.tan(ELEVATION) * up / np.linalg.norm(up)
     start = Camera.look_at(width, height, FOV_X, middle - ahead, middle, up)
     corners = half * np.stack(np.meshgrid(*([-1, 1],) * 3), -1).reshape(-1, 3)
     corners = corners @ start.world_to_camera[:3, :3].T

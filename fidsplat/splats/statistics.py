@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fidsplat.splats.cloud import SplatCloud
-from fidsplat.splats.rotations import quaternion_to_matrix
+from fidsplat.splats.rotations import matrix_to_quaternion, quaternion_to_matrix
 
 SHARES = (1, 50, 99)
 """percent"""
@@ -48,23 +48,34 @@ def describe(cloud: SplatCloud) -> dict[str, Any]:
     low, high = cloud.bounds()
     inner = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0) + cloud.origin
     extent = inner[1] - inner[0]
-    front = np.array([*inner.mean(0)[:2], inner[0, 2]])
+    guess = guess_up(cloud)
+    facing = level_rotation(guess.direction)
+    front = inner.mean(0) - facing[:, 2] * (extent @ np.abs(facing[:, 2])) / 2
     front[np.abs(front) < 1e-9 * extent.max()] = 0.0  # rounding errors of a mean
-    up, why, _ = guess_up(cloud)
-    axis = "xyz".index(up[1])
+    axis = "xyz".index(guess.axis[1])
     scales = cloud.scales.astype(np.float64)
     return facts | {
         "bounds": [low, high],
         "middle_bounds": list(inner),
         "marker_position": front,
-        "up": up,
-        "up_because": why,
+        "marker_quaternion": matrix_to_quaternion(facing),
+        "up": guess.axis,
+        "up_because": guess.reason,
         "height": float(extent[axis]),
         "marker_size": float(f"{0.1 * max(extent.max(), 1e-9):.1g}"),
         "scales": np.percentile(scales.max(1), SHARES),
         "aspect": float(np.median(scales.max(1) / scales.min(1))),
         "opacities": np.percentile(cloud.opacities, SHARES),
     }
+
+
+def level_rotation(up) -> np.ndarray:
+    """Axes of a horizontal camera for an up direction (3,), as columns (3, 3): right (x where possible), down
+    and ahead. A marker with these axes faces the camera."""
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    ahead = np.cross(up, (0.0, 1.0, 0.0) if np.abs(up[1:]).max() < 1e-6 else (1.0, 0.0, 0.0))
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([np.cross(-up, ahead), -up, ahead], 1) + 0.0
 
 
 def guess_up(cloud: SplatCloud) -> Up:

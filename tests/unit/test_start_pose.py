@@ -10,8 +10,10 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands.view import View
 from fidsplat.images.files import read_image, to_uint8
+from fidsplat.scenes import PlacedMarker
 from fidsplat.scenes.sources import StartPose, framing_camera, load_source
 from fidsplat.splats.rotations import matrix_to_quaternion
+from fidsplat.splats.statistics import describe
 
 AXES = {"+z": (0, 0, 1), "-z": (0, 0, -1), "+y": (0, 1, 0), "-y": (0, -1, 0), "+x": (1, 0, 0)}
 
@@ -50,6 +52,22 @@ def test_a_scene_starts_upright_and_above_its_ground(axis, thin):
     assert abs(camera.world_to_camera[0, :3] @ up) < 1e-12  # no roll
     inside = camera.project(cloud.means)
     assert ((inside > 0) & (inside < (1280, 720))).all()
+
+
+@pytest.mark.parametrize("axis", ["+z", "+y", "-y"])
+def test_the_suggested_marker_faces_the_first_view(axis):
+    cloud = yard(AXES[axis])
+    facts = describe(cloud)
+    pose = (facts["marker_position"], facts["marker_quaternion"])
+    placed = PlacedMarker(fs.marker("apriltag:36h11:5", size=facts["marker_size"]), pose)
+    camera = framing_camera(cloud)
+    corners = camera.project(placed.corners)
+    (left_top, right_top, right_bottom, left_bottom) = corners  # upright, not mirrored
+    assert left_top[0] < right_top[0] - 20
+    assert left_top[1] < left_bottom[1] - 20
+    assert right_bottom[0] > left_bottom[0] + 20
+    distances = (cloud.means - camera.position) @ camera.world_to_camera[2, :3]
+    assert (placed.pose[:3, 3] - camera.position) @ camera.world_to_camera[2, :3] < np.median(distances)
 
 
 def test_a_marker_and_a_cloud_without_ground_are_framed_from_the_front():
